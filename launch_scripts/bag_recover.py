@@ -1,0 +1,13 @@
+#!/usr/bin/env python3
+"""Bring back a killed recording: python3 launch_scripts/bag_recover.py runs/x/bag.partial [--output FOLDER]."""
+
+import sys
+
+import wm_setup
+
+wm_setup.ensure()
+
+from wm_nodes.recording.recovery import main  # noqa: E402
+
+if __name__ == "__main__":
+    sys.exit(main())

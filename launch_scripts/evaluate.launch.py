@@ -1,0 +1,16 @@
+"""ros2 launch wm_bringup evaluate.launch.py, or: python3 launch_scripts/evaluate.launch.py [--show-args]"""
+
+
+def generate_launch_description():
+    from wm_nodes.ros.launch_face import launch_description
+
+    return launch_description("evaluate")
+
+
+if __name__ == "__main__":
+    import wm_setup
+
+    wm_setup.ensure()
+    from wm_nodes.ros.runner import main
+
+    raise SystemExit(main("evaluate"))

@@ -1,0 +1,16 @@
+"""ros2 launch wm_bringup replay_offline.launch.py, or: python3 launch_scripts/replay_offline.launch.py [--show-args]"""
+
+
+def generate_launch_description():
+    from wm_nodes.ros.launch_face import launch_description
+
+    return launch_description("replay_offline")
+
+
+if __name__ == "__main__":
+    import wm_setup
+
+    wm_setup.ensure()
+    from wm_nodes.ros.runner import main
+
+    raise SystemExit(main("replay_offline"))

@@ -1,0 +1,48 @@
+"""What the virtual environment already holds: one fingerprint per step, so that only what changed is done again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+
+def fingerprint(files: Iterable[Path], *extra: str) -> str:
+    """Return a sha256 over names and contents of files, and `extra`."""
+    digest = hashlib.sha256(platform.machine().encode())
+    for text in extra:
+        digest.update(b"\0" + text.encode())
+    for file in sorted(files):
+        digest.update(b"\0" + file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def python_version(venv: Path) -> str:
+    """Version of the Python in a virtual environment; of the running one where there is none yet."""
+    try:
+        lines = (venv / "pyvenv.cfg").read_text().splitlines()
+    except OSError:
+        return platform.python_version()
+    values = {key.strip(): value.strip() for key, _, value in (line.partition("=") for line in lines)}
+    return values.get("version", platform.python_version())
+
+
+def read_stamp(path: Path) -> dict[str, str]:
+    """Return step -> fingerprint; empty where there is no readable stamp."""
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(values, dict):
+        return {}
+    return {str(k): str(v) for k, v in values.items()}
+
+
+def write_stamp(path: Path, stamp: dict[str, str]) -> None:
+    """Replace the stamp in one go, so that an interrupted set-up leaves the old one."""
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps({**stamp, "python": sys.executable}, indent=1, sort_keys=True))
+    temporary.replace(path)

@@ -1,0 +1,266 @@
+"""What only the system's package manager can bring: a software renderer, a C++ compiler, Python's headers."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from setup_steps.console import SetupError, run, say
+
+MIN_MESA = (24, 3)
+"""The first Mesa whose software renderer (lavapipe) has VK_KHR_external_memory_fd, which SAPIEN needs."""
+BACKPORTS_FILE = "/etc/apt/sources.list.d/wm-backports.sources"
+RENDERER = ("mesa-vulkan-drivers", "libvulkan1")
+
+
+@dataclass(frozen=True)
+class AptSource:
+    """One enabled `deb` entry of the machine's package sources."""
+
+    uri: str
+    suites: tuple[str, ...]
+    components: tuple[str, ...]
+    signed_by: str = ""
+
+
+@dataclass
+class AptPlan:
+    """What to install, from where, and why."""
+
+    packages: list[str] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+    backports: str = ""
+    """deb822 text of BACKPORTS_FILE; empty where the configured suites hold what is needed."""
+    target: str = ""
+    """Value of apt-get's -t, for the renderer only."""
+
+    def commands(self) -> list[str]:
+        """The shell commands, as root would type them."""
+        lines = []
+        if self.backports:
+            body = self.backports.replace("\n", "\\n")
+            lines.append(f"printf '{body}' > {BACKPORTS_FILE}")
+        lines.append("apt-get update")
+        renderer = [name for name in self.packages if name in RENDERER]
+        others = [name for name in self.packages if name not in RENDERER]
+        if others:
+            lines.append("apt-get install -y --no-install-recommends " + " ".join(others))
+        if renderer:
+            target = f"-t {self.target} " if self.target else ""
+            lines.append(f"apt-get install -y --no-install-recommends {target}" + " ".join(renderer))
+        return lines
+
+
+def parse_sources(text: str) -> list[AptSource]:
+    """Read `.sources` (deb822) or `.list` (one-line) text; disabled and source-code entries are left out."""
+    one_line = [line for line in text.splitlines() if re.match(r"\s*deb\s", line)]
+    return (
+        [_parse_line(line) for line in one_line] if one_line else list(filter(None, map(_parse_stanza, _stanzas(text))))
+    )
+
+
+def backports_source(sources: list[AptSource], codename: str) -> str:
+    """Return deb822 text for <codename>-backports on the mirror that serves <codename>; empty if it is there already.
+
+    Raises:
+        SetupError: no entry serves <codename>, so there is no mirror to derive.
+    """
+    suite = f"{codename}-backports"
+    if any(suite in source.suites for source in sources):
+        return ""
+    main = next((source for source in sources if codename in source.suites), None)
+    if main is None:
+        raise SetupError(
+            f"no package source for {codename} in /etc/apt/sources.list or /etc/apt/sources.list.d: cannot tell which "
+            f"mirror holds {suite}; add that suite yourself and start again"
+        )
+    signed = f"Signed-By: {main.signed_by}\n" if main.signed_by else ""
+    return f"Types: deb\nURIs: {main.uri}\nSuites: {suite}\nComponents: main\n{signed}"
+
+
+def read_sources(root: Path = Path("/etc/apt")) -> list[AptSource]:
+    files = [root / "sources.list", *sorted((root / "sources.list.d").glob("*.list"))]
+    files += sorted((root / "sources.list.d").glob("*.sources"))
+    return [source for file in files if file.is_file() for source in parse_sources(file.read_text(errors="replace"))]
+
+
+def read_os_release(path: Path = Path("/etc/os-release")) -> dict[str, str]:
+    try:
+        lines = path.read_text().splitlines()
+    except OSError:
+        return {}
+    return {key: value.strip('"') for key, _, value in (line.partition("=") for line in lines)}
+
+
+def mesa_version(text: str) -> tuple[int, int] | None:
+    """Return (major, minor) of a package version like `25.0.7-2~bpo12+1`; None where there is none."""
+    match = re.match(r"(?:\d+:)?(\d+)\.(\d+)", text.strip())
+    return (int(match[1]), int(match[2])) if match else None
+
+
+def make_plan(
+    *,
+    missing_tools: list[str],
+    mesa: str,
+    loader: bool,
+    gpu_renderer: bool,
+    os_release: dict[str, str],
+    sources: list[AptSource],
+) -> AptPlan:
+    """Decide what to install.
+
+    Args:
+        missing_tools: package names of absent build tools.
+        mesa: installed version of mesa-vulkan-drivers, or an empty string.
+        loader: True where libvulkan.so.1 is found.
+        gpu_renderer: True where a GPU's own Vulkan driver is installed: Mesa is then not needed.
+    """
+    plan = AptPlan(packages=list(missing_tools))
+    if missing_tools:
+        plan.reasons.append(f"{', '.join(missing_tools)}: to build the ROS 2 message types")
+    if not loader:
+        plan.packages.append("libvulkan1")
+        plan.reasons.append("libvulkan1: the simulator renders through Vulkan")
+    version = mesa_version(mesa)
+    if not gpu_renderer and (version is None or version < MIN_MESA):
+        plan.packages.append("mesa-vulkan-drivers")
+        found = f"{mesa} is too old" if mesa else "none is installed"
+        plan.reasons.append(f"mesa-vulkan-drivers >= 24.3: draws the simulator's images without a GPU ({found})")
+        if os_release.get("VERSION_CODENAME") == "bookworm" and os_release.get("ID") == "debian":
+            plan.backports = backports_source(sources, "bookworm")
+            plan.target = "bookworm-backports"
+            plan.reasons.append("from bookworm-backports: Debian 12 itself has Mesa 22.3")
+    return plan
+
+
+def current_plan(gpu_renderer: bool) -> AptPlan:
+    """make_plan for this machine."""
+    missing = [package for tool, package in (("cc", "gcc"), ("c++", "g++"), ("make", "make")) if not shutil.which(tool)]
+    if not shutil.which("cmake"):
+        missing.append("cmake")
+    if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
+        missing.append(f"python{sys.version_info[0]}.{sys.version_info[1]}-dev")
+    if not _library("libX11.so.6"):
+        missing.append("libx11-6")
+    return make_plan(
+        missing_tools=missing,
+        mesa=_installed("mesa-vulkan-drivers"),
+        loader=_library("libvulkan.so.1"),
+        gpu_renderer=gpu_renderer,
+        os_release=read_os_release(),
+        sources=read_sources(),
+    )
+
+
+def install(plan: AptPlan, log: Path) -> bool:
+    """Carry out a plan if this user may; otherwise say what to type. Return True when everything is installed."""
+    if not plan.packages:
+        return True
+    for reason in plan.reasons:
+        say(f"system package {reason}")
+    prefix = _root_prefix()
+    if prefix is None or not shutil.which("apt-get"):
+        why = "no apt-get here" if not shutil.which("apt-get") else "neither root nor sudo here"
+        say(f"cannot install them ({why}); what needs them will not work until root has typed:")
+        for command in plan.commands():
+            say(f"    {command}")
+        return False
+    env = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    try:
+        for command in plan.commands():
+            say(f"running: {command}")
+            run([*prefix, "sh", "-c", command], log=log, why="installing system packages", env=env)
+    except SetupError as error:
+        say(str(error))
+        say("continuing without them")
+        return False
+    left = current_plan(nvidia_vulkan()).packages
+    if left:
+        say(f"{', '.join(left)}: this system's package sources hold no version that is new enough; continuing without")
+    return not left
+
+
+def nvidia_vulkan() -> bool:
+    """True where NVIDIA's own Vulkan driver is registered."""
+    folders = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+    return any(path.is_file() for folder in folders for path in Path(folder).glob("nvidia_icd*.json"))
+
+
+def _root_prefix() -> list[str] | None:
+    if os.geteuid() == 0:
+        return []
+    sudo = shutil.which("sudo")
+    if not sudo:
+        return None
+    quiet = subprocess.run([sudo, "-n", "true"], capture_output=True, check=False).returncode == 0
+    return [sudo] if quiet or sys.stdin.isatty() else None
+
+
+def _installed(package: str) -> str:
+    """Version of an installed Debian package, else an empty string."""
+    if not shutil.which("dpkg-query"):
+        icd = any(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
+        return f"{MIN_MESA[0]}.{MIN_MESA[1]} (assumed)" if icd else ""
+    command = ["dpkg-query", "-W", "-f", "${db:Status-Status} ${Version}", package]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    status, _, version = done.stdout.partition(" ")
+    return version if done.returncode == 0 and status == "installed" else ""
+
+
+def _library(name: str) -> bool:
+    import ctypes
+
+    try:
+        ctypes.CDLL(name)
+    except OSError:
+        return False
+    return True
+
+
+def _stanzas(text: str) -> list[dict[str, str]]:
+    stanzas: list[dict[str, str]] = [{}]
+    last = ""
+    for line in text.splitlines():
+        if line.startswith("#"):
+            continue
+        if not line.strip():
+            stanzas.append({})
+        elif line[0] in " \t":
+            stanzas[-1][last] = f"{stanzas[-1].get(last, '')}\n{line.strip()}"
+        else:
+            last, _, value = line.partition(":")
+            last = last.strip().lower()
+            stanzas[-1][last] = value.strip()
+    return [stanza for stanza in stanzas if stanza]
+
+
+def _parse_stanza(stanza: dict[str, str]) -> AptSource | None:
+    if "deb" not in stanza.get("types", "").split() or stanza.get("enabled", "yes").lower() in {"no", "false", "0"}:
+        return None
+    uris = stanza.get("uris", "").split()
+    if not uris:
+        return None
+    # A key written out in the entry spans lines; only a file name can be repeated in another entry.
+    key = stanza.get("signed-by", "")
+    return AptSource(
+        uri=uris[0],
+        suites=tuple(stanza.get("suites", "").split()),
+        components=tuple(stanza.get("components", "").split()),
+        signed_by="" if "\n" in key else key,
+    )
+
+
+def _parse_line(line: str) -> AptSource:
+    match = re.match(r"\s*deb\s+(?:\[([^\]]*)\]\s+)?(\S+)\s+(\S+)\s*([^#]*)", line)
+    if match is None:
+        raise SetupError(f"cannot read the package source {line!r}; see `man sources.list`")
+    options = dict(option.partition("=")[::2] for option in (match[1] or "").split())
+    return AptSource(
+        uri=match[2], suites=(match[3],), components=tuple(match[4].split()), signed_by=options.get("signed-by", "")
+    )

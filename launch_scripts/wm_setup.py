@@ -1,0 +1,175 @@
+"""Set up everything that the entry points of this folder need, once; later starts only compare a stamp.
+
+    python3 launch_scripts/wm_setup.py            # set up what is missing, then say what is there
+    python3 launch_scripts/wm_setup.py --check    # only say what is missing; exit code 1 if anything is
+
+An entry point calls `wm_setup.ensure()` first: it returns inside the virtual environment's Python, starting the same
+script again there if need be. $WM_VENV names another virtual environment than <repository>/.venv.
+"""
+
+import argparse
+import fcntl
+import os
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+REQUIREMENTS = ROOT / "requirements"
+MESSAGES = ROOT / "msgs_schema"
+PACKAGE = ROOT / "wm_nodes"
+WORKSPACE = ROOT / "ros2_ws"
+MISSING = ":missing"
+"""Suffix of the renderer's stamp where this user may not install system packages."""
+
+if str(ROOT / "launch_scripts") not in sys.path:
+    sys.path.insert(0, str(ROOT / "launch_scripts"))
+
+from setup_steps import interpreter  # noqa: E402  (the folder must be on sys.path first)
+from setup_steps.console import SetupError, isolated_environment, say  # noqa: E402
+from setup_steps.stamp import fingerprint, python_version, read_stamp, write_stamp  # noqa: E402
+
+
+def venv_folder():
+    """The virtual environment: $WM_VENV, else <repository>/.venv."""
+    return Path(os.environ.get("WM_VENV") or ROOT / ".venv").expanduser().absolute()
+
+
+def ensure():
+    """Return when the running Python is the virtual environment's and holds all that is needed; else make it so.
+
+    Ends the process with one message when that is impossible.
+    """
+    if not interpreter.supported(sys.version_info):
+        other = interpreter.find_supported()
+        if other is None:
+            raise SystemExit("error: " + interpreter.unsupported_message(sys.version_info))
+        say(f"this is Python {sys.version_info[0]}.{sys.version_info[1]}; continuing with {other}")
+        os.execv(other, [other, *sys.argv])
+    venv = venv_folder()
+    try:
+        if pending(venv):
+            with _alone(venv):
+                _set_up(venv)
+        elif read_stamp(_stamp_file(venv)).get("renderer", "").endswith(MISSING):
+            _recheck_renderer(venv)
+    except SetupError as error:
+        raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit("interrupted; start again to continue where the set-up stopped") from None
+    if Path(sys.prefix).resolve() != venv.resolve():
+        python = str(venv / "bin" / "python")
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os.execve(python, [python, *sys.orig_argv[1:]], isolated_environment(venv))
+
+
+def pending(venv):
+    """Return the steps that are to be done, in order: packages, messages, wm_nodes, renderer."""
+    stamp, wanted = read_stamp(_stamp_file(venv)), _wanted(venv)
+    present = {
+        "packages": (venv / "bin" / "python").exists(),
+        "messages": (WORKSPACE / "install" / "wm_msgs" / "share" / "wm_msgs" / "package.xml").exists(),
+        "wm_nodes": True,
+        "renderer": True,
+    }
+    done = {step: stamp.get(step, "").removesuffix(MISSING) for step in wanted}
+    return [step for step in wanted if not present[step] or done[step] != wanted[step]]
+
+
+def _wanted(venv):
+    from setup_steps.messages import message_sources
+
+    packages = fingerprint(REQUIREMENTS.glob("*.txt"), str(venv), python_version(venv))
+    build_files = [PACKAGE / name for name in ("setup.py", "setup.cfg", "pyproject.toml")]
+    return {
+        "packages": packages,
+        "messages": fingerprint(message_sources(MESSAGES), packages, str(ROOT)),
+        "wm_nodes": fingerprint(build_files, packages, str(ROOT)),
+        "renderer": fingerprint([ROOT / "launch_scripts" / "setup_steps" / "system.py"]),
+    }
+
+
+def _set_up(venv):
+    from setup_steps import messages, packages, system
+
+    steps = pending(venv)
+    if not steps:
+        return
+    log, stamp, wanted = venv.parent / (venv.name + "_setup.log"), read_stamp(_stamp_file(venv)), _wanted(venv)
+    say(f"setting up {', '.join(steps)}; output of the commands is in {log}")
+    if "renderer" in steps or "packages" in steps:
+        ready = system.install(system.current_plan(system.nvidia_vulkan()), log)
+        stamp["renderer"] = wanted["renderer"] + ("" if ready else MISSING)
+    actions = {
+        "packages": lambda: (packages.create_venv(venv, log), packages.install_packages(venv, REQUIREMENTS, log)),
+        "messages": lambda: messages.build_messages(venv, WORKSPACE, log),
+        "wm_nodes": lambda: packages.install_editable(venv, PACKAGE, log),
+    }
+    for step, action in actions.items():
+        if step in steps:
+            action()
+            stamp[step] = wanted[step]
+            write_stamp(_stamp_file(venv), stamp)
+    write_stamp(_stamp_file(venv), stamp)
+    say("done")
+
+
+def _recheck_renderer(venv):
+    """The last set-up could not install system packages: look whether they have arrived, and say so if not."""
+    from setup_steps import system
+
+    plan = system.current_plan(system.nvidia_vulkan())
+    if plan.packages:
+        say(f"still without {', '.join(plan.packages)}; `python3 launch_scripts/wm_setup.py --system` says what to do")
+        return
+    stamp = read_stamp(_stamp_file(venv))
+    write_stamp(_stamp_file(venv), {**stamp, "renderer": stamp["renderer"].removesuffix(MISSING)})
+
+
+def _stamp_file(venv):
+    return venv / "wm_setup_stamp.json"
+
+
+@contextmanager
+def _alone(venv):
+    """Hold a lock file, so that two starts at the same time set up once."""
+    venv.parent.mkdir(parents=True, exist_ok=True)
+    with open(venv.parent / (venv.name + ".lock"), "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            say(f"another process is setting up {venv}; waiting for it")
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="change nothing; exit code 1 when something is missing")
+    parser.add_argument("--system", action="store_true", help="only install, or name, missing system packages")
+    arguments = parser.parse_args()
+    if arguments.check:
+        steps = pending(venv_folder())
+        print("missing or out of date: " + ", ".join(steps) if steps else "complete")
+        return int(bool(steps))
+    if arguments.system:
+        from setup_steps import system
+
+        log = ROOT / ".venv_setup.log"
+        return int(not system.install(system.current_plan(system.nvidia_vulkan()), log))
+    ensure()
+    import rclpy
+    import torch
+
+    import wm_msgs.msg
+    from wm_nodes import __version__
+
+    print(f"wm_nodes {__version__} on Python {sys.version.split()[0]}, torch {torch.__version__}")
+    print(f"rclpy from {Path(rclpy.__file__).parent}, wm_msgs from {Path(wm_msgs.msg.__file__).parents[1]}")
+    print(f"activate: source {venv_folder() / 'bin' / 'activate'}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

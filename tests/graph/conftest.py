@@ -1,0 +1,38 @@
+"""Fixtures: a graph and a probe on an own domain; nothing is left over afterwards."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+pytest.importorskip("rclpy", reason="the graph tests need rclpy")
+
+from graph.harness import Graph, Probe, own_domain
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    with own_domain() as number:
+        yield number
+
+
+@pytest.fixture
+def graph(domain: int, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Graph]:
+    graph = Graph(domain, tmp_path / "run")
+    yield graph
+    codes = graph.stop()
+    killed = request.node.get_closest_marker("kills") is not None
+    if killed:
+        os.system("fastdds shm clean >/dev/null 2>&1")
+    else:
+        assert all(code == 0 for code in codes.values()), f"exit codes {codes}; logs in {graph.folder}"
+
+
+@pytest.fixture
+def probe(domain: int) -> Iterator[Probe]:
+    probe = Probe(domain)
+    yield probe
+    probe.close()

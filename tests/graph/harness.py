@@ -1,0 +1,210 @@
+"""Real nodes in real processes on an own ROS domain, and a probe node that talks to them."""
+
+import contextlib
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.action import ActionClient
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from wm_nodes.config.load import dump_config, load_config
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.ros.qos import topic
+
+DOMAINS = range(20, 90)
+TOY_FOLDER = Path(__file__).parent
+START_S = 60.0
+MATCH_S = 0.5
+"""A server that has not matched a new client's reader yet loses its answer (rmw_fastrtps 556)."""
+
+
+@contextlib.contextmanager
+def own_domain() -> Iterator[int]:
+    """A ROS domain that no other test process holds; the lock ends with the process, however it ends."""
+    for domain in DOMAINS:
+        with contextlib.ExitStack() as stack:
+            file = stack.enter_context(open(f"/tmp/wm_test_domain_{domain}.lock", "w"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield domain
+            return
+    raise RuntimeError(f"all domains {DOMAINS} are in use; are test processes left over?")
+
+
+def wait_until(what: str, ready: Callable[[], Any], timeout_s: float = 20.0) -> Any:
+    """Return the first true value of ready(); fail after timeout_s."""
+    deadline = time.monotonic() + timeout_s
+    while not (value := ready()):
+        assert time.monotonic() < deadline, f"not within {timeout_s:g} s: {what}"
+        time.sleep(0.02)
+    return value
+
+
+class Probe:
+    """A node of the test process on the graph's domain, spun in a thread."""
+
+    def __init__(self, domain: int, namespace: str = "/wm") -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = rclpy.create_node("probe", namespace=namespace, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self.messages: dict[str, list[Any]] = defaultdict(list)
+        self.diagnostics: dict[str, DiagnosticStatus] = {}
+        self.seen_errors: dict[str, list[str]] = defaultdict(list)
+        self._clients: dict[str, Any] = {}
+        row = topic("/diagnostics")
+        self.node.create_subscription(DiagnosticArray, row.name, self._on_diagnostics, row.qos)
+        self._stopped = False
+        self._thread = threading.Thread(target=self._spin)
+        self._thread.start()
+
+    def listen(self, name: str, at: str | None = None) -> list[Any]:
+        """Collect the messages of a topic of the QoS table."""
+        row = topic(name)
+        self.node.create_subscription(row.type, at or name, self.messages[name].append, row.qos)
+        return self.messages[name]
+
+    def publisher(self, name: str) -> Any:
+        row = topic(name)
+        return self.node.create_publisher(row.type, name, row.qos)
+
+    def call(self, kind: type[Any], name: str, request: Any, timeout_s: float = 20.0) -> Any:
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+            wait_until(f"service {name}", self._clients[name].service_is_ready, START_S)
+            time.sleep(MATCH_S)
+        client = self._clients[name]
+        wait_until(f"service {name}", client.service_is_ready, START_S)
+        return self.result(client.call_async(request), timeout_s, name)
+
+    def action(self, kind: type[Any], name: str) -> ActionClient:
+        client = ActionClient(self.node, kind, name)
+        wait_until(f"action {name}", client.server_is_ready, START_S)
+        return client
+
+    def send(self, client: ActionClient, goal: Any, feedback: Any = None) -> Any:
+        """Send a goal and return its accepted handle."""
+        handle = self.result(client.send_goal_async(goal, feedback_callback=feedback), 20.0, "goal")
+        assert handle.accepted
+        return handle
+
+    def finish(self, handle: Any, timeout_s: float = 60.0) -> Any:
+        """Wait for a goal's result; return the Result message."""
+        return self.result(handle.get_result_async(), timeout_s, "result").result
+
+    def result(self, future: Any, timeout_s: float, what: str) -> Any:
+        done = threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        assert done.wait(timeout_s), f"{what}: no answer within {timeout_s:g} s"
+        return future.result()
+
+    def value(self, node: str, key: str) -> str | None:
+        """A diagnostics value of a node, e.g. value("/wm/environment", "step_id")."""
+        status = self.diagnostics.get(node)
+        return None if status is None else next((v.value for v in status.values if v.key == key), None)
+
+    def close(self) -> None:
+        self._stopped = True
+        self._thread.join()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            name = status.name.split(":")[0]
+            self.diagnostics[name] = status
+            if status.level == DiagnosticStatus.ERROR:
+                self.seen_errors[name].append(status.message)
+
+    def _spin(self) -> None:
+        with contextlib.suppress(ExternalShutdownException):
+            while not self._stopped:
+                self._executor.spin_once(timeout_sec=0.05)
+
+
+class Graph:
+    """Processes of one run folder on one domain."""
+
+    def __init__(self, domain: int, folder: Path, config: RunConfig | None = None) -> None:
+        self.domain, self.folder = domain, folder
+        folder.mkdir(parents=True, exist_ok=True)
+        self.config = config or load_config("smoke")
+        (folder / "config.yaml").write_text(dump_config(self.config))
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._logs: list[IO[bytes]] = []
+
+    def start(self, node: str, namespace: str = "/wm", **params: Any) -> subprocess.Popen[bytes]:
+        """Start python -m wm_nodes.nodes.<node>_node; a parameter is given by keyword."""
+        values = {"config_file": self.folder / "config.yaml", "run_dir": self.folder, **params}
+        command = [sys.executable, "-m", f"wm_nodes.nodes.{node}_node", "--ros-args", "-r", f"__ns:={namespace}"]
+        for name, value in values.items():
+            command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
+        name = f"{namespace}/{node}"
+        log = open(self.log_path(name), "ab")  # noqa: SIM115
+        self._logs.append(log)
+        process = subprocess.Popen(command, env=self.environment(), stdout=log, stderr=subprocess.STDOUT)
+        self.processes[name] = process
+        return process
+
+    def environment(self) -> dict[str, str]:
+        path = os.pathsep.join([str(TOY_FOLDER), *filter(None, [os.environ.get("PYTHONPATH")])])
+        return {
+            **os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": str(self.domain), "OMP_NUM_THREADS": "1",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(self.folder / "ros_log"),
+        }  # fmt: skip
+
+    def start_environment(self, factory: str = "toy:make_environment", num_envs: int = 4, **params: Any) -> Any:
+        return self.start("environment", backend="factory", backend_factory=factory, num_envs=num_envs, **params)
+
+    def start_policy(self, **params: Any) -> Any:
+        return self.start("policy", policy_factory="toy:make_policy", **params)
+
+    def start_reward(self, **params: Any) -> Any:
+        return self.start("reward_evaluator", reward="rule", **params)
+
+    def start_learner(self, **params: Any) -> Any:
+        return self.start("learner", policy_factory="toy:make_policy", **params)
+
+    def log_path(self, name: str) -> Path:
+        return self.folder / f"{name.strip('/').replace('/', '_')}.log"
+
+    def log(self, name: str) -> str:
+        return self.log_path(name).read_text()
+
+    def kill(self, name: str) -> None:
+        """kill -9 and reap."""
+        self.processes[name].kill()
+        self.processes[name].wait(10)
+
+    def stop(self) -> dict[str, int]:
+        """SIGINT all; after 10 s SIGKILL. Return the exit codes."""
+        for process in self.processes.values():
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        for process in self.processes.values():
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait(5)
+        for log in self._logs:
+            log.close()
+        return {name: process.returncode for name, process in self.processes.items()}
+
+
+def shm_files() -> set[str]:
+    """Shared-memory files of Fast DDS on this host."""
+    return {name for name in os.listdir("/dev/shm") if "fastrtps" in name or "fastdds" in name}

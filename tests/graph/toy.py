@@ -1,0 +1,97 @@
+"""A tiny deterministic environment and policy: real objects for the graph, small enough for two cores."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from wm_nodes.config.schema import PolicyConfig, RunConfig
+from wm_nodes.control import check_actions, next_state
+from wm_nodes.policy import ImageEncoder, ImagePolicy
+from wm_nodes.specs import SOURCE_SIMULATOR, EnvironmentSpec
+from wm_nodes.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+
+SIDE_PX = 16
+GOAL_M = np.array([0.6, 0.0, 0.1], np.float32)
+
+
+class ReachToy:
+    """A dot that must reach GOAL_M within 3 cm: the image shows tool (red) and goal (green) from above."""
+
+    def __init__(self, num_envs: int, seed: int, max_episode_steps: int = 12) -> None:
+        self.spec = EnvironmentSpec(
+            env_id="toy/reach", task="reach", instruction="reach the dot", source=SOURCE_SIMULATOR, num_envs=num_envs,
+            height=SIDE_PX, width=SIDE_PX, cameras=("top",), action_names=("dx", "dy", "dz"),
+            action_units=("m", "m", "m"), action_scale=(0.03, 0.03, 0.03), state_names=("x", "y", "z"),
+            state_units=("m", "m", "m"), ground_truth_names=("tool_x", "tool_y"), control_period_s=0.1,
+            max_episode_steps=max_episode_steps, state_low=(0.4, -0.2, 0.0), state_high=(0.8, 0.2, 0.3),
+        )  # fmt: skip
+        self._seed = seed
+        self._resets = 0
+        self._states = np.tile(GOAL_M, (num_envs, 1))
+        self._steps = np.zeros(num_envs, np.uint32)
+        self._ids = np.zeros(num_envs, np.uint64)
+        self._ended = np.ones(num_envs, bool)
+
+    @property
+    def ground_truth(self) -> FloatArray:
+        return self._states[:, :2].copy()
+
+    def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
+        for i in range(self.spec.num_envs) if mask is None else np.flatnonzero(mask):
+            self._resets += 1
+            seed = self._seed * 100_003 + self._resets if seeds is None else int(seeds[i])
+            offset = np.random.default_rng(seed).uniform(-0.12, 0.12, 3)
+            self._states[i] = GOAL_M + offset.astype(np.float32) * np.array([1, 1, 0], np.float32)
+            self._steps[i], self._ids[i], self._ended[i] = 0, self._resets, False
+        return self._observation()
+
+    def step(self, actions: FloatArray) -> StepResult:
+        check_actions(actions, self.spec)
+        valid = ~self._ended
+        self._states = np.where(valid[:, None], next_state(self._states, actions, self.spec), self._states)
+        self._steps = self._steps + valid.astype(np.uint32)
+        near = np.linalg.norm(self._states - GOAL_M, axis=1) < 0.03
+        terminated = near & valid
+        truncated = valid & ~near & (self._steps >= self.spec.max_episode_steps)
+        self._ended = self._ended | terminated | truncated
+        return StepResult(
+            self._observation(), terminated, truncated, near.astype(np.float32),
+            np.zeros(self.spec.num_envs, np.float32), self.ground_truth, valid,
+        )  # fmt: skip
+
+    def goals(self) -> tuple[UInt8Array, BoolArray] | None:
+        return None
+
+    def close(self) -> None:
+        self._ended[:] = True
+
+    def _observation(self) -> Observation:
+        return Observation(self._draw(), self._states.copy(), self._ids.copy(), self._steps.copy())
+
+    def _draw(self) -> UInt8Array:
+        images = np.zeros((self.spec.num_envs, SIDE_PX, SIDE_PX, 3), np.uint8)
+        for color, points in ((0, self._states), (1, np.tile(GOAL_M, (self.spec.num_envs, 1)))):
+            pixels: NDArray[np.int64] = ((points[:, :2] - np.array([0.4, -0.2])) / 0.4 * (SIDE_PX - 1)).astype(int)
+            for i, (x, y) in enumerate(pixels.clip(0, SIDE_PX - 1)):
+                images[i, x, y, color] = 255
+        return images
+
+
+def make_environment(config: RunConfig, num_envs: int, seed: int) -> ReachToy:
+    return ReachToy(num_envs, seed)
+
+
+def make_long_environment(config: RunConfig, num_envs: int, seed: int) -> ReachToy:
+    """Episodes that outlast every test."""
+    return ReachToy(num_envs, seed, max_episode_steps=100_000)
+
+
+def make_policy(config: RunConfig) -> ImagePolicy:
+    def encode(images: torch.Tensor) -> torch.Tensor:
+        return images.float().reshape(len(images), -1)[:, ::3] / 255
+
+    encoder = ImageEncoder(encode, SIDE_PX * SIDE_PX, sha256="toy")
+    small = config.policy.model_copy(update={"width": 16, "depth": 1, "projection": 8})
+    assert isinstance(small, PolicyConfig)
+    torch.set_num_threads(1)
+    return ImagePolicy(encoder, 3, 3, small, seed=config.seed)

@@ -1,0 +1,27 @@
+"""Build of the package wm_nodes, by pip and by colcon. Versions of what it needs are pinned in ../requirements."""
+
+from setuptools import find_packages, setup
+
+NODES = ("environment", "policy", "reward_evaluator", "learner", "recorder", "player", "evaluation")
+
+setup(
+    name="wm_nodes",
+    version="0.1.0",
+    description="Online world-model reinforcement learning as a ROS 2 graph",
+    license="Apache-2.0",
+    python_requires=">=3.11,<3.13",
+    packages=find_packages(include=["wm_nodes", "wm_nodes.*"]),
+    package_data={"": ["*.yaml", "*.xml", "*.json", "*.safetensors", "*.md", "py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/wm_nodes"]),
+        ("share/wm_nodes", ["package.xml"]),
+    ],
+    install_requires=["mcap", "numpy", "pydantic", "pyyaml", "rosbags", "safetensors", "setuptools", "torch"],
+    zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            *(f"{node}_node = wm_nodes.nodes.{node}_node:main" for node in NODES),
+            "wm_compose = wm_nodes.nodes.compose:main",
+        ]
+    },
+)

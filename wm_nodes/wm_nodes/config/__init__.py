@@ -1,0 +1,1 @@
+"""Configuration: schema explains, presets hold the numbers."""

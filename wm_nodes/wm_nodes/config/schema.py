@@ -1,0 +1,193 @@
+"""What every setting means and which values are allowed. The numbers live in presets/*.yaml, not here."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+PositiveInt = Annotated[int, Field(ge=1)]
+NonNegativeInt = Annotated[int, Field(ge=0)]
+PositiveFloat = Annotated[float, Field(gt=0)]
+NonNegativeFloat = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+TaskName = Literal["reach", "push_cube", "pull_cube"]
+
+
+class Section(BaseModel):
+    """Frozen, and every unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SimulationConfig(Section):
+    cameras: list[Literal["side", "wrist"]]
+    """Rendered side by side, left to right, in every observation."""
+    image_size: PositiveInt
+    """Height and width of one camera image, px."""
+    control_hz: PositiveFloat
+    """Policy and world-model steps per simulated second."""
+    max_action_m: PositiveFloat
+    """Displacement of the commanded tool position by a full-scale action, m per axis and step."""
+    workspace_low_m: tuple[float, float, float]
+    workspace_high_m: tuple[float, float, float]
+    """Box that the commanded tool position stays in, robot base frame, m."""
+    max_episode_steps: PositiveInt
+    """An episode is truncated after this many steps."""
+    render_device: str
+    """SAPIEN render device; `auto` takes a GPU when there is one, else the software device."""
+
+
+class DataConfig(Section):
+    num_episodes: PositiveInt
+    """Simulator episodes to collect for the world model."""
+    num_heldout: PositiveInt
+    """Episodes kept apart for the gate; never trained on."""
+    behaviours: dict[str, NonNegativeFloat]
+    """Relative share of each behaviour (expert, noisy, near_miss, biased, waypoint, random, reach, ...)."""
+    num_workers: PositiveInt
+    """Collecting processes."""
+
+
+class TokenizerConfig(Section):
+    kind: Literal["continuous", "lfq"]
+    """continuous: real-valued latent tokens; lfq: lookup-free quantised tokens (MAGVIT-2)."""
+    patch_px: PositiveInt
+    """Side of the square patch behind one token, px; must divide the image."""
+    latent_dim: PositiveInt
+    """Values per token (continuous), or bits per token (lfq)."""
+    width: PositiveInt
+    depth: PositiveInt
+    """Transformer width and number of blocks of the encoder, and of the decoder."""
+    num_iterations: PositiveInt
+    batch_size: PositiveInt
+    learning_rate: PositiveFloat
+    entropy_weight: NonNegativeFloat
+    commitment_weight: NonNegativeFloat
+    """lfq only."""
+    foreground_weight: NonNegativeFloat
+    """Extra weight of pixels that differ from the episode-independent background."""
+
+
+class WorldModelConfig(Section):
+    width: PositiveInt
+    depth: PositiveInt
+    num_heads: PositiveInt
+    window: PositiveInt
+    """Frames the temporal attention looks back over."""
+    num_iterations: PositiveInt
+    batch_size: PositiveInt
+    learning_rate: PositiveFloat
+    rollout_steps: list[PositiveInt]
+    """Curriculum: imagined steps unrolled and back-propagated through, raised in equal stages over the training."""
+    done_weight: NonNegativeFloat
+    """Weight of the done loss (E4)."""
+    num_done_heads: PositiveInt
+    """Independent done heads; their minimum is the done signal, their spread the uncertainty."""
+    decoding_steps: PositiveInt
+    """MaskGIT passes per frame (lfq only)."""
+    text_num_iterations: PositiveInt
+    """Iterations of the text model, warm-started from the action model."""
+    state_weight: NonNegativeFloat
+    """Weight of the auxiliary loss that reads simulator positions off the predicted frame (0: off)."""
+
+
+class RewardConfig(Section):
+    mode: Literal["delta", "abs", "progress"]
+    """Dense reward (E5): change of the goal distance, its level, or progress along the golden trajectory."""
+    dense_weight: NonNegativeFloat
+    sparse_weight: NonNegativeFloat
+    success_threshold: Fraction
+    """tau_s of E7: the done signal above which the sparse reward is paid and the episode terminates."""
+    goal_threshold: Fraction
+    """tau_goal of E6: the text model's done signal above which its frame is the goal."""
+    dense_clip: PositiveFloat
+    """The dense reward of one step is clipped to [-dense_clip, dense_clip]."""
+    uncertainty_limit: NonNegativeFloat
+    """An imagined step above it pays no sparse reward and truncates the episode; 0: off."""
+
+
+class PolicyConfig(Section):
+    width: PositiveInt
+    depth: PositiveInt
+    """Hidden width and layers of the actor, and of the critic."""
+    projection: PositiveInt
+    """Width to which the encoder features are projected first; keeps the weights below the 1 MiB that travel inline."""
+    init_log_std: float
+    """Initial log standard deviation of the Gaussian, normalised action units."""
+
+
+class SftConfig(Section):
+    num_demonstrations: PositiveInt
+    num_iterations: PositiveInt
+    batch_size: PositiveInt
+    learning_rate: PositiveFloat
+
+
+class PpoConfig(Section):
+    updates: NonNegativeInt
+    num_envs: PositiveInt
+    num_steps: PositiveInt
+    """Lock-steps per update."""
+    gamma: Fraction
+    gae_lambda: Fraction
+    clip: PositiveFloat
+    value_clip: NonNegativeFloat
+    """0: the value loss is not clipped."""
+    epochs: PositiveInt
+    minibatch_size: PositiveInt
+    learning_rate: PositiveFloat
+    value_learning_rate: PositiveFloat
+    value_weight: NonNegativeFloat
+    entropy_weight: NonNegativeFloat
+    kl_reference_weight: NonNegativeFloat
+    """Weight of KL(policy || SFT policy), against exploiting the model."""
+    max_grad_norm: PositiveFloat
+    target_kl: NonNegativeFloat
+    """Stop the epochs of an update early beyond this approximate KL, nats; 0: never."""
+    value_warmup_updates: NonNegativeInt
+    """First updates that train the critic only."""
+
+
+class GateConfig(Section):
+    num_episodes: PositiveInt
+    """Held-out real episodes the model is judged on."""
+    object_error_ratio: PositiveFloat
+    """Full-horizon object error must be below this share of the error of copying the first frame."""
+    tool_error_ratio: PositiveFloat
+    done_precision: Fraction
+    done_recall: Fraction
+    """On rollouts of held-out actions, not on real frames."""
+    require_success_agreement: bool
+    """The SFT policy's imagined success must agree with its real success within the joint 95 % interval."""
+
+
+class EvaluationConfig(Section):
+    episodes: PositiveInt
+    first_seed: NonNegativeInt
+    """Reset seed of the first evaluation episode; training never uses seeds from here on."""
+    deterministic: bool
+
+
+class RoundsConfig(Section):
+    count: NonNegativeInt
+    """Online rounds after the first training: collect with the policy, refresh the model, continue."""
+    episodes: PositiveInt
+    """Simulator episodes per round."""
+    refresh_iterations: PositiveInt
+    updates: PositiveInt
+
+
+class RunConfig(Section):
+    seed: NonNegativeInt
+    task: TaskName
+    simulation: SimulationConfig
+    data: DataConfig
+    tokenizer: TokenizerConfig
+    world_model: WorldModelConfig
+    reward: RewardConfig
+    policy: PolicyConfig
+    sft: SftConfig
+    ppo: PpoConfig
+    gate: GateConfig
+    evaluation: EvaluationConfig
+    rounds: RoundsConfig

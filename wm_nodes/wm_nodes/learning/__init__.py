@@ -1,0 +1,1 @@
+"""Learners, rollouts, evaluation, weights and checkpoints. Import from the submodules; nothing is loaded here."""

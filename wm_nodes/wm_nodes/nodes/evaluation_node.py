@@ -1,0 +1,119 @@
+"""evaluation: plays episodes on fixed seeds in another environment node (the simulator) and says how many succeed."""
+
+import sys
+from typing import Any
+
+from wm_msgs.action import Evaluate
+from wm_msgs.msg import PolicyVersion
+from wm_nodes.learning.evaluation import EvaluationResult, evaluate
+from wm_nodes.nodes.backends import existing, make_policy
+from wm_nodes.nodes.policy_holder import PolicyHolder, read_weights, weights_uri
+from wm_nodes.nodes.remote_environment import RemoteEnvironment
+from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.clients import RosEnvironmentClient
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.params import Param
+from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.wire import PeerLost, WireError
+
+PARAMS = (
+    Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
+    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
+          read_only=True),
+    Param("initial_policy", "", "Weights (safetensors) for goals without version and file, before any announcement",
+          read_only=True),
+    Param("env_namespace", "sim", "Relative namespace of the environment node to evaluate in", read_only=True),
+    Param("step_timeout_s", 20.0, "Deadline of one env/step or env/reset", "s", minimum=0.1, maximum=600.0),
+    Param("handshake_timeout_s", 20.0, "Deadline for the environment to answer env/get_spec", "s",
+          minimum=0.1, maximum=600.0),
+)  # fmt: skip
+
+
+class EvaluationNode(ManagedNode):
+    """Action evaluate; follows policy/version."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("evaluation", PARAMS, **node_arguments)
+
+    def configure(self) -> None:
+        self._config = self.run_config()
+        self._holder = PolicyHolder(
+            make_policy(self._config, str(self.param("model_dir")), str(self.param("policy_factory")))
+        )
+        self._newest: PolicyVersion | None = None
+        self._environment = RosEnvironmentClient(
+            self, str(self.param("env_namespace")), float(self.param("step_timeout_s"))
+        )
+        self.listen("policy/version", self._on_version, while_inactive=True)
+        self._action = WorkerAction(self, Evaluate, "evaluate", self._evaluate, self._describe)
+        self.own(self._action.destroy)
+
+    def deactivate(self, reason: str) -> None:
+        self._action.stop(reason)
+
+    def _on_version(self, message: PolicyVersion) -> None:
+        self._newest = message
+
+    def _evaluate(self, work: Work) -> Evaluate.Result:
+        goal: Evaluate.Goal = work.request
+        result = Evaluate.Result(termination_reason=Evaluate.Result.FINISHED)
+        try:
+            result.policy_version = self._load(goal)
+            environment = RemoteEnvironment(
+                self._environment, work.check, timeout_s=float(self.param("handshake_timeout_s")),
+                behaviour=goal.behaviour or "policy", policy_version=result.policy_version,
+            )  # fmt: skip
+
+            def report(done: int, successes: int) -> None:
+                work.feedback(Evaluate.Feedback(episodes_done=done, success_rate=successes / max(done, 1)))
+
+            found = evaluate(
+                self._holder.policy, environment, int(goal.episodes), int(goal.seed), goal.deterministic,
+                on_progress=report,
+            )  # fmt: skip
+            self._fill(result, found)
+        except PeerLost as error:
+            result.termination_reason, result.message = Evaluate.Result.PEER_LOST, f"the environment is lost: {error}"
+        except (WireError, ValueError) as error:
+            result.termination_reason, result.message = Evaluate.Result.FAILED, str(error)
+        if result.message:
+            self.get_logger().error(result.message)
+            self.diagnostics.count("failed_evaluations", level=diagnostics.ERROR, text=result.message)
+        return result
+
+    def _load(self, goal: Evaluate.Goal) -> int:
+        """Load the weights the goal names; return their version (0 for a file)."""
+        if goal.policy_uri:
+            self._holder.load(read_weights(goal.policy_uri, self.run_dir), 0)
+            return 0
+        newest = self._newest
+        if goal.policy_version == 0 and newest is None:
+            path = existing(str(self.param("initial_policy")), "initial_policy (or give policy_uri in the goal)")
+            self._holder.load(path.read_bytes(), 0)
+        elif newest is not None and goal.policy_version in (0, newest.version):
+            self._holder.follow(newest, self.run_dir)
+        else:
+            version = int(goal.policy_version)
+            self._holder.load(read_weights(weights_uri(version), self.run_dir), version)
+        return self._holder.version
+
+    @staticmethod
+    def _fill(result: Evaluate.Result, found: EvaluationResult) -> None:
+        result.episodes, result.successes = found.episodes, found.successes
+        result.success_rate, result.success_low, result.success_high = found.success_rate, found.low, found.high
+        result.mean_return, result.mean_length = float("nan"), found.mean_length
+        result.success = convert.to_field(found.success)
+        result.length = convert.to_field(found.length)
+
+    @staticmethod
+    def _describe(reason: int, text: str) -> Evaluate.Result:
+        return Evaluate.Result(termination_reason=reason, message=text)
+
+
+def main() -> int:
+    return run_node(EvaluationNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

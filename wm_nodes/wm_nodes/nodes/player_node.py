@@ -1,0 +1,247 @@
+"""player: publishes a bag's messages again, byte for byte, with their QoS and the bag's time on /clock."""
+
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from wm_msgs.action import Replay
+from wm_msgs.msg import Credit, ErrorCode
+from wm_msgs.srv import PlayNext, Seek, SetRate
+from wm_nodes.nodes.bag_qos import message_class, offered_qos
+from wm_nodes.recording import BagError
+from wm_nodes.recording.cdr import session_and_seq
+from wm_nodes.recording.playback import Playback
+from wm_nodes.ros import diagnostics
+from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.convert import time_msg
+from wm_nodes.ros.credit import CreditLedger
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.params import Param
+from wm_nodes.ros.qos import topic
+from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.wire import Cancelled
+
+FEEDBACK_S = 0.2
+CREDITED = "env/transition"
+MATCH_S = 0.5
+"""Time for subscribers to find fresh publishers before the first message, s."""
+
+PARAMS = (
+    Param("bag_uri", "", "Bag to play when activated, and by a replay goal without one; relative to run_dir"),
+    Param("play_at_start", True, "Play bag_uri when activated", read_only=True),
+    Param("start_paused", False, "Begin paused: player/resume or player/play_next go on"),
+    Param("rate", 1.0, "Recorded seconds per second", minimum=1e-3, maximum=1e6),
+    Param("start_offset", 0.0, "Where to begin", "s", minimum=0.0),
+    Param("loop", False, "Begin again at the end"),
+    Param("publish_clock", True, "Publish the bag's time on /clock"),
+    Param("topics", [""], "Topics to play, relative or absolute; empty: all"),
+)  # fmt: skip
+
+
+class PlayerNode(ManagedNode):
+    """Action replay; services player/pause, resume, set_rate, seek, play_next."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("player", PARAMS, **node_arguments)
+        self._playback: Playback | None = None
+        self._thread: threading.Thread | None = None
+        self._outlets: dict[str, Publisher] = {}
+        self._lock = threading.Lock()
+
+    def configure(self) -> None:
+        row = topic("/clock")
+        self._clock_publisher = self.create_publisher(Clock, row.name, row.qos)
+        self.own(self.destroy_publisher, self._clock_publisher)
+        self._ledgers: dict[int, CreditLedger] = {}
+        self.listen("flow/credit", self._on_credit)
+        self.serve(Trigger, "player/pause", self._on_pause)
+        self.serve(Trigger, "player/resume", self._on_resume)
+        self.serve(SetRate, "player/set_rate", self._on_set_rate)
+        self.serve(Seek, "player/seek", self._on_seek)
+        self.serve(PlayNext, "player/play_next", self._on_play_next)
+        self._action = WorkerAction(self, Replay, "replay", self._replay, _describe)
+        self.own(self._action.destroy)
+
+    def activate(self) -> None:
+        uri = str(self.param("bag_uri"))
+        if not uri or not self.param("play_at_start"):
+            return
+        request = Replay.Goal(
+            bag_uri=uri, rate=float(self.param("rate")), start_offset=float(self.param("start_offset")),
+            loop=bool(self.param("loop")), publish_clock=bool(self.param("publish_clock")),
+            topics=[name for name in self.param("topics") if name],
+        )  # fmt: skip
+        playback = self._open(request)
+        self._thread = threading.Thread(target=self._play_alone, args=(playback, request), name="player")
+        self._thread.start()
+
+    def deactivate(self, reason: str) -> None:
+        self._action.stop(reason)
+        if self._playback is not None:
+            self._playback.stop()
+        if self._thread is not None:
+            self._thread.join(5.0)
+        self._thread = None
+
+    def cleanup(self) -> None:
+        for publisher in self._outlets.values():
+            self.destroy_publisher(publisher)
+        self._outlets = {}
+
+    def update_diagnostics(self) -> None:
+        playback = self._playback
+        self.diagnostics.gauge("playing", playback is not None)
+        if playback is not None:
+            self.diagnostics.gauge("position_s", playback.position_s)
+            self.diagnostics.gauge("messages", playback.messages)
+
+    # Playing.
+
+    def _open(self, request: Replay.Goal) -> Playback:
+        """Raises BagError when the bag cannot be played or another is being played."""
+        uri = request.bag_uri or str(self.param("bag_uri"))
+        if not uri:
+            raise BagError("no bag named; set bag_uri in the goal or as a parameter")
+        path = self.run_dir / uri if self.param("run_dir") else Path(uri)
+        namespace = self.get_namespace().rstrip("/")
+        names = [name if name.startswith("/") else f"{namespace}/{name}" for name in request.topics]
+        with self._lock:
+            if self._playback is not None:
+                raise BagError("another bag is being played; cancel that goal or wait")
+            playback = Playback(
+                path, names=names, rate=request.rate, start_offset_s=request.start_offset, loop=request.loop,
+                paused=bool(self.param("start_paused")),
+            )  # fmt: skip
+            self._playback = playback
+        try:
+            for name, connection in playback.topics.items():
+                if name not in self._outlets:
+                    qos = offered_qos(list(connection.ext.offered_qos_profiles))
+                    self._outlets[name] = self.create_publisher(message_class(connection.msgtype), name, qos)
+        except ValueError:
+            self._playback = None
+            raise
+        return playback
+
+    def _play(self, playback: Playback, request: Replay.Goal, work: Work | None) -> None:
+        began, last_feedback = time.monotonic(), 0.0
+        while not playback.paused and time.monotonic() - began < MATCH_S:
+            time.sleep(0.02)
+
+        def check() -> None:
+            nonlocal last_feedback
+            if work is None:
+                return
+            work.check()
+            if time.monotonic() - last_feedback >= FEEDBACK_S:
+                last_feedback = time.monotonic()
+                work.feedback(Replay.Feedback(position=playback.position_s, messages=playback.messages))
+
+        def publish(name: str, data: bytes) -> None:
+            if name.endswith(f"/{CREDITED}"):
+                self._wait_for_credit(playback, data, check)
+            self._outlets[name].publish(data)
+
+        def tick(time_ns: int) -> None:
+            if request.publish_clock:
+                self._clock_publisher.publish(Clock(clock=time_msg(time_ns)))
+
+        try:
+            playback.run(publish, tick, check)
+        finally:
+            self._playback = None
+
+    def _play_alone(self, playback: Playback, request: Replay.Goal) -> None:
+        try:
+            self._play(playback, request, None)
+            self.get_logger().info(f"played {playback.messages} messages")
+        except BagError as error:
+            self.get_logger().error(f"playing failed: {error}")
+            self.diagnostics.set_condition("playing", diagnostics.ERROR, str(error))
+
+    def _replay(self, work: Work) -> Replay.Result:
+        began = time.monotonic()
+        try:
+            playback = self._open(work.request)
+            self._play(playback, work.request, work)
+        except (BagError, ValueError) as error:
+            self.get_logger().error(f"replay failed: {error}")
+            return _describe(Replay.Result.FAILED, str(error))
+        if not self.active:
+            raise Cancelled("deactivated")
+        return Replay.Result(
+            termination_reason=Replay.Result.FINISHED, messages=playback.messages, duration=time.monotonic() - began
+        )
+
+    def _wait_for_credit(self, playback: Playback, data: bytes, check: Any) -> None:
+        """Hold a transition back until every consumer has granted it, as the environment does."""
+        session, seq = session_and_seq(data)
+        ledger = self._ledgers.setdefault(session, CreditLedger(CREDITED, session))
+        while ledger.holding(seq):
+            for name in ledger.drop_silent(seq):
+                self.diagnostics.count("silent_consumers", text=f"{name} granted nothing for 5 s and is not waited for")
+            check()
+            time.sleep(0.002)
+
+    def _on_credit(self, message: Credit) -> None:
+        ledger = self._ledgers.get(message.stream_session)
+        if ledger is not None:
+            ledger.note(message)
+
+    # Services.
+
+    def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._trigger(response, lambda playback: playback.pause())
+
+    def _on_resume(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._trigger(response, lambda playback: playback.resume())
+
+    def _trigger(self, response: Trigger.Response, act: Any) -> Trigger.Response:
+        playback = self._playback
+        if playback is None:
+            response.message = "not playing; send a replay goal"
+            return response
+        act(playback)
+        response.success = True
+        return response
+
+    def _on_set_rate(self, request: SetRate.Request, response: SetRate.Response) -> SetRate.Response:
+        return self._control(response, lambda playback: playback.set_rate(request.rate))
+
+    def _on_seek(self, request: Seek.Request, response: Seek.Response) -> Seek.Response:
+        return self._control(response, lambda playback: playback.seek(request.position))
+
+    def _on_play_next(self, request: PlayNext.Request, response: PlayNext.Response) -> PlayNext.Response:
+        def play(playback: Playback) -> None:
+            response.played = playback.play_next(request.num_messages)
+
+        return self._control(response, play)
+
+    def _control(self, response: Any, act: Any) -> Any:
+        playback = self._playback
+        if playback is None:
+            response.error_code, response.message = ErrorCode.NOT_ACTIVE, "not playing; send a replay goal"
+            return response
+        try:
+            act(playback)
+        except BagError as error:
+            response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
+        return response
+
+
+def _describe(reason: int, message: str) -> Replay.Result:
+    return Replay.Result(termination_reason=reason, message=message)
+
+
+def main() -> None:
+    sys.exit(run_node(PlayerNode))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,269 @@
+"""policy: acts in the environment for a number of lock-steps (action rollout), and follows the learner's versions."""
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from wm_msgs.action import Rollout
+from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
+from wm_msgs.srv import InferAction, LoadPolicy
+from wm_nodes.learning.rollouts import action_noise, reset_seeds
+from wm_nodes.nodes.backends import existing, make_policy
+from wm_nodes.nodes.policy_holder import PolicyHolder, read_weights
+from wm_nodes.policy import PolicyOutput
+from wm_nodes.recording.layout import Tiles
+from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.params import Param
+from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.specs import EnvironmentSpec
+
+FEEDBACK_S = 0.5
+
+PARAMS = (
+    Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
+    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
+          read_only=True),
+    Param("initial_policy", "", "Weights (safetensors) to act with before the learner announces any", read_only=True),
+    Param("step_timeout_s", 10.0, "Deadline of one env/step or env/reset, retries included", "s",
+          minimum=0.1, maximum=600.0),
+    Param("handshake_timeout_s", 10.0, "Deadline for the environment to answer env/get_spec", "s",
+          minimum=0.1, maximum=600.0),
+    Param("version_timeout_s", 10.0, "Deadline for the policy version that a goal asks for to arrive", "s",
+          minimum=0.1, maximum=600.0),
+)  # fmt: skip
+
+
+class PolicyNode(ManagedNode):
+    """Action rollout; services policy/infer, policy/load; follows policy/version; publishes action.
+
+    Args:
+        local_environment: in a composed process, returns the environment node's lock-step environment; it is then
+            called directly instead of through env/step.
+    """
+
+    def __init__(self, local_environment: Callable[[], Any] | None = None, **node_arguments: Any) -> None:
+        super().__init__("policy", PARAMS, **node_arguments)
+        self._local_environment = local_environment
+
+    def configure(self) -> None:
+        self._holder = PolicyHolder(
+            make_policy(self.run_config(), str(self.param("model_dir")), str(self.param("policy_factory")))
+        )
+        if self.param("initial_policy"):
+            path = existing(str(self.param("initial_policy")), "initial_policy")
+            try:
+                self._holder.load(path.read_bytes(), 0)
+            except WireError as error:
+                raise ValueError(f"initial_policy {path}: {error}") from None
+        self._spec: EnvironmentSpec | None = None
+        self._last_reply: Reply | None = None
+        timeout_s = float(self.param("step_timeout_s"))
+        self._environment: EnvironmentClient = (
+            RosEnvironmentClient(self, timeout_s=timeout_s) if self._local_environment is None
+            else LocalEnvironmentClient(self._local_environment, timeout_s)
+        )  # fmt: skip
+        self._actions = self.publish_on("action")
+        self.listen("env/spec", self._on_spec, while_inactive=True)
+        self.listen("policy/version", self._on_version, while_inactive=True)
+        self.serve(InferAction, "policy/infer", self._on_infer)
+        self.serve(LoadPolicy, "policy/load", self._on_load)
+        self._rollouts = WorkerAction(self, Rollout, "rollout", self._rollout, self._describe)
+        self.own(self._rollouts.destroy)
+
+    def deactivate(self, reason: str) -> None:
+        self._rollouts.stop(reason)
+
+    def update_diagnostics(self) -> None:
+        if hasattr(self, "_holder"):
+            self.diagnostics.gauge("policy_version", self._holder.version)
+
+    # The rollout, in a worker thread.
+
+    def _rollout(self, work: Work) -> Rollout.Result:
+        result = Rollout.Result(termination_reason=Rollout.Result.FINISHED)
+        try:
+            self._act(work, result)
+        except PeerLost as error:
+            self._fail(result, Rollout.Result.PEER_LOST, f"the environment is lost: {error}")
+        except (WireError, ValueError) as error:
+            self._fail(result, Rollout.Result.FAILED, str(error))
+        return result
+
+    def _fail(self, result: Rollout.Result, reason: int, text: str) -> None:
+        result.termination_reason, result.message = reason, text
+        self._last_reply = None
+        self.get_logger().error(text)
+        self.diagnostics.count("failed_rollouts", level=diagnostics.ERROR, text=text)
+
+    def _act(self, work: Work, result: Rollout.Result) -> None:
+        goal: Rollout.Goal = work.request
+        if goal.steps < 1:
+            raise ValueError(f"steps must be at least 1, got {goal.steps}")
+        spec = self._environment.handshake(float(self.param("handshake_timeout_s")), work.check)
+        self._check_spec(spec)
+        self._await_version(goal.policy_version, work)
+        version = self._holder.version
+        reply = self._first_observation(goal, spec, version, work)
+        result.policy_version, result.env_session = version, reply.session
+        result.first_step_id = reply.step_id + 1
+        ended = reply.terminated | reply.truncated
+        started = reported = time.monotonic()
+        for step in range(goal.steps):
+            work.check()
+            assert reply.images is not None
+            noise = None
+            if not goal.deterministic:
+                noise = action_noise(goal.seed, version, step, spec.num_envs, spec.action_dim)
+            began = time.perf_counter()
+            output, acting = self._holder.act(reply.images, reply.states, noise)
+            infer_s = time.perf_counter() - began
+            if goal.policy_version and acting != goal.policy_version:
+                raise WireError(
+                    ErrorCode.STALE_POLICY, f"version {acting} was loaded while {goal.policy_version} had to act"
+                )
+            step_id = reply.step_id + 1
+            self._publish_actions(reply, step_id, output, acting, infer_s)
+            began = time.perf_counter()
+            reply = self._environment.step(
+                StepCommand(
+                    session=reply.session, step_id=step_id, spec_hash=spec.spec_hash,
+                    actions=output.actions.reshape(-1), policy_version=acting, logprobs=output.logprobs,
+                    values=output.values, reset_mask=ended if ended.any() else None,
+                    reset_seeds=reset_seeds(goal.seed, version, step, spec.num_envs) if ended.any() else None,
+                ),
+                work.check,
+            )  # fmt: skip
+            self.diagnostics.latency("infer", infer_s)
+            self.diagnostics.latency("step", time.perf_counter() - began)
+            self._last_reply = reply
+            ended = reply.terminated | reply.truncated
+            result.last_step_id = step_id
+            result.episodes += int(ended.sum())
+            result.successes += int(reply.terminated.sum())
+            now = time.monotonic()
+            result.steps_per_s = (step + 1) * spec.num_envs / max(now - started, 1e-9)
+            if now - reported > FEEDBACK_S:
+                reported = now
+                work.feedback(Rollout.Feedback(step=step + 1, steps_per_s=result.steps_per_s))
+
+    def _first_observation(self, goal: Rollout.Goal, spec: EnvironmentSpec, version: int, work: Work) -> Reply:
+        last = self._last_reply
+        if not goal.reset and last is not None and last.session == self._environment.session:
+            return last
+        seeds = reset_seeds(goal.seed, version, 0, spec.num_envs)
+        return self._environment.reset(ResetCommand(seeds=seeds, behaviour=goal.behaviour), work.check)
+
+    def _check_spec(self, spec: EnvironmentSpec) -> None:
+        found, expected = (spec.state_dim, spec.action_dim), (self._holder.state_dim, self._holder.action_dim)
+        if found != expected:
+            raise WireError(
+                ErrorCode.SPEC_MISMATCH,
+                f"environment {spec.env_id} has {found} state and action values, the policy {expected}; "
+                "start both with the same config_file",
+            )
+        self._spec = spec
+
+    def _await_version(self, version: int, work: Work) -> None:
+        deadline = time.monotonic() + float(self.param("version_timeout_s"))
+        while version and self._holder.version != version:
+            if time.monotonic() > deadline:
+                raise WireError(
+                    ErrorCode.STALE_POLICY,
+                    f"version {version} did not arrive, {self._holder.version} is loaded; is the learner running?",
+                )
+            work.sleep(0.01)
+
+    def _publish_actions(
+        self, reply: Reply, step_id: int, output: PolicyOutput, version: int, infer_s: float
+    ) -> None:
+        message = self._action_message(output, version, infer_s)
+        message.header = convert.header(reply.stamp_ns)
+        message.step_id = step_id
+        self._actions.publish(message)
+
+    @staticmethod
+    def _action_message(output: PolicyOutput, version: int, infer_s: float) -> ActionBatch:
+        count, action_dim = output.actions.shape
+        message = ActionBatch(
+            num_envs=count, action_dim=action_dim, chunk_length=1, policy_version=version, infer_ms=infer_s * 1e3,
+            mode=ActionBatch.MODE_POLICY,
+        )  # fmt: skip
+        message.action = convert.to_field(output.actions)
+        message.log_prob = convert.to_field(output.logprobs)
+        message.value = convert.to_field(output.values)
+        return message
+
+    @staticmethod
+    def _describe(reason: int, text: str) -> Rollout.Result:
+        return Rollout.Result(termination_reason=reason, message=text)
+
+    # Callbacks.
+
+    def _on_spec(self, message: EnvSpec) -> None:
+        try:
+            self._spec = convert.spec_from_msg(message)
+        except WireError as error:
+            self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
+
+    def _on_version(self, message: PolicyVersion) -> None:
+        try:
+            if self._holder.follow(message, self.run_dir):
+                self.diagnostics.clear_condition("policy version")
+        except (WireError, ValueError) as error:
+            self.get_logger().error(f"{error}; still acting with version {self._holder.version}")
+            self.diagnostics.count("refused_versions", level=diagnostics.OK)
+            self.diagnostics.set_condition("policy version", diagnostics.ERROR, str(error))
+
+    def _on_infer(self, request: InferAction.Request, response: InferAction.Response) -> InferAction.Response:
+        try:
+            if not self.active:
+                raise WireError(ErrorCode.NOT_ACTIVE, "the policy node is not active; activate it first")
+            if self._spec is None:
+                raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
+            count = len(request.state) // self._holder.state_dim
+            spec = replace(self._spec, num_envs=max(count, 1))
+            states = convert.floats(request.state, (spec.num_envs, spec.state_dim), "state")
+            tile = request.tile
+            images = convert.images_of(
+                request.observation, spec, Tiles(tile.rows, tile.cols, tile.tile_height, tile.tile_width)
+            )
+            noise = None if request.deterministic else np.random.default_rng().standard_normal(
+                (spec.num_envs, spec.action_dim), np.float32
+            )  # fmt: skip
+            began = time.perf_counter()
+            output, version = self._holder.act(images, states, noise)
+            response.action = self._action_message(output, version, time.perf_counter() - began)
+            response.action.header.stamp = request.observation.header.stamp
+        except (WireError, ValueError) as error:
+            wire = error if isinstance(error, WireError) else WireError(ErrorCode.BAD_SHAPE, str(error))
+            self.diagnostics.count("refused_infer", text=f"policy/infer refused: {error}")
+            return convert.fill_error(response, wire)
+        return response
+
+    def _on_load(self, request: LoadPolicy.Request, response: LoadPolicy.Response) -> LoadPolicy.Response:
+        try:
+            if self._rollouts.busy:
+                raise WireError(ErrorCode.BUSY, "a rollout is running; cancel it or wait")
+            self._holder.load(read_weights(request.uri, self.run_dir), 0, request.sha256)
+        except (WireError, ValueError) as error:
+            wire = error if isinstance(error, WireError) else WireError(ErrorCode.IO_ERROR, str(error))
+            self.diagnostics.count("refused_loads", text=f"policy/load refused: {error}")
+            return convert.fill_error(response, wire)
+        response.version = self._holder.version
+        return response
+
+
+def main() -> int:
+    return run_node(PolicyNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

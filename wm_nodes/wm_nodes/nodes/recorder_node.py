@@ -1,0 +1,283 @@
+"""recorder: writes the graph's topics, byte for byte as received, into a rosbag2 MCAP bag."""
+
+import json
+import shutil
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
+from std_srvs.srv import Trigger
+
+from wm_msgs.msg import ErrorCode
+from wm_msgs.srv import StartRecording, StopRecording
+from wm_nodes.nodes.bag_qos import recorded_qos
+from wm_nodes.recording import BagError, RawBagWriter, RecordingError, topics
+from wm_nodes.recording import messages as m
+from wm_nodes.recording.cdr import session_and_seq
+from wm_nodes.ros import diagnostics
+from wm_nodes.ros.credit import CreditGrantor
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.params import Param
+from wm_nodes.ros.qos import TOPICS, Topic
+from wm_nodes.ros.sequence import GapTracker
+from wm_nodes.ros.spin import run_node
+
+FLUSH_S = 0.25
+MIB = 2**20
+SEQUENCED = {topic.name for topic in topics.ALL_TOPICS if topic.sequenced}
+DEFAULT_TOPICS = [topic.name for topic in topics.ALL_TOPICS]
+
+PARAMS = (
+    Param("bag_uri", "", "Bag folder, relative to run_dir; empty: the next free run_dir/bags/bag_NNN", read_only=True),
+    Param("topics", DEFAULT_TOPICS, "Topics to record, relative to the namespace", read_only=True),
+    Param("record_at_start", True, "Begin to record when activated; else wait for recorder/start", read_only=True),
+    Param("split_mib", 256, "Start a new .mcap file after this much", "MiB", read_only=True, minimum=1, maximum=65536),
+    Param("split_s", 600.0, "Start a new .mcap file after this time; 0: never", "s", read_only=True, minimum=0.0),
+    Param("min_free_mib", 512, "Stop, with the bag complete, when the disk has less left", "MiB", minimum=16),
+)  # fmt: skip
+
+
+class RecorderNode(ManagedNode):
+    """Services recorder/start, stop, pause, resume, split; credits the keep-all streams it records."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("recorder", PARAMS, **node_arguments)
+        self._bag: RawBagWriter | None = None
+        self._paused = False
+        self._latched: dict[str, bytes] = {}
+
+    def configure(self) -> None:
+        self._rows = {name: _row(name) for name in self.param("topics")}
+        self._gaps = {name: GapTracker() for name in self._rows if _base(name) in SEQUENCED}
+        self._names: dict[str, str] = {}
+        self._latched = {}
+        for name, row in self._rows.items():
+            grantor = None
+            if row.qos.history == HistoryPolicy.KEEP_ALL:
+                grantor = CreditGrantor(self, name)
+                self.own(grantor.close)
+            subscription = self.create_subscription(
+                row.type, name, partial(self._on_message, name, grantor), _lossless(row.qos), raw=True
+            )
+            self._names[name] = subscription.topic_name
+            self.own(self.destroy_subscription, subscription)
+        self.serve(StartRecording, "recorder/start", self._on_start)
+        self.serve(StopRecording, "recorder/stop", self._on_stop)
+        for name in ("pause", "resume", "split"):
+            self.serve(Trigger, f"recorder/{name}", getattr(self, f"_on_{name}"))
+        timer = self.create_timer(FLUSH_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.own(self.destroy_timer, timer)
+
+    def activate(self) -> None:
+        if self.param("record_at_start"):
+            self._start(str(self.param("bag_uri")))
+
+    def deactivate(self, reason: str) -> None:
+        self._stop()
+
+    def cleanup(self) -> None:
+        self._stop()
+
+    def update_diagnostics(self) -> None:
+        self.diagnostics.gauge("bag", self._bag.path if self._bag is not None else "none")
+        self.diagnostics.gauge("paused", self._paused)
+        if self._bag is not None:
+            self.diagnostics.gauge("messages", self._bag.messages)
+            self.diagnostics.gauge("lost", sum(tracker.lost for tracker in self._gaps.values()))
+
+    # Recording.
+
+    def _on_message(self, name: str, grantor: CreditGrantor | None, data: bytes) -> None:
+        tracker = self._gaps.get(name)
+        if tracker is not None:
+            missing = tracker.observe(*session_and_seq(data))
+            if missing and self._bag is not None:
+                self.diagnostics.count(f"gaps {name}", missing, text=f"{missing} messages of {name} missed")
+        if self._rows[name].qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+            self._latched[name] = data
+        if not self._paused:
+            self._write(name, data)
+        if grantor is not None and tracker is not None:
+            grantor.consumed(tracker)
+
+    def _write(self, name: str, data: bytes) -> None:
+        if self._bag is None:
+            return
+        began = time.perf_counter()
+        self._time_ns = max(self._time_ns + 1, time.time_ns())
+        try:
+            self._bag.write(self._names[name], data, self._time_ns)
+        except RecordingError as error:
+            self._fail(error)
+        self.diagnostics.latency("write", time.perf_counter() - began)
+
+    def _start(self, uri: str) -> Path:
+        """Open a bag and write into it the latched messages (spec, goal, policy) that still hold."""
+        if self._bag is not None:
+            raise BagError(f"already recording to {self._bag.path}; call recorder/stop first")
+        path = self.run_dir / uri if uri else self._next_path()
+        self._check_free(path.parent)
+        self._bag = RawBagWriter(
+            path, custom={"wm.run_id": self.run_dir.name}, split_bytes=int(self.param("split_mib")) * MIB,
+            split_s=float(self.param("split_s")),
+        )  # fmt: skip
+        self._paused, self._time_ns = False, 0
+        self._gaps = {name: GapTracker() for name in self._gaps}
+        for name, row in self._rows.items():
+            msgtype = f"{row.type.__module__.split('.')[0]}/msg/{row.type.__name__}"
+            self._bag.add_topic(self._names[name], msgtype, [recorded_qos(row.qos)])
+        for name, data in self._latched.items():
+            self._write(name, data)
+        self.diagnostics.clear_condition("recording")
+        self.get_logger().info(f"recording to {path}")
+        return path
+
+    def _stop(self) -> tuple[Path, int, int] | None:
+        """Complete the bag; return its path, messages and losses, or None while not recording."""
+        bag, self._bag = self._bag, None
+        if bag is None:
+            return None
+        lost = {name: tracker for name, tracker in self._gaps.items() if tracker.lost}
+        drops = {self._names[name]: {"lost": tracker.lost, "gaps": tracker.gaps} for name, tracker in lost.items()}
+        bag.custom["wm.recorder_drops"] = json.dumps(drops)
+        bag.custom.update(self._facts())
+        messages, total = bag.messages, sum(tracker.lost for tracker in lost.values())
+        path = bag.close()
+        self._note_in_index(path, messages, total)
+        self.get_logger().info(f"recorded {messages} messages to {path}, {total} missed")
+        return path, messages, total
+
+    def _facts(self) -> dict[str, str]:
+        """custom_data taken from the latched messages: spec, model, newest policy."""
+        facts = {}
+        for name, data in self._latched.items():
+            if _base(name) == topics.SPEC.name:
+                spec, _ = m.spec_of(m.deserialize(data, topics.SPEC.msgtype))
+                facts["wm.spec_json"] = m.spec_to_json(spec)
+                facts["wm.world_model_sha256"] = spec.world_model_sha256
+            elif _base(name) == topics.POLICY_VERSION.name:
+                newest = m.deserialize(data, topics.POLICY_VERSION.msgtype)
+                facts["wm.policy_versions"] = json.dumps([int(newest.version)])
+        return facts
+
+    def _next_path(self) -> Path:
+        folder = self.run_dir / "bags"
+        taken = {path.name.split(".")[0] for path in folder.glob("bag_*")}
+        number = next(i for i in range(len(taken) + 1) if f"bag_{i:03d}" not in taken)
+        return folder / f"bag_{number:03d}"
+
+    def _note_in_index(self, path: Path, messages: int, lost: int) -> None:
+        """run_dir/bags.json lists every completed bag of the run."""
+        index = self.run_dir / "bags.json"
+        rows = json.loads(index.read_text()) if index.is_file() else []
+        uri = str(path.relative_to(self.run_dir)) if path.is_relative_to(self.run_dir) else str(path)
+        rows.append({"bag": uri, "messages": messages, "lost": lost})
+        partial_file = index.with_suffix(".json.partial")
+        partial_file.write_text(json.dumps(rows, indent=1))
+        partial_file.replace(index)
+
+    def _on_timer(self) -> None:
+        if self._bag is None:
+            return
+        try:
+            self._bag.flush()
+            self._check_free(self._bag.partial_path)
+        except RecordingError as error:
+            self._fail(error)
+
+    def _check_free(self, folder: Path) -> None:
+        existing = next(path for path in (folder, *folder.parents) if path.is_dir())
+        free, least = shutil.disk_usage(existing).free // MIB, int(self.param("min_free_mib"))
+        if free < least:
+            raise RecordingError(f"only {free} MiB free in {existing}, less than min_free_mib={least}; free some space")
+
+    def _fail(self, error: RecordingError) -> None:
+        """Stop recording with one error; the bag is completed where the disk still allows it."""
+        try:
+            stopped = self._stop()
+        except (BagError, RecordingError):
+            stopped, self._bag = None, None
+        state = f"bag {stopped[0]} is complete up to here" if stopped else "the bag is unfinished"
+        text = f"recording stopped: {error}; {state}"
+        self.get_logger().error(text)
+        self.diagnostics.set_condition("recording", diagnostics.ERROR, text)
+
+    # Services.
+
+    def _on_start(self, request: StartRecording.Request, response: StartRecording.Response) -> Any:
+        if not self.active:
+            response.error_code, response.message = ErrorCode.NOT_ACTIVE, "the recorder is not active; activate it"
+            return response
+        try:
+            response.bag_uri = str(self._start(request.bag_uri))
+        except BagError as error:
+            response.error_code, response.message = ErrorCode.BUSY, str(error)
+        except (RecordingError, ValueError) as error:
+            response.error_code, response.message = ErrorCode.IO_ERROR, str(error)
+        return response
+
+    def _on_stop(self, request: StopRecording.Request, response: StopRecording.Response) -> Any:
+        try:
+            stopped = self._stop()
+        except RecordingError as error:
+            response.error_code, response.message = ErrorCode.IO_ERROR, str(error)
+            return response
+        if stopped is None:
+            response.error_code, response.message = ErrorCode.NOT_ACTIVE, "not recording; call recorder/start"
+            return response
+        path, response.messages, response.gaps = stopped
+        response.bag_uri = str(path)
+        return response
+
+    def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._trigger(response, lambda: setattr(self, "_paused", True))
+
+    def _on_resume(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._trigger(response, lambda: setattr(self, "_paused", False))
+
+    def _on_split(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._trigger(response, lambda: self._bag.split() if self._bag is not None else None)
+
+    def _trigger(self, response: Trigger.Response, act: Any) -> Trigger.Response:
+        if self._bag is None:
+            response.message = "not recording; call recorder/start"
+            return response
+        try:
+            act()
+            response.success = True
+        except RecordingError as error:
+            self._fail(error)
+            response.message = str(error)
+        return response
+
+
+def _base(name: str) -> str:
+    """The row of the QoS table that a topic name ends with: sim/env/image is an env/image."""
+    fitting = [row for row in TOPICS if name == row or name.endswith(f"/{row.lstrip('/')}")]
+    return max(fitting, key=len, default=name)
+
+
+def _row(name: str) -> Topic:
+    base = _base(name)
+    if base not in TOPICS:
+        raise ValueError(f"cannot record {name!r}; the graph's topics are {', '.join(sorted(TOPICS))}")
+    return TOPICS[base]
+
+
+def _lossless(offered: QoSProfile) -> QoSProfile:
+    """A keep-all subscription that every publisher of the row matches."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL, depth=0, reliability=offered.reliability, durability=offered.durability
+    )
+
+
+def main() -> None:
+    sys.exit(run_node(RecorderNode))
+
+
+if __name__ == "__main__":
+    main()

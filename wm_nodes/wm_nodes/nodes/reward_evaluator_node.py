@@ -1,0 +1,246 @@
+"""reward_evaluator: judges every transition, after joining it with its two images by exact stamp and with its goals."""
+
+import sys
+import time
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+from sensor_msgs.msg import Image
+
+from wm_msgs.msg import EnvSpec, ErrorCode, RewardSummary, TaskGoal, TransitionBatch
+from wm_msgs.srv import EvaluateReward
+from wm_nodes.nodes.backends import REWARDS, make_reward
+from wm_nodes.nodes.joiner import ImageCache
+from wm_nodes.nodes.reward_summary import SummaryWindow
+from wm_nodes.reward import RewardInput, RewardResult
+from wm_nodes.reward.base import SUCCESS_UNKNOWN
+from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.params import Param
+from wm_nodes.ros.qos import CREDIT_WINDOW
+from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.wire import Transition, WireError
+from wm_nodes.specs import EnvironmentSpec
+from wm_nodes.types import BoolArray, UInt8Array
+
+PARAMS = (
+    Param("reward", "endogenous", "Reward model", read_only=True, choices=REWARDS),
+    Param("reward_factory", "", "module:callable(config) -> RewardModel instead of a built-in one", read_only=True),
+    Param("model_dir", "", "World-model folder, for the endogenous reward's distance", read_only=True),
+    Param("image_wait_s", 1.0, "A transition waits for its images and goals at most so long", "s",
+          minimum=0.0, maximum=60.0),
+    Param("summary_period_s", 1.0, "Time between two reward/summary", "s", minimum=0.1, maximum=60.0),
+)  # fmt: skip
+
+GOALS_KEPT_PER_ENV = 2 * CREDIT_WINDOW
+
+
+class RewardEvaluatorNode(ManagedNode):
+    """Listens to env/spec, env/image, env/transition, env/goal; publishes reward, reward/summary."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("reward_evaluator", PARAMS, **node_arguments)
+
+    def configure(self) -> None:
+        self._model = make_reward(
+            str(self.param("reward")), self.run_config(), str(self.param("model_dir")),
+            str(self.param("reward_factory")),
+        )  # fmt: skip
+        self._spec: EnvironmentSpec | None = None
+        self._session = 0
+        self._images = ImageCache(4 * CREDIT_WINDOW)
+        self._goals: OrderedDict[int, tuple[UInt8Array | None, bool]] = OrderedDict()
+        self._goals_expected = True
+        self._waiting: list[tuple[float, Transition]] = []
+        self._window = SummaryWindow()
+        self._rewards = self.publish_on("reward")
+        self._summaries = self.publish_on("reward/summary")
+        self.listen("env/spec", self._on_spec, while_inactive=True)
+        self.listen("env/image", self._on_image)
+        self.listen("env/goal", self._on_goal, while_inactive=True)
+        self.listen("env/transition", self._on_transition, credit=True)
+        self.serve(EvaluateReward, "reward/evaluate", self._on_evaluate)
+        timers = (
+            self.create_timer(0.1, self._judge_waiting),
+            self.create_timer(float(self.param("summary_period_s")), self._publish_summary),
+        )
+        for timer in timers:
+            self.own(self.destroy_timer, timer)
+
+    def on_gap(self, name: str, missing: int) -> None:
+        self._window.invalid += missing if name == "env/transition" else 0
+
+    # Topics.
+
+    def _on_spec(self, message: EnvSpec) -> None:
+        try:
+            self._spec = convert.spec_from_msg(message)
+        except WireError as error:
+            self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
+            return
+        self._enter_session(message.session)
+
+    def _enter_session(self, session: int) -> None:
+        """Stamps start again with every environment process: what came from the one before must not be joined."""
+        if session != self._session:
+            self._session = session
+            self._images.clear()
+            self._goals.clear()
+            self._goals_expected = True
+            self._waiting.clear()
+            self._window.forget_episodes()
+
+    def _on_image(self, message: Image) -> None:
+        if self._spec is None:
+            return
+        try:
+            self._images.put(convert.time_ns(message.header.stamp), convert.images_of(message, self._spec))
+        except WireError as error:
+            self._count_refused("image", error)
+            return
+        self._judge_waiting()
+
+    def _on_goal(self, message: TaskGoal) -> None:
+        if self._spec is None:
+            return
+        try:
+            goals = convert.goals_of(message, self._spec)
+        except WireError as error:
+            self._count_refused("goal", error)
+            return
+        self._enter_session(message.session)
+        for i, episode_id in enumerate(goals.episode_ids):
+            self._goals[int(episode_id)] = (None if goals.images is None else goals.images[i], bool(goals.found[i]))
+        self._judge_waiting()
+        while len(self._goals) > GOALS_KEPT_PER_ENV * self._spec.num_envs:
+            self._goals.popitem(last=False)
+
+    def _on_transition(self, message: TransitionBatch) -> None:
+        if self._spec is None:
+            self.diagnostics.count("before_spec", text="a transition came before env/spec; it gets no reward")
+            return
+        self._enter_session(message.session)
+        try:
+            transition = convert.transition_of(message, self._spec)
+        except WireError as error:
+            self._count_refused("transition", error)
+            return
+        if not transition.is_reset and transition.valid.any():
+            self._waiting.append((time.monotonic(), transition))
+            self._judge_waiting()
+
+    def _judge_waiting(self) -> None:
+        """Judge, in order, the transitions whose images are there or are overdue."""
+        while self._waiting:
+            since, transition = self._waiting[0]
+            images, next_images = self._images.get(transition.stamp_ns), self._images.get(transition.next_stamp_ns)
+            complete = images is not None and next_images is not None and self._has_goals(transition)
+            if not complete and time.monotonic() - since < float(self.param("image_wait_s")):
+                return
+            if images is not None and next_images is not None and not complete and not self._goals:
+                self._goals_expected = False
+            self._waiting.pop(0)
+            if images is None or next_images is None:
+                missing = transition.stamp_ns if images is None else transition.next_stamp_ns
+                self._publish(transition, _unjudged(transition, f"no image with stamp {missing} ns"), 0.0)
+            else:
+                began = time.perf_counter()
+                result = self._judge(transition, images, next_images, *self._goals_of(transition, images))
+                self._publish(transition, result, time.perf_counter() - began)
+            self._images.drop_before(transition.stamp_ns)
+
+    def _has_goals(self, transition: Transition) -> bool:
+        """Whether the goal message of every stepped episode is there; a bag without goals is waited for only once."""
+        judged = transition.episode_ids[transition.valid]
+        return not self._goals_expected or all(int(episode_id) in self._goals for episode_id in judged)
+
+    def _goals_of(
+        self, transition: Transition, images: UInt8Array
+    ) -> tuple[UInt8Array | None, BoolArray | None]:
+        found = [self._goals.get(int(episode_id)) for episode_id in transition.episode_ids]
+        if all(goal is None or goal[0] is None for goal in found):
+            return None, None
+        goals = np.zeros_like(images)
+        there = np.zeros(len(images), bool)
+        for i, goal in enumerate(found):
+            if goal is not None and goal[0] is not None:
+                goals[i], there[i] = goal
+        return goals, there
+
+    def _judge(
+        self, transition: Transition, images: UInt8Array, next_images: UInt8Array, goals: UInt8Array | None,
+        goal_found: BoolArray | None,
+    ) -> RewardResult:  # fmt: skip
+        try:
+            step = RewardInput(
+                images=images, next_images=next_images, success_probability=transition.success_probability,
+                valid=transition.valid, uncertainty=transition.uncertainty, goals=goals, goal_found=goal_found,
+            )  # fmt: skip
+            return self._model.evaluate(step)
+        except (ValueError, RuntimeError) as error:
+            self.get_logger().error(f"reward of step {transition.step_id} failed: {error}")
+            return _unjudged(transition, f"{type(error).__name__}: {error}")
+
+    def _publish(self, transition: Transition, result: RewardResult, eval_s: float) -> None:
+        self._rewards.publish(
+            convert.reward_msg(transition, result, name=self._model.name, version=self._model.version, eval_s=eval_s)
+        )
+        self.diagnostics.latency("evaluate", eval_s)
+        missing = int((transition.valid & ~result.valid).sum())
+        if missing:
+            self.diagnostics.count("invalid_rewards", missing, text=f"{missing} invalid: {result.invalid_reason}")
+        self._window.add(transition, result)
+
+    def _publish_summary(self) -> None:
+        values = self._window.take()
+        if values is not None:
+            message = RewardSummary(**values)
+            message.header = convert.header(self._window.last_stamp_ns)
+            self._summaries.publish(message)
+
+    def _count_refused(self, what: str, error: WireError) -> None:
+        self.get_logger().error(f"{what} refused: {error}", throttle_duration_sec=1.0)
+        self.diagnostics.count(f"refused_{what}s", text=f"{what} refused: {error}")
+
+    # Service.
+
+    def _on_evaluate(
+        self, request: EvaluateReward.Request, response: EvaluateReward.Response
+    ) -> EvaluateReward.Response:
+        try:
+            if not self.active:
+                raise WireError(ErrorCode.NOT_ACTIVE, "the reward evaluator is not active; activate it first")
+            if self._spec is None:
+                raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
+            transition = convert.transition_of(request.transition, self._spec)
+            images = convert.images_of(request.observation, self._spec)
+            next_images = convert.images_of(request.next_observation, self._spec)
+            goals = convert.images_of(request.goal, self._spec) if len(request.goal.data) else None
+        except WireError as error:
+            self._count_refused("evaluation", error)
+            return convert.fill_error(response, error)
+        began = time.perf_counter()
+        result = self._judge(transition, images, next_images, goals, None)
+        response.reward = convert.reward_msg(
+            transition, result, name=self._model.name, version=self._model.version, eval_s=time.perf_counter() - began
+        )
+        return response
+
+
+def _unjudged(transition: Transition, reason: str) -> RewardResult:
+    """A result without any reward: missing is missing, never 0."""
+    count = len(transition.valid)
+    nan = np.full(count, np.nan, np.float32)
+    return RewardResult(
+        total=nan, dense=nan, sparse=nan, valid=np.zeros(count, bool),
+        success=np.full(count, SUCCESS_UNKNOWN, np.uint8), invalid_reason=reason,
+    )  # fmt: skip
+
+
+def main() -> int:
+    return run_node(RewardEvaluatorNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

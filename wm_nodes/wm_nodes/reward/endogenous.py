@@ -1,0 +1,112 @@
+"""The reward that the world model gives itself: goal distance plus done signal. Shapes: N environments, K golden
+frames. Equations: E5, E7, E8.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wm_nodes.config.schema import RewardConfig
+from wm_nodes.reward.base import (
+    SUCCESS_NO,
+    SUCCESS_UNKNOWN,
+    SUCCESS_YES,
+    RewardInput,
+    RewardResult,
+    assemble,
+    version_of,
+)
+from wm_nodes.reward.distances import Distance
+from wm_nodes.types import BoolArray, FloatArray
+
+
+class EndogenousReward:
+    """r = w_d r^d + w_s r^s (E8).
+
+    Dense (E5), with Phi(x) = 1 - Perc(x, goal):
+        delta: Phi(x_{t+1}) - Phi(x_t), clipped: pays for coming closer, nothing for staying close.
+        abs: Phi(x_{t+1}), not clipped: its level is the signal.
+        progress: index of the nearest golden frame over that of the goal, difference over the step, clipped.
+    Sparse (E7): 1 where the done signal is strictly above the threshold; nothing above the uncertainty limit. It is
+    paid once because the environment terminates on the crossing and later steps are invalid.
+
+    A goal is needed only while dense_weight > 0; without one the step is invalid, never worth 0.
+    """
+
+    def __init__(self, config: RewardConfig, distance: Distance) -> None:
+        self._config = config
+        self._distance = distance
+
+    @property
+    def name(self) -> str:
+        return "endogenous"
+
+    @property
+    def version(self) -> int:
+        return version_of(self.name, self._config.model_dump_json(), self._distance.name)
+
+    def evaluate(self, step: RewardInput) -> RewardResult:
+        config = self._config
+        dense = np.zeros(len(step.images), np.float32)
+        reasons: dict[str, BoolArray] = {}
+        if config.dense_weight > 0:
+            dense, missing = self._dense(step)
+            what = "golden trajectory" if config.mode == "progress" else "goal"
+            reasons[f"no {what}"] = missing
+        unknown = ~np.isfinite(step.success_probability) | ~np.isfinite(step.uncertainty)
+        reasons["success probability or uncertainty is not finite"] = unknown
+        crossed = step.success_probability > config.success_threshold
+        if config.uncertainty_limit > 0:
+            crossed &= step.uncertainty <= config.uncertainty_limit
+        success = np.where(unknown, SUCCESS_UNKNOWN, np.where(crossed, SUCCESS_YES, SUCCESS_NO)).astype(np.uint8)
+        return assemble(
+            np.float32(config.dense_weight) * dense,
+            np.float32(config.sparse_weight) * crossed.astype(np.float32),
+            step,
+            success,
+            reasons,
+            {"dense": config.dense_weight, "sparse": config.sparse_weight},
+        )
+
+    def _dense(self, step: RewardInput) -> tuple[FloatArray, BoolArray]:
+        """Return unweighted dense rewards (N,) and where the goal is missing; rewards are 0 there and where invalid."""
+        count = len(step.images)
+        reference = step.golden if self._config.mode == "progress" else step.goals
+        if reference is None:
+            return np.zeros(count, np.float32), np.ones(count, np.bool_)
+        found = np.ones(count, np.bool_) if step.goal_found is None else step.goal_found
+        judged = np.flatnonzero(step.valid & found)
+        dense = np.zeros(count, np.float32)
+        if len(judged):
+            dense[judged] = (
+                self._progress(step, judged) if self._config.mode == "progress" else self._goal(step, judged)
+            )
+        return dense, ~found
+
+    def _goal(self, step: RewardInput, judged: NDArray[np.intp]) -> FloatArray:
+        assert step.goals is not None  # checked by _dense
+        goals = step.goals[judged]
+        after: FloatArray = 1 - self._distance(step.next_images[judged], goals)
+        if self._config.mode == "abs":
+            return after
+        before = 1 - self._distance(step.images[judged], goals)
+        return self._clipped(after - before)
+
+    def _progress(self, step: RewardInput, judged: NDArray[np.intp]) -> FloatArray:
+        assert step.golden is not None and step.golden_lengths is not None  # checked by _dense and RewardInput
+        golden, lengths = step.golden[judged], step.golden_lengths[judged]
+        num_frames = golden.shape[1]
+        frames = golden.reshape(-1, *golden.shape[2:])
+        beyond = np.arange(num_frames)[None, :] >= lengths[:, None]
+        progress: list[NDArray[np.float64]] = []
+        for images in (step.images[judged], step.next_images[judged]):
+            distances = self._distance(np.repeat(images, num_frames, axis=0), frames).reshape(-1, num_frames)
+            nearest = np.where(beyond, np.inf, distances).argmin(1)
+            progress.append(nearest / (lengths - 1))
+        return self._clipped(progress[1] - progress[0])
+
+    def _clipped(self, change: NDArray[Any]) -> FloatArray:
+        limit = self._config.dense_clip
+        clipped: FloatArray = change.clip(-limit, limit).astype(np.float32)
+        return clipped

@@ -1,0 +1,51 @@
+"""Losses of proximal policy optimisation, one value per sample. Shapes: B samples. Equations: E10b, E10c.
+
+Nothing is averaged here: the learner divides by the sample count of the whole minibatch, which may be spread over
+several ranks.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def clipped_policy_loss(logprobs_B: Tensor, old_logprobs_B: Tensor, advantages_B: Tensor, *, clip: float) -> Tensor:
+    """Return -min(rho A, clamp(rho, 1 - clip, 1 + clip) A), rho = exp(logprob - old logprob) (E10b), shape (B,).
+
+    old_logprobs_B: nats, of the executed action under the policy that acted. clip: > 0.
+    """
+    ratio_B = torch.exp(logprobs_B - old_logprobs_B)
+    clipped_B = ratio_B.clamp(1 - clip, 1 + clip)
+    return -torch.minimum(ratio_B * advantages_B, clipped_B * advantages_B)
+
+
+def value_loss(
+    values_B: Tensor, old_values_B: Tensor, returns_B: Tensor, *, clip: float, huber_delta: float = 10.0
+) -> Tensor:
+    """Return the Huber loss of the critic (E10c), shape (B,): half the squared error up to huber_delta.
+
+    With clip > 0 it is the larger of this loss and that of values kept within clip of old_values_B. clip 0: off.
+    huber_delta: math.inf gives half the squared error everywhere.
+    """
+    plain_B = _huber(values_B - returns_B, huber_delta)
+    if clip == 0:
+        return plain_B
+    kept_B = old_values_B + (values_B - old_values_B).clamp(-clip, clip)
+    return torch.maximum(plain_B, _huber(kept_B - returns_B, huber_delta))
+
+
+def approximate_kl(logprobs_B: Tensor, old_logprobs_B: Tensor) -> Tensor:
+    """Return the per-sample estimate (rho - 1) - log rho of KL(old || new), nats; never negative."""
+    log_ratio_B = logprobs_B - old_logprobs_B
+    return torch.expm1(log_ratio_B) - log_ratio_B
+
+
+def clip_fraction(logprobs_B: Tensor, old_logprobs_B: Tensor, *, clip: float) -> Tensor:
+    """Return 1 where the probability ratio left [1 - clip, 1 + clip], else 0, as floats (B,)."""
+    return ((torch.exp(logprobs_B - old_logprobs_B) - 1).abs() > clip).to(logprobs_B.dtype)
+
+
+def _huber(error_B: Tensor, delta: float) -> Tensor:
+    if delta == float("inf"):
+        return 0.5 * error_B.square()
+    return F.huber_loss(error_B, torch.zeros_like(error_B), delta=delta, reduction="none")

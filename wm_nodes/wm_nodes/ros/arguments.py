@@ -1,0 +1,89 @@
+"""From given launch arguments to a graph on disk: run folder, configuration, model; shared by both starters."""
+
+import dataclasses
+import os
+import sys
+from collections.abc import Mapping
+from datetime import datetime
+from importlib import resources
+from pathlib import Path
+
+from wm_nodes.config.load import dump_config, load_config
+from wm_nodes.ros.graph import Graph, GraphError, build_graph, compose, parse_arguments
+
+
+def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None) -> dict[str, str]:
+    """Fill what depends on this machine and moment: run_dir (made), config_file (written), model, bag, counts.
+
+    Raises:
+        GraphError: for an unknown argument or value, and where no model is known.
+        ConfigError: for a wrong preset or setting.
+    """
+    values = parse_arguments(scenario, given)
+    time = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
+    run_dir = Path(values["run_dir"] or f"runs/{time}-{scenario}").expanduser().absolute()
+    run_dir.mkdir(parents=True, exist_ok=True)
+    values["run_dir"] = str(run_dir)
+    if not values["config_file"]:
+        overrides = {"task": values["task"]} | (
+            {"seed": int(values["seed"])} if values.get("seed", "").isdigit() else {}
+        )
+        config = load_config(values["preset"], overrides)
+        values["config_file"] = str(run_dir / "config.yaml")
+        Path(values["config_file"]).write_text(dump_config(config))
+    else:
+        values["config_file"] = str(Path(values["config_file"]).expanduser().absolute())
+        config = load_config(values["config_file"])
+    if values.get("num_envs") == "0":
+        values["num_envs"] = str(config.ppo.num_envs)
+    if "model_dir" in values:
+        values["model_dir"] = _model_dir(values["model_dir"], config.task)
+    if values.get("starts_file") == "":
+        values["starts_file"] = str(Path(values["model_dir"]) / "starts.safetensors")
+    if "bag_uri" in values:
+        values["bag_uri"] = _bag_uri(values["bag_uri"], scenario, run_dir)
+    return values
+
+
+def prepare(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
+    """Return the graph to start and its resolved arguments; graph.json in the run folder holds the nodes."""
+    values = resolve(scenario, given)
+    graph = build_graph(scenario, values)
+    graph_file = Path(values["run_dir"]) / "graph.json"
+    graph_file.write_text(graph.to_json())
+    if values["compose"] == "true" or scenario == "composed":
+        single = tuple(dataclasses.replace(node, ranks=1) for node in graph.nodes)
+        graph_file.write_text(dataclasses.replace(graph, nodes=single).to_json())
+        graph = compose(graph, str(graph_file))
+    return graph, values
+
+
+def interpreter(values: Mapping[str, str]) -> str:
+    """The Python that runs the nodes."""
+    return values.get("python") or os.environ.get("WM_PYTHON") or sys.executable
+
+
+def _model_dir(given: str, task: str) -> str:
+    if given:
+        folder = Path(given).expanduser().absolute()
+        if not (folder / "manifest.json").is_file():
+            raise GraphError(
+                f"model_dir {str(folder)!r} holds no manifest.json; give the folder of a trained world model"
+            )
+        return str(folder)
+    shipped = Path(str(resources.files("wm_nodes"))) / "pretrained" / task
+    if not shipped.is_dir():
+        raise GraphError(
+            f"no world model is shipped for task {task!r}; train one (python3 launch_scripts/online_rl.py "
+            f"--from-scratch --task {task}) and give model_dir:=<run folder>/model"
+        )
+    return str(shipped)
+
+
+def _bag_uri(given: str, scenario: str, run_dir: Path) -> str:
+    if scenario == "replay_offline":
+        if not given:
+            raise GraphError("replay_offline needs bag_uri:=<folder of a recorded bag>")
+        if not Path(given).expanduser().exists():
+            raise GraphError(f"bag_uri {given!r} does not exist")
+    return str(Path(given).expanduser().absolute()) if given else str(run_dir / "bags" / scenario)

@@ -1,0 +1,274 @@
+"""Calls from worker threads, each with a deadline; and the environment as a remote or a local one."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rclpy.action import ActionClient
+from rclpy.client import Client
+from rclpy.task import Future
+
+from wm_msgs.msg import ErrorCode
+from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
+from wm_nodes.ros import convert
+from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.specs import EnvironmentSpec
+
+if TYPE_CHECKING:
+    from wm_nodes.ros.lifecycle import ManagedNode
+
+POLL_S = 0.1
+"""How often a waiting thread looks whether it must stop."""
+
+ATTEMPT_S = 2.0
+"""A step request without an answer is sent again after this time; the environment answers the same step_id once."""
+
+BUSY_WAIT_S = 0.005
+
+Check = Callable[[], None]
+
+
+def wait_for(future: Future, timeout_s: float, check: Check) -> Any:
+    """Wait in a worker thread for a future that the executor completes.
+
+    Raises:
+        PeerLost: not done after timeout_s.
+    """
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    deadline = time.monotonic() + timeout_s
+    while not done.wait(min(POLL_S, max(0.0, deadline - time.monotonic()))):
+        check()
+        if time.monotonic() >= deadline:
+            raise PeerLost(f"no answer within {timeout_s:g} s")
+    return future.result()
+
+
+def wait_until(ready: Callable[[], bool], timeout_s: float, check: Check, what: str) -> None:
+    """Poll `ready` in a worker thread. Raises PeerLost after timeout_s."""
+    deadline = time.monotonic() + timeout_s
+    while not ready():
+        check()
+        if time.monotonic() >= deadline:
+            raise PeerLost(f"{what} is not there after {timeout_s:g} s; is its node running and active?")
+        time.sleep(POLL_S / 2)
+
+
+def call(client: Client, request: Any, timeout_s: float, check: Check = lambda: None) -> Any:
+    """Call a service from a worker thread. Raises PeerLost after timeout_s without an answer."""
+    future = client.call_async(request)
+    try:
+        return wait_for(future, timeout_s, check)
+    except PeerLost as error:
+        raise PeerLost(f"{client.srv_name}: {error}") from None
+    finally:
+        if not future.done():
+            client.remove_pending_request(future)
+
+
+class EnvironmentClient(Protocol):
+    """An environment that is stepped, wherever it lives."""
+
+    @property
+    def session(self) -> int:
+        """Session of the environment as of the last handshake."""
+        ...
+
+    def handshake(self, timeout_s: float, check: Check) -> EnvironmentSpec:
+        """Fetch the spec and the session; needed at first and after each PeerLost."""
+        ...
+
+    def reset(self, command: ResetCommand, check: Check) -> Reply: ...
+
+    def step(self, command: StepCommand, check: Check) -> Reply: ...
+
+
+class RosEnvironmentClient:
+    """env/step, env/reset and env/get_spec of one environment node.
+
+    Args:
+        node: owns the clients until its cleanup.
+        prefix: relative namespace of the environment, "" or e.g. "sim".
+        timeout_s: deadline of one step or reset, retries and waiting for credit included.
+    """
+
+    def __init__(self, node: "ManagedNode", prefix: str = "", timeout_s: float = 10.0) -> None:
+        self._node, self._timeout_s = node, timeout_s
+        base = f"{prefix}/" if prefix else ""
+        self._step = node.create_client(StepBatch, f"{base}env/step")
+        self._reset = node.create_client(ResetBatch, f"{base}env/reset")
+        self._get_spec = node.create_client(GetEnvSpec, f"{base}env/get_spec")
+        for client in (self._step, self._reset, self._get_spec):
+            node.own(node.destroy_client, client)
+        namespace = node.get_namespace().rstrip("/")
+        self._peer = f"{namespace}/{base}environment"
+        self._spec: EnvironmentSpec | None = None
+        self._session = 0
+
+    @property
+    def session(self) -> int:
+        return self._session
+
+    def handshake(self, timeout_s: float, check: Check) -> EnvironmentSpec:
+        for client in (self._get_spec, self._reset, self._step):
+            wait_until(client.service_is_ready, timeout_s, check, client.srv_name)
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                response = call(self._get_spec, GetEnvSpec.Request(), ATTEMPT_S, check)
+                if response.error_code == ErrorCode.OK:
+                    break
+                text = response.message
+            except PeerLost as error:
+                text = str(error)
+            if time.monotonic() >= deadline:
+                raise PeerLost(text)
+            check()
+            time.sleep(POLL_S)
+        self._spec = convert.spec_from_msg(response.spec)
+        self._session = response.spec.session
+        return self._spec
+
+    def reset(self, command: ResetCommand, check: Check) -> Reply:
+        spec = self._known_spec()
+        request = convert.reset_request(command)
+
+        def attempt(left_s: float) -> Reply:
+            # Twice the same reset gives the same observation; a server that has not matched this client's reader yet
+            # loses its first answer (rmw_fastrtps 556).
+            try:
+                response = self._call(self._reset, request, min(left_s, self._timeout_s / 2), check)
+            except PeerLost:
+                if left_s <= self._timeout_s / 2:
+                    raise
+                raise WireError(ErrorCode.BUSY, "sent again") from None
+            return convert.reset_reply(response, spec)
+
+        reply = self._retry(attempt, check)
+        if reply.session != self._session:
+            raise PeerLost(f"the environment was restarted (session {reply.session}, not {self.session})")
+        return reply
+
+    def step(self, command: StepCommand, check: Check) -> Reply:
+        spec = self._known_spec()
+        request = convert.step_request(command)
+
+        def attempt(left_s: float) -> Reply:
+            try:
+                response = self._call(self._step, request, min(left_s, ATTEMPT_S), check)
+            except PeerLost:
+                if left_s <= ATTEMPT_S:
+                    raise
+                self._node.diagnostics.count("step_retries", level=0)
+                raise WireError(ErrorCode.BUSY, "sent again") from None
+            return convert.step_reply(response, spec, self._session)
+
+        try:
+            return self._retry(attempt, check)
+        except WireError as error:
+            if error.code == ErrorCode.SPEC_MISMATCH:
+                raise PeerLost(f"the environment was restarted: {error}") from None
+            raise
+
+    def _known_spec(self) -> EnvironmentSpec:
+        if self._spec is None:
+            raise PeerLost("no handshake with the environment yet")
+        return self._spec
+
+    def _retry(self, attempt: Callable[[float], Reply], check: Check) -> Reply:
+        deadline = time.monotonic() + self._timeout_s
+        while True:
+            try:
+                return attempt(max(0.0, deadline - time.monotonic()))
+            except WireError as error:
+                if error.code != ErrorCode.BUSY:
+                    raise
+                if time.monotonic() >= deadline:
+                    raise PeerLost(f"busy for {self._timeout_s:g} s: {error}") from None
+            check()
+            time.sleep(BUSY_WAIT_S)
+
+    def _call(self, client: Client, request: Any, timeout_s: float, check: Check) -> Any:
+        def alive() -> None:
+            check()
+            if self._node.peers.is_lost(self._peer):
+                raise PeerLost(f"{self._peer} is silent")
+
+        return call(client, request, timeout_s, alive)
+
+
+class LocalEnvironmentClient:
+    """An environment node in the same process: a direct call instead of the service; topics stay the same.
+
+    Args:
+        served: returns the node's lock-step environment, or None while it is not configured.
+    """
+
+    def __init__(self, served: Callable[[], Any], timeout_s: float = 10.0) -> None:
+        self._served, self._timeout_s = served, timeout_s
+
+    @property
+    def session(self) -> int:
+        return int(self._served().session)
+
+    def handshake(self, timeout_s: float, check: Check) -> EnvironmentSpec:
+        wait_until(lambda: self._served() is not None, timeout_s, check, "the local environment")
+        spec: EnvironmentSpec = self._served().spec
+        return spec
+
+    def reset(self, command: ResetCommand, check: Check) -> Reply:
+        return self._retry(lambda: self._served().reset(command), check)
+
+    def step(self, command: StepCommand, check: Check) -> Reply:
+        return self._retry(lambda: self._served().step(command), check)
+
+    def _retry(self, attempt: Callable[[], Reply], check: Check) -> Reply:
+        deadline = time.monotonic() + self._timeout_s
+        while True:
+            try:
+                return attempt()
+            except AttributeError:
+                raise PeerLost("the local environment was cleaned up") from None
+            except WireError as error:
+                if error.code != ErrorCode.BUSY or time.monotonic() >= deadline:
+                    raise
+            check()
+            time.sleep(BUSY_WAIT_S)
+
+
+def run_goal(
+    client: ActionClient, goal: Any, *, accept_s: float, check: Check, alive: Check, on_feedback: Any = None
+) -> Any:
+    """Send an action goal from a worker thread and wait for its result.
+
+    Args:
+        accept_s: deadline for the server to be there and to accept.
+        check: raises Cancelled when the caller must stop; the goal is then cancelled too.
+        alive: raises PeerLost when the server is known to be gone.
+
+    Raises:
+        PeerLost: no server, no acceptance, a refusal, or a lost server.
+    """
+    name = client._action_name
+    wait_until(client.server_is_ready, accept_s, check, name)
+    deadline = time.monotonic() + accept_s
+    while True:
+        handle = wait_for(client.send_goal_async(goal, feedback_callback=on_feedback), accept_s, check)
+        if handle.accepted:
+            break
+        if time.monotonic() >= deadline:
+            raise PeerLost(f"{name} refused the goal for {accept_s:g} s; is its node active and idle?")
+        check()
+        time.sleep(POLL_S)
+    result = handle.get_result_async()
+
+    def both() -> None:
+        check()
+        alive()
+
+    try:
+        return wait_for(result, float("inf"), both).result
+    except BaseException:
+        handle.cancel_goal_async()
+        raise

@@ -1,0 +1,317 @@
+"""Which processes a scenario has, as plain data: no rclpy, no launch, no files read.
+
+One table of arguments and one function per scenario serve both `ros2 launch` (ros.launch_face) and the plain Python
+starter (ros.runner).
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+ParameterValue = bool | int | float | str | list[str]
+TRUTHS = ("true", "false")
+
+
+class GraphError(ValueError):
+    """An argument or scenario that does not exist, or a value that is not allowed."""
+
+
+@dataclass(frozen=True)
+class LaunchArgument:
+    """One `name:=value` argument. choices: allowed values; empty where any text is."""
+
+    name: str
+    default: str
+    help: str
+    choices: tuple[str, ...] = ()
+
+
+ARGUMENTS: tuple[LaunchArgument, ...] = (
+    LaunchArgument("preset", "cpu", "Settings to start from, when config_file is empty: a name or a .yaml file"),
+    LaunchArgument("task", "push_cube", "Task, when config_file is empty", ("reach", "push_cube", "pull_cube")),
+    LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
+    LaunchArgument("run_dir", "", "Folder for weights, bags and logs; empty: runs/<time>-<scenario>"),
+    LaunchArgument("namespace", "wm", "ROS namespace of the graph; several runs need several"),
+    LaunchArgument("model_dir", "", "World-model folder; empty: the one shipped for the task"),
+    LaunchArgument("starts_file", "", "First frames to imagine from; empty: starts.safetensors in model_dir"),
+    LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
+    LaunchArgument("backend", "world_model", "What the environment node steps", ("world_model", "maniskill")),
+    LaunchArgument("reward", "", "Reward model; empty: endogenous if imagined, else rule", ("", "endogenous", "rule")),
+    LaunchArgument("num_envs", "0", "Environments stepped together; 0: ppo.num_envs of the configuration"),
+    LaunchArgument("simulator_envs", "4", "Environments of the simulator that evaluates"),
+    LaunchArgument("simulator", "true", "Also start the simulator and the evaluation node", TRUTHS),
+    LaunchArgument("seed", "0", "Root seed of the environments"),
+    LaunchArgument("learner_ranks", "1", "Learner processes under torchrun"),
+    LaunchArgument("record", "true", "Also start the recorder", TRUTHS),
+    LaunchArgument("bag_uri", "", "Bag folder to write or to play; empty: <run_dir>/bags/<scenario>"),
+    LaunchArgument("executor", "events", "Which rclpy executor spins the nodes", ("events", "single", "multi")),
+    LaunchArgument("autostart", "true", "Nodes activate themselves; false: a lifecycle manager does", TRUTHS),
+    LaunchArgument("use_sim_time", "false", "Nodes take their time from /clock", TRUTHS),
+    LaunchArgument("log_level", "info", "Least severity that nodes log", ("debug", "info", "warn", "error")),
+    LaunchArgument("compose", "false", "All nodes in one process: fewer copies, one interpreter", TRUTHS),
+    LaunchArgument("domain_id", "", "ROS domain, 0 to 101; empty: $ROS_DOMAIN_ID, else 0"),
+    LaunchArgument(
+        "discovery_range", "LOCALHOST", "Who may find the nodes; beyond this host nothing is authenticated",
+        ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT"),
+    ),
+    LaunchArgument("python", "", "Interpreter of the nodes; empty: $WM_PYTHON, else the one that starts the graph"),
+)  # fmt: skip
+"""Every argument of every scenario: the only place with a default."""
+
+_BY_NAME = {argument.name: argument for argument in ARGUMENTS}
+_COMMON = (
+    "preset", "task", "config_file", "run_dir", "namespace", "executor", "autostart", "use_sim_time", "log_level",
+    "compose", "domain_id", "discovery_range", "python",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class NodeSpec:
+    """One node.
+
+    namespace: absolute, e.g. /wm. required: its end ends the graph. lifecycle: ready when active, else when visible.
+    ranks: processes under torchrun; rank 0 is the node. environment: variables on top of the graph's.
+    """
+
+    module: str
+    name: str
+    namespace: str = "/wm"
+    parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+    required: bool = True
+    lifecycle: bool = True
+    ranks: int = 1
+    log_level: str = "info"
+    arguments: tuple[str, ...] = ()
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def full_name(self) -> str:
+        return f"{self.namespace.rstrip('/')}/{self.name}"
+
+    @property
+    def label(self) -> str:
+        """What the starter calls it: the full name without the slash in front."""
+        return self.full_name.lstrip("/")
+
+    def program(self) -> list[str]:
+        """Arguments of the interpreter, without those of ROS."""
+        ranks = ["torch.distributed.run", "--standalone", f"--nproc-per-node={self.ranks}"] if self.ranks > 1 else []
+        return ["-m", *ranks, *(["-m"] if ranks else []), self.module, *self.arguments]
+
+    def ros_arguments(self) -> list[str]:
+        """Name, namespace and parameters as rcl reads them (values are YAML; JSON quoting keeps text a string)."""
+        remaps = ["-r", f"__node:={self.name}", "-r", f"__ns:={self.namespace}"]
+        values = [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={json.dumps(value)}")]
+        return ["--ros-args", *remaps, "--log-level", self.log_level, *values]
+
+
+@dataclass(frozen=True)
+class Graph:
+    """The nodes of one scenario; environment: variables of all of them."""
+
+    name: str
+    nodes: tuple[NodeSpec, ...]
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        labels = [node.label for node in self.nodes]
+        twice = sorted({label for label in labels if labels.count(label) > 1})
+        if twice:
+            raise GraphError(f"graph {self.name!r} has two nodes called {', '.join(twice)}; give one another namespace")
+
+    def node(self, name: str) -> NodeSpec:
+        """A node by its label or, where only one has it, by its name."""
+        found = [node for node in self.nodes if name.lstrip("/") == node.label]
+        found = found or [node for node in self.nodes if node.name == name]
+        if len(found) != 1:
+            raise GraphError(
+                f"no single node {name!r} in graph {self.name!r}: {', '.join(n.label for n in self.nodes)}"
+            )
+        return found[0]
+
+    def to_json(self) -> str:
+        return json.dumps(dataclasses.asdict(self), indent=1)
+
+
+def graph_from_json(text: str) -> Graph:
+    """Inverse of Graph.to_json, for `wm_nodes.nodes.compose`."""
+    values = json.loads(text)
+    nodes = tuple(NodeSpec(**{**node, "arguments": tuple(node["arguments"])}) for node in values["nodes"])
+    return Graph(values["name"], nodes, values["environment"])
+
+
+def compose(graph: Graph, graph_file: str) -> Graph:
+    """The same nodes in one process: `python -m wm_nodes.nodes.compose <graph_file>`, which reads graph.to_json()."""
+    namespace = graph.nodes[0].namespace
+    one = NodeSpec(
+        "wm_nodes.nodes.compose", "composed", namespace, lifecycle=False, arguments=(graph_file,),
+        log_level=graph.nodes[0].log_level,
+    )  # fmt: skip
+    return Graph(f"{graph.name}-composed", (one,), graph.environment)
+
+
+def parse_arguments(scenario: str, given: Mapping[str, str]) -> dict[str, str]:
+    """Return every argument of a scenario with its given or default value.
+
+    Raises:
+        GraphError: names the argument and what is allowed.
+    """
+    names = scenario_of(scenario).arguments
+    for name, value in given.items():
+        if name not in names:
+            raise GraphError(f"unknown argument {name!r} of {scenario}; it has {', '.join(names)}")
+        choices = _BY_NAME[name].choices
+        if choices and value not in choices:
+            raise GraphError(f"{name} must be one of {', '.join(c or '(empty)' for c in choices)}; got {value!r}")
+    return {name: given.get(name, _BY_NAME[name].default) for name in names}
+
+
+def build_graph(scenario: str, arguments: Mapping[str, str]) -> Graph:
+    """Return the graph for resolved arguments (ros.arguments.resolve fills run_dir, config_file and the like)."""
+    graph = scenario_of(scenario).build(arguments)
+    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": arguments["discovery_range"]}
+    if arguments["domain_id"]:
+        environment["ROS_DOMAIN_ID"] = str(_integer(arguments, "domain_id", 0, 101))
+    return dataclasses.replace(graph, environment=environment)
+
+
+def _integer(arguments: Mapping[str, str], name: str, low: int, high: int = 2**31) -> int:
+    try:
+        value = int(arguments[name])
+    except ValueError:
+        raise GraphError(f"{name} must be a whole number, got {arguments[name]!r}") from None
+    if not low <= value <= high:
+        raise GraphError(f"{name} must be {low} to {high}, got {value}")
+    return value
+
+
+def _node(
+    arguments: Mapping[str, str],
+    name: str,
+    parameters: Mapping[str, ParameterValue],
+    *,
+    below: str = "",
+    ranks: int = 1,
+) -> NodeSpec:
+    namespace = "/" + "/".join(part for part in (arguments["namespace"].strip("/"), below) if part)
+    common: dict[str, ParameterValue] = {
+        "config_file": arguments["config_file"],
+        "run_dir": arguments["run_dir"],
+        "autostart": arguments["autostart"] == "true",
+        "executor": arguments["executor"],
+        "use_sim_time": arguments["use_sim_time"] == "true",
+    }
+    module, values = f"wm_nodes.nodes.{name}_node", {**common, **parameters}
+    return NodeSpec(module, name, namespace, values, ranks=ranks, log_level=arguments["log_level"])
+
+
+def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "num_envs", below: str = "") -> NodeSpec:
+    parameters: dict[str, ParameterValue] = {
+        "backend": backend,
+        "num_envs": _integer(arguments, count, 1, 4096),
+        "seed": _integer(arguments, "seed", 0),
+    }
+    if backend == "world_model":
+        parameters |= {"model_dir": arguments["model_dir"], "starts_file": arguments["starts_file"]}
+    return _node(arguments, "environment", parameters, below=below)
+
+
+def _simulator_and_evaluation(arguments: Mapping[str, str]) -> list[NodeSpec]:
+    evaluation = {"model_dir": arguments["model_dir"], "env_namespace": "sim"}
+    return [
+        _environment(arguments, "maniskill", count="simulator_envs", below="sim"),
+        _node(arguments, "evaluation", evaluation),
+    ]
+
+
+def _recorder(arguments: Mapping[str, str]) -> list[NodeSpec]:
+    return [_node(arguments, "recorder", {"bag_uri": arguments["bag_uri"]})] if arguments["record"] == "true" else []
+
+
+def _weights(arguments: Mapping[str, str]) -> dict[str, ParameterValue]:
+    return {"model_dir": arguments["model_dir"], "initial_policy": arguments["initial_policy"]}
+
+
+def _rollout_nodes(arguments: Mapping[str, str], backend: str) -> list[NodeSpec]:
+    reward = arguments["reward"] or ("endogenous" if backend == "world_model" else "rule")
+    return [
+        _environment(arguments, backend),
+        _node(arguments, "reward_evaluator", {"reward": reward, "model_dir": arguments["model_dir"]}),
+        _node(arguments, "policy", _weights(arguments)),
+        *_recorder(arguments),
+    ]
+
+
+def _online_training(arguments: Mapping[str, str]) -> Graph:
+    ranks = _integer(arguments, "learner_ranks", 1, 1024)
+    nodes = [*_rollout_nodes(arguments, "world_model"), _node(arguments, "learner", _weights(arguments), ranks=ranks)]
+    if arguments["simulator"] == "true":
+        nodes += _simulator_and_evaluation(arguments)
+    return Graph("online_training", tuple(nodes))
+
+
+def _rollout_record(arguments: Mapping[str, str]) -> Graph:
+    return Graph("rollout_record", tuple(_rollout_nodes(arguments, arguments["backend"])))
+
+
+def _replay_offline(arguments: Mapping[str, str]) -> Graph:
+    player = _node(arguments, "player", {"bag_uri": arguments["bag_uri"]})
+    return Graph("replay_offline", (player, _node(arguments, "learner", _weights(arguments))))
+
+
+def _evaluate(arguments: Mapping[str, str]) -> Graph:
+    return Graph("evaluate", (*_simulator_and_evaluation(arguments), *_recorder(arguments)))
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A named graph; arguments: names in ARGUMENTS, in the order in which --show-args lists them."""
+
+    name: str
+    summary: str
+    arguments: tuple[str, ...]
+    build: Callable[[Mapping[str, str]], Graph]
+
+
+_TRAINING = (
+    *_COMMON, "model_dir", "starts_file", "initial_policy", "reward", "num_envs", "simulator_envs", "simulator", "seed",
+    "learner_ranks", "record", "bag_uri",
+)  # fmt: skip
+_ROLLOUT = ("model_dir", "starts_file", "initial_policy", "backend", "reward", "num_envs", "seed", "record", "bag_uri")
+_EVALUATE = (*_COMMON, "model_dir", "simulator_envs", "seed", "record", "bag_uri")
+
+SCENARIOS: dict[str, Scenario] = {
+    scenario.name: scenario
+    for scenario in (
+        Scenario("online_training", "Train a policy in the world model; evaluate it in the simulator", _TRAINING,
+                 _online_training),
+        Scenario("rollout_record", "Let a policy act and record it", (*_COMMON, *_ROLLOUT), _rollout_record),
+        Scenario("replay_offline", "Play a bag to the learner",
+                 (*_COMMON, "model_dir", "initial_policy", "bag_uri"), _replay_offline),
+        Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
+        Scenario("composed", "online_training with all nodes in one process", _TRAINING, _online_training),
+    )
+}  # fmt: skip
+
+
+def scenario_of(name: str) -> Scenario:
+    if name not in SCENARIOS:
+        raise GraphError(f"unknown scenario {name!r}; choose one of {', '.join(SCENARIOS)}")
+    return SCENARIOS[name]
+
+
+def describe_arguments(scenario: str) -> str:
+    """The text of --show-args."""
+    lines = [f"{scenario}: {scenario_of(scenario).summary}", "Arguments (name:=value):"]
+    for name in scenario_of(scenario).arguments:
+        argument = _BY_NAME[name]
+        choices = (
+            f" One of: {', '.join(choice or '(empty)' for choice in argument.choices)}." if argument.choices else ""
+        )
+        lines += [f"    {name}:", f"        {argument.help}.{choices} (default: {argument.default!r})"]
+    return "\n".join(lines)
+
+
+def argument_table(scenario: str) -> list[LaunchArgument]:
+    return [_BY_NAME[name] for name in scenario_of(scenario).arguments]

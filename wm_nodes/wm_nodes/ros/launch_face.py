@@ -1,0 +1,65 @@
+"""The face of a scenario for `ros2 launch`: needs the ROS 2 packages launch and launch_ros (apt), nothing of rclpy.
+
+PyPI's `launch` 0.1.3 is an unrelated project of the same name.
+"""
+
+from typing import Any
+
+from wm_nodes.ros import arguments as launch_arguments
+from wm_nodes.ros.environment import graph_environment
+from wm_nodes.ros.graph import Graph, NodeSpec, argument_table
+
+
+def launch_description(scenario: str) -> Any:
+    """Return the launch.LaunchDescription of a scenario.
+
+    Raises:
+        ImportError: where ROS 2's launch is missing, or shadowed by the other project of that name.
+    """
+    import launch
+
+    if not hasattr(launch, "LaunchDescription"):
+        raise ImportError(
+            f"{getattr(launch, '__file__', 'launch')} is not ROS 2's launch but an unrelated project; "
+            f"pip uninstall launch, or start without it: python3 launch_scripts/{scenario}.launch.py"
+        )
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+
+    table = argument_table(scenario)
+    declared = [
+        DeclareLaunchArgument(
+            argument.name, default_value=argument.default, description=argument.help,
+            **({"choices": list(argument.choices)} if argument.choices else {}),
+        )
+        for argument in table
+    ]  # fmt: skip
+    start = OpaqueFunction(function=lambda context: _start(scenario, context))
+    return launch.LaunchDescription([*declared, start])
+
+
+def _start(scenario: str, context: Any) -> list[Any]:
+    from launch.substitutions import LaunchConfiguration
+
+    given = {
+        argument.name: LaunchConfiguration(argument.name).perform(context) for argument in argument_table(scenario)
+    }
+    graph, values = launch_arguments.prepare(scenario, given)
+    return node_actions(graph, launch_arguments.interpreter(values))
+
+
+def node_actions(graph: Graph, python: str) -> list[Any]:
+    """One launch_ros Node per NodeSpec; the end of a required one shuts the launch down."""
+    environment = graph_environment(graph.environment, python=python)
+    return [_action(node, python, {**environment, **node.environment}) for node in graph.nodes]
+
+
+def _action(node: NodeSpec, python: str, environment: dict[str, str]) -> Any:
+    from launch.actions import Shutdown
+    from launch_ros.actions import Node
+
+    return Node(
+        executable=python, arguments=node.program(), name=node.name, namespace=node.namespace,
+        parameters=[dict(node.parameters)] if node.parameters else [],
+        ros_arguments=["--log-level", node.log_level], additional_env=environment, output="screen",
+        **({"on_exit": Shutdown(reason=f"{node.label} ended")} if node.required else {}),
+    )  # fmt: skip

@@ -1,0 +1,296 @@
+"""The base of every node: lifecycle, described parameters, diagnostics, heartbeat, sequence numbers, clean stop."""
+
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidHandle
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from wm_msgs.msg import RunState
+from wm_nodes.config.load import ConfigError, load_config
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.ros import diagnostics
+from wm_nodes.ros.credit import CreditGrantor
+from wm_nodes.ros.diagnostics import Diagnostics
+from wm_nodes.ros.params import COMMON, Param, declare
+from wm_nodes.ros.peers import HEARTBEAT_S, PeerWatch
+from wm_nodes.ros.qos import topic
+from wm_nodes.ros.sequence import GapTracker, Stamper, new_session
+
+REFUSALS = (ConfigError, ValueError, OSError, KeyError, ImportError)
+"""What a bad setting raises: reported as one line, the node stays where it was. Anything else is a bug: with trace."""
+
+
+class StampedPublisher:
+    """A publisher of one row of the QoS table that numbers its messages (session, seq)."""
+
+    def __init__(self, node: "ManagedNode", name: str, at: str | None = None) -> None:
+        row = topic(name)
+        self._publisher = node.create_publisher(row.type, at or row.name, row.qos)
+        self._stamper = Stamper(node.session)
+
+    @property
+    def next_seq(self) -> int:
+        return self._stamper.next_seq
+
+    def publish(self, message: Any) -> int:
+        """Number and publish a message; return its seq."""
+        seq = self._stamper.stamp(message)
+        self._publisher.publish(message)
+        return seq
+
+
+class ManagedNode(LifecycleNode):  # type: ignore[misc]
+    """A lifecycle node whose subclass says what to do in configure, activate, deactivate and cleanup.
+
+    configure() builds objects, publishers, subscriptions and services; cleanup() lets go of what configure() made
+    (entities made through publish_on, listen, serve are destroyed here). The four raise on failure: one of REFUSALS
+    leaves the state as it was with one error line; anything else goes through error processing to `unconfigured`.
+    """
+
+    def __init__(self, name: str, params: Sequence[Param] = (), **node_arguments: Any) -> None:
+        super().__init__(name, **node_arguments)
+        self.session = new_session()
+        self.failed = False
+        """True: the process should end with a non-zero exit code."""
+        self._active = False
+        self._entities: list[Callable[[], object]] = []
+        self._trackers: dict[str, GapTracker] = {}
+        declare(self, (*COMMON, *params))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        run_dir = self.run_dir if self.param("run_dir") else None
+        row = topic("/diagnostics")
+        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, row.name, row.qos)
+        self.diagnostics = Diagnostics(
+            self.get_fully_qualified_name(), run_dir.name if run_dir else "", self._publish_diagnostics,
+            lambda: self.get_clock().now().to_msg(), run_dir,
+        )  # fmt: skip
+        self.peers = PeerWatch(self.get_fully_qualified_name(), float(self.param("peer_timeout_s")))
+        row = topic("run/state")
+        self._state_publisher = self.create_publisher(RunState, row.name, row.qos)
+        self._state_subscription = self.create_subscription(RunState, row.name, self._on_run_state, row.qos)
+        self._heartbeat_timer = self.create_timer(HEARTBEAT_S, self._on_heartbeat, clock=steady)
+        self._diagnostics_timer = self.create_timer(1.0, self._on_diagnostics, clock=steady)
+
+    # What subclasses fill in.
+
+    def configure(self) -> None:
+        """Build what the node needs."""
+
+    def activate(self) -> None:
+        """Start work."""
+
+    def deactivate(self, reason: str) -> None:
+        """Stop work; goals end with this reason."""
+
+    def cleanup(self) -> None:
+        """Let go of what configure() built."""
+
+    def on_peer_lost(self, name: str) -> None:
+        """A node of the graph has gone silent (fully qualified name)."""
+
+    def update_diagnostics(self) -> None:
+        """Set gauges; called once a second."""
+
+    # What subclasses use.
+
+    @property
+    def active(self) -> bool:
+        return self._active
+
+    @property
+    def run_dir(self) -> Path:
+        """Raises ValueError where the parameter is empty."""
+        if not self.param("run_dir"):
+            raise ValueError(f"{self.get_name()}: parameter run_dir is empty; give the run folder")
+        return Path(str(self.param("run_dir")))
+
+    def param(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def run_config(self) -> RunConfig:
+        """The configuration in `config_file`. Raises ValueError where it is empty, ConfigError where it is wrong."""
+        path = str(self.param("config_file"))
+        if not path:
+            raise ValueError(f"{self.get_name()}: parameter config_file is empty; give the resolved YAML configuration")
+        if not Path(path).is_file():
+            raise ValueError(f"{self.get_name()}: config_file {path!r} does not exist")
+        return load_config(path)
+
+    def publish_on(self, name: str) -> StampedPublisher:
+        """A numbering publisher for a row of the QoS table, destroyed at cleanup."""
+        publisher = StampedPublisher(self, name)
+        self._entities.append(lambda: self.destroy_publisher(publisher._publisher))
+        return publisher
+
+    def listen(
+        self, name: str, callback: Callable[[Any], None], *, credit: bool = False, while_inactive: bool = False
+    ) -> None:
+        """Subscribe to a row of the QoS table until cleanup. Messages with (session, seq) are checked for gaps.
+
+        credit: grant the producer messages as they are consumed (see ros.credit); for keep-all streams.
+        while_inactive: latched topics, whose message must not be missed before activation.
+        """
+        row = topic(name)
+        grantor = CreditGrantor(self, name) if credit else None
+        tracker = self._trackers.setdefault(name, GapTracker())
+
+        def observe(message: Any) -> None:
+            if hasattr(message, "seq"):
+                self._note_gap(name, tracker, message)
+            if self._active or while_inactive:
+                callback(message)
+            if grantor is not None:
+                grantor.consumed(tracker)
+
+        subscription = self.create_subscription(row.type, row.name, observe, row.qos)
+        self._entities.append(lambda: self.destroy_subscription(subscription))
+        if grantor is not None:
+            self._entities.append(grantor.close)
+
+    def tracker(self, name: str) -> GapTracker:
+        """The gap counts of a topic this node listens to."""
+        return self._trackers.setdefault(name, GapTracker())
+
+    def serve(self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any]) -> None:
+        """A service until cleanup."""
+        service = self.create_service(service_type, name, callback)
+        self._entities.append(lambda: self.destroy_service(service))
+
+    def own(self, destroy: Callable[..., object], *arguments: Any) -> None:
+        """Call destroy(*arguments) at cleanup."""
+        self._entities.append(lambda: destroy(*arguments))
+
+    def on_gap(self, name: str, missing: int) -> None:
+        """Sequence numbers of a topic were missed; already counted and logged."""
+
+    # Start and stop, for ros.spin.
+
+    def start(self) -> bool:
+        """Configure and activate when `autostart` is set; return False (and set failed) when that fails."""
+        if not self.param("autostart"):
+            return True
+        done = TransitionCallbackReturn.SUCCESS
+        if self.trigger_configure() != done or self.trigger_activate() != done:
+            self.failed = True
+        return not self.failed
+
+    def stop(self) -> None:
+        """Go from any state to finalized; tell the peers that this is no loss."""
+        label = self._state_machine.current_state[1]
+        if label in ("unconfigured", "inactive", "active"):
+            self.trigger_shutdown()
+        self._publish_state(RunState.FAILED if self.failed else RunState.FINISHED, "stopped")
+
+    # Lifecycle callbacks of rclpy.
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = self._attempt("configure", self.configure)
+        if result == TransitionCallbackReturn.FAILURE:
+            self._release()
+        return result
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._active = True
+        result = self._attempt("activate", self.activate)
+        if result != TransitionCallbackReturn.SUCCESS:
+            self._active = False
+            return result
+        self.get_logger().info("active")
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = self._attempt("deactivate", lambda: self.deactivate("deactivated"))
+        self._active = False
+        return result
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        result = self._attempt("cleanup", self.cleanup)
+        self._release()
+        return result
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        if self._active:
+            self._attempt("deactivate", lambda: self.deactivate("shut down"))
+        self._active = False
+        if state.label != "unconfigured":
+            self._attempt("cleanup", self.cleanup)
+        self._release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._active = False
+        self._attempt("cleanup", self.cleanup)
+        self._release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _attempt(self, what: str, work: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            work()
+        except REFUSALS as error:
+            return self._refuse(what, error, TransitionCallbackReturn.FAILURE)
+        except Exception as error:
+            self.get_logger().error(traceback.format_exc())
+            return self._refuse(what, error, TransitionCallbackReturn.ERROR)
+        self.diagnostics.clear_condition("lifecycle")
+        return TransitionCallbackReturn.SUCCESS
+
+    def _refuse(self, what: str, error: Exception, result: TransitionCallbackReturn) -> TransitionCallbackReturn:
+        text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+        self.get_logger().error(f"{what} failed: {text or type(error).__name__}")
+        self.diagnostics.set_condition("lifecycle", diagnostics.ERROR, f"{what} failed: {text}")
+        return result
+
+    def _release(self) -> None:
+        while self._entities:
+            self._entities.pop()()
+        self._trackers.clear()
+
+    # Heartbeat and diagnostics.
+
+    def _note_gap(self, name: str, tracker: GapTracker, message: Any) -> None:
+        missing = tracker.observe(message.session, message.seq)
+        if missing:
+            self.diagnostics.count(f"gaps {name}", missing, text=f"{missing} messages of {name} missed")
+            self.on_gap(name, missing)
+
+    def _on_run_state(self, message: RunState) -> None:
+        if message.state in (RunState.FINISHED, RunState.FAILED):
+            self.peers.left(message.node)
+        elif not self.peers.heard(message.node):
+            return
+        self.diagnostics.clear_condition(f"peer {message.node}")
+
+    def _on_heartbeat(self) -> None:
+        self.peers.timeout_s = float(self.param("peer_timeout_s"))
+        self._publish_state(RunState.RUNNING if self._active else RunState.IDLE, "")
+        for name in self.peers.check():
+            text = f"{name} is lost: silent for more than {self.peers.timeout_s:g} s; restart it"
+            self.get_logger().error(text)
+            self.diagnostics.set_condition(f"peer {name}", diagnostics.ERROR, text)
+            self.on_peer_lost(name)
+
+    def _on_diagnostics(self) -> None:
+        self.update_diagnostics()
+        self.diagnostics.gauge("state", self._state_machine.current_state[1])
+        for name, tracker in self._trackers.items():
+            if tracker.received:
+                self.diagnostics.gauge(f"received {name}", tracker.received)
+                self.diagnostics.gauge(f"lost {name}", tracker.lost)
+        self.diagnostics.publish()
+
+    def _publish_state(self, state: int, detail: str) -> None:
+        message = RunState(state=state, node=self.get_fully_qualified_name(), detail=detail)
+        message.run_id = Path(str(self.param("run_dir"))).name
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._state_publisher.publish(message)
+
+    def _publish_diagnostics(self, message: DiagnosticArray) -> None:
+        try:
+            self._diagnostics_publisher.publish(message)
+        except InvalidHandle:
+            return

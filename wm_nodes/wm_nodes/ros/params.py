@@ -1,0 +1,118 @@
+"""Described parameters: text, unit, range, choices; unknown names and bad values are refused with a reason."""
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterAlreadyDeclaredException,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+
+class ParameterError(ValueError):
+    """A parameter that does not exist, or a value outside its range."""
+
+
+@dataclass(frozen=True)
+class Param:
+    """One parameter of a node. The type is the default's type; minimum and maximum are inclusive."""
+
+    name: str
+    default: bool | int | float | str | list[str]
+    description: str
+    unit: str = ""
+    read_only: bool = False
+    """True where a change would need a new configuration (shapes, files, seeds)."""
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+
+    def descriptor(self) -> ParameterDescriptor:
+        described = ParameterDescriptor(
+            name=self.name,
+            description=f"{self.description} [{self.unit}]" if self.unit else self.description,
+            additional_constraints=f"one of: {', '.join(self.choices)}" if self.choices else "",
+            read_only=self.read_only,
+        )
+        if self.minimum is None and self.maximum is None:
+            return described
+        if isinstance(self.default, int):
+            low = 0 if self.minimum is None else int(self.minimum)
+            high = 2**62 if self.maximum is None else int(self.maximum)
+            described.integer_range = [IntegerRange(from_value=low, to_value=high, step=0)]
+        else:
+            low_f = -1e308 if self.minimum is None else float(self.minimum)
+            high_f = 1e308 if self.maximum is None else float(self.maximum)
+            described.floating_point_range = [FloatingPointRange(from_value=low_f, to_value=high_f, step=0.0)]
+        return described
+
+    def problem(self, value: Any) -> str:
+        """Return why a value is refused, or ''."""
+        if self.choices and value not in self.choices:
+            return f"{self.name} must be one of {', '.join(self.choices)}; got {value!r}"
+        for limit, wrong in ((self.minimum, "at least"), (self.maximum, "at most")):
+            if limit is None or not isinstance(value, (int, float)):
+                continue
+            if (wrong == "at least" and value < limit) or (wrong == "at most" and value > limit):
+                return f"{self.name} must be {wrong} {limit:g} {self.unit}".rstrip() + f"; got {value!r}"
+        return ""
+
+
+COMMON = (
+    Param("config_file", "", "Resolved configuration (YAML), as saved in the run folder", read_only=True),
+    Param("run_dir", "", "Run folder: weights, checkpoints and bags go here; its name is the run id", read_only=True),
+    Param("autostart", True, "Configure and activate at start, without a lifecycle manager", read_only=True),
+    Param("executor", "events", "Which rclpy executor spins the node", read_only=True,
+          choices=("events", "single", "multi")),
+    Param("peer_timeout_s", 3.0, "A node of the graph that is silent for longer is reported as lost", "s",
+          minimum=1.0, maximum=60.0),
+)  # fmt: skip
+"""Parameters that every node of the graph has."""
+
+
+def declare(node: Node, params: Sequence[Param]) -> None:
+    """Declare all parameters and guard later changes.
+
+    Raises:
+        ParameterError: for a value outside its range or choices, or an override that no parameter has the name of.
+    """
+    by_name = {param.name: param for param in params}
+    for param in params:
+        try:
+            node.declare_parameter(param.name, param.default, param.descriptor())
+        except ParameterAlreadyDeclaredException:
+            continue
+        except InvalidParameterTypeException as error:
+            kind = type(param.default).__name__
+            raise ParameterError(f"{node.get_name()}: parameter {param.name} must be a {kind}; {error}") from None
+        except InvalidParameterValueException:
+            given = node._parameter_overrides[param.name].value
+            raise ParameterError(f"{node.get_name()}: {param.problem(given) or f'{param.name}={given!r}'}") from None
+        if problem := param.problem(node.get_parameter(param.name).value):
+            raise ParameterError(f"{node.get_name()}: {problem}")
+    _refuse_unknown(node)
+
+    def check(changes: list[Parameter]) -> SetParametersResult:
+        for change in changes:
+            param = by_name.get(change.name)
+            if param is not None and (problem := param.problem(change.value)):
+                return SetParametersResult(successful=False, reason=problem)
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+
+
+def _refuse_unknown(node: Node) -> None:
+    """rclpy ignores overrides of undeclared parameters silently; a misspelt name must not start a run."""
+    for name in node._parameter_overrides:
+        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
+            known = sorted(declared for declared in node._parameters if "." not in declared)
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+            raise ParameterError(f"{node.get_name()}: unknown parameter {name!r}; {hint}")

@@ -1,0 +1,47 @@
+"""Who else is in the graph: every node says on run/state twice a second that it is there; silence is a lost peer."""
+
+import time
+
+HEARTBEAT_S = 0.5
+
+
+class PeerWatch:
+    """Keeps the last time each other node was heard. Times are monotonic, in s; pass `now` in tests."""
+
+    def __init__(self, own_name: str, timeout_s: float) -> None:
+        self._own_name, self.timeout_s = own_name, timeout_s
+        self._heard: dict[str, float] = {}
+        self._lost: set[str] = set()
+
+    def heard(self, name: str, now: float | None = None) -> bool:
+        """Note a sign of life; return whether the peer is new or had been lost."""
+        if name == self._own_name:
+            return False
+        returned = name in self._lost or name not in self._heard
+        self._lost.discard(name)
+        self._heard[name] = time.monotonic() if now is None else now
+        return returned
+
+    def left(self, name: str) -> None:
+        """A peer said that it stops: its silence is no loss."""
+        self._heard.pop(name, None)
+        self._lost.discard(name)
+
+    def check(self, now: float | None = None) -> list[str]:
+        """Return the peers that became lost since the last check."""
+        now = time.monotonic() if now is None else now
+        silent = {name for name, last in self._heard.items() if now - last > self.timeout_s}
+        fresh = sorted(silent - self._lost)
+        self._lost |= silent
+        return fresh
+
+    def is_lost(self, name: str) -> bool:
+        return name in self._lost
+
+    @property
+    def lost(self) -> list[str]:
+        return sorted(self._lost)
+
+    @property
+    def present(self) -> list[str]:
+        return sorted(set(self._heard) - self._lost)

@@ -1,0 +1,60 @@
+"""Sequence numbers in the messages themselves: DDS does not report what a keep-last history overwrote."""
+
+import time
+from dataclasses import dataclass, field
+
+
+def new_session() -> int:
+    """Start time of a publisher in ns since the epoch; tells a restarted publisher from the one before."""
+    return time.time_ns()
+
+
+@dataclass
+class Stamper:
+    """Numbers the messages of one topic: (session, 0), (session, 1), ..."""
+
+    session: int
+    next_seq: int = 0
+
+    def stamp(self, message: object) -> int:
+        """Set `session` and `seq` of a message; return the seq."""
+        seq = self.next_seq
+        message.session, message.seq = self.session, seq  # type: ignore[attr-defined]
+        self.next_seq += 1
+        return seq
+
+
+@dataclass
+class GapTracker:
+    """Counts the sequence numbers that one consumer of one topic missed.
+
+    The first message of a session sets the starting point: what was sent before a consumer joined is not a gap.
+    """
+
+    session: int | None = None
+    last_seq: int = -1
+    received: int = 0
+    lost: int = 0
+    """Over all sessions."""
+    repeated: int = 0
+    sessions: int = 0
+    gaps: list[tuple[int, int, int]] = field(default_factory=list)
+    """(session, first missing seq, number of missing seqs), newest last; at most 1000 kept."""
+
+    def observe(self, session: int, seq: int) -> int:
+        """Note one message; return how many were missed directly before it (0: none, or a new session)."""
+        self.received += 1
+        if session != self.session:
+            self.session, self.last_seq = session, seq
+            self.sessions += 1
+            return 0
+        if seq <= self.last_seq:
+            self.repeated += 1
+            return 0
+        missing = seq - self.last_seq - 1
+        if missing:
+            self.lost += missing
+            self.gaps.append((session, self.last_seq + 1, missing))
+            del self.gaps[:-1000]
+        self.last_seq = seq
+        return missing

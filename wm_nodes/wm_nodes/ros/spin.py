@@ -1,0 +1,110 @@
+"""One way to spin: a loop of finite spin_once calls, until a signal, on whichever executor was chosen.
+
+EventsExecutor.spin() of the pip wheel delivers nothing, and awaiting in it keeps a core busy; a finite spin_once works.
+"""
+
+import logging
+import signal
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+import rclpy
+from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+EXECUTORS = ("events", "single", "multi")
+SPIN_ONCE_S = 0.1
+"""Longest wait inside one spin_once; a signal is seen after at most this long."""
+
+SWITCH_INTERVAL_S = 0.0005
+"""Python's thread switch interval: ten times shorter than the default, so that a busy worker delays callbacks less."""
+
+
+def make_executor(kind: str) -> Executor:
+    """Return an executor by name; falls back to `single`, with a warning, where rclpy has no events executor.
+
+    Raises:
+        ValueError: for a name that is not in EXECUTORS.
+    """
+    if kind not in EXECUTORS:
+        raise ValueError(f"executor must be one of {', '.join(EXECUTORS)}, got {kind!r}")
+    if kind == "multi":
+        return MultiThreadedExecutor(num_threads=2)
+    if kind == "events":
+        try:
+            from rclpy.experimental import EventsExecutor
+
+            return EventsExecutor()
+        except ImportError:
+            logging.getLogger(__name__).warning("this rclpy has no EventsExecutor; using the single-threaded executor")
+    return SingleThreadedExecutor()
+
+
+def spin(executor: Executor, until: Callable[[], bool]) -> None:
+    """Spin until `until()` is true or the context is shut down."""
+    try:
+        while rclpy.ok() and not until():
+            executor.spin_once(timeout_sec=SPIN_ONCE_S)
+    except ExternalShutdownException:
+        return
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Callable[[], bool]]:
+    """Turn SIGINT and SIGTERM into a flag, so that nodes can still publish while they stop."""
+    received: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+
+    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = None) -> int:
+    """Create nodes, start them, spin until a signal, stop them, shut down. Return the exit code.
+
+    Each node is an rclpy node with start() -> bool and stop(), as ros.lifecycle.ManagedNode is. The first node's
+    `executor` parameter chooses the executor. A start that fails gives exit code 1 after one line of error.
+    """
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    nodes: list[Any] = []
+    code = 0
+    try:
+        with stop_on_signals() as stopped:
+            nodes = list(make_nodes())
+            executor = make_executor(executor_kind(nodes[0]))
+            for node in nodes:
+                executor.add_node(node)
+            if all(node.start() for node in nodes):
+                spin(executor, until=lambda: stopped() or any(node.failed for node in nodes))
+            code = int(any(node.failed for node in nodes))
+            for node in reversed(nodes):
+                node.stop()
+            for node in nodes:
+                executor.remove_node(node)
+                node.destroy_node()
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        code = 1
+    finally:
+        rclpy.try_shutdown()
+    return code
+
+
+def run_node(make_node: Callable[[], Any], args: list[str] | None = None) -> int:
+    """run_nodes for one node; `sys.exit(run_node(MyNode))` is a node's main."""
+    return run_nodes(lambda: [make_node()], args)
+
+
+def executor_kind(node: Node) -> str:
+    return str(node.get_parameter("executor").value) if node.has_parameter("executor") else "events"

@@ -1,0 +1,141 @@
+"""The wire's requests, answers and batches as numpy, so that a local and a remote caller share one path.
+
+Shapes: N environments, A action, S state, P ground truth, H W 3 image. Stamps in ns.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wm_nodes.types import BoolArray, FloatArray, UInt8Array, UInt64Array
+
+
+class WireError(Exception):
+    """A refused request: code is one of wm_msgs/ErrorCode, the text names the value and the remedy."""
+
+    def __init__(self, code: int, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class PeerLost(Exception):
+    """A peer did not answer before the deadline, or was restarted in between."""
+
+
+class Cancelled(Exception):
+    """The goal was cancelled or the node deactivated while it worked; args[0] is the reason."""
+
+
+@dataclass(frozen=True)
+class StepCommand:
+    """StepBatch's request. actions: (N * A,), row-major. Optional arrays: (N,) or None."""
+
+    session: int
+    step_id: int
+    spec_hash: str
+    actions: FloatArray
+    policy_version: int = 0
+    logprobs: FloatArray | None = None
+    values: FloatArray | None = None
+    reset_mask: BoolArray | None = None
+    reset_seeds: UInt64Array | None = None
+    with_image: bool = True
+
+
+@dataclass(frozen=True)
+class ResetCommand:
+    """ResetBatch's request. Optional arrays: (N,) or None."""
+
+    mask: BoolArray | None = None
+    seeds: UInt64Array | None = None
+    task: str = ""
+    behaviour: str = ""
+    with_image: bool = True
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The answer to a step or a reset. images: (N, H, W, 3), or None when not asked for. step_s: s inside."""
+
+    session: int
+    step_id: int
+    """The step answered; after a reset the last one before it, so step_id + 1 comes next in both cases."""
+    stamp_ns: int
+    images: UInt8Array | None
+    states: FloatArray
+    terminated: BoolArray
+    truncated: BoolArray
+    episode_ids: UInt64Array
+    success_probability: FloatArray
+    uncertainty: FloatArray
+    step_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Transition:
+    """TransitionBatch. ground_truth: (N, P), or (N, 0) where unknown."""
+
+    stamp_ns: int
+    next_stamp_ns: int
+    step_id: int
+    actions: FloatArray
+    states: FloatArray
+    next_states: FloatArray
+    logprobs: FloatArray
+    values: FloatArray
+    terminated: BoolArray
+    truncated: BoolArray
+    valid: BoolArray
+    episode_ids: UInt64Array
+    episode_steps: NDArray[np.uint32]
+    policy_versions: UInt64Array
+    success_probability: FloatArray
+    uncertainty: FloatArray
+    ground_truth: FloatArray
+    source: int
+    session: int = 0
+
+    @property
+    def is_reset(self) -> bool:
+        """True for the transition that env/reset publishes: no action, both stamps those of the first frame."""
+        return self.stamp_ns == self.next_stamp_ns
+
+
+@dataclass(frozen=True)
+class Rewards:
+    """What a learner reads of a RewardBatch; arrays (N,)."""
+
+    transition_session: int
+    step_id: int
+    total: FloatArray
+    valid: BoolArray
+    success: UInt8Array
+    invalid_reason: str
+
+
+@dataclass(frozen=True)
+class Goals:
+    """TaskGoal. images: (N, H, W, 3), or None where the environment has no goals. found: bool (N,)."""
+
+    stamp_ns: int
+    images: UInt8Array | None
+    found: BoolArray
+    episode_ids: UInt64Array
+
+
+@dataclass(frozen=True)
+class EpisodeNote:
+    """EpisodeEvent. Constants of the message are used for kind, outcome and reason."""
+
+    stamp_ns: int
+    kind: int
+    env_index: int
+    episode_id: int
+    seed: int
+    behaviour: str
+    length: int
+    outcome: int
+    reason: int
+    policy_version_first: int
+    policy_version_last: int

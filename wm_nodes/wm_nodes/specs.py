@@ -1,0 +1,84 @@
+"""The specification of an environment: what fixes shapes, units and order on the wire and in a bag."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+SOURCE_IMAGINED, SOURCE_SIMULATOR, SOURCE_REAL, SOURCE_REPLAY = 0, 1, 2, 3
+SOURCE_NAMES = ("imagined", "simulator", "real", "replay")
+
+GROUND_TRUTH_NAMES = (
+    "cube_x", "cube_y", "cube_z", "cube_yaw", "tool_x", "tool_y", "tool_z", "goal_x", "goal_y",
+    "cube_start_x", "cube_start_y",
+)  # fmt: skip
+"""Simulator truth of the table-top scenes, in this order. Positions in m, yaw in rad, world frame."""
+
+
+@dataclass(frozen=True)
+class EnvironmentSpec:
+    """See msgs_schema/msg/EnvSpec.msg, field by field. Sizes in px, control_period_s in s."""
+
+    env_id: str
+    task: str
+    instruction: str
+    source: int
+    num_envs: int
+    height: int
+    width: int
+    cameras: tuple[str, ...]
+    action_names: tuple[str, ...]
+    action_units: tuple[str, ...]
+    action_scale: tuple[float, ...]
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    ground_truth_names: tuple[str, ...]
+    control_period_s: float
+    max_episode_steps: int
+    state_low: tuple[float, ...] = ()
+    state_high: tuple[float, ...] = ()
+    """Box that actions cannot leave, state units; empty: no box."""
+    world_model_sha256: str = ""
+    channels: int = 3
+    encoding: str = "rgb8"
+
+    @property
+    def action_dim(self) -> int:
+        return len(self.action_names)
+
+    @property
+    def state_dim(self) -> int:
+        return len(self.state_names)
+
+    @property
+    def ground_truth_dim(self) -> int:
+        return len(self.ground_truth_names)
+
+    @property
+    def spec_hash(self) -> str:
+        """sha256 over every field: two sides with equal hashes agree on shapes, units and order."""
+        return _hash(asdict(self))
+
+    def policy_hash(self) -> str:
+        """sha256 over what a policy depends on; equal for an imagined and a simulated environment of one scene."""
+        keys = ("height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale",
+                "state_names", "state_units", "control_period_s")  # fmt: skip
+        fields = asdict(self)
+        return _hash({k: fields[k] for k in keys})
+
+
+def as_sent(value: float) -> float:
+    """The shortest decimal that names the same float32: what a number is after a trip through a message or a bag."""
+    return float(str(np.float32(value)))
+
+
+def _hash(fields: dict[str, Any]) -> str:
+    def sent(value: Any) -> Any:
+        if isinstance(value, float):
+            return as_sent(value)
+        return [sent(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+    text = json.dumps({name: sent(value) for name, value in fields.items()}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()

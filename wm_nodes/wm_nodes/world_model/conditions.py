@@ -1,0 +1,50 @@
+"""Condition tokens of the world models. Shapes: B batch, T transitions, A action, S state, N tokens, D width."""
+
+import torch
+from torch import Tensor, nn
+
+NUM_FREQUENCIES = 6
+
+
+class ScalarTokens(nn.Module):
+    """One token per scalar: Fourier features, then a linear map of its own per scalar, then a shared MLP."""
+
+    def __init__(self, num_scalars: int, width: int) -> None:
+        super().__init__()
+        num_features = 1 + 2 * NUM_FREQUENCIES
+        self.weight = nn.Parameter(torch.randn(num_scalars, num_features, width) * num_features**-0.5)
+        self.bias = nn.Parameter(torch.randn(num_scalars, width) * 0.5)
+        self.mlp = nn.Sequential(nn.SiLU(), nn.Linear(width, width))
+
+    def forward(self, scalars_BTN: Tensor) -> Tensor:
+        """Tokens (B, T, N, D) of scalars whose useful range is about [-1, 1]."""
+        scalars = scalars_BTN.float()
+        phases = scalars.unsqueeze(-1) * (0.5 * torch.pi * 2.0 ** torch.arange(NUM_FREQUENCIES, device=scalars.device))
+        features = torch.cat((scalars.unsqueeze(-1), phases.sin(), phases.cos()), -1)
+        tokens: Tensor = self.mlp(torch.einsum("btnf,nfd->btnd", features, self.weight) + self.bias)
+        return tokens
+
+
+class ActionCondition(nn.Module):
+    """Tokens of one transition: each action dimension, each value of the commanded tool position before and after,
+    and a null token.
+
+    The tool positions add no information to eq. (1): state t + 1 = clip(state t + max_action a_t) is a function of the
+    first state and of a_0 .. a_t.
+    """
+
+    def __init__(self, action_dim: int, state_dim: int, width: int) -> None:
+        super().__init__()
+        self.scalars = ScalarTokens(action_dim + 2 * state_dim, width)
+        self.null = nn.Parameter(torch.randn(width) * 0.5)
+        self.state_mean: Tensor
+        self.state_scale: Tensor
+        self.register_buffer("state_mean", torch.zeros(state_dim))
+        self.register_buffer("state_scale", torch.ones(state_dim))
+
+    def forward(self, actions_BTA: Tensor, states_BTS: Tensor, next_states_BTS: Tensor) -> Tensor:
+        """Tokens (B, T, A + 2 S + 1, D); actions in [-1, 1], states in m."""
+        before, after = ((s - self.state_mean) / self.state_scale for s in (states_BTS, next_states_BTS))
+        tokens = self.scalars(torch.cat((actions_BTA, before, after), -1))
+        null = self.null.to(tokens.dtype).expand(*tokens.shape[:2], 1, -1)
+        return torch.cat((tokens, null), 2)

@@ -1,0 +1,104 @@
+"""The next-frame model over continuous latents, eq. (1): (x_t+1, d_t+1) from frames 0..t and a condition.
+
+Shapes: B batch, T frames, S tokens per frame, D values per token, N condition tokens, K done heads, J tasks,
+A action, P state.
+
+Economy: the trunk reads frame t and its condition once, and from the same features come frame t + 1 (as a residual on
+frame t) and the done signal of frame t + 1. A terminal frame therefore costs no extra pass. The first frame has no done
+signal; episodes start unfinished.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from wm_nodes.config.schema import WorldModelConfig
+from wm_nodes.world_model.conditions import ActionCondition
+from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer, TemporalCache
+
+Caches = list[TemporalCache] | list[RingCache]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """change_BTSD: added to the latents of frame t to give frame t + 1, before normalisation.
+    done_logits_BTKJ: of frame t + 1, per head and task."""
+
+    change_BTSD: Tensor
+    done_logits_BTKJ: Tensor
+
+
+class DoneHeads(nn.Module):
+    """K independent MLPs on the frame's pooled temporal features; the minimum over heads is the done signal."""
+
+    def __init__(self, width: int, num_heads: int, num_tasks: int) -> None:
+        super().__init__()
+        self.num_heads, self.num_tasks = num_heads, num_tasks
+        self.heads = nn.ModuleList(
+            nn.Sequential(nn.Linear(3 * width, width), nn.SiLU(), nn.Linear(width, num_tasks)) for _ in range(num_heads)
+        )
+        for head in self.heads:
+            nn.init.constant_(head[-1].bias, -2.0)  # type: ignore[index]
+
+    def forward(self, tokens_BTSD: Tensor, register_BTD: Tensor) -> Tensor:
+        pooled = torch.cat((tokens_BTSD.mean(2), tokens_BTSD.amax(2), register_BTD), -1)
+        return torch.stack([head(pooled) for head in self.heads], 2).float()
+
+
+class FrameModel(nn.Module):
+    """Trunk and heads shared by the action model and the text model; they differ in their condition tokens."""
+
+    def __init__(self, config: WorldModelConfig, num_tokens: int, latent_dim: int, num_tasks: int) -> None:
+        super().__init__()
+        width = config.width
+        self.num_tokens, self.latent_dim, self.num_tasks = num_tokens, latent_dim, num_tasks
+        self.embed = nn.Linear(latent_dim, width)
+        self.position = nn.Parameter(torch.randn(num_tokens, width) * 0.5)
+        self.register = nn.Parameter(torch.randn(1, width) * 0.5)
+        self.trunk = SpatioTemporalTransformer(width, config.depth, config.num_heads, config.window)
+        self.change = nn.Linear(width, latent_dim)
+        nn.init.zeros_(self.change.weight)
+        nn.init.zeros_(self.change.bias)
+        self.done = DoneHeads(width, config.num_done_heads, num_tasks)
+
+    def predict(self, latents_BTSD: Tensor, condition_BTND: Tensor, caches: Caches | None = None) -> Prediction:
+        """Predict frame t + 1 for each of T given frames; later frames never influence earlier predictions."""
+        tokens = self.embed(latents_BTSD) + self.position
+        register = self.register.to(tokens.dtype).expand(*tokens.shape[:2], 1, -1)
+        features = self.trunk(torch.cat((tokens, register), 2), condition_BTND, caches)
+        tokens, register = features[:, :, :-1], features[:, :, -1]
+        return Prediction(self.change(tokens).float(), self.done(tokens, register))
+
+
+class ActionModel(FrameModel):
+    """WM_act: the environment of the policy."""
+
+    def __init__(
+        self,
+        config: WorldModelConfig,
+        *,
+        num_tokens: int,
+        latent_dim: int,
+        action_dim: int,
+        state_dim: int,
+        num_tasks: int,
+    ) -> None:
+        super().__init__(config, num_tokens, latent_dim, num_tasks)
+        self.condition = ActionCondition(action_dim, state_dim, config.width)
+
+    def forward(
+        self,
+        latents_BTSD: Tensor,
+        actions_BTA: Tensor,
+        states_BTP: Tensor,
+        next_states_BTP: Tensor,
+        caches: Caches | None = None,
+    ) -> Prediction:
+        return self.predict(latents_BTSD, self.condition(actions_BTA, states_BTP, next_states_BTP), caches)
+
+
+def done_signal(done_logits_BKJ: Tensor) -> tuple[Tensor, Tensor]:
+    """Pessimistic done probability (B, J), the minimum over heads, and the heads' standard deviation (B, J)."""
+    probabilities = done_logits_BKJ.sigmoid()
+    return probabilities.amin(-2), probabilities.std(-2, correction=0)

@@ -1,0 +1,21 @@
+"""Which floating-point type the models compute in on a device."""
+
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache
+from typing import Any
+
+import torch
+
+
+@cache
+def cpu_has_fast_bfloat16() -> bool:
+    """True where the processor multiplies bfloat16 in hardware (avx512_bf16 or AMX): about twice the speed of float32."""
+    return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
+
+
+def compute_context(device: torch.device, *, exact: bool = False) -> AbstractContextManager[Any]:
+    """Autocast to bfloat16 where the device is fast at it; float32 everywhere else, and always if `exact`."""
+    fast = torch.cuda.is_bf16_supported() if device.type == "cuda" else cpu_has_fast_bfloat16()
+    if exact or not fast:
+        return nullcontext()
+    return torch.autocast(device.type, dtype=torch.bfloat16)
