@@ -1,4 +1,4 @@
-"""ros2 launch wm_bringup rollout_record.launch.py, or: python3 launch_scripts/rollout_record.launch.py [--show-args]"""
+"""ros2 launch wm_bringup rollout_record.launch.py, or: python3 <this file> [--show-args] [name:=value ...]"""
 
 
 def generate_launch_description():

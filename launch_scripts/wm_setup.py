@@ -73,7 +73,7 @@ def pending(venv):
         "wm_nodes": True,
         "renderer": True,
     }
-    done = {step: stamp.get(step, "").removesuffix(MISSING) for step in wanted}
+    done = {step: stamp.get(step, "").split(":")[0] for step in wanted}
     return [step for step in wanted if not present[step] or done[step] != wanted[step]]
 
 

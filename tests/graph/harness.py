@@ -17,6 +17,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.ros.qos import topic
@@ -91,9 +92,12 @@ class Probe:
         return self.result(client.call_async(request), timeout_s, name)
 
     def action(self, kind: type[Any], name: str) -> ActionClient:
-        client = ActionClient(self.node, kind, name)
-        wait_until(f"action {name}", client.server_is_ready, START_S)
-        return client
+        if name not in self._clients:
+            self._clients[name] = ActionClient(self.node, kind, name)
+            wait_until(f"action {name}", self._clients[name].server_is_ready, START_S)
+            time.sleep(MATCH_S)
+        wait_until(f"action {name}", self._clients[name].server_is_ready, START_S)
+        return self._clients[name]
 
     def send(self, client: ActionClient, goal: Any, feedback: Any = None) -> Any:
         """Send a goal and return its accepted handle."""
@@ -176,7 +180,15 @@ class Graph:
         return self.start("reward_evaluator", reward="rule", **params)
 
     def start_learner(self, **params: Any) -> Any:
-        return self.start("learner", policy_factory="toy:make_policy", **params)
+        factory = params.pop("learner_factory", "toy:ToyLearner")
+        return self.start("learner", policy_factory="toy:make_policy", learner_factory=factory, **params)
+
+    def start_training_nodes(self, **learner: Any) -> None:
+        """environment, policy, reward_evaluator and learner, as in a training run."""
+        self.start_environment()
+        self.start_policy()
+        self.start_reward()
+        self.start_learner(**learner)
 
     def log_path(self, name: str) -> Path:
         return self.folder / f"{name.strip('/').replace('/', '_')}.log"

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.config.schema import SimulationConfig
+
 SOURCE_IMAGINED, SOURCE_SIMULATOR, SOURCE_REAL, SOURCE_REPLAY = 0, 1, 2, 3
 SOURCE_NAMES = ("imagined", "simulator", "real", "replay")
 
@@ -82,3 +84,28 @@ def _hash(fields: dict[str, Any]) -> str:
 
     text = json.dumps({name: sent(value) for name, value in fields.items()}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def simulation_spec(task: str, instruction: str, config: SimulationConfig, num_envs: int) -> EnvironmentSpec:
+    """The spec of `task` in ManiSkill; the imagined environment shares all but env_id, source and ground truth."""
+    axes = ("x", "y", "z")
+    return EnvironmentSpec(
+        env_id=f"maniskill/{task}",
+        task=task,
+        instruction=instruction,
+        source=SOURCE_SIMULATOR,
+        num_envs=num_envs,
+        height=config.image_size,
+        width=config.image_size * len(config.cameras),
+        cameras=tuple(config.cameras),
+        action_names=tuple(f"tool_d{axis}" for axis in axes),
+        action_units=("m",) * 3,
+        action_scale=(config.max_action_m,) * 3,
+        state_names=tuple(f"tool_target_{axis}" for axis in axes),
+        state_units=("m",) * 3,
+        ground_truth_names=GROUND_TRUTH_NAMES,
+        control_period_s=1.0 / config.control_hz,
+        max_episode_steps=config.max_episode_steps,
+        state_low=config.workspace_low_m,
+        state_high=config.workspace_high_m,
+    )

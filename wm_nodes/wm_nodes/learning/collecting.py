@@ -5,7 +5,8 @@ from pathlib import Path
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.recording import EpisodeBagWriter
 from wm_nodes.simulation.collection import CollectionPlan, collect
-from wm_nodes.simulation.environment import simulation_spec
+from wm_nodes.simulation.tasks import instruction
+from wm_nodes.specs import simulation_spec
 from wm_nodes.types import Episode
 
 TRAINING_SEEDS, HELDOUT_SEEDS = 0, 500_000
@@ -23,7 +24,7 @@ def collect_heldout_data(config: RunConfig, folder: Path, *, progress: bool = Tr
 
 
 def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
-    scene_task = "push_cube" if config.task == "reach" else config.task
+    scene_task = "push_cube" if config.task == "reach" else config.task  # one scene, one data set, two tasks
     return CollectionPlan(
         task=scene_task,
         simulation=config.simulation,
@@ -45,13 +46,19 @@ def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int) ->
     )
 
 
+def first_frames_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
+    """Episodes of one step: first frames to imagine from."""
+    one_step = config.simulation.model_copy(update={"max_episode_steps": 1})
+    return CollectionPlan(config.task, one_step, num_episodes, first_seed, behaviours={"random": 1.0})
+
+
 def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path, progress: bool = True) -> list[Path]:
     return collect(folder, plan, write_shard, num_workers=config.data.num_workers, progress=progress)
 
 
 def write_shard(path: Path, plan: CollectionPlan, episodes: list[Episode]) -> None:
     """Write one shard's episodes into a bag that is renamed to `path` when complete."""
-    spec = simulation_spec(plan.task, plan.simulation, 1)
+    spec = simulation_spec(plan.task, instruction(plan.task), plan.simulation, 1)
     custom = {"wm.seeds": f"{episodes[0].seed}..{episodes[-1].seed}"}
     with EpisodeBagWriter(
         path, spec, run_id=path.parent.name, custom=custom, start_ns=1, discard_partial=True

@@ -115,7 +115,5 @@ def _seeds(first_seed: int, playing: NDArray[np.int64]) -> UInt64Array:
 
 
 def _noise(seed: int, step: int, action_dim: int) -> NDArray[np.float32]:
-    noise: NDArray[np.float32] = torch.randn(
-        action_dim, generator=torch_stream(seed, "evaluation_noise", step)
-    ).numpy()
+    noise: NDArray[np.float32] = torch.randn(action_dim, generator=torch_stream(seed, "evaluation_noise", step)).numpy()
     return noise

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from wm_nodes.policy import ImagePolicy
@@ -49,8 +50,6 @@ def reset_seeds(seed: int, policy_version: int, step: int, num_envs: int) -> UIn
 
 def action_noise(seed: int, policy_version: int, step: int, num_envs: int, action_dim: int) -> FloatArray:
     """Return the (N, A) standard-normal action noise of lock-step `step` (stream `action_noise`)."""
-    import torch
-
     generator = torch_stream(seed, "action_noise", policy_version, step)
     noise: FloatArray = torch.randn(num_envs, action_dim, generator=generator).numpy()
     return noise
@@ -101,8 +100,8 @@ def collect_rollout(
             "logprobs_TN": output.logprobs,
             "values_TN": output.values,
             "rewards_TN": judged.total,
-            "terminated_TN": result.terminated,
-            "truncated_TN": result.truncated,
+            "terminated_TN": result.terminated & result.valid,
+            "truncated_TN": result.truncated & result.valid,
             "valid_TN": result.valid & judged.valid,
         }
         for name, array in row.items():

@@ -30,14 +30,14 @@ class SftResult:
 
 
 def demonstrations(episodes: Iterable[Episode], count: int) -> list[Episode]:
-    """Return the first `count` expert episodes that end in success.
+    """Return the first `count` expert episodes that reach success.
 
     Raises:
         ValueError: there are fewer.
     """
     found: list[Episode] = []
     for episode in episodes:
-        if episode.behaviour == EXPERT and bool(episode.success[-1]):
+        if episode.behaviour == EXPERT and bool(episode.success.any()):
             found.append(episode)
             if len(found) == count:
                 return found
@@ -59,8 +59,9 @@ def train_sft(
 ) -> SftResult:
     """Fit the actor's mean to the demonstrated actions in place; critic and log standard deviation stay.
 
-    Also sets the policy's feature normalisation from the demonstrations. Every image counts once, and with
-    `reconstruct` (the tokenizer's decode of encode, uint8 (B, H, W, 3)) once more as the world model will show it.
+    Steps after the first success are left out: an episode ends there when a policy acts. The demonstrations also set the
+    policy's feature normalisation. Every image counts once, and with `reconstruct` (the tokenizer's decode of encode,
+    uint8 (B, H, W, 3)) once more as the world model will show it.
     With one seed and one number of torch threads the result is bit-identical on a CPU.
 
     Args:
@@ -73,10 +74,13 @@ def train_sft(
     """
     others = {episode.behaviour for episode in demos} - {EXPERT}
     if not demos or others:
-        raise ValueError(f"behaviour cloning needs {EXPERT} demonstrations only, got {len(demos)} with {sorted(others)}")
-    images = np.concatenate([episode.images[:-1] for episode in demos])
-    states_BS = _tensor([episode.states[:-1] for episode in demos], policy)
-    actions_BA = _tensor([episode.actions for episode in demos], policy)
+        raise ValueError(
+            f"behaviour cloning needs {EXPERT} demonstrations only, got {len(demos)} with {sorted(others)}"
+        )
+    steps = [_steps_to_success(episode) for episode in demos]
+    images = np.concatenate([episode.images[:count] for episode, count in zip(demos, steps, strict=True)])
+    states_BS = _tensor([episode.states[:count] for episode, count in zip(demos, steps, strict=True)], policy)
+    actions_BA = _tensor([episode.actions[:count] for episode, count in zip(demos, steps, strict=True)], policy)
     features = [policy.features(images)]
     if reconstruct is not None:
         features.append(policy.features(reconstruct(images)))
@@ -100,6 +104,10 @@ def train_sft(
         if on_progress is not None and (iteration + 1) % report_every == 0:
             on_progress(iteration + 1, float(losses[iteration]))
     return SftResult(losses, len(features_BF))
+
+
+def _steps_to_success(episode: Episode) -> int:
+    return int(episode.success.argmax()) if episode.success.any() else episode.num_steps
 
 
 def _tensor(arrays: list[NDArray[np.float32]], policy: ImagePolicy) -> torch.Tensor:

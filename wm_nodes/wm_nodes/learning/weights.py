@@ -93,9 +93,13 @@ def check_same_layout(expected: Mapping[str, Tensor], found: Mapping[str, Tensor
     """Raise WeightsError that names the first parameter, in sorted order, that is missing, extra or of another kind."""
     for name in sorted(set(expected) | set(found)):
         if name not in found:
-            raise WeightsError(f"{what} of another architecture: {name} is missing; use the configuration it was made by")
+            raise WeightsError(
+                f"{what} of another architecture: {name} is missing; use the configuration it was made by"
+            )
         if name not in expected:
-            raise WeightsError(f"{what} of another architecture: {name} is unknown; use the configuration it was made by")
+            raise WeightsError(
+                f"{what} of another architecture: {name} is unknown; use the configuration it was made by"
+            )
         (_, shape, dtype), (_, other_shape, other_dtype) = _entry(name, expected[name]), _entry(name, found[name])
         if (shape, dtype) != (other_shape, other_dtype):
             raise WeightsError(

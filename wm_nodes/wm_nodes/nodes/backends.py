@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.nodes.training import Learner
 from wm_nodes.policy import ImagePolicy
 from wm_nodes.reward import RewardModel
 from wm_nodes.types import Environment
@@ -51,11 +52,10 @@ def make_environment(
     if backend == "factory":
         environment = load_factory(factory)(config, num_envs, seed)
         return environment
+    model, starts = existing(model_dir, "model_dir"), existing(starts_file, "starts_file")
     from wm_nodes.learning.policies import make_imagined_environment
 
-    environment = make_imagined_environment(
-        config, existing(model_dir, "model_dir"), existing(starts_file, "starts_file"), num_envs=num_envs, seed=seed
-    )
+    environment = make_imagined_environment(config, model, starts, num_envs=num_envs, seed=seed)
     return environment
 
 
@@ -68,9 +68,10 @@ def make_reward(kind: str, config: RunConfig, model_dir: str, factory: str = "")
         return reward
     if kind == "rule":
         return RuleReward(config.reward.sparse_weight)
+    folder = existing(model_dir, "model_dir")
     from wm_nodes.learning.policies import make_endogenous_reward
 
-    model: RewardModel = make_endogenous_reward(config, existing(model_dir, "model_dir"))
+    model: RewardModel = make_endogenous_reward(config, folder)
     return model
 
 
@@ -80,10 +81,23 @@ def make_policy(config: RunConfig, model_dir: str, factory: str = "") -> ImagePo
     if factory:
         policy = load_factory(factory)(config)
         return policy
+    folder = existing(model_dir, "model_dir")
     from wm_nodes.learning.policies import make_policy as make_model_policy
 
-    policy = make_model_policy(config, existing(model_dir, "model_dir"))
+    policy = make_model_policy(config, folder)
     return policy
+
+
+def make_learner(policy: ImagePolicy, config: RunConfig, factory: str = "") -> Learner:
+    """Build the algorithm that trains `policy` in place; its present weights are the reference it stays close to."""
+    learner: Learner
+    if factory:
+        learner = load_factory(factory)(policy, config)
+        return learner
+    from wm_nodes.learning.ppo import PpoLearner
+
+    learner = PpoLearner(policy, policy, config.ppo, config.seed)
+    return learner
 
 
 def existing(path: str, parameter: str) -> Path:

@@ -51,8 +51,7 @@ class Dropped:
 class RolloutJoiner:
     """Collects one rollout at a time. Thread-safe: callbacks put, the worker waits and takes.
 
-    Args:
-        session: of the environment whose rollout is wanted; what belongs to another session is ignored.
+    session: of the environment; a new one makes everything collected before worthless.
     """
 
     def __init__(self) -> None:
@@ -62,6 +61,10 @@ class RolloutJoiner:
         self._transitions: dict[int, Transition] = {}
         self._rewards: dict[int, Rewards] = {}
         self._collecting = False
+
+    @property
+    def collecting(self) -> bool:
+        return self._collecting
 
     def begin(self) -> None:
         """Forget everything and collect from now on."""

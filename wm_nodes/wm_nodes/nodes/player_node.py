@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.publisher import Publisher
+from rosbags.interfaces import ConnectionExtRosbag2
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -14,7 +15,7 @@ from wm_msgs.action import Replay
 from wm_msgs.msg import Credit, ErrorCode
 from wm_msgs.srv import PlayNext, Seek, SetRate
 from wm_nodes.nodes.bag_qos import message_class, offered_qos
-from wm_nodes.recording import BagError
+from wm_nodes.recording import Bag, BagError
 from wm_nodes.recording.cdr import session_and_seq
 from wm_nodes.recording.playback import Playback
 from wm_nodes.ros import diagnostics
@@ -29,6 +30,9 @@ from wm_nodes.ros.wire import Cancelled
 
 FEEDBACK_S = 0.2
 CREDITED = "env/transition"
+NOT_PLAYED = ("/run/state", "/flow/credit", "/clock", "/diagnostics")
+"""Signs of life and of demand: left out unless named, since recorded ones would speak for absent nodes."""
+
 MATCH_S = 0.5
 """Time for subscribers to find fresh publishers before the first message, s."""
 
@@ -40,7 +44,8 @@ PARAMS = (
     Param("start_offset", 0.0, "Where to begin", "s", minimum=0.0),
     Param("loop", False, "Begin again at the end"),
     Param("publish_clock", True, "Publish the bag's time on /clock"),
-    Param("topics", [""], "Topics to play, relative or absolute; empty: all"),
+    Param("topics", [""], "Topics to play, relative or absolute; empty: all but signs of life (run/state, flow/credit, "
+          "/clock, /diagnostics)"),
 )  # fmt: skip
 
 
@@ -114,6 +119,9 @@ class PlayerNode(ManagedNode):
         with self._lock:
             if self._playback is not None:
                 raise BagError("another bag is being played; cancel that goal or wait")
+            if not names:
+                with Bag(path) as bag:
+                    names = [c.topic for c in bag.connections if not c.topic.endswith(NOT_PLAYED)]
             playback = Playback(
                 path, names=names, rate=request.rate, start_offset_s=request.start_offset, loop=request.loop,
                 paused=bool(self.param("start_paused")),
@@ -122,6 +130,7 @@ class PlayerNode(ManagedNode):
         try:
             for name, connection in playback.topics.items():
                 if name not in self._outlets:
+                    assert isinstance(connection.ext, ConnectionExtRosbag2)
                     qos = offered_qos(list(connection.ext.offered_qos_profiles))
                     self._outlets[name] = self.create_publisher(message_class(connection.msgtype), name, qos)
         except ValueError:

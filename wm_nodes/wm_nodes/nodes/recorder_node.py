@@ -49,6 +49,8 @@ class RecorderNode(ManagedNode):
         self._bag: RawBagWriter | None = None
         self._paused = False
         self._latched: dict[str, bytes] = {}
+        self._versions: set[int] = set()
+        self._time_ns = 0
 
     def configure(self) -> None:
         self._rows = {name: _row(name) for name in self.param("topics")}
@@ -109,6 +111,8 @@ class RecorderNode(ManagedNode):
             return
         began = time.perf_counter()
         self._time_ns = max(self._time_ns + 1, time.time_ns())
+        if _base(name) == topics.POLICY_VERSION.name:
+            self._versions.add(int(m.deserialize(data, topics.POLICY_VERSION.msgtype).version))
         try:
             self._bag.write(self._names[name], data, self._time_ns)
         except RecordingError as error:
@@ -125,7 +129,7 @@ class RecorderNode(ManagedNode):
             path, custom={"wm.run_id": self.run_dir.name}, split_bytes=int(self.param("split_mib")) * MIB,
             split_s=float(self.param("split_s")),
         )  # fmt: skip
-        self._paused, self._time_ns = False, 0
+        self._paused, self._time_ns, self._versions = False, 0, set()
         self._gaps = {name: GapTracker() for name in self._gaps}
         for name, row in self._rows.items():
             msgtype = f"{row.type.__module__.split('.')[0]}/msg/{row.type.__name__}"
@@ -152,17 +156,14 @@ class RecorderNode(ManagedNode):
         return path, messages, total
 
     def _facts(self) -> dict[str, str]:
-        """custom_data taken from the latched messages: spec, model, newest policy."""
-        facts = {}
+        """custom_data taken from what was recorded: spec, model, policy versions."""
+        facts: dict[str, str] = {}
         for name, data in self._latched.items():
             if _base(name) == topics.SPEC.name:
                 spec, _ = m.spec_of(m.deserialize(data, topics.SPEC.msgtype))
                 facts["wm.spec_json"] = m.spec_to_json(spec)
                 facts["wm.world_model_sha256"] = spec.world_model_sha256
-            elif _base(name) == topics.POLICY_VERSION.name:
-                newest = m.deserialize(data, topics.POLICY_VERSION.msgtype)
-                facts["wm.policy_versions"] = json.dumps([int(newest.version)])
-        return facts
+        return {**facts, "wm.policy_versions": json.dumps(sorted(self._versions))}
 
     def _next_path(self) -> Path:
         folder = self.run_dir / "bags"

@@ -1,6 +1,5 @@
 """From given launch arguments to a graph on disk: run folder, configuration, model; shared by both starters."""
 
-import dataclasses
 import os
 import sys
 from collections.abc import Mapping
@@ -22,18 +21,17 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     values = parse_arguments(scenario, given)
     time = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
     run_dir = Path(values["run_dir"] or f"runs/{time}-{scenario}").expanduser().absolute()
-    run_dir.mkdir(parents=True, exist_ok=True)
     values["run_dir"] = str(run_dir)
-    if not values["config_file"]:
-        overrides = {"task": values["task"]} | (
-            {"seed": int(values["seed"])} if values.get("seed", "").isdigit() else {}
-        )
-        config = load_config(values["preset"], overrides)
-        values["config_file"] = str(run_dir / "config.yaml")
-        Path(values["config_file"]).write_text(dump_config(config))
-    else:
-        values["config_file"] = str(Path(values["config_file"]).expanduser().absolute())
+    given_config = values["config_file"]
+    if given_config:
+        values["config_file"] = str(Path(given_config).expanduser().absolute())
         config = load_config(values["config_file"])
+    else:
+        seed = values.get("seed", "")
+        config = load_config(
+            values["preset"], {"task": values["task"]} | ({"seed": int(seed)} if seed.isdigit() else {})
+        )
+        values["config_file"] = str(run_dir / "config.yaml")
     if values.get("num_envs") == "0":
         values["num_envs"] = str(config.ppo.num_envs)
     if "model_dir" in values:
@@ -42,19 +40,22 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
         values["starts_file"] = str(Path(values["model_dir"]) / "starts.safetensors")
     if "bag_uri" in values:
         values["bag_uri"] = _bag_uri(values["bag_uri"], scenario, run_dir)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    if not given_config:
+        Path(values["config_file"]).write_text(dump_config(config))
     return values
 
 
 def prepare(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
-    """Return the graph to start and its resolved arguments; graph.json in the run folder holds the nodes."""
+    """Return the graph to start and its resolved arguments; graph.json in the run folder keeps a copy for people."""
     values = resolve(scenario, given)
     graph = build_graph(scenario, values)
-    graph_file = Path(values["run_dir"]) / "graph.json"
-    graph_file.write_text(graph.to_json())
     if values["compose"] == "true" or scenario == "composed":
-        single = tuple(dataclasses.replace(node, ranks=1) for node in graph.nodes)
-        graph_file.write_text(dataclasses.replace(graph, nodes=single).to_json())
-        graph = compose(graph, str(graph_file))
+        graph = compose(graph, str(Path(values["run_dir"]) / "composed.params.yaml"))
+        for node in graph.nodes:
+            if node.inside:
+                Path(node.parameter_file).write_text(node.carried_parameters())
+    (Path(values["run_dir"]) / "graph.json").write_text(graph.to_json())
     return graph, values
 
 

@@ -253,8 +253,16 @@ def run_goal(
     name = client._action_name
     wait_until(client.server_is_ready, accept_s, check, name)
     deadline = time.monotonic() + accept_s
+
+    def both() -> None:
+        check()
+        alive()
+
     while True:
-        handle = wait_for(client.send_goal_async(goal, feedback_callback=on_feedback), accept_s, check)
+        try:
+            handle = wait_for(client.send_goal_async(goal, feedback_callback=on_feedback), accept_s, both)
+        except PeerLost as error:
+            raise PeerLost(f"{name}: {error}") from None
         if handle.accepted:
             break
         if time.monotonic() >= deadline:
@@ -262,11 +270,6 @@ def run_goal(
         check()
         time.sleep(POLL_S)
     result = handle.get_result_async()
-
-    def both() -> None:
-        check()
-        alive()
-
     try:
         return wait_for(result, float("inf"), both).result
     except BaseException:

@@ -46,6 +46,11 @@ def to_field(values: NDArray[Any]) -> "array[Any]":
     return field
 
 
+def bytes_field(data: bytes) -> "array[int]":
+    """Return a uint8[] field."""
+    return array("B", data)
+
+
 def from_field(field: Any, dtype: DTypeLike) -> NDArray[Any]:
     """Return a flat view of a message's array field."""
     return np.frombuffer(field, dtype) if len(field) else np.empty(0, dtype)

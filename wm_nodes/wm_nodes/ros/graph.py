@@ -5,12 +5,15 @@ starter (ros.runner).
 """
 
 import dataclasses
+import difflib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 ParameterValue = bool | int | float | str | list[str]
 TRUTHS = ("true", "false")
+COMPOSABLE = ("environment", "policy", "reward_evaluator", "learner", "recorder", "evaluation")
+"""Nodes that wm_nodes.nodes.compose can carry."""
 
 
 class GraphError(ValueError):
@@ -83,6 +86,10 @@ class NodeSpec:
     ranks: int = 1
     log_level: str = "info"
     arguments: tuple[str, ...] = ()
+    inside: tuple["NodeSpec", ...] = ()
+    """The nodes that a composed process carries."""
+    parameter_file: str = ""
+    """Where the starter keeps carried_parameters() of a composed process."""
     environment: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -99,11 +106,29 @@ class NodeSpec:
         ranks = ["torch.distributed.run", "--standalone", f"--nproc-per-node={self.ranks}"] if self.ranks > 1 else []
         return ["-m", *ranks, *(["-m"] if ranks else []), self.module, *self.arguments]
 
+    def carried(self) -> tuple["NodeSpec", ...]:
+        """The ROS nodes of this process."""
+        return self.inside or (self,)
+
     def ros_arguments(self) -> list[str]:
-        """Name, namespace and parameters as rcl reads them (values are YAML; JSON quoting keeps text a string)."""
-        remaps = ["-r", f"__node:={self.name}", "-r", f"__ns:={self.namespace}"]
-        values = [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={json.dumps(value)}")]
-        return ["--ros-args", *remaps, "--log-level", self.log_level, *values]
+        """Name, namespace and parameters as rcl reads them. A composed process keeps its nodes' own names."""
+        names = [] if self.inside else ["-r", f"__node:={self.name}"]
+        log_level = ["--log-level", self.log_level]
+        return ["--ros-args", *names, "-r", f"__ns:={self.namespace}", *log_level, *self.parameter_arguments()]
+
+    def parameter_arguments(self) -> list[str]:
+        """-p name:=value, or the file of a composed process: `-p node:name:=value` misses nodes in a namespace.
+
+        Values are YAML; JSON quoting keeps text a string.
+        """
+        if self.inside:
+            return ["--params-file", self.parameter_file]
+        return [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={json.dumps(value)}")]
+
+    def carried_parameters(self) -> str:
+        """The text of parameter_file: JSON, which is YAML."""
+        values = {node.full_name: {"ros__parameters": dict(node.parameters)} for node in self.carried()}
+        return json.dumps(values, indent=1)
 
 
 @dataclass(frozen=True)
@@ -121,9 +146,9 @@ class Graph:
             raise GraphError(f"graph {self.name!r} has two nodes called {', '.join(twice)}; give one another namespace")
 
     def node(self, name: str) -> NodeSpec:
-        """A node by its label or, where only one has it, by its name."""
-        found = [node for node in self.nodes if name.lstrip("/") == node.label]
-        found = found or [node for node in self.nodes if node.name == name]
+        """The process of a node: by label or, where only one has it, by name; a composed process carries several."""
+        found = [node for node in self.nodes if name.lstrip("/") in [one.label for one in (node, *node.inside)]]
+        found = found or [node for node in self.nodes if name in [one.name for one in (node, *node.inside)]]
         if len(found) != 1:
             raise GraphError(
                 f"no single node {name!r} in graph {self.name!r}: {', '.join(n.label for n in self.nodes)}"
@@ -134,21 +159,22 @@ class Graph:
         return json.dumps(dataclasses.asdict(self), indent=1)
 
 
-def graph_from_json(text: str) -> Graph:
-    """Inverse of Graph.to_json, for `wm_nodes.nodes.compose`."""
-    values = json.loads(text)
-    nodes = tuple(NodeSpec(**{**node, "arguments": tuple(node["arguments"])}) for node in values["nodes"])
-    return Graph(values["name"], nodes, values["environment"])
+def compose(graph: Graph, parameter_file: str) -> Graph:
+    """The same graph with the nodes of its namespace in one process, where `wm_nodes.nodes.compose` can carry them.
 
-
-def compose(graph: Graph, graph_file: str) -> Graph:
-    """The same nodes in one process: `python -m wm_nodes.nodes.compose <graph_file>`, which reads graph.to_json()."""
+    Nodes of other namespaces, the player, and a learner of several ranks stay processes of their own.
+    """
     namespace = graph.nodes[0].namespace
+    inside = [
+        node for node in graph.nodes if node.namespace == namespace and node.name in COMPOSABLE and node.ranks == 1
+    ]
+    if len(inside) < 2:
+        return graph
     one = NodeSpec(
-        "wm_nodes.nodes.compose", "composed", namespace, lifecycle=False, arguments=(graph_file,),
-        log_level=graph.nodes[0].log_level,
+        "wm_nodes.nodes.compose", "composed", namespace, log_level=inside[0].log_level,
+        arguments=tuple(node.name for node in inside), inside=tuple(inside), parameter_file=parameter_file,
     )  # fmt: skip
-    return Graph(f"{graph.name}-composed", (one,), graph.environment)
+    return dataclasses.replace(graph, nodes=(one, *(node for node in graph.nodes if node not in inside)))
 
 
 def parse_arguments(scenario: str, given: Mapping[str, str]) -> dict[str, str]:
@@ -160,7 +186,9 @@ def parse_arguments(scenario: str, given: Mapping[str, str]) -> dict[str, str]:
     names = scenario_of(scenario).arguments
     for name, value in given.items():
         if name not in names:
-            raise GraphError(f"unknown argument {name!r} of {scenario}; it has {', '.join(names)}")
+            close = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(names)}"
+            raise GraphError(f"unknown argument {name!r} of {scenario}; {hint}")
         choices = _BY_NAME[name].choices
         if choices and value not in choices:
             raise GraphError(f"{name} must be one of {', '.join(c or '(empty)' for c in choices)}; got {value!r}")

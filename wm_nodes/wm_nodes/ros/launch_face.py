@@ -57,9 +57,10 @@ def _action(node: NodeSpec, python: str, environment: dict[str, str]) -> Any:
     from launch.actions import Shutdown
     from launch_ros.actions import Node
 
+    named = {} if node.inside else {"name": node.name, "parameters": [dict(node.parameters)] if node.parameters else []}
+    by_node = node.parameter_arguments() if node.inside else []
     return Node(
-        executable=python, arguments=node.program(), name=node.name, namespace=node.namespace,
-        parameters=[dict(node.parameters)] if node.parameters else [],
-        ros_arguments=["--log-level", node.log_level], additional_env=environment, output="screen",
+        executable=python, arguments=node.program(), namespace=node.namespace,
+        ros_arguments=["--log-level", node.log_level, *by_node], additional_env=environment, output="screen", **named,
         **({"on_exit": Shutdown(reason=f"{node.label} ended")} if node.required else {}),
     )  # fmt: skip

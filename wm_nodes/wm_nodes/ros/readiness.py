@@ -28,8 +28,8 @@ def wait_ready(
         NotReadyError: after timeout_s.
     """
     deadline = time.monotonic() + timeout_s
-    states: dict[str, str] = {node.full_name: "not seen" for node in nodes}
-    waiting = {node.full_name: node for node in nodes}
+    waiting = {node.full_name: node for process in nodes for node in process.carried()}
+    states = dict.fromkeys(waiting, "not seen")
     with _observer(domain) as (observer, spin_once):
         asked: dict[str, tuple[Any, Any, float]] = {}
         while waiting:

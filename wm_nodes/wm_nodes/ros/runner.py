@@ -52,8 +52,9 @@ class Runner:
         use_domain_lock: bool = True,
     ) -> None:  # fmt: skip
         self.graph = graph
-        self._environment = graph_environment({**graph.environment, **(env or {})}, python=python)
-        self.domain = _domain(self._environment)
+        self.environment = graph_environment({**graph.environment, **(env or {})}, python=python)
+        """Variables that every process gets."""
+        self.domain = _domain(self.environment)
         self._lock = DomainLock(self.domain, f"graph {graph.name!r}") if use_domain_lock else None
         self._log = log
         self._log_dir = log_dir
@@ -74,14 +75,14 @@ class Runner:
         if self._lock is not None:
             self._lock.acquire()
         try:
-            clean_shared_memory(self._environment)
+            clean_shared_memory(self.environment)
             self._fit_shared_memory()
             if self._log_dir is not None:
                 self._log_dir.mkdir(parents=True, exist_ok=True)
             self._starter = ThreadPoolExecutor(max_workers=1, thread_name_prefix="runner")
             for index, node in enumerate(self.graph.nodes):
                 self._processes[node.label] = NodeProcess(
-                    node, self._python, self._environment, log=self._log, colour=index if self._colour else None,
+                    node, self._python, self.environment, log=self._log, colour=index if self._colour else None,
                     width=max(len(other.label) for other in self.graph.nodes),
                     file=self._log_dir / f"{node.label.replace('/', '.')}.log" if self._log_dir else None,
                 )  # fmt: skip
@@ -171,7 +172,7 @@ class Runner:
             self._starter.shutdown()
             self._starter = None
         if self._processes:
-            clean_shared_memory(self._environment)
+            clean_shared_memory(self.environment)
         if self._lock is not None:
             self._lock.release()
 
@@ -203,11 +204,11 @@ class Runner:
 
     def _fit_shared_memory(self) -> None:
         """Leave the big segment out where /dev/shm (64 MiB in many containers) cannot hold one for each process."""
-        if self._environment.get("FASTRTPS_DEFAULT_PROFILES_FILE") != str(PROFILE) or not Path("/dev/shm").is_dir():
+        if self.environment.get("FASTRTPS_DEFAULT_PROFILES_FILE") != str(PROFILE) or not Path("/dev/shm").is_dir():
             return
         free, needed = shutil.disk_usage("/dev/shm").free, SEGMENT_BYTES * len(self.graph.nodes)
         if free < needed:
-            del self._environment["FASTRTPS_DEFAULT_PROFILES_FILE"]
+            del self.environment["FASTRTPS_DEFAULT_PROFILES_FILE"]
             self._say(
                 f"/dev/shm has {free >> 20} MiB free, {needed >> 20} MiB wanted: going on with small segments; images "
                 "above 300 kB may be lost (docker run --shm-size=1g cures it)"

@@ -3,6 +3,7 @@
 EventsExecutor.spin() of the pip wheel delivers nothing, and awaiting in it keeps a core busy; a finite spin_once works.
 """
 
+import gc
 import logging
 import signal
 import sys
@@ -93,11 +94,16 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
             for node in nodes:
                 executor.remove_node(node)
                 node.destroy_node()
+            executor.shutdown()
+            del node, executor
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         code = 1
     finally:
+        nodes.clear()
         rclpy.try_shutdown()
+        # Lifecycle nodes are reference cycles; while they live, so does the DDS participant with its shared memory.
+        gc.collect()
     return code
 
 

@@ -13,36 +13,12 @@ from wm_nodes.control import check_actions, next_state
 from wm_nodes.seeding import stream_seed
 from wm_nodes.simulation.scenes import make_scene, render
 from wm_nodes.simulation.tasks import get_task
-from wm_nodes.specs import GROUND_TRUTH_NAMES, SOURCE_SIMULATOR, EnvironmentSpec
+from wm_nodes.specs import GROUND_TRUTH_NAMES, simulation_spec
 from wm_nodes.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 
 CONTROLLER_RANGE_M = 0.1
 """A full-scale action of ManiSkill's stock Panda controller."""
 GRIPPER_CLOSED = -1.0
-
-
-def simulation_spec(task: str, config: SimulationConfig, num_envs: int) -> EnvironmentSpec:
-    """The spec of `task` in ManiSkill; the imagined environment shares everything but env_id, source and truth."""
-    return EnvironmentSpec(
-        env_id=f"maniskill/{task}",
-        task=task,
-        instruction=get_task(task).instruction,
-        source=SOURCE_SIMULATOR,
-        num_envs=num_envs,
-        height=config.image_size,
-        width=config.image_size * len(config.cameras),
-        cameras=tuple(config.cameras),
-        action_names=("tool_dx", "tool_dy", "tool_dz"),
-        action_units=("m", "m", "m"),
-        action_scale=(config.max_action_m,) * 3,
-        state_names=("tool_target_x", "tool_target_y", "tool_target_z"),
-        state_units=("m", "m", "m"),
-        ground_truth_names=GROUND_TRUTH_NAMES,
-        control_period_s=1.0 / config.control_hz,
-        max_episode_steps=config.max_episode_steps,
-        state_low=config.workspace_low_m,
-        state_high=config.workspace_high_m,
-    )
 
 
 class ManiSkillEnvironment:
@@ -54,7 +30,7 @@ class ManiSkillEnvironment:
     def __init__(
         self, task: str, config: SimulationConfig, num_envs: int = 1, seed: int = 0, *, end_on_success: bool = True
     ) -> None:
-        self.spec = simulation_spec(task, config, num_envs)
+        self.spec = simulation_spec(task, get_task(task).instruction, config, num_envs)
         self._task = get_task(task)
         self._config = config
         self._seed = seed

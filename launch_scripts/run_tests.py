@@ -1,0 +1,56 @@
+"""Every check of the repository: ruff, mypy, import contracts, then the tests. Sets up what is missing first.
+
+python3 launch_scripts/run_tests.py            # everything
+python3 launch_scripts/run_tests.py --fast     # without the tests marked slow
+python3 launch_scripts/run_tests.py tests/unit -k setup    # other arguments go to pytest; the checks still run
+"""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import wm_setup
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def main(argv):
+    """Run the checks, then pytest, whose closing line comes last. Return 0 if all passed."""
+    arguments = [text for text in argv if text != "--fast"]
+    if "--fast" in argv:
+        arguments = ["-m", "not slow", *arguments]
+    scripts = Path(sys.prefix) / "bin"
+    checks = {
+        "ruff": [str(scripts / "ruff"), "check", "."],
+        "mypy --strict": [str(scripts / "mypy")],
+        "import contracts": [str(scripts / "lint-imports"), "--no-cache"],
+    }
+    failed = [name for name, command in checks.items() if not _passes(name, command)]
+    if failed:
+        print(f"failed before the tests: {', '.join(failed)}", flush=True)
+    command = [sys.executable, "-m", "pytest", *arguments]
+    code = subprocess.run(command, cwd=ROOT, check=False, env=_environment()).returncode
+    return code or int(bool(failed))
+
+
+def _passes(name, command):
+    start = time.monotonic()
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=_environment())
+    print(f"{name}: {'passed' if done.returncode == 0 else 'FAILED'} ({time.monotonic() - start:.0f} s)", flush=True)
+    if done.returncode:
+        print(done.stdout + done.stderr, flush=True)
+    return done.returncode == 0
+
+
+def _environment():
+    """This host only, one thread per process unless told otherwise; tests/conftest.py picks the ROS domain."""
+    env = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    env.setdefault("OMP_NUM_THREADS", "1")
+    return env
+
+
+if __name__ == "__main__":
+    wm_setup.ensure()
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,54 @@
+"""Fixtures of all tests: an own ROS domain on the local host, nothing left over."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from wm_nodes.ros.domain import DomainLock, first_free
+
+ROOT = Path(__file__).resolve().parents[1]
+DOMAINS = range(91, 102)
+"""tests/graph/harness.py uses 20 to 89 for its own graphs."""
+
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+_session_lock: DomainLock | None = None
+
+
+def pytest_configure() -> None:
+    """Whatever a test starts without asking for a domain still meets nobody else's nodes."""
+    global _session_lock
+    _session_lock = first_free(DOMAINS, "a test run", group="test")
+    os.environ["ROS_DOMAIN_ID"] = str(_session_lock.domain)
+
+
+def pytest_unconfigure() -> None:
+    if _session_lock is not None:
+        _session_lock.release()
+
+
+@pytest.fixture
+def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A ROS domain that no other test process uses, also set as ROS_DOMAIN_ID."""
+    lock = first_free(DOMAINS, "a test", group="test")
+    try:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(lock.domain))
+        yield lock.domain
+    finally:
+        lock.release()
+
+
+@pytest.fixture
+def repository() -> Path:
+    return ROOT
+
+
+def pytest_sessionfinish() -> None:
+    """Remove what killed processes left in /dev/shm; files of living processes are locked and stay."""
+    from wm_nodes.ros.environment import graph_environment
+    from wm_nodes.ros.runner import clean_shared_memory
+
+    clean_shared_memory(graph_environment())

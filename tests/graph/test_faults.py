@@ -1,0 +1,158 @@
+"""What happens when nodes die, messages are missed, or settings are wrong."""
+
+import os
+import subprocess
+import sys
+import time
+from typing import Any
+
+import pytest
+from graph.harness import Graph, Probe, shm_files, wait_until
+
+from wm_msgs.action import Train
+from wm_msgs.msg import Credit, TransitionBatch
+from wm_nodes.ros.wire import WireError
+
+pytestmark = pytest.mark.graph
+
+
+@pytest.mark.kills
+def test_each_killed_node_is_reported_within_5_s_and_training_goes_on_after_its_restart(
+    graph: Graph, probe: Probe
+) -> None:
+    graph.start_training_nodes()
+    client = probe.action(Train, "train")
+    updates: list[Any] = []
+    handle = probe.send(client, Train.Goal(updates=100000), updates.append)
+    restart = {
+        "/wm/policy": graph.start_policy, "/wm/environment": graph.start_environment,
+        "/wm/reward_evaluator": graph.start_reward,
+    }  # fmt: skip
+    for name, start in restart.items():
+        count = len(updates)
+        wait_until(f"an update before {name} dies", lambda c=count: len(updates) > c, 60)
+        probe.seen_errors.clear()
+        graph.kill(name)
+        wait_until(f"a report that {name} is lost", lambda n=name: _reported(probe, "/wm/learner", n), 5.0)
+        count = len(updates)
+        start()
+        wait_until(f"an update after {name} is back", lambda c=count: len(updates) > c, 90)
+    graph.kill("/wm/learner")
+    wait_until("a report that the learner is lost", lambda: _reported(probe, "/wm/policy", "/wm/learner"), 5.0)
+    probe.diagnostics.pop("/wm/learner")
+    graph.start_learner()
+    wait_until("the restarted learner", lambda: probe.value("/wm/learner", "state") == "active", 60)
+    time.sleep(1.0)
+    result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=1)))
+    assert result.termination_reason == Train.Result.FINISHED
+    assert result.updates > 1
+    del handle
+
+
+def _reported(probe: Probe, reporter: str, lost: str) -> bool:
+    return any(f"{lost} is lost" in text for text in probe.seen_errors[reporter])
+
+
+@pytest.mark.kills
+def test_training_ends_with_peer_lost_when_a_node_does_not_come_back(graph: Graph, probe: Probe) -> None:
+    graph.start_training_nodes(recovery_timeout_s=8.0)
+    names = ("environment", "policy", "reward_evaluator", "learner")
+    wait_until("active nodes", lambda: all(probe.value(f"/wm/{name}", "state") == "active" for name in names), 60)
+    updates: list[Any] = []
+    handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
+    wait_until("an update", lambda: updates, 60)
+    graph.kill("/wm/policy")
+    result = probe.finish(handle, 30)
+    assert result.termination_reason == Train.Result.PEER_LOST
+    assert "/wm/policy" in result.message
+
+
+def test_reported_gaps_equal_the_true_gaps_of_a_flood(graph: Graph, probe: Probe) -> None:
+    graph.start_reward()
+    credits = probe.listen("flow/credit")
+    publisher = probe.publisher("env/transition")
+    wait_until("matching", lambda: publisher.get_subscription_count(), 30)
+    left_out = {seq for seq in range(1, 2000) if seq % 7 == 0 or 500 <= seq < 600}
+    for seq in range(2000):
+        if seq not in left_out:
+            publisher.publish(TransitionBatch(session=9, seq=seq))
+    publisher.publish(TransitionBatch(session=9, seq=2000))
+    wait_until("the last message", lambda: credits and credits[-1].received_seq == 2000, 30)
+    assert credits[-1].lost_total == len(left_out)
+    lost = str(len(left_out))
+    wait_until("the count", lambda: probe.value("/wm/reward_evaluator", "lost env/transition") == lost)
+
+
+def test_a_consumer_without_credit_holds_the_environment_up_until_it_is_dropped(graph: Graph, probe: Probe) -> None:
+    from graph.test_environment import Client
+
+    graph.start_environment()
+    client = Client(probe)
+    start = client.reset()
+    credit = probe.publisher("flow/credit")
+    wait_until("matching", lambda: credit.get_subscription_count())
+    credit.publish(
+        Credit(consumer="/wm/slow", topic="env/transition", stream_session=client.session, granted_seq=0)
+    )
+    wait_until("the credit", lambda: "/wm/slow" in (probe.value("/wm/environment", "credit_consumers") or ""))
+    began = time.monotonic()
+    refusals: list[str] = []
+
+    def stepped() -> bool:
+        try:
+            client.step(client.command(start.step_id + 1))
+        except WireError as error:
+            refusals.append(str(error))
+            return False
+        return True
+
+    assert not stepped()
+    wait_until("the drop", stepped, 10)
+    assert time.monotonic() - began > 3.0
+    assert all("/wm/slow" in text for text in refusals)
+    wait_until("the report", lambda: probe.value("/wm/environment", "dropped_consumers") == "1")
+
+
+@pytest.mark.kills
+@pytest.mark.parametrize(
+    ("params", "words"),
+    [
+        ({"backend": "gazebo"}, "backend must be one of world_model, maniskill, factory; got 'gazebo'"),
+        ({"num_env": 3}, "unknown parameter 'num_env'; did you mean 'num_envs'?"),
+        ({"num_envs": 0}, "num_envs must be at least 1; got 0"),
+        ({"backend": "factory", "backend_factory": "nowhere:make"}, "No module named 'nowhere'"),
+        ({"backend": "world_model"}, "model_dir"),
+        ({"config_file": "/nowhere.yaml"}, "'/nowhere.yaml' does not exist"),
+        ({"executor": "fast"}, "executor must be one of events, single, multi; got 'fast'"),
+    ],
+)
+def test_a_wrong_setting_ends_the_node_with_one_line_that_names_it(
+    graph: Graph, params: dict[str, Any], words: str
+) -> None:
+    assert graph.start("environment", **params).wait(60) == 1
+    log = graph.log("/wm/environment")
+    assert words in log
+    assert "Traceback" not in log
+
+
+@pytest.mark.slow
+def test_fifty_start_stop_cycles_leave_no_shared_memory(domain: int) -> None:
+    cycle = (
+        "import os, signal, sys\n"
+        "from wm_nodes.ros.lifecycle import ManagedNode\n"
+        "from wm_nodes.ros.spin import run_node\n"
+        "class Cycle(ManagedNode):\n"
+        "    def activate(self):\n"
+        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        "for _ in range(50):\n"
+        "    assert run_node(lambda: Cycle('cycle')) == 0\n"
+        "    print(sum('fast' in name for name in os.listdir('/dev/shm')))\n"
+    )
+    before = shm_files()
+    env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+    done = subprocess.run([sys.executable, "-c", cycle], env=env, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    ports = range(7400 + 250 * domain, 7400 + 250 * (domain + 1))
+    assert not {name for name in shm_files() - before if name in {f"fastrtps_port{port}" for port in ports}}
+    counts = [int(line) for line in done.stdout.split()]
+    assert counts[-1] - counts[0] < len(counts), f"shared-memory files per cycle: {counts}"

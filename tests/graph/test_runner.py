@@ -1,0 +1,160 @@
+"""The runner with real processes and real DDS."""
+
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from wm_nodes.ros.domain import DomainInUseError
+from wm_nodes.ros.graph import Graph, NodeSpec
+from wm_nodes.ros.readiness import NotReadyError
+from wm_nodes.ros.runner import NodeDiedError, Runner
+
+pytestmark = pytest.mark.graph
+TESTS = Path(__file__).resolve().parents[1]
+
+
+def tiny(name: str, **parameters: object) -> NodeSpec:
+    path = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
+    return NodeSpec("graph.tiny_node", name, "/wm", parameters, lifecycle=False, environment={"PYTHONPATH": path})
+
+
+def graph(*nodes: NodeSpec) -> Graph:
+    return Graph("tiny", nodes)
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_nodes_start_become_ready_and_end_without_a_trace(ros_domain: int, tmp_path: Path) -> None:
+    log = io.StringIO()
+    with Runner(graph(tiny("a", text="1"), tiny("b")), log=log, log_dir=tmp_path) as runner:
+        runner.wait_ready(30)
+        pids = [runner.pid("a"), runner.pid("wm/b")]
+        assert all(os.getpgid(pid) == pid for pid in pids)
+        assert runner.failure() is None
+    assert not any(alive(pid) for pid in pids)
+    assert runner.wait_ended("a") == runner.wait_ended("b") == 0
+    assert f"[wm/a] tiny says '1' on domain {ros_domain}" in log.getvalue()
+    assert "tiny says '1'" in (tmp_path / "wm.a.log").read_text()
+
+
+def test_end_of_a_required_node_is_reported_with_its_last_words_and_code(ros_domain: int) -> None:
+    log = io.StringIO()
+    with Runner(graph(tiny("short", die_after_s=1.0), tiny("long")), log=log) as runner:
+        assert runner.wait(timeout_s=60) == 7
+        with pytest.raises(NodeDiedError, match="required node wm/short ended with code 7: tiny gives up"):
+            runner.check()
+    assert "[runner] required node wm/short ended with code 7" in log.getvalue()
+
+
+@pytest.mark.kills
+def test_death_by_sigkill_is_reported_within_five_seconds(ros_domain: int) -> None:
+    with Runner(graph(tiny("a"), tiny("b")), log=None) as runner:
+        runner.wait_ready(30)
+        os.kill(runner.pid("b"), signal.SIGKILL)
+        since = time.monotonic()
+        assert runner.wait(timeout_s=30) == 128 + signal.SIGKILL
+        assert time.monotonic() - since < 5.0
+
+
+@pytest.mark.kills
+def test_killed_node_can_be_restarted_and_its_end_is_no_failure(ros_domain: int) -> None:
+    with Runner(graph(tiny("a"), tiny("b")), log=None) as runner:
+        runner.wait_ready(30)
+        first = runner.pid("a")
+        runner.kill("a")
+        assert runner.wait_ended("a") == -signal.SIGKILL
+        assert runner.failure() is None
+        runner.restart("a")
+        assert runner.pid("a") != first
+        runner.wait_ready(30)
+
+
+@pytest.mark.kills
+def test_node_that_ignores_sigint_and_sigterm_is_killed_in_the_end(ros_domain: int) -> None:
+    with Runner(graph(tiny("a", stubborn=True)), log=None) as runner:
+        runner.wait_ready(30)
+        pid = runner.pid("a")
+        since = time.monotonic()
+    assert not alive(pid) and runner.killed
+    assert time.monotonic() - since < 20
+
+
+def test_second_runner_on_the_domain_is_refused(ros_domain: int) -> None:
+    with Runner(graph(tiny("a")), log=None):
+        with pytest.raises(DomainInUseError, match=f"ROS domain {ros_domain} is already in use.*graph 'tiny'"):
+            Runner(graph(tiny("b")), log=None).start()
+
+
+def test_node_that_never_appears_is_named(ros_domain: int) -> None:
+    silent = NodeSpec("timeit", "absent", lifecycle=False, arguments=("-n1", "-r1", "import time; time.sleep(60)"))
+    with Runner(graph(silent), log=None) as runner:
+        with pytest.raises((NotReadyError, NodeDiedError), match="absent"):
+            runner.wait_ready(3)
+
+
+def test_ctrl_c_ends_all_nodes_and_the_starter_with_code_0(ros_domain: int, tmp_path: Path) -> None:
+    script = tmp_path / "start.py"
+    script.write_text(
+        "import sys; from pathlib import Path\n"
+        "from graph.test_runner import graph, tiny\n"
+        "from wm_nodes.ros.runner import run\n"
+        "sys.exit(run(graph(tiny('a'), tiny('b')), Path(sys.argv[1])))\n"
+    )
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])}
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path)], env=env, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if "ready; Ctrl-C stops" in line:
+            break
+    os.killpg(process.pid, signal.SIGINT)
+    process.stdout.read()
+    assert process.wait(timeout=30) == 0, "".join(lines)
+
+
+@pytest.mark.kills
+def test_nodes_do_not_outlive_a_killed_starter(ros_domain: int, tmp_path: Path) -> None:
+    script = tmp_path / "start.py"
+    script.write_text(
+        "import time; from graph.test_runner import graph, tiny\n"
+        "from wm_nodes.ros.runner import Runner\n"
+        "with Runner(graph(tiny('a')), log=None) as runner:\n"
+        "    runner.wait_ready(30); print(runner.pid('a'), flush=True); time.sleep(60)\n"
+    )
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])}
+    process = subprocess.Popen([sys.executable, str(script)], env=env, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    pid = int(process.stdout.readline())
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 10
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(pid)
+
+
+def test_big_shared_memory_segment_of_the_profile_is_in_use(ros_domain: int) -> None:
+    with Runner(graph(tiny("a")), log=None) as runner:
+        runner.wait_ready(30)
+        mapped = Path(f"/proc/{runner.pid('a')}/maps").read_text()
+        sizes = []
+        for line in mapped.splitlines():
+            if "/dev/shm/fastrtps_" in line:
+                low, high = (int(part, 16) for part in line.split()[0].split("-"))
+                sizes.append(high - low)
+    assert sizes and max(sizes) >= 32 * 2**20

@@ -1,0 +1,164 @@
+"""The training path end to end: environment, policy, reward_evaluator and learner in four processes over DDS."""
+
+import hashlib
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from graph import toy
+from graph.harness import Graph, Probe, own_domain, wait_until
+
+from wm_msgs.action import Train
+from wm_msgs.msg import ErrorCode
+from wm_msgs.srv import GetWeights, InferAction, SaveCheckpoint, StopRecording
+from wm_nodes.ros import convert
+
+pytestmark = pytest.mark.graph
+
+
+def train(probe: Probe, **goal: Any) -> Train.Result:
+    client = probe.action(Train, "train")
+    return probe.finish(probe.send(client, Train.Goal(**goal)))
+
+
+def weights_in(folder: Path) -> dict[str, str]:
+    files = sorted((folder / "policies").glob("*.safetensors"))
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def test_two_updates_run_end_to_end_and_leave_versions_metrics_and_a_checkpoint(graph: Graph, probe: Probe) -> None:
+    metrics, rewards = probe.listen("learner/metrics"), probe.listen("reward")
+    graph.start_training_nodes()
+    result = train(probe, updates=2)
+    assert (result.termination_reason, result.policy_version, result.updates) == (Train.Result.FINISHED, 3, 2)
+    assert list(weights_in(graph.folder)) == [f"policy_{v:06d}.safetensors" for v in (1, 2, 3)]
+    wait_until("metrics", lambda: len(metrics) == 2)
+    assert [m.policy_version for m in metrics] == [2, 3]
+    assert rewards
+    assert all(r.reward_name == "rule" for r in rewards)
+    assert (graph.folder / result.checkpoint_uri).is_file()
+    again = train(probe, updates=1)
+    assert (again.policy_version, again.updates) == (4, 3)
+
+
+def test_a_late_joiner_gets_the_newest_version_inline_and_in_chunks(graph: Graph, probe: Probe) -> None:
+    graph.start_training_nodes()
+    train(probe, updates=1)
+    versions = probe.listen("policy/version")
+    version = wait_until("the latched version", lambda: versions)[-1]
+    assert version.version == 2
+    data = bytes(version.inline_data)
+    assert hashlib.sha256(data).hexdigest() == version.sha256
+    chunks = b""
+    while len(chunks) < len(data):
+        request = GetWeights.Request(version=0, offset=len(chunks), max_bytes=1000)
+        part = probe.call(GetWeights, "learner/get_weights", request)
+        assert zlib.crc32(bytes(part.data)) == part.crc32
+        chunks += bytes(part.data)
+    assert chunks == data
+    refused = probe.call(GetWeights, "learner/get_weights", GetWeights.Request(version=99, max_bytes=10))
+    assert refused.error_code == ErrorCode.NOT_FOUND
+    assert "ask for 0" in refused.message
+    saved = probe.call(SaveCheckpoint, "learner/save", SaveCheckpoint.Request(uri="mine/best.json"))
+    assert saved.error_code == ErrorCode.OK
+    assert (graph.folder / "mine" / "best.json").is_file()
+
+
+def _run(folder: Path, updates: int) -> dict[str, str]:
+    with own_domain() as domain:
+        graph, probe = Graph(domain, folder), Probe(domain)
+        try:
+            graph.start_training_nodes()
+            assert train(probe, updates=updates).termination_reason == Train.Result.FINISHED
+        finally:
+            probe.close()
+            graph.stop()
+    return weights_in(folder)
+
+
+def test_two_runs_with_one_seed_give_bit_equal_weights_and_a_resumed_run_the_same(tmp_path: Path) -> None:
+    first, second = _run(tmp_path / "a", 3), _run(tmp_path / "b", 3)
+    assert first == second
+    assert len(set(first.values())) == 4
+    _run(tmp_path / "c", 1)
+    assert _run(tmp_path / "c", 2) == first
+
+
+def test_training_over_dds_gives_the_weights_of_the_same_loop_in_one_process(tmp_path: Path) -> None:
+    graph_weights = _run(tmp_path / "graph", 2)
+    assert len(graph_weights) == 3
+    toy.assert_trained_in_one_process(tmp_path / "graph" / "policies" / "policy_000003.safetensors", updates=2)
+
+
+def test_training_from_the_recorded_bag_gives_the_weights_of_the_live_training(graph: Graph, probe: Probe) -> None:
+    graph.start("recorder")
+    wait_until("the recorder", lambda: probe.value("/wm/recorder", "state") == "active", 60)
+    graph.start_training_nodes()
+    assert train(probe, updates=2).termination_reason == Train.Result.FINISHED
+    stopped = probe.call(StopRecording, "recorder/stop", StopRecording.Request())
+    assert stopped.gaps == 0
+    live = weights_in(graph.folder)
+    with own_domain() as domain:
+        offline, other = Graph(domain, graph.folder.parent / "offline"), Probe(domain)
+        try:
+            offline.start_learner()
+            bag = graph.folder / stopped.bag_uri
+            result = train(other, updates=2, from_bags=True, bag_uris=[str(bag)])
+            assert result.termination_reason == Train.Result.FINISHED, result.message
+        finally:
+            other.close()
+            offline.stop()
+    assert weights_in(offline.folder) == live
+
+
+def test_cancel_ends_training_within_a_second_and_the_next_goal_works(graph: Graph, probe: Probe) -> None:
+    graph.start_training_nodes()
+    client = probe.action(Train, "train")
+    updates: list[Any] = []
+    handle = probe.send(client, Train.Goal(updates=100000), updates.append)
+    wait_until("the first update", lambda: updates, 30)
+    began = time.monotonic()
+    probe.result(handle.cancel_goal_async(), 5, "cancel")
+    result = probe.finish(handle, 5)
+    assert result.termination_reason == Train.Result.CANCELED
+    assert time.monotonic() - began < 1.0
+    assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
+
+
+def test_limits_and_a_second_goal(graph: Graph, probe: Probe) -> None:
+    graph.start_training_nodes()
+    result = train(probe, updates=1000, max_samples=1)
+    assert (result.termination_reason, result.updates) == (Train.Result.LIMIT, 1)
+    client = probe.action(Train, "train")
+    running = probe.send(client, Train.Goal(updates=100000))
+    refused = probe.result(client.send_goal_async(Train.Goal(updates=1)), 10, "second goal")
+    assert not refused.accepted
+    probe.result(running.cancel_goal_async(), 5, "cancel")
+    assert probe.finish(running, 5).termination_reason == Train.Result.CANCELED
+
+
+def test_an_image_of_another_size_is_refused_by_infer_with_value_and_remedy(graph: Graph, probe: Probe) -> None:
+    graph.start_environment()
+    graph.start_policy()
+    specs = probe.listen("env/spec")
+    spec = convert.spec_from_msg(wait_until("the spec", lambda: specs, 30)[0])
+    request = InferAction.Request(tile=convert.tile_msg(spec), deterministic=True)
+    request.state = convert.to_field(np.zeros((4, 3), np.float32))
+    images = np.zeros((4, spec.height, spec.width, 3), np.uint8)
+    request.observation = convert.mosaic_msg(images, 0, spec)
+
+    def infer() -> Any:
+        response = probe.call(InferAction, "policy/infer", request)
+        return response if response.error_code != ErrorCode.NOT_ACTIVE else None
+
+    assert wait_until("an answer", infer).action.num_envs == 4
+    request.observation.encoding = "bgr8"
+    refused = infer()
+    assert refused.error_code == ErrorCode.BAD_SHAPE
+    assert "'bgr8'" in refused.message
+    request.observation.encoding = "rgb8"
+    request.observation.step = 1
+    assert "step is 1" in infer().message

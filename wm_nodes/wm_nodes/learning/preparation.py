@@ -1,0 +1,48 @@
+"""What a run needs besides a world model: first frames to imagine from, and the weak policy that RL starts from."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.learning.files import write_atomic
+from wm_nodes.learning.policies import make_policy, make_reconstruct
+from wm_nodes.learning.sft import demonstrations, train_sft
+from wm_nodes.learning.weights import save_weights
+from wm_nodes.policy import ImagePolicy
+from wm_nodes.recording import read_episodes
+from wm_nodes.types import Episode
+
+MAX_STARTS = 512
+
+
+def write_starts(bags: Iterable[Path], path: Path) -> int:
+    """Write the first frame and state of up to MAX_STARTS recorded episodes; returns how many."""
+    episodes: list[Episode] = []
+    for bag in bags:
+        episodes += list(read_episodes(bag))
+        if len(episodes) >= MAX_STARTS:
+            break
+    chosen = episodes[:MAX_STARTS]
+    tensors = {
+        "images": torch.from_numpy(np.stack([episode.images[0] for episode in chosen])),
+        "states": torch.from_numpy(np.stack([episode.states[0] for episode in chosen])),
+    }
+    write_atomic(path, save(tensors))
+    return len(chosen)
+
+
+def train_weak_policy(config: RunConfig, model_dir: Path, demo_bags: Iterable[Path], path: Path) -> ImagePolicy:
+    """Behaviour-clone a few demonstrations on raw and on tokenizer-reconstructed frames; write the weights to `path`.
+
+    Raises:
+        ValueError: the bags hold fewer successful demonstrations than sft.num_demonstrations.
+    """
+    policy = make_policy(config, model_dir)
+    demos = demonstrations((e for bag in demo_bags for e in read_episodes(bag)), config.sft.num_demonstrations)
+    train_sft(policy, demos, config.sft, config.seed, reconstruct=make_reconstruct(model_dir))
+    save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
+    return policy

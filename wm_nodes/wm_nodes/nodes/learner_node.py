@@ -1,0 +1,344 @@
+"""learner: asks the policy for rollouts, joins what the graph publishes about them, trains, announces new versions."""
+
+import sys
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+from rclpy.action import ActionClient
+from sensor_msgs.msg import Image
+
+from wm_msgs.action import Rollout as RolloutAction
+from wm_msgs.action import Train
+from wm_msgs.msg import EnvSpec, ErrorCode, LearnerMetrics, PolicyVersion, RewardBatch, TransitionBatch
+from wm_msgs.srv import GetWeights, SaveCheckpoint
+from wm_nodes.learning.rollouts import Canceled
+from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, load_weights
+from wm_nodes.nodes.backends import existing, make_learner, make_policy
+from wm_nodes.nodes.joiner import Dropped, RolloutJoiner
+from wm_nodes.nodes.policy_holder import weights_uri
+from wm_nodes.nodes.training import PolicyTraining
+from wm_nodes.recording import read_rollouts
+from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.clients import run_goal
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.params import Param
+from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.specs import EnvironmentSpec
+from wm_nodes.types import Rollout
+
+MAX_CHUNK_BYTES = 4 << 20
+RETRY_S = 0.5
+MAX_GAP_RETRIES = 2
+TRAINING_PEERS = ("environment", "policy", "reward_evaluator")
+
+PARAMS = (
+    Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
+    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
+          read_only=True),
+    Param("learner_factory", "", "module:callable(policy, config) -> Learner instead of PPO (nodes/training.py)",
+          read_only=True),
+    Param("initial_policy", "", "Weights (safetensors) to start from, where the run folder has no checkpoint",
+          read_only=True),
+    Param("resume", True, "Continue exactly from the run folder's checkpoint", read_only=True),
+    Param("keep_versions", 20, "Weights files kept in run_dir/policies", minimum=1, maximum=100000, read_only=True),
+    Param("join_timeout_s", 5.0, "How long a rollout's last images and rewards may take to arrive", "s",
+          minimum=0.1, maximum=600.0),
+    Param("recovery_timeout_s", 60.0, "How long a lost node may take to come back before training ends", "s",
+          minimum=0.0, maximum=3600.0),
+)  # fmt: skip
+
+METRICS = (
+    "loss_policy", "loss_value", "entropy", "approx_kl", "kl_reference", "clip_fraction", "grad_norm", "learning_rate",
+    "explained_variance",
+)  # fmt: skip
+"""Metrics with their own field in LearnerMetrics; all others travel as names and values."""
+
+
+class LearnerNode(ManagedNode):
+    """Action train; services learner/save, learner/get_weights; publishes policy/version, learner/metrics."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("learner", PARAMS, **node_arguments)
+
+    def configure(self) -> None:
+        self._config = self.run_config()
+        policy = make_policy(self._config, str(self.param("model_dir")), str(self.param("policy_factory")))
+        if self.param("initial_policy"):
+            load_weights(policy, existing(str(self.param("initial_policy")), "initial_policy").read_bytes())
+        learner = make_learner(policy, self._config, str(self.param("learner_factory")))
+        self._training = PolicyTraining(
+            policy, learner, self.run_dir, resume=bool(self.param("resume")),
+            keep_versions=int(self.param("keep_versions")), metadata={"tokenizer_sha256": policy.encoder.sha256},
+        )  # fmt: skip
+        self._spec: EnvironmentSpec | None = None
+        self._joiner = RolloutJoiner()
+        self._versions = self.publish_on("policy/version")
+        self._metrics = self.publish_on("learner/metrics")
+        self.listen("env/spec", self._on_spec, while_inactive=True)
+        self.listen("env/image", self._on_image)
+        self.listen("env/transition", self._on_transition, credit=True)
+        self.listen("reward", self._on_reward)
+        self.serve(SaveCheckpoint, "learner/save", self._on_save)
+        self.serve(GetWeights, "learner/get_weights", self._on_get_weights)
+        self._rollouts = ActionClient(self, RolloutAction, "rollout")
+        self.own(self._rollouts.destroy)
+        self._action = WorkerAction(self, Train, "train", self._train, self._describe)
+        self.own(self._action.destroy)
+
+    def activate(self) -> None:
+        self._announce()
+
+    def deactivate(self, reason: str) -> None:
+        self._action.stop(reason)
+
+    def update_diagnostics(self) -> None:
+        if hasattr(self, "_training"):
+            progress = self._training.progress
+            for name in ("updates", "version", "samples", "dropped_invalid", "dropped_gap", "dropped_stale"):
+                self.diagnostics.gauge(name, getattr(progress, name))
+
+    # Training, in a worker thread.
+
+    def _train(self, work: Work) -> Train.Result:
+        goal: Train.Goal = work.request
+        began = time.monotonic()
+        first_samples = self._training.progress.samples
+        result = Train.Result(termination_reason=Train.Result.FINISHED)
+        source = self._bag_rollouts(goal) if goal.from_bags else None
+        try:
+            for update in range(int(goal.updates)):
+                work.check()
+                if self._over_limit(goal, began, first_samples):
+                    result.termination_reason = Train.Result.LIMIT
+                    break
+                if source is None:
+                    rollout, dropped = self._collect(work)
+                elif (following := next(source, None)) is not None:
+                    rollout, dropped = following
+                else:
+                    result.message = f"the bags hold {update} rollouts of the trained versions, not {goal.updates}"
+                    break
+                self._update(work, goal, update, rollout, dropped)
+        except PeerLost as error:
+            result.termination_reason, result.message = Train.Result.PEER_LOST, str(error)
+        except Canceled:
+            work.check()
+        except (WireError, ValueError, OSError) as error:
+            result.termination_reason, result.message = Train.Result.FAILED, str(error)
+        finally:
+            self._joiner.end()
+        if result.termination_reason in (Train.Result.PEER_LOST, Train.Result.FAILED):
+            self.get_logger().error(f"training ended: {result.message}")
+            self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=result.message)
+        return self._fill(result)
+
+    def _over_limit(self, goal: Train.Goal, began: float, first_samples: int) -> bool:
+        samples = self._training.progress.samples - first_samples
+        minutes = (time.monotonic() - began) / 60
+        return bool(goal.max_samples and samples >= goal.max_samples) or bool(
+            goal.max_minutes and minutes >= goal.max_minutes
+        )
+
+    def _update(self, work: Work, goal: Train.Goal, update: int, rollout: Rollout, dropped: Dropped) -> None:
+        began = time.perf_counter()
+        metrics = self._training.update(rollout, dropped, lambda: work.stopped)
+        self.diagnostics.latency("update", time.perf_counter() - began)
+        self._announce()
+        samples_per_s = float(rollout.valid_TN.sum()) / max(time.perf_counter() - began, 1e-9)
+        self._publish_metrics(metrics, samples_per_s)
+        progress = self._training.progress
+        work.feedback(
+            Train.Feedback(
+                update=update + 1, samples=progress.samples, mean_return=progress.mean_return,
+                success_rate=progress.success_rate, loss=metrics.get("loss_policy", float("nan")),
+                samples_per_s=samples_per_s, policy_version=progress.version, progress=(update + 1) / goal.updates,
+            )
+        )
+
+    def _collect(self, work: Work) -> tuple[Rollout, Dropped]:
+        """One rollout of the newest version. A lost node may come back: the same seed gives the same rollout again.
+
+        Raises:
+            PeerLost: not within recovery_timeout_s.
+        """
+        give_up = time.monotonic() + float(self.param("recovery_timeout_s"))
+        gaps = 0
+        while True:
+            try:
+                return self._attempt_rollout(work, accept_gaps=gaps > MAX_GAP_RETRIES)
+            except PeerLost as error:
+                text = str(error)
+                gaps += 1
+                self.diagnostics.count("repeated_rollouts", text=f"rollout repeated: {text}")
+                self.get_logger().warning(f"rollout repeated: {text}")
+                if time.monotonic() > give_up:
+                    raise PeerLost(f"{text}; nothing came back for {self.param('recovery_timeout_s'):g} s") from None
+            work.sleep(RETRY_S)
+
+    def _attempt_rollout(self, work: Work, *, accept_gaps: bool) -> tuple[Rollout, Dropped]:
+        version = self._training.progress.version
+        goal = RolloutAction.Goal(
+            policy_version=version, steps=self._config.ppo.num_steps, seed=self._config.seed, reset=True,
+            behaviour="policy",
+        )  # fmt: skip
+        self._check_peers()
+        self._joiner.begin()
+        found: RolloutAction.Result = run_goal(
+            self._rollouts, goal, accept_s=5.0, check=work.check, alive=self._check_peers
+        )
+        if found.termination_reason == RolloutAction.Result.FAILED:
+            raise WireError(ErrorCode.INTERNAL, f"the policy node failed: {found.message}")
+        if found.termination_reason != RolloutAction.Result.FINISHED:
+            raise PeerLost(found.message or "the rollout was cut short")
+        span = (found.env_session, found.first_step_id, found.last_step_id)
+        deadline = time.monotonic() + float(self.param("join_timeout_s"))
+        while missing := self._joiner.missing(*span):
+            work.check()
+            if time.monotonic() > deadline:
+                self.diagnostics.count("incomplete_steps", len(missing), text=f"{len(missing)} lock-steps incomplete")
+                if accept_gaps:
+                    break
+                raise PeerLost(f"images or rewards of {len(missing)} lock-steps did not arrive; is every node active?")
+            self._joiner.wait(0.1)
+        rollout, dropped = self._joiner.take(found.first_step_id, found.last_step_id, version)
+        for key, number in (("invalid", dropped.invalid), ("gap", dropped.gap), ("stale", dropped.stale)):
+            if number:
+                self.diagnostics.count(f"dropped_{key}", number, text=f"{number} transitions dropped: {key}")
+        return rollout, dropped
+
+    def _check_peers(self) -> None:
+        namespace = self.get_namespace().rstrip("/")
+        lost = [name for name in self.peers.lost if name.removeprefix(f"{namespace}/") in TRAINING_PEERS]
+        if lost:
+            raise PeerLost(f"{', '.join(lost)} is silent")
+
+    def _bag_rollouts(self, goal: Train.Goal) -> Any:
+        """Rollouts of the bags that were made by the version that is trained now; others are stale."""
+        for uri in goal.bag_uris:
+            path = existing(uri if Path(uri).is_absolute() else str(self.run_dir / uri), "bag_uris")
+            for rollout in read_rollouts(path):
+                if rollout.policy_version == self._training.progress.version:
+                    yield rollout, Dropped()
+                else:
+                    self._training.progress.dropped_stale += int(rollout.valid_TN.sum())
+
+    def _fill(self, result: Train.Result) -> Train.Result:
+        progress = self._training.progress
+        result.policy_version, result.updates, result.samples = progress.version, progress.updates, progress.samples
+        result.mean_return, result.success_rate = progress.mean_return, progress.success_rate
+        result.checkpoint_uri = str(self._training.checkpoint.relative_to(self.run_dir))
+        return result
+
+    def _describe(self, reason: int, text: str) -> Train.Result:
+        return self._fill(Train.Result(termination_reason=reason, message=text))
+
+    # Publishing.
+
+    def _announce(self) -> None:
+        packed, progress = self._training.packed, self._training.progress
+        message = PolicyVersion(
+            version=progress.version, train_step=progress.updates, uri=weights_uri(progress.version),
+            sha256=packed.sha256, size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
+        )  # fmt: skip
+        message.header.stamp = self.get_clock().now().to_msg()
+        if len(packed.data) <= INLINE_LIMIT_BYTES:
+            message.inline_data = convert.bytes_field(packed.data)
+        self._versions.publish(message)
+
+    def _publish_metrics(self, metrics: dict[str, float], samples_per_s: float) -> None:
+        progress = self._training.progress
+        message = LearnerMetrics(
+            update=progress.updates, policy_version=progress.version, samples=progress.samples,
+            mean_return=progress.mean_return, success_rate=progress.success_rate, samples_per_s=samples_per_s,
+            dropped_invalid=progress.dropped_invalid, dropped_gap=progress.dropped_gap,
+            dropped_stale=progress.dropped_stale,
+        )  # fmt: skip
+        message.header.stamp = self.get_clock().now().to_msg()
+        for name in METRICS:
+            setattr(message, name, metrics.get(name, float("nan")))
+        extras = {name: value for name, value in metrics.items() if name not in METRICS}
+        message.names = list(extras)[:64]
+        message.values = [extras[name] for name in message.names]
+        self._metrics.publish(message)
+
+    # Callbacks.
+
+    def _on_spec(self, message: EnvSpec) -> None:
+        try:
+            self._spec = convert.spec_from_msg(message)
+            self._joiner.enter_session(message.session)
+        except WireError as error:
+            self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
+
+    def _on_image(self, message: Image) -> None:
+        if self._spec is None or not self._joiner.collecting:
+            return
+        try:
+            images = convert.images_of(message, self._spec)
+        except WireError as error:
+            self.diagnostics.count("refused_images", text=str(error))
+            return
+        self._joiner.put_image(convert.time_ns(message.header.stamp), images)
+
+    def _on_transition(self, message: TransitionBatch) -> None:
+        if self._spec is None or not self._joiner.collecting:
+            return
+        try:
+            self._joiner.put_transition(convert.transition_of(message, self._spec))
+        except WireError as error:
+            self.diagnostics.count("refused_transitions", text=str(error))
+
+    def _on_reward(self, message: RewardBatch) -> None:
+        if not self._joiner.collecting:
+            return
+        try:
+            self._joiner.put_rewards(convert.rewards_of(message))
+        except WireError as error:
+            self.diagnostics.count("refused_rewards", text=str(error))
+
+    def _on_save(self, request: SaveCheckpoint.Request, response: SaveCheckpoint.Response) -> SaveCheckpoint.Response:
+        try:
+            if self._action.busy:
+                raise WireError(ErrorCode.BUSY, "training is running and saves after every update; cancel it or wait")
+            path = self.run_dir / request.uri if request.uri else None
+            response.uri = str(self._training.save_checkpoint(path))
+        except WireError as error:
+            return convert.fill_error(response, error)
+        except OSError as error:
+            self.diagnostics.count("failed_saves", level=diagnostics.ERROR, text=f"checkpoint not written: {error}")
+            return convert.fill_error(response, WireError(ErrorCode.IO_ERROR, f"checkpoint not written: {error}"))
+        response.version = self._training.progress.version
+        return response
+
+    def _on_get_weights(self, request: GetWeights.Request, response: GetWeights.Response) -> GetWeights.Response:
+        try:
+            if not 0 < request.max_bytes <= MAX_CHUNK_BYTES:
+                raise WireError(
+                    ErrorCode.OUT_OF_RANGE, f"max_bytes must lie in 1..{MAX_CHUNK_BYTES}, got {request.max_bytes}"
+                )
+            version, data = self._training.weights_of(request.version)
+            if request.offset >= len(data):
+                raise WireError(
+                    ErrorCode.OUT_OF_RANGE, f"offset {request.offset} lies behind the end of {len(data)} bytes"
+                )
+        except WireError as error:
+            return convert.fill_error(response, error)
+        except OSError:
+            text = f"policy version {request.version} is not in {self.run_dir / 'policies'}; ask for 0, the newest"
+            return convert.fill_error(response, WireError(ErrorCode.NOT_FOUND, text))
+        chunk = data[request.offset : request.offset + request.max_bytes]
+        response.version, response.total, response.crc32 = version, len(data), zlib.crc32(chunk)
+        response.data = convert.bytes_field(chunk)
+        return response
+
+
+def main() -> int:
+    return run_node(LearnerNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

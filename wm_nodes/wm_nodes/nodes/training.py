@@ -1,0 +1,156 @@
+"""The state of policy training in a run folder: weights, version, counts, checkpoints. No rclpy.
+
+Version v is written as run_dir/policies/policy_<v>.safetensors. The checkpoint that holds version v is on disk before
+v is announced, so that a version number never stands for two different weights, restarts included.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, is_dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from wm_nodes.learning.files import write_atomic
+from wm_nodes.learning.rollouts import rollout_statistics
+from wm_nodes.learning.weights import PackedWeights, load_weights, pack_weights
+from wm_nodes.nodes.joiner import Dropped
+from wm_nodes.nodes.policy_holder import weights_uri
+from wm_nodes.policy import ImagePolicy
+from wm_nodes.types import Rollout
+
+
+class Learner(Protocol):
+    """What the learner node needs of an algorithm; learning.ppo.PpoLearner is one."""
+
+    def update(self, rollout: Rollout, *, should_stop: Callable[[], bool] | None = None) -> Any:
+        """Train on one rollout; return metrics, a mapping or a dataclass of numbers.
+
+        Raises learning.rollouts.Canceled when should_stop said so; the weights are then as they were before.
+        """
+        ...
+
+    def save(self, path: Path) -> None:
+        """Write everything that an exact continuation needs (optimiser, counters, random streams), atomically."""
+        ...
+
+    def load(self, path: Path) -> None: ...
+
+
+@dataclass
+class Progress:
+    """Counts over the whole run folder. samples: valid transitions trained on."""
+
+    updates: int = 0
+    version: int = 1
+    samples: int = 0
+    dropped_invalid: int = 0
+    dropped_gap: int = 0
+    dropped_stale: int = 0
+    mean_return: float = math.nan
+    success_rate: float = math.nan
+
+
+class PolicyTraining:
+    """Updates a policy and keeps its versions in a run folder.
+
+    Args:
+        resume: continue from the newest checkpoint of the run folder, where there is one.
+        keep_versions: weights files kept; older ones are deleted.
+    """
+
+    def __init__(
+        self, policy: ImagePolicy, learner: Learner, run_dir: Path, *, resume: bool, keep_versions: int,
+        metadata: Mapping[str, str],
+    ) -> None:  # fmt: skip
+        self.policy, self.learner, self.run_dir = policy, learner, run_dir
+        self.progress = Progress()
+        self._keep_versions, self._metadata = keep_versions, dict(metadata)
+        self.packed: PackedWeights
+        if resume and self.checkpoint.is_file():
+            self._restore()
+        else:
+            self.progress.version = self._last_version() + 1
+            self.save_checkpoint()
+        self._write_version()
+
+    @property
+    def checkpoint(self) -> Path:
+        """The file that marks a complete checkpoint; its sibling .learner holds the algorithm's state."""
+        return self.run_dir / "checkpoints" / "learner.json"
+
+    def update(
+        self, rollout: Rollout, dropped: Dropped, should_stop: Callable[[], bool]
+    ) -> dict[str, float]:
+        """Make one update and one new version; return the metrics.
+
+        Raises:
+            Canceled: nothing has changed. ValueError: the rollout cannot be trained on.
+        """
+        began = time.perf_counter()
+        found = self.learner.update(rollout, should_stop=should_stop)
+        statistics = rollout_statistics(rollout)
+        progress = self.progress
+        progress.updates += 1
+        progress.version += 1
+        progress.samples += int(rollout.valid_TN.sum())
+        progress.dropped_invalid += dropped.invalid
+        progress.dropped_gap += dropped.gap
+        progress.dropped_stale += dropped.stale
+        progress.mean_return, progress.success_rate = statistics.mean_return, statistics.success_rate
+        self.save_checkpoint()
+        self._write_version()
+        metrics = _numbers(found)
+        metrics["update_s"] = time.perf_counter() - began
+        metrics["episodes"] = float(statistics.episodes)
+        return metrics
+
+    def save_checkpoint(self, path: Path | None = None) -> Path:
+        """Write weights, learner state and counts; return the file that names them."""
+        path = path or self.checkpoint
+        self.packed = pack_weights(self.policy, {**self._metadata, "policy_version": str(self.progress.version)})
+        generation = self.progress.updates
+        weights, state = (path.with_name(f"{path.stem}_{generation:06d}.{kind}") for kind in ("safetensors", "learner"))
+        write_atomic(weights, self.packed.data)
+        self.learner.save(state)
+        content = {"progress": asdict(self.progress), "weights": weights.name, "learner": state.name,
+                   "sha256": self.packed.sha256}  # fmt: skip
+        write_atomic(path, json.dumps(content, indent=1).encode())
+        for kind in ("safetensors", "learner"):
+            for old in path.parent.glob(f"{path.stem}_*.{kind}"):
+                if old not in (weights, state):
+                    old.unlink(missing_ok=True)
+        return path
+
+    def weights_of(self, version: int) -> tuple[int, bytes]:
+        """Return (version, bytes); 0 means the newest. Raises FileNotFoundError."""
+        version = version or self.progress.version
+        if version == self.progress.version:
+            return version, self.packed.data
+        return version, (self.run_dir / weights_uri(version)).read_bytes()
+
+    def _restore(self) -> None:
+        content = json.loads(self.checkpoint.read_text())
+        data = (self.checkpoint.parent / content["weights"]).read_bytes()
+        load_weights(self.policy, data, sha256=content["sha256"])
+        self.learner.load(self.checkpoint.parent / content["learner"])
+        self.progress = Progress(**content["progress"])
+        self.packed = pack_weights(self.policy, {**self._metadata, "policy_version": str(self.progress.version)})
+
+    def _write_version(self) -> None:
+        write_atomic(self.run_dir / weights_uri(self.progress.version), self.packed.data)
+        files = sorted((self.run_dir / "policies").glob("policy_*.safetensors"))
+        for old in files[: -self._keep_versions]:
+            old.unlink(missing_ok=True)
+
+    def _last_version(self) -> int:
+        names = [path.stem.removeprefix("policy_") for path in (self.run_dir / "policies").glob("policy_*.safetensors")]
+        return max((int(name) for name in names if name.isdigit()), default=0)
+
+
+def _numbers(found: Any) -> dict[str, float]:
+    values = asdict(found) if is_dataclass(found) and not isinstance(found, type) else dict(found)
+    return {name: float(value) for name, value in values.items() if isinstance(value, (int, float, np.number))}

@@ -1,0 +1,165 @@
+"""World models on disk: one folder with safetensors files and a manifest that says how they were made."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+from wm_nodes.config.schema import SimulationConfig, TokenizerConfig, WorldModelConfig
+from wm_nodes.world_model.dynamics import ActionModel
+from wm_nodes.world_model.text import TextModel
+from wm_nodes.world_model.tokenizer import Tokenizer
+
+MANIFEST = "manifest.json"
+FILES = {"tokenizer": "tokenizer.safetensors", "action": "action_model.safetensors", "text": "text_model.safetensors"}
+FORMAT = 1
+
+
+class ModelFolderError(ValueError):
+    """A world-model folder that is incomplete, damaged, or of another architecture."""
+
+
+@dataclass(frozen=True)
+class WorldModels:
+    """tasks: the done head's outputs, in order. text is None where no text model was trained."""
+
+    tokenizer: Tokenizer
+    action: ActionModel
+    text: TextModel | None
+    tasks: tuple[str, ...]
+    simulation: SimulationConfig
+    manifest: Mapping[str, Any]
+
+    @property
+    def sha256(self) -> str:
+        """Of the manifest's file hashes: the identity of the world model."""
+        return hashlib.sha256(json.dumps(self.manifest["sha256"], sort_keys=True).encode()).hexdigest()
+
+    @property
+    def tokenizer_sha256(self) -> str:
+        return str(self.manifest["sha256"]["tokenizer"])
+
+    def task_index(self, task: str) -> int:
+        if task not in self.tasks:
+            raise ModelFolderError(f"this world model knows the tasks {', '.join(self.tasks)}, not {task!r}")
+        return self.tasks.index(task)
+
+
+def save_model_folder(
+    folder: Path,
+    tokenizer: Tokenizer,
+    action: ActionModel,
+    text: TextModel | None,
+    *,
+    tokenizer_config: TokenizerConfig,
+    world_model_config: WorldModelConfig,
+    simulation: SimulationConfig,
+    tasks: tuple[str, ...],
+    story: Mapping[str, Any],
+) -> Path:
+    """Write the models as float16 and the manifest; `story`: data, seeds, commands, metrics, machine, date."""
+    folder.mkdir(parents=True, exist_ok=True)
+    hashes: dict[str, str] = {}
+    modules: dict[str, nn.Module | None] = {"tokenizer": tokenizer, "action": action, "text": text}
+    for key, module in modules.items():
+        if module is None:
+            (folder / FILES[key]).unlink(missing_ok=True)
+            continue
+        data = save({name: _compact(tensor) for name, tensor in module.state_dict().items()})
+        _write(folder / FILES[key], data)
+        hashes[key] = hashlib.sha256(data).hexdigest()
+    manifest = {
+        "format": FORMAT,
+        "tasks": list(tasks),
+        "vocabulary": list(text.condition.vocabulary) if text else [],
+        "action_dim": action.condition.scalars.weight.shape[0] - 2 * len(action.condition.state_mean),
+        "state_dim": len(action.condition.state_mean),
+        "height": tokenizer.height,
+        "width": tokenizer.width,
+        "tokenizer": tokenizer_config.model_dump(),
+        "world_model": world_model_config.model_dump(),
+        "simulation": simulation.model_dump(),
+        "sha256": hashes,
+        **story,
+    }
+    _write(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
+    return folder
+
+
+def load_model_folder(folder: Path) -> WorldModels:
+    """Load and verify a model folder; weights come back as float32, in evaluation mode, without gradients.
+
+    Raises:
+        ModelFolderError: names the file, what is wrong, and the remedy.
+    """
+    manifest = read_manifest(folder)
+    tokenizer_config = TokenizerConfig.model_validate(manifest["tokenizer"])
+    config = WorldModelConfig.model_validate(manifest["world_model"])
+    num_tasks = len(manifest["tasks"])
+    tokenizer = Tokenizer(tokenizer_config, manifest["height"], manifest["width"])
+    sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim}
+    action = ActionModel(
+        config, action_dim=manifest["action_dim"], state_dim=manifest["state_dim"], num_tasks=num_tasks, **sizes
+    )
+    _load(folder, "tokenizer", tokenizer, manifest)
+    _load(folder, "action", action, manifest)
+    text = None
+    if "text" in manifest["sha256"]:
+        text = TextModel(config, vocabulary=tuple(manifest["vocabulary"]), num_tasks=num_tasks, **sizes)
+        _load(folder, "text", text, manifest)
+    simulation = SimulationConfig.model_validate(manifest["simulation"])
+    return WorldModels(tokenizer, action, text, tuple(manifest["tasks"]), simulation, manifest)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    path = Path(folder) / MANIFEST
+    if not path.is_file():
+        raise ModelFolderError(f"{folder} holds no {MANIFEST}; name the folder of a trained world model")
+    manifest: dict[str, Any] = json.loads(path.read_text())
+    if manifest.get("format") != FORMAT:
+        raise ModelFolderError(f"{path}: format {manifest.get('format')!r}, this version reads {FORMAT}; train it anew")
+    return manifest
+
+
+def _load(folder: Path, key: str, module: nn.Module, manifest: Mapping[str, Any]) -> None:
+    path = Path(folder) / FILES[key]
+    if not path.is_file():
+        raise ModelFolderError(f"{path} is missing; copy the whole model folder")
+    data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != manifest["sha256"][key]:
+        raise ModelFolderError(f"{path} is not the file its manifest names (sha256 differs): copy the folder again")
+    try:
+        tensors = load(data)
+    except SafetensorError as error:
+        raise ModelFolderError(f"{path} is damaged: {error}") from None
+    expected = module.state_dict()
+    for name in sorted(expected.keys() | tensors.keys()):
+        have, want = tensors.get(name), expected.get(name)
+        if have is None or want is None or have.shape != want.shape:
+            raise ModelFolderError(
+                f"{path} is of another architecture: {name} is {_shape(have)} in the file and {_shape(want)} in the "
+                "model; train it anew with this version"
+            )
+    module.load_state_dict({name: tensor.to(expected[name].dtype) for name, tensor in tensors.items()})
+    module.eval().requires_grad_(False)
+
+
+def _shape(tensor: Tensor | None) -> str:
+    return "absent" if tensor is None else str(tuple(tensor.shape))
+
+
+def _compact(tensor: Tensor) -> Tensor:
+    return tensor.detach().cpu().to(torch.float16 if tensor.is_floating_point() else tensor.dtype).contiguous()
+
+
+def _write(path: Path, data: bytes) -> None:
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_bytes(data)
+    temporary.replace(path)

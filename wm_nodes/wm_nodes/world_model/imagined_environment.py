@@ -1,0 +1,159 @@
+"""The world model behind the Environment interface: the policy's training ground, eq. (9).
+
+Shapes: N environments, M starts, S tokens, D values per token, A action, P state.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from wm_nodes.config.schema import RewardConfig
+from wm_nodes.control import check_actions, next_state
+from wm_nodes.seeding import numpy_stream, stream_seed
+from wm_nodes.specs import SOURCE_IMAGINED, EnvironmentSpec
+from wm_nodes.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.world_model.dynamics import done_signal
+from wm_nodes.world_model.folder import WorldModels
+from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.text import imagine_goals
+
+GOAL_BATCH = 64
+
+
+def load_starts(path: Path) -> tuple[UInt8Array, FloatArray]:
+    """Real first frames uint8 (M, H, W, 3) and states float32 (M, P) to imagine from."""
+    tensors = load_file(path)
+    missing = {"images", "states"} - tensors.keys()
+    if missing or not len(tensors["images"]):
+        raise ValueError(f"{path} is no starts file: it must hold images and states of at least one first frame")
+    return tensors["images"].numpy(), tensors["states"].numpy()
+
+
+class ImaginedEnvironment:
+    """N imagined environments in lock-step. An episode terminates when the done signal exceeds
+    reward.success_threshold (E7), and is truncated at the step limit or above reward.uncertainty_limit.
+
+    Args:
+        spec: of the simulator the model was learned from; env_id, source and truth are replaced.
+        starts: first frames and states; a reset with seed s begins at start hash(s) mod M.
+        with_goals: imagine goals by the text model (needed for the dense reward).
+        exact: compute in float32 even where bfloat16 is faster.
+    """
+
+    def __init__(
+        self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig, *,
+        num_envs: int, seed: int = 0, with_goals: bool = True, exact: bool = False,
+    ) -> None:  # fmt: skip
+        self.spec = replace(
+            spec, env_id=f"wm/{spec.task}", source=SOURCE_IMAGINED, num_envs=num_envs, ground_truth_names=(),
+            world_model_sha256=models.sha256,
+        )  # fmt: skip
+        self._models, self._reward, self._exact = models, reward, exact
+        self._task = models.task_index(spec.task)
+        self._images, self._start_states = starts
+        tokenizer = models.tokenizer
+        self._start_latents = torch.cat(
+            [tokenizer.encode(self._images[i : i + 256]) for i in range(0, len(self._images), 256)]
+        )
+        self._goals = self._imagine_goals() if with_goals and models.text is not None else None
+        self._seed, self._num_resets = seed, 0
+        self._caches = models.action.trunk.new_ring_caches(num_envs, tokenizer.device)
+        self._latents = self._start_latents[:1].repeat(num_envs, 1, 1)
+        self._starts = np.zeros(num_envs, np.int64)
+        self._shown = np.repeat(self._images[:1], num_envs, 0)
+        self._states = np.repeat(self._start_states[:1], num_envs, 0).astype(np.float32)
+        self._steps = np.zeros(num_envs, np.uint32)
+        self._episode_ids = np.zeros(num_envs, np.uint64)
+        self._ended = np.ones(num_envs, np.bool_)
+
+    @torch.inference_mode()
+    def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
+        mask = np.ones(self.spec.num_envs, np.bool_) if mask is None else mask
+        for i in np.flatnonzero(mask):
+            self._num_resets += 1
+            seed = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else int(seeds[i])
+            self._starts[i] = numpy_stream(seed, "start").integers(len(self._images))
+            self._episode_ids[i] = self._num_resets
+        chosen = self._starts[mask]
+        self._shown[mask] = self._images[chosen]
+        self._states[mask] = self._start_states[chosen]
+        self._latents[torch.from_numpy(mask)] = self._start_latents[torch.from_numpy(chosen)]
+        for cache in self._caches:
+            cache.restart(torch.from_numpy(mask))
+        self._steps[mask] = 0
+        self._ended[mask] = False
+        return self.current()
+
+    @torch.inference_mode()
+    def step(self, actions: FloatArray) -> StepResult:
+        check_actions(actions, self.spec)
+        valid = ~self._ended
+        moved = next_state(self._states, actions, self.spec)
+        latents, signal, spread = self._predict(actions, moved)
+        keep = torch.from_numpy(valid)
+        self._latents = torch.where(keep[:, None, None], latents, self._latents)
+        self._states = np.where(valid[:, None], moved, self._states)
+        self._steps += valid.astype(np.uint32)
+        frames = self._models.tokenizer.decode(self._latents).numpy()
+        self._shown = np.where(valid[:, None, None, None], frames, self._shown)
+        terminated = valid & (signal > self._reward.success_threshold)
+        too_long = self._steps >= self.spec.max_episode_steps
+        unsure = (self._reward.uncertainty_limit > 0) & (spread > self._reward.uncertainty_limit)
+        truncated = valid & ~terminated & (too_long | unsure)
+        self._ended = self._ended | terminated | truncated
+        return StepResult(
+            observation=self.current(),
+            terminated=terminated,
+            truncated=truncated,
+            success_probability=signal,
+            uncertainty=spread,
+            ground_truth=np.zeros((self.spec.num_envs, 0), np.float32),
+            valid=valid,
+        )
+
+    def current(self) -> Observation:
+        return Observation(
+            self._shown.copy(), self._states.copy(), self._episode_ids.copy(), self._steps.copy()
+        )
+
+    def goals(self) -> tuple[UInt8Array, BoolArray] | None:
+        if self._goals is None:
+            return None
+        frames, found = self._goals
+        return frames[self._starts], found[self._starts]
+
+    def close(self) -> None:
+        return None
+
+    def _predict(self, actions: FloatArray, moved: FloatArray) -> tuple[Tensor, FloatArray, FloatArray]:
+        """Next latents (N, S, D), done signal (N,) and disagreement (N,)."""
+        tokenizer = self._models.tokenizer
+        with compute_context(tokenizer.device, exact=self._exact):
+            prediction = self._models.action(
+                self._latents.unsqueeze(1),
+                torch.from_numpy(actions).unsqueeze(1),
+                torch.from_numpy(self._states).unsqueeze(1),
+                torch.from_numpy(moved).unsqueeze(1),
+                self._caches,
+            )
+        latents = tokenizer.normalise(self._latents + prediction.change_BTSD[:, 0])
+        signal, spread = done_signal(prediction.done_logits_BTKJ[:, 0])
+        if not torch.isfinite(latents).all():
+            raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
+        return latents, signal[:, self._task].numpy(), spread[:, self._task].numpy()
+
+    def _imagine_goals(self) -> tuple[UInt8Array, BoolArray]:
+        """Goal frame and found flag of every start: one per (first frame, instruction), so computed once."""
+        assert self._models.text is not None
+        parts = [
+            imagine_goals(
+                self._models.text, self._models.tokenizer, self._images[i : i + GOAL_BATCH], self.spec.instruction,
+                self._task, horizon=self.spec.max_episode_steps, threshold=self._reward.goal_threshold,
+            )
+            for i in range(0, len(self._images), GOAL_BATCH)
+        ]  # fmt: skip
+        return np.concatenate([part.goals for part in parts]), np.concatenate([part.found for part in parts])

@@ -1,0 +1,110 @@
+"""WM_txt and the goals it imagines, eq. (6). Shapes: B batch, T frames, S tokens, D values per token, L words."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from wm_nodes.config.schema import WorldModelConfig
+from wm_nodes.types import BoolArray, UInt8Array
+from wm_nodes.world_model.dynamics import FrameModel, Prediction, done_signal
+from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.transformer import RingCache, TemporalCache
+
+MAX_WORDS = 12
+
+
+class InstructionCondition(nn.Module):
+    """A learned embedding per word of the closed instruction templates, plus a null token."""
+
+    def __init__(self, vocabulary: tuple[str, ...], width: int) -> None:
+        super().__init__()
+        self.vocabulary = vocabulary
+        self._index = {word: i for i, word in enumerate(vocabulary)}
+        self.words = nn.Embedding(len(vocabulary), width)
+        self.position = nn.Parameter(torch.randn(MAX_WORDS, width) * 0.1)
+        self.null = nn.Parameter(torch.randn(1, width) * 0.5)
+
+    def forward(self, instruction: str) -> Tensor:
+        """Condition tokens (L + 1, D).
+
+        Raises:
+            ValueError: a word that the model was not trained on, or too many words.
+        """
+        words = instruction.lower().split()
+        unknown = [word for word in words if word not in self._index]
+        if unknown or not 0 < len(words) <= MAX_WORDS:
+            raise ValueError(
+                f"instruction {instruction!r}: {'unknown words ' + ', '.join(unknown) if unknown else 'length'}; this "
+                f"model knows at most {MAX_WORDS} of {', '.join(self.vocabulary)}"
+            )
+        index = torch.tensor([self._index[word] for word in words], device=self.null.device)
+        return torch.cat((self.words(index) + self.position[: len(words)], self.null))
+
+
+class TextModel(FrameModel):
+    """The same architecture as WM_act; its condition is the instruction, equal for all frames."""
+
+    def __init__(
+        self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, vocabulary: tuple[str, ...], num_tasks: int
+    ) -> None:
+        super().__init__(config, num_tokens, latent_dim, num_tasks)
+        self.condition = InstructionCondition(vocabulary, config.width)
+
+    def forward(
+        self, latents_BTSD: Tensor, instruction: str, caches: list[TemporalCache] | list[RingCache] | None = None
+    ) -> Prediction:
+        tokens = self.condition(instruction).expand(*latents_BTSD.shape[:2], -1, -1)
+        return self.predict(latents_BTSD, tokens, caches)
+
+
+def vocabulary_of(instructions: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(sorted({word for text in instructions for word in text.lower().split()}))
+
+
+@dataclass(frozen=True)
+class ImaginedGoals:
+    """Golden trajectories of B first frames.
+
+    frames: uint8 (B, T + 1, H, W, 3), from the first frame. lengths: int64 (B,), frames up to and with the goal.
+    found: bool (B,), whether the done signal crossed the threshold; else the goal is the frame of the highest signal.
+    """
+
+    frames: UInt8Array
+    lengths: np.ndarray[tuple[int], np.dtype[np.int64]]
+    found: BoolArray
+
+    @property
+    def goals(self) -> UInt8Array:
+        """(B, H, W, 3)"""
+        return self.frames[np.arange(len(self.frames)), self.lengths - 1]
+
+
+@torch.inference_mode()
+def imagine_goals(
+    model: TextModel, tokenizer: Tokenizer, images: UInt8Array, instruction: str, task: int, *, horizon: int,
+    threshold: float,
+) -> ImaginedGoals:  # fmt: skip
+    """Roll the text model out from first frames (B, H, W, 3); the goal is the first frame whose done signal is above
+    `threshold` (E6: t* = min{t : d_t > tau_goal}), else the frame of the highest signal, with found=False."""
+    current = tokenizer.encode(images).unsqueeze(1)
+    caches = model.trunk.new_ring_caches(len(images), current.device)
+    frames, signals = [np.asarray(images)], list[Tensor]()
+    for _ in range(horizon):
+        with compute_context(current.device):
+            prediction = model(current, instruction, caches)
+        current = tokenizer.normalise(current + prediction.change_BTSD)
+        frames.append(tokenizer.decode(current[:, 0]).numpy())
+        signals.append(done_signal(prediction.done_logits_BTKJ[:, 0])[0][:, task])
+    signal_BT = torch.stack(signals, 1).numpy()
+    crossed = signal_BT > threshold
+    found = crossed.any(1)
+    first = np.where(found, crossed.argmax(1), signal_BT.argmax(1))
+    return ImaginedGoals(np.stack(frames, 1), first.astype(np.int64) + 2, found)
+
+
+def frame_hash(image: UInt8Array) -> str:
+    return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
