@@ -101,13 +101,17 @@ class Probe:
 
     def send(self, client: ActionClient, goal: Any, feedback: Any = None) -> Any:
         """Send a goal and return its accepted handle."""
-        handle = self.result(client.send_goal_async(goal, feedback_callback=feedback), 20.0, "goal")
+        handle = self.run(lambda: client.send_goal_async(goal, feedback_callback=feedback), 20.0, "goal")
         assert handle.accepted
         return handle
 
     def finish(self, handle: Any, timeout_s: float = 60.0) -> Any:
         """Wait for a goal's result; return the Result message."""
-        return self.result(handle.get_result_async(), timeout_s, "result").result
+        return self.run(handle.get_result_async, timeout_s, "result").result
+
+    def run(self, send: Callable[[], Any], timeout_s: float, what: str) -> Any:
+        """Call `send` in the executor's thread (rclpy's action client races with it otherwise) and wait."""
+        return self.result(self.result(self._executor.create_task(send), timeout_s, what), timeout_s, what)
 
     def result(self, future: Any, timeout_s: float, what: str) -> Any:
         done = threading.Event()
@@ -150,10 +154,13 @@ class Graph:
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self._logs: list[IO[bytes]] = []
 
-    def start(self, node: str, namespace: str = "/wm", **params: Any) -> subprocess.Popen[bytes]:
-        """Start python -m wm_nodes.nodes.<node>_node; a parameter is given by keyword."""
+    def start(
+        self, node: str, namespace: str = "/wm", launcher: tuple[str, ...] = (), **params: Any
+    ) -> subprocess.Popen[bytes]:
+        """Start python [launcher] -m wm_nodes.nodes.<node>_node; a parameter is given by keyword."""
         values = {"config_file": self.folder / "config.yaml", "run_dir": self.folder, **params}
-        command = [sys.executable, "-m", f"wm_nodes.nodes.{node}_node", "--ros-args", "-r", f"__ns:={namespace}"]
+        command = [sys.executable, *launcher, "-m", f"wm_nodes.nodes.{node}_node"]
+        command += ["--ros-args", "-r", f"__ns:={namespace}"]
         for name, value in values.items():
             command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
         name = f"{namespace}/{node}"
@@ -180,8 +187,7 @@ class Graph:
         return self.start("reward_evaluator", reward="rule", **params)
 
     def start_learner(self, **params: Any) -> Any:
-        factory = params.pop("learner_factory", "toy:ToyLearner")
-        return self.start("learner", policy_factory="toy:make_policy", learner_factory=factory, **params)
+        return self.start("learner", policy_factory="toy:make_policy", **params)
 
     def start_training_nodes(self, **learner: Any) -> None:
         """environment, policy, reward_evaluator and learner, as in a training run."""
@@ -202,15 +208,15 @@ class Graph:
         self.processes[name].wait(10)
 
     def stop(self) -> dict[str, int]:
-        """SIGINT all; after 10 s SIGKILL. Return the exit codes."""
+        """SIGINT all; after 20 s SIGABRT, which leaves the stack in the log. Return the exit codes."""
         for process in self.processes.values():
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
         for process in self.processes.values():
             try:
-                process.wait(10)
+                process.wait(20)
             except subprocess.TimeoutExpired:
-                process.kill()
+                process.send_signal(signal.SIGABRT)
                 process.wait(5)
         for log in self._logs:
             log.close()

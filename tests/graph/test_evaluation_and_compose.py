@@ -47,7 +47,7 @@ def test_a_composed_process_steps_by_direct_call_and_trains_to_the_same_weights(
     params: dict[str, dict[str, Any]] = {
         "environment": {"backend": "factory", "backend_factory": "toy:make_environment", "num_envs": 4},
         "policy": {"policy_factory": "toy:make_policy"},
-        "learner": {"policy_factory": "toy:make_policy", "learner_factory": "toy:ToyLearner"},
+        "learner": {"policy_factory": "toy:make_policy"},
         "reward_evaluator": {"reward": "rule"},
     }
     content = {f"/**/{node}": {"ros__parameters": values} for node, values in params.items()}

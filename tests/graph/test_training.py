@@ -114,6 +114,18 @@ def test_training_from_the_recorded_bag_gives_the_weights_of_the_live_training(g
     assert weights_in(offline.folder) == live
 
 
+@pytest.mark.kills  # torchrun answers SIGINT with a non-zero code
+def test_two_ranks_under_torchrun_give_the_update_of_one(graph: Graph, probe: Probe) -> None:
+    torchrun = ("-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", str(29500 + graph.domain))
+    graph.start_environment()
+    graph.start_policy()
+    graph.start_reward()
+    graph.start_learner(launcher=torchrun)
+    assert train(probe, updates=2).termination_reason == Train.Result.FINISHED
+    file = graph.folder / "policies" / "policy_000003.safetensors"
+    toy.assert_trained_in_one_process(file, updates=2, tolerance=1e-5)
+
+
 def test_cancel_ends_training_within_a_second_and_the_next_goal_works(graph: Graph, probe: Probe) -> None:
     graph.start_training_nodes()
     client = probe.action(Train, "train")
@@ -121,7 +133,7 @@ def test_cancel_ends_training_within_a_second_and_the_next_goal_works(graph: Gra
     handle = probe.send(client, Train.Goal(updates=100000), updates.append)
     wait_until("the first update", lambda: updates, 30)
     began = time.monotonic()
-    probe.result(handle.cancel_goal_async(), 5, "cancel")
+    probe.run(handle.cancel_goal_async, 5, "cancel")
     result = probe.finish(handle, 5)
     assert result.termination_reason == Train.Result.CANCELED
     assert time.monotonic() - began < 1.0
@@ -134,9 +146,9 @@ def test_limits_and_a_second_goal(graph: Graph, probe: Probe) -> None:
     assert (result.termination_reason, result.updates) == (Train.Result.LIMIT, 1)
     client = probe.action(Train, "train")
     running = probe.send(client, Train.Goal(updates=100000))
-    refused = probe.result(client.send_goal_async(Train.Goal(updates=1)), 10, "second goal")
+    refused = probe.run(lambda: client.send_goal_async(Train.Goal(updates=1)), 10, "second goal")
     assert not refused.accepted
-    probe.result(running.cancel_goal_async(), 5, "cancel")
+    probe.run(running.cancel_goal_async, 5, "cancel")
     assert probe.finish(running, 5).termination_reason == Train.Result.CANCELED
 
 

@@ -27,12 +27,12 @@ from wm_nodes.learning.collecting import (
 )
 from wm_nodes.learning.evaluation import EvaluationResult, evaluate
 from wm_nodes.learning.gate import GateReport, judge_model
+from wm_nodes.learning.pictures import write_pictures
 from wm_nodes.learning.policies import load_policy, make_imagined_environment
 from wm_nodes.learning.preparation import train_weak_policy, write_starts
 from wm_nodes.learning.pretraining import load_arrays, make_model, shipped_model
 from wm_nodes.learning.statistics import paired_difference, wilson_interval
 from wm_nodes.reports import Rate, Summary, machine_facts, results_table, write_report, write_summary
-from wm_nodes.reports.pictures import write_pictures
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.domain import DomainInUseError
 from wm_nodes.ros.graph import GraphError

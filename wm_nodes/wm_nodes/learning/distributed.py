@@ -1,6 +1,7 @@
 """Several learner processes under torchrun (gloo or nccl): every rank holds the whole rollout and a share of each
 minibatch; gradients are summed, so R ranks make the update of one."""
 
+import json
 import os
 from dataclasses import fields
 from typing import Any
@@ -30,12 +31,15 @@ class Ranks:
                 dist.all_reduce(tensor)
 
     def sum_gradients(self, module: nn.Module) -> None:
-        if self.size > 1:
-            gradients = [p.grad if p.grad is not None else torch.zeros_like(p) for p in module.parameters()]
+        """Sum each parameter's gradient. A frozen one has none on any rank and keeps none: with a zero instead, Adam
+        would count a step that a single process does not make."""
+        gradients = [parameter.grad for parameter in module.parameters() if parameter.grad is not None]
+        if self.size > 1 and gradients:
             flat = torch.cat([gradient.flatten() for gradient in gradients])
             dist.all_reduce(flat)
-            for parameter, part in zip(module.parameters(), flat.split([g.numel() for g in gradients]), strict=True):
-                parameter.grad = part.view_as(parameter).clone()
+            parts = torch.split(flat, [gradient.numel() for gradient in gradients])  # type: ignore[no-untyped-call]
+            for gradient, part in zip(gradients, parts, strict=True):
+                gradient.copy_(part.view_as(gradient))
 
     def agree(self, flag: bool) -> bool:
         """True when any rank says so; ranks must ask together."""
@@ -57,17 +61,17 @@ def join() -> Ranks:
 
 
 def broadcast_rollout(rollout: Rollout | None, ranks: Ranks) -> Rollout | None:
-    """Rank 0 gives its rollout to all ranks; None from rank 0 means that there are no more."""
+    """Rank 0 gives its rollout to all ranks; None from rank 0 means that there are no more. Nothing is pickled."""
     if ranks.size == 1:
         return rollout
-    layout: list[Any] = [None]
+    layout: Any = None
     if ranks.rank == 0 and rollout is not None:
         arrays = {f.name: getattr(rollout, f.name) for f in fields(rollout) if f.name != "policy_version"}
-        layout = [(rollout.policy_version, {name: (a.shape, str(a.dtype)) for name, a in arrays.items()})]
-    dist.broadcast_object_list(layout, src=0)
-    if layout[0] is None:
+        layout = [rollout.policy_version, {name: (a.shape, str(a.dtype)) for name, a in arrays.items()}]
+    layout = _broadcast_json(layout)
+    if layout is None:
         return None
-    version, shapes = layout[0]
+    version, shapes = layout
     received: dict[str, Any] = {}
     for name, (shape, dtype) in shapes.items():
         source = np.ascontiguousarray(getattr(rollout, name)) if ranks.rank == 0 else np.empty(shape, dtype)
@@ -75,3 +79,13 @@ def broadcast_rollout(rollout: Rollout | None, ranks: Ranks) -> Rollout | None:
         dist.broadcast(data, src=0)
         received[name] = data.numpy().view(dtype).reshape(shape)
     return Rollout(policy_version=version, **received)
+
+
+def _broadcast_json(value: Any) -> Any:
+    text = torch.tensor(list(json.dumps(value).encode()), dtype=torch.uint8)
+    size = torch.tensor([len(text)])
+    dist.broadcast(size, src=0)
+    if dist.get_rank() != 0:
+        text = torch.empty(int(size.item()), dtype=torch.uint8)
+    dist.broadcast(text, src=0)
+    return json.loads(text.numpy().tobytes())

@@ -129,12 +129,15 @@ class PpoLearner:
         (header_size,) = struct.unpack("<Q", data[:8])
         metadata = json.loads(data[8 : 8 + header_size])["__metadata__"]
         if int(metadata["seed"]) != self.seed:
-            raise ValueError(f"{path} was made with seed {metadata['seed']}, this run has {self.seed}; use a new run folder")
+            raise ValueError(
+                f"{path} was made with seed {metadata['seed']}, this run has {self.seed}; use a new run folder"
+            )
         tensors = load(data)
         reference = {n.removeprefix("reference."): t for n, t in tensors.items() if n.startswith("reference.")}
         check_same_layout(self.reference.state_dict(), reference, what=str(path))
         self.reference.load_state_dict(reference)
-        self._restore_optimizer({n.removeprefix("optimizer."): t for n, t in tensors.items() if n.startswith("optimizer.")})
+        optimizer = {n.removeprefix("optimizer."): t for n, t in tensors.items() if n.startswith("optimizer.")}
+        self._restore_optimizer(optimizer)
         self.updates = int(metadata["updates"])
 
     def _update(self, rollout: Rollout, should_stop: Callable[[], bool] | None) -> PpoMetrics:
@@ -211,7 +214,9 @@ class PpoLearner:
         steps, num_envs = rollout.valid_TN.shape
         valid_TN = torch.from_numpy(rollout.valid_TN)
         if not bool(valid_TN.any()):
-            raise ValueError("the rollout has no valid transition: every reward or step was invalid; see the reward's reason")
+            raise ValueError(
+                "the rollout has no valid transition: every reward or step was invalid; see the reward's reason"
+            )
         flat = (steps * num_envs, -1)
         features = self.policy.features(rollout.images_TN.reshape(-1, *rollout.images_TN.shape[2:]))
         states = torch.from_numpy(rollout.states_TN).reshape(flat)
@@ -219,8 +224,8 @@ class PpoLearner:
         rewards = torch.from_numpy(np.where(rollout.valid_TN, rollout.rewards_TN, 0.0).astype(np.float32))
         values = torch.from_numpy(rollout.values_TN)
         advantages, returns = gae(
-            rewards, values, next_values, torch.from_numpy(rollout.terminated_TN), torch.from_numpy(rollout.truncated_TN),
-            valid_TN, gamma=self.config.gamma, lambda_=self.config.gae_lambda,
+            rewards, values, next_values, torch.from_numpy(rollout.terminated_TN),
+            torch.from_numpy(rollout.truncated_TN), valid_TN, gamma=self.config.gamma, lambda_=self.config.gae_lambda,
         )  # fmt: skip
         advantages = masked_normalise(advantages, valid_TN)
         chosen = valid_TN.reshape(-1)

@@ -1,7 +1,8 @@
 """Collects rollouts in lock-step inside one process, step for step as the graph does over DDS.
 
 Shapes: T time, N environments. An environment that has ended is reset in the next lock-step instead of stepped, so that
-column of the rollout is invalid there. Seeds of resets and action noise depend on (seed, policy version, lock-step) only.
+column of the rollout is invalid there. Seeds of resets and action noise depend on (seed, policy version, lock-step)
+only.
 """
 
 from collections.abc import Callable
@@ -91,7 +92,7 @@ def collect_rollout(
         goals = env.goals()
         result = env.step(output.actions)
         judged = reward.evaluate(reward_input(observation, result, goals))
-        row = {
+        row: dict[str, NDArray[Any]] = {
             "images_TN": observation.image,
             "states_TN": observation.state,
             "next_images_TN": result.observation.image,

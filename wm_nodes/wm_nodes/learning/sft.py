@@ -59,9 +59,9 @@ def train_sft(
 ) -> SftResult:
     """Fit the actor's mean to the demonstrated actions in place; critic and log standard deviation stay.
 
-    Steps after the first success are left out: an episode ends there when a policy acts. The demonstrations also set the
-    policy's feature normalisation. Every image counts once, and with `reconstruct` (the tokenizer's decode of encode,
-    uint8 (B, H, W, 3)) once more as the world model will show it.
+    Steps after the first success are left out: an episode ends there when a policy acts. The demonstrations also set
+    the policy's feature normalisation. Every image counts once, and with `reconstruct` (the tokenizer's decode of
+    encode, uint8 (B, H, W, 3)) once more as the world model will show it.
     With one seed and one number of torch threads the result is bit-identical on a CPU.
 
     Args:

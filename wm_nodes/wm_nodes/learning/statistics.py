@@ -84,7 +84,7 @@ def mcnemar_exact(gained: int, lost: int) -> float:
     """Return the two-sided exact p: twice the smaller binomial(1/2) tail of the discordant pairs, at most 1."""
     discordant = gained + lost
     tail = sum(math.comb(discordant, k) for k in range(min(gained, lost) + 1))
-    return min(1.0, 2 * tail / 2**discordant)
+    return min(1.0, 2 * tail / (1 << discordant))
 
 
 def _tango_interval(gained: int, lost: int, episodes: int, z: float) -> tuple[float, float]:
@@ -112,7 +112,7 @@ def _tango_score(gained: int, lost: int, episodes: int, difference: float) -> fl
     b = -gained - lost + (2 * episodes - gained + lost) * difference
     c = -lost * difference * (1 - difference)
     p_lost = (math.sqrt(max(b * b - 4 * a * c, 0.0)) - b) / (2 * a)
-    variance = episodes * (2 * p_lost + difference * (1 - difference))
+    variance: float = episodes * (2 * p_lost + difference * (1 - difference))
     numerator = gained - lost - episodes * difference
     if variance <= 1e-12:
         return 0.0 if abs(numerator) < 1e-12 else math.copysign(math.inf, numerator)

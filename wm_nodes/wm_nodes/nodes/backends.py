@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.learning.distributed import Ranks
 from wm_nodes.nodes.training import Learner
 from wm_nodes.policy import ImagePolicy
 from wm_nodes.reward import RewardModel
@@ -88,7 +89,7 @@ def make_policy(config: RunConfig, model_dir: str, factory: str = "") -> ImagePo
     return policy
 
 
-def make_learner(policy: ImagePolicy, config: RunConfig, factory: str = "") -> Learner:
+def make_learner(policy: ImagePolicy, config: RunConfig, factory: str = "", ranks: Ranks | None = None) -> Learner:
     """Build the algorithm that trains `policy` in place; its present weights are the reference it stays close to."""
     learner: Learner
     if factory:
@@ -96,7 +97,7 @@ def make_learner(policy: ImagePolicy, config: RunConfig, factory: str = "") -> L
         return learner
     from wm_nodes.learning.ppo import PpoLearner
 
-    learner = PpoLearner(policy, policy, config.ppo, config.seed)
+    learner = PpoLearner(policy, config.ppo, seed=config.seed, ranks=ranks)
     return learner
 
 

@@ -1,30 +1,36 @@
 """learner: asks the policy for rollouts, joins what the graph publishes about them, trains, announces new versions."""
 
+import signal
 import sys
 import time
 import zlib
 from pathlib import Path
 from typing import Any
 
+import rclpy
 from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
 from wm_msgs.action import Rollout as RolloutAction
 from wm_msgs.action import Train
 from wm_msgs.msg import EnvSpec, ErrorCode, LearnerMetrics, PolicyVersion, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
+from wm_nodes.config.load import load_config
+from wm_nodes.learning.distributed import Ranks, join
 from wm_nodes.learning.rollouts import Canceled
 from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, load_weights
 from wm_nodes.nodes.backends import existing, make_learner, make_policy
 from wm_nodes.nodes.joiner import Dropped, RolloutJoiner
 from wm_nodes.nodes.policy_holder import weights_uri
-from wm_nodes.nodes.training import PolicyTraining
+from wm_nodes.nodes.training import PolicyTraining, follow
 from wm_nodes.recording import read_rollouts
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import run_goal
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import Param
+from wm_nodes.ros.params import COMMON, Param, declare
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, WireError
 from wm_nodes.specs import EnvironmentSpec
@@ -61,18 +67,20 @@ METRICS = (
 class LearnerNode(ManagedNode):
     """Action train; services learner/save, learner/get_weights; publishes policy/version, learner/metrics."""
 
-    def __init__(self, **node_arguments: Any) -> None:
+    def __init__(self, ranks: Ranks | None = None, **node_arguments: Any) -> None:
         super().__init__("learner", PARAMS, **node_arguments)
+        self._ranks = ranks or Ranks()
 
     def configure(self) -> None:
         self._config = self.run_config()
         policy = make_policy(self._config, str(self.param("model_dir")), str(self.param("policy_factory")))
         if self.param("initial_policy"):
             load_weights(policy, existing(str(self.param("initial_policy")), "initial_policy").read_bytes())
-        learner = make_learner(policy, self._config, str(self.param("learner_factory")))
+        learner = make_learner(policy, self._config, str(self.param("learner_factory")), self._ranks)
         self._training = PolicyTraining(
             policy, learner, self.run_dir, resume=bool(self.param("resume")),
             keep_versions=int(self.param("keep_versions")), metadata={"tokenizer_sha256": policy.encoder.sha256},
+            ranks=self._ranks,
         )  # fmt: skip
         self._spec: EnvironmentSpec | None = None
         self._joiner = RolloutJoiner()
@@ -94,6 +102,11 @@ class LearnerNode(ManagedNode):
 
     def deactivate(self, reason: str) -> None:
         self._action.stop(reason)
+
+    def cleanup(self) -> None:
+        if hasattr(self, "_training"):
+            self._training.close()
+            del self._training
 
     def update_diagnostics(self) -> None:
         if hasattr(self, "_training"):
@@ -336,8 +349,26 @@ class LearnerNode(ManagedNode):
         return response
 
 
+def follow_rank_0(ranks: Ranks) -> int:
+    """The process of another rank: reads the learner's parameters, then leaves the graph to rank 0."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("learner", enable_rosout=False)
+    declare(node, (*COMMON, *PARAMS))
+    values = {param.name: str(node.get_parameter(param.name).value) for param in (*COMMON, *PARAMS)}
+    node.destroy_node()
+    rclpy.shutdown()
+    config = load_config(values["config_file"])
+    policy = make_policy(config, values["model_dir"], values["policy_factory"])
+    learner = make_learner(policy, config, values["learner_factory"], ranks)
+    follow(policy, learner, Path(values["run_dir"]), ranks)
+    return 0
+
+
 def main() -> int:
-    return run_node(LearnerNode)
+    """One process, or under torchrun rank 0 as the node and the other ranks behind it."""
+    ranks = join()
+    return follow_rank_0(ranks) if ranks.rank else run_node(lambda: LearnerNode(ranks))
 
 
 if __name__ == "__main__":

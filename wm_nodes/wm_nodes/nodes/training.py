@@ -13,14 +13,18 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import torch.distributed
 
+from wm_nodes.learning.distributed import Ranks, broadcast_rollout
 from wm_nodes.learning.files import write_atomic
-from wm_nodes.learning.rollouts import rollout_statistics
+from wm_nodes.learning.rollouts import Canceled, rollout_statistics
 from wm_nodes.learning.weights import PackedWeights, load_weights, pack_weights
 from wm_nodes.nodes.joiner import Dropped
 from wm_nodes.nodes.policy_holder import weights_uri
 from wm_nodes.policy import ImagePolicy
 from wm_nodes.types import Rollout
+
+CHECKPOINT = Path("checkpoints") / "learner.json"
 
 
 class Learner(Protocol):
@@ -64,8 +68,9 @@ class PolicyTraining:
 
     def __init__(
         self, policy: ImagePolicy, learner: Learner, run_dir: Path, *, resume: bool, keep_versions: int,
-        metadata: Mapping[str, str],
+        metadata: Mapping[str, str], ranks: Ranks | None = None,
     ) -> None:  # fmt: skip
+        self._ranks = ranks or Ranks()
         self.policy, self.learner, self.run_dir = policy, learner, run_dir
         self.progress = Progress()
         self._keep_versions, self._metadata = keep_versions, dict(metadata)
@@ -76,11 +81,12 @@ class PolicyTraining:
             self.progress.version = self._last_version() + 1
             self.save_checkpoint()
         self._write_version()
+        barrier(self._ranks)
 
     @property
     def checkpoint(self) -> Path:
         """The file that marks a complete checkpoint; its sibling .learner holds the algorithm's state."""
-        return self.run_dir / "checkpoints" / "learner.json"
+        return self.run_dir / CHECKPOINT
 
     def update(
         self, rollout: Rollout, dropped: Dropped, should_stop: Callable[[], bool]
@@ -91,6 +97,7 @@ class PolicyTraining:
             Canceled: nothing has changed. ValueError: the rollout cannot be trained on.
         """
         began = time.perf_counter()
+        broadcast_rollout(rollout, self._ranks)
         found = self.learner.update(rollout, should_stop=should_stop)
         statistics = rollout_statistics(rollout)
         progress = self.progress
@@ -107,6 +114,10 @@ class PolicyTraining:
         metrics["update_s"] = time.perf_counter() - began
         metrics["episodes"] = float(statistics.episodes)
         return metrics
+
+    def close(self) -> None:
+        """Let the other ranks end."""
+        broadcast_rollout(None, self._ranks)
 
     def save_checkpoint(self, path: Path | None = None) -> Path:
         """Write weights, learner state and counts; return the file that names them."""
@@ -133,11 +144,7 @@ class PolicyTraining:
         return version, (self.run_dir / weights_uri(version)).read_bytes()
 
     def _restore(self) -> None:
-        content = json.loads(self.checkpoint.read_text())
-        data = (self.checkpoint.parent / content["weights"]).read_bytes()
-        load_weights(self.policy, data, sha256=content["sha256"])
-        self.learner.load(self.checkpoint.parent / content["learner"])
-        self.progress = Progress(**content["progress"])
+        self.progress = restore(self.policy, self.learner, self.checkpoint)
         self.packed = pack_weights(self.policy, {**self._metadata, "policy_version": str(self.progress.version)})
 
     def _write_version(self) -> None:
@@ -149,6 +156,30 @@ class PolicyTraining:
     def _last_version(self) -> int:
         names = [path.stem.removeprefix("policy_") for path in (self.run_dir / "policies").glob("policy_*.safetensors")]
         return max((int(name) for name in names if name.isdigit()), default=0)
+
+
+def restore(policy: ImagePolicy, learner: Learner, checkpoint: Path) -> Progress:
+    """Load a checkpoint into policy and learner; return its counts."""
+    content = json.loads(checkpoint.read_text())
+    load_weights(policy, (checkpoint.parent / content["weights"]).read_bytes(), sha256=content["sha256"])
+    learner.load(checkpoint.parent / content["learner"])
+    return Progress(**content["progress"])
+
+
+def follow(policy: ImagePolicy, learner: Learner, run_dir: Path, ranks: Ranks) -> None:
+    """Be a rank other than 0: start from rank 0's checkpoint and make its updates until it ends."""
+    barrier(ranks)
+    restore(policy, learner, run_dir / CHECKPOINT)
+    while (rollout := broadcast_rollout(None, ranks)) is not None:
+        try:
+            learner.update(rollout)
+        except (Canceled, ValueError):
+            continue
+
+
+def barrier(ranks: Ranks) -> None:
+    if ranks.size > 1:
+        torch.distributed.barrier()
 
 
 def _numbers(found: Any) -> dict[str, float]:

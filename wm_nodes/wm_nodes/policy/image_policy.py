@@ -19,7 +19,7 @@ from wm_nodes.policy.gaussian import DiagonalGaussian
 from wm_nodes.seeding import stream_seed
 from wm_nodes.types import FloatArray, UInt8Array
 
-TOOL_CENTER_M = (0.675, 0.0, 0.13)
+TOOL_CENTER_M = (0.6, 0.0, 0.15)
 TOOL_SCALE_M = 0.2
 """The commanded tool position in the robot base frame lies within about one scale of the centre, m."""
 

@@ -134,8 +134,9 @@ def _find(folder: Path, patterns: tuple[str, ...]) -> Path:
 
 def _read(path: Path) -> dict[str, Tensor]:
     if path.suffix == ".safetensors":
-        return load_file(path)
-    loaded = torch.load(path, map_location="cpu", weights_only=True)
+        tensors: dict[str, Tensor] = load_file(path)
+        return tensors
+    loaded: dict[str, Tensor] = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(loaded, dict):
         raise TypeError(f"{path} holds a {type(loaded).__name__}, expected a dictionary of tensors")
     return loaded

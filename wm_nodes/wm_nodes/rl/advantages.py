@@ -41,7 +41,7 @@ def gae(
         t, n = (int(i) for i in torch.nonzero(~torch.isfinite(deltas_TN))[0])
         raise ValueError(
             f"step {t} of environment {n} is valid, but its reward ({float(rewards_TN[t, n])}) or value "
-            f"({float(values_TN[t, n])} -> {float(next_values_TN[t, n])}) is not finite; mark it valid=False or repair it"
+            f"({float(values_TN[t, n])} -> {float(next_values_TN[t, n])}) is not finite; mark it valid=False"
         )
     advantages_TN = torch.zeros_like(values_TN)
     ahead_N = torch.zeros_like(values_TN[0])

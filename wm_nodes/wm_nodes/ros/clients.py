@@ -237,6 +237,28 @@ class LocalEnvironmentClient:
             time.sleep(BUSY_WAIT_S)
 
 
+def from_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Any:
+    """Call `send` in the executor's thread and wait for the future it returns.
+
+    rclpy's ActionClient notes a request only after sending it: sent from another thread, the answer may come before the
+    note and is then dropped ("Ignoring unexpected goal response").
+    """
+    sent: list[Future] = []
+    ready = threading.Event()
+
+    def run() -> None:
+        sent.append(send())
+        ready.set()
+
+    node.executor.create_task(run)
+    deadline = time.monotonic() + timeout_s
+    while not ready.wait(POLL_S):
+        check()
+        if time.monotonic() >= deadline:
+            raise PeerLost(f"this node's executor did not run for {timeout_s:g} s")
+    return wait_for(sent[0], max(0.0, deadline - time.monotonic()), check)
+
+
 def run_goal(
     client: ActionClient, goal: Any, *, accept_s: float, check: Check, alive: Check, on_feedback: Any = None
 ) -> Any:
@@ -250,7 +272,7 @@ def run_goal(
     Raises:
         PeerLost: no server, no acceptance, a refusal, or a lost server.
     """
-    name = client._action_name
+    name, node = client._action_name, client._node
     wait_until(client.server_is_ready, accept_s, check, name)
     deadline = time.monotonic() + accept_s
 
@@ -260,7 +282,9 @@ def run_goal(
 
     while True:
         try:
-            handle = wait_for(client.send_goal_async(goal, feedback_callback=on_feedback), accept_s, both)
+            handle = from_executor(
+                node, lambda: client.send_goal_async(goal, feedback_callback=on_feedback), accept_s, both
+            )
         except PeerLost as error:
             raise PeerLost(f"{name}: {error}") from None
         if handle.accepted:
@@ -269,9 +293,8 @@ def run_goal(
             raise PeerLost(f"{name} refused the goal for {accept_s:g} s; is its node active and idle?")
         check()
         time.sleep(POLL_S)
-    result = handle.get_result_async()
     try:
-        return wait_for(result, float("inf"), both).result
+        return from_executor(node, handle.get_result_async, float("inf"), both).result
     except BaseException:
-        handle.cancel_goal_async()
+        node.executor.create_task(handle.cancel_goal_async)
         raise

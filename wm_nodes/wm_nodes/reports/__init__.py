@@ -1,0 +1,16 @@
+"""What a run leaves for people: film strips, curves, a table with intervals, report.html and summary.json.
+
+Plain arrays and numbers go in; nothing here knows a model, a policy or a graph.
+"""
+
+from wm_nodes.reports.curves import curves
+from wm_nodes.reports.film_strip import film_strip
+from wm_nodes.reports.html import Picture, write_report
+from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.summary import Rate, Summary, read_summary, write_summary
+from wm_nodes.reports.tables import results_table
+
+__all__ = [
+    "Picture", "Rate", "Summary", "curves", "film_strip", "machine_facts", "read_summary", "results_table",
+    "write_report", "write_summary",
+]  # fmt: skip

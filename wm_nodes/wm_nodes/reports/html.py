@@ -1,0 +1,166 @@
+"""report.html: everything about one run in one file without outside parts, readable on light and dark screens."""
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from wm_nodes.reports.summary import Summary, write_whole
+from wm_nodes.reports.tables import result_rows, verdict
+
+FILE_NAME = "report.html"
+
+STYLE = """
+:root { color-scheme: light dark; --ink: #1d1d22; --faint: #66666f; --paper: #fbfbf9; --card: #fff; --line: #dcdcd8;
+  --good: #1c7a4b; --bad: #b3362b; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e8e8ea; --faint: #a0a0aa; --paper: #17171a; --card: #202024;
+  --line: #3a3a40; --good: #5cc98e; --bad: #f0857a; } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 76rem; padding: 2rem 1.25rem 4rem; background: var(--paper); color: var(--ink);
+  font: 16px/1.5 system-ui, sans-serif; }
+h1 { font-size: 1.7rem; margin: 0 0 .3rem; } h2 { font-size: 1.15rem; margin: 2.4rem 0 .6rem; }
+p.lead { font-size: 1.1rem; margin: 0; } .faint, figcaption { color: var(--faint); font-size: .92rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; background: var(--card); border: 1px solid var(--line); }
+th, td { padding: .4rem .8rem; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
+td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+tr.last td { font-weight: 600; border-bottom: 0; }
+.good { color: var(--good); font-weight: 600; } .bad { color: var(--bad); font-weight: 600; }
+figure { margin: 0 0 1.2rem; } figure img { max-width: 100%; background: #fff; border: 1px solid var(--line); }
+pre, code { font: .86rem/1.45 ui-monospace, monospace; }
+pre { overflow-x: auto; background: var(--card); border: 1px solid var(--line); padding: .7rem .9rem; margin: .4rem 0; }
+code { overflow-wrap: anywhere; } summary { cursor: pointer; }
+"""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG of the report. caption: what one sees in it."""
+
+    title: str
+    caption: str
+    path: Path
+
+
+def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = (), *, config_text: str = "") -> Path:
+    """Write <run_dir>/report.html and return its path.
+
+    Raises:
+        FileNotFoundError: a picture does not exist.
+    """
+    title = f"{summary.task}: a policy trained inside a world model"
+    body = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="lead">{escape(verdict(summary))}</p>',
+        f'<p class="faint">preset {escape(summary.preset)}, seed {summary.seed}, '
+        f"{summary.samples} imagined environment steps at {summary.imagined_steps_per_s:.0f} per second, "
+        f"{summary.minutes:.1f} minutes in all</p>",
+        "<h2>Success</h2>", _results(summary),
+        "<h2>Gate: did the world model deserve it?</h2>", _gate(summary.gate),
+        *_pictures(pictures),
+        "<h2>Look closer, do it again</h2>", _again(run_dir, summary),
+        "<h2>Made on</h2>", _table(("", ""), [(name, value) for name, value in summary.machine.items()]),
+    ]  # fmt: skip
+    if config_text:
+        body += [f"<h2>Settings</h2><details><summary>resolved configuration</summary><pre>{escape(config_text)}</pre>"
+                 "</details>"]  # fmt: skip
+    page = (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
+        f'content="width=device-width, initial-scale=1"><title>{escape(title)}</title><style>{STYLE}</style></head>'
+        f"<body>{''.join(body)}</body></html>\n"
+    )
+    path = Path(run_dir) / FILE_NAME
+    write_whole(path, page)
+    return path
+
+
+def _results(summary: Summary) -> str:
+    head = "".join(
+        f'<th class="number">{side}</th><th class="number"></th><th class="number">interval</th>'
+        for side in ("real simulator", "imagined")
+    )
+    rows = result_rows(summary)
+    lines = []
+    for row in rows:
+        cells = (text for cell in (row.real, row.imagined) for text in (cell.count, cell.percent, cell.interval))
+        kind = ' class="last"' if row is rows[-1] else ""
+        lines.append(f"<tr{kind}><td>{escape(row.label)}</td>{''.join(map(_number, cells))}</tr>")
+    return (
+        f'<div class="wide"><table><tr><th></th>{head}</tr>{"".join(lines)}</table></div>'
+        '<p class="faint">Intervals of rates: Wilson. Interval of the real difference: the same seeds before and after '
+        "(Tango's score interval). Imagined success is what the world model claims; only real success counts.</p>"
+    )
+
+
+def _gate(gate: Mapping[str, Any]) -> str:
+    if not gate:
+        return "<p>The gate was not asked.</p>"
+    rows = []
+    for criterion in gate["criteria"]:
+        passed = criterion["passed"]
+        mark = '<span class="good">passed</span>' if passed else '<span class="bad">failed</span>'
+        remedy = "" if passed else escape(str(criterion["remedy"]))
+        rows.append(
+            f"<tr><td>{escape(str(criterion['name']))}</td>{_number(_value(criterion['value']))}"
+            f"<td>{escape(str(criterion['rule']))} {escape(_threshold(criterion))}</td><td>{mark}</td>"
+            f"<td>{remedy}</td></tr>"
+        )
+    notes = "".join(f'<p class="faint">{escape(str(note))}</p>' for note in gate.get("notes", ()))
+    words = "Passed" if gate["passed"] else "Failed: trained in it all the same"
+    return (
+        f"<p>{words}. Judged on {gate['episodes']} held-out real episodes.</p>"
+        '<div class="wide"><table><tr><th>criterion</th><th class="number">value</th><th>must be</th><th></th>'
+        f"<th>remedy</th></tr>{''.join(rows)}</table></div>{notes}{_metrics(gate.get('metrics', {}))}"
+    )
+
+
+def _metrics(metrics: Mapping[str, Any]) -> str:
+    if not metrics:
+        return ""
+    table = _table(("metric", "value"), [(name, _value(value)) for name, value in metrics.items()])
+    return f"<details><summary>all numbers of the held-out rollouts</summary>{table}</details>"
+
+
+def _pictures(pictures: Sequence[Picture]) -> Iterable[str]:
+    for picture in pictures:
+        if not picture.path.is_file():
+            raise FileNotFoundError(f"picture {picture.path} of the report does not exist")
+        data = base64.b64encode(picture.path.read_bytes()).decode()
+        yield (
+            f'<h2>{escape(picture.title)}</h2><figure><img alt="{escape(picture.title)}" '
+            f'src="data:image/png;base64,{data}"><figcaption>{escape(picture.caption)}</figcaption></figure>'
+        )
+
+
+def _again(run_dir: Path, summary: Summary) -> str:
+    bag = escape(summary.bag or "no bag was recorded")
+    parts = [
+        f"<p>Run folder: <code>{escape(str(run_dir))}</code><br>Bag (images, actions, rewards, episodes, versions): "
+        f"<code>{bag}</code></p>"
+    ]
+    if summary.command:
+        parts.append(f"<p>The command behind this page:</p><pre>{escape(summary.command)}</pre>")
+    if summary.bag:
+        replay = f"python3 launch_scripts/replay_offline.launch.py bag_uri:={summary.bag}"
+        parts.append(f"<p>Play the bag to a learner:</p><pre>{escape(replay)}</pre>")
+    return "".join(parts)
+
+
+def _table(head: tuple[str, str], rows: Iterable[tuple[str, str]]) -> str:
+    lines = "".join(f"<tr><td>{escape(str(name))}</td><td>{escape(str(value))}</td></tr>" for name, value in rows)
+    title = f"<tr><th>{escape(head[0])}</th><th>{escape(head[1])}</th></tr>" if any(head) else ""
+    return f'<div class="wide"><table>{title}{lines}</table></div>'
+
+
+def _number(text: str) -> str:
+    return f'<td class="number">{escape(text)}</td>'
+
+
+def _value(value: Any) -> str:
+    return "undefined" if value is None else f"{float(value):.3f}"
+
+
+def _threshold(criterion: Mapping[str, Any]) -> str:
+    return "" if criterion["threshold"] is None else f"{float(criterion['threshold']):g}"

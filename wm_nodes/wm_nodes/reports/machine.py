@@ -1,0 +1,42 @@
+"""Where and with what a number was measured."""
+
+import os
+import platform
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+
+PACKAGES = ("wm_nodes", "torch", "numpy", "mani_skill", "sapien", "rclpy", "rosbags")
+
+
+def machine_facts() -> dict[str, str]:
+    """Date, processor, usable cores, memory, system, Python and package versions, by name. No host or user name."""
+    facts = {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "processor": _field("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
+        "cores": str(len(os.sched_getaffinity(0))),
+        "memory": _memory(),
+        "system": f"{_field('/etc/os-release', 'PRETTY_NAME', '=').strip(chr(34))} {platform.machine()}".strip(),
+        "python": platform.python_version(),
+    }
+    for name in PACKAGES:
+        try:
+            facts[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return facts
+
+
+def _memory() -> str:
+    kilobytes = _field("/proc/meminfo", "MemTotal").split()[:1]
+    return f"{int(kilobytes[0]) / 2**20:.1f} GiB" if kilobytes else "unknown"
+
+
+def _field(path: str, name: str, separator: str = ":") -> str:
+    """The first `name: value` of a text file, "" where there is none."""
+    try:
+        lines = Path(path).read_text(errors="replace").splitlines()
+    except OSError:
+        return ""
+    found = (line.split(separator, 1)[1].strip() for line in lines if line.split(separator)[0].strip() == name)
+    return next(found, "")

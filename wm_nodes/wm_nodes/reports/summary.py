@@ -1,0 +1,106 @@
+"""The numbers of one run, as plain data, and summary.json."""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+FILE_NAME = "summary.json"
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Successes of `episodes` episodes; low, high: 95 % interval of the rate."""
+
+    successes: int
+    episodes: int
+    low: float = 0.0
+    high: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1 or not 0 <= self.successes <= self.episodes:
+            raise ValueError(f"a rate needs 0 <= successes <= episodes >= 1, got {self.successes} of {self.episodes}")
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.episodes
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run found out.
+
+    real_, imagined_: success before and after training, in the simulator and in the world model.
+    imagined_steps_per_s: environment steps of the training in the world model, per second of training.
+    bag: path of the recorded training. paired, imagined_paired: after minus before on the same seeds, with the keys
+        difference, low and high (and more); empty where not measured.
+    gate: GateReport.to_dict(). samples: environment steps trained on. minutes: of the whole run.
+    command: as typed. machine: facts by name.
+    """
+
+    task: str
+    preset: str
+    seed: int
+    real_before: Rate
+    real_after: Rate
+    imagined_before: Rate
+    imagined_after: Rate
+    imagined_steps_per_s: float
+    bag: str
+    paired: Mapping[str, Any] = field(default_factory=dict)
+    imagined_paired: Mapping[str, Any] = field(default_factory=dict)
+    gate: Mapping[str, Any] = field(default_factory=dict)
+    samples: int = 0
+    minutes: float = float("nan")
+    command: str = ""
+    machine: Mapping[str, str] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values; a number that is not finite becomes None."""
+        values: dict[str, Any] = plain(asdict(self))
+        for name in ("real_before", "real_after", "imagined_before", "imagined_after"):
+            values[name]["rate"] = getattr(self, name).rate
+        return values
+
+
+def write_summary(run_dir: Path, summary: Summary) -> Path:
+    """Write <run_dir>/summary.json, complete or not at all."""
+    path = Path(run_dir) / FILE_NAME
+    write_whole(path, json.dumps(summary.to_dict(), indent=1, allow_nan=False) + "\n")
+    return path
+
+
+def read_summary(run_dir: Path) -> dict[str, Any]:
+    """The values of <run_dir>/summary.json.
+
+    Raises:
+        FileNotFoundError: the run has not ended; names the file.
+    """
+    path = Path(run_dir) / FILE_NAME
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: the run has not come to its end")
+    values: dict[str, Any] = json.loads(path.read_text())
+    return values
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON can hold it: mappings and lists of plain values, None for a number that is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, bool) or value is None or isinstance(value, (str, int)):
+        return value
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write under a temporary name, then rename."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)

@@ -1,0 +1,83 @@
+"""The result of a run as a table: before and after, imagined and real, always together."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rich.table import Table
+
+from wm_nodes.reports.summary import Rate, Summary
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One rate as texts: "123 / 200", "61.5 %", "95 %: 54.6 to 68.0 %"."""
+
+    count: str
+    percent: str
+    interval: str
+
+
+@dataclass(frozen=True)
+class Row:
+    label: str
+    real: Cell
+    imagined: Cell
+
+
+def result_rows(summary: Summary) -> list[Row]:
+    """Before, after, and the difference on the same seeds."""
+    return [
+        Row("before (SFT policy)", _rate(summary.real_before), _rate(summary.imagined_before)),
+        Row("after (RL in the world model)", _rate(summary.real_after), _rate(summary.imagined_after)),
+        Row(
+            "difference",
+            _difference(summary.real_before, summary.real_after, summary.paired),
+            _difference(summary.imagined_before, summary.imagined_after, summary.imagined_paired),
+        ),
+    ]
+
+
+def verdict(summary: Summary) -> str:
+    """One sentence: whether the real difference is above what chance explains."""
+    if "low" not in summary.paired:
+        return "The real difference was not measured on paired seeds."
+    points = 100 * float(summary.paired["difference"])
+    low, high = 100 * float(summary.paired["low"]), 100 * float(summary.paired["high"])
+    found = f"{points:+.1f} points in the real simulator (95 % interval {low:+.1f} to {high:+.1f})"
+    if low > 0:
+        return f"The policy got better: {found}."
+    if high < 0:
+        return f"The policy got worse: {found}."
+    return f"No difference that chance does not explain: {found}."
+
+
+def results_table(summary: Summary) -> Table:
+    """The table for the terminal."""
+    table = Table(title=f"{summary.task}, preset {summary.preset}, seed {summary.seed}", caption=verdict(summary))
+    for name in ("success", "real simulator", "imagined"):
+        table.add_column(name, justify="left" if name == "success" else "right")
+    for row in result_rows(summary):
+        style = "bold" if row.label == "difference" else ""
+        table.add_row(row.label, *(f"{c.percent}   {c.count}\n[dim]{c.interval}" for c in (row.real, row.imagined)),
+                      style=style, end_section=True)  # fmt: skip
+    return table
+
+
+def _rate(rate: Rate) -> Cell:
+    return Cell(
+        f"{rate.successes} / {rate.episodes}", f"{100 * rate.rate:.1f} %",
+        f"95 %: {100 * rate.low:.1f} to {100 * rate.high:.1f} %",
+    )  # fmt: skip
+
+
+def _difference(before: Rate, after: Rate, paired: Mapping[str, Any]) -> Cell:
+    points = f"{100 * (after.rate - before.rate):+.1f} points"
+    if "low" not in paired or not math.isfinite(float(paired["low"])):
+        return Cell("", points, "not paired")
+    count = f"{paired['gained']} gained, {paired['lost']} lost" if "gained" in paired else ""
+    return Cell(
+        count, f"{100 * float(paired['difference']):+.1f} points",
+        f"95 %: {100 * float(paired['low']):+.1f} to {100 * float(paired['high']):+.1f}",
+    )  # fmt: skip
