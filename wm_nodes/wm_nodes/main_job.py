@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from wm_nodes.config.load import ConfigError, dump_config, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.learning.collecting import (
     HELDOUT_SEEDS,
     collect_plan,
@@ -30,7 +31,7 @@ from wm_nodes.learning.gate import GateReport, judge_model
 from wm_nodes.learning.pictures import write_pictures
 from wm_nodes.learning.policies import load_policy, make_imagined_environment
 from wm_nodes.learning.preparation import train_weak_policy, write_starts
-from wm_nodes.learning.pretraining import load_arrays, make_model, shipped_model
+from wm_nodes.learning.pretraining import load_arrays, make_model
 from wm_nodes.learning.statistics import paired_difference, wilson_interval
 from wm_nodes.reports import Rate, Summary, machine_facts, results_table, write_report, write_summary
 from wm_nodes.ros import arguments as launch_arguments

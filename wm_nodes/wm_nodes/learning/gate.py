@@ -63,11 +63,11 @@ class GateReport:
         return tuple(criterion.name for criterion in self.criteria if not criterion.passed)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, numbers that are not finite as None; with `passed`."""
+        """Plain values for JSON, numbers that are not finite as None; with `passed` and `failed`."""
         values = asdict(self)
         values["criteria"] = [{**row, "value": _finite(row["value"])} for row in values["criteria"]]
         values["metrics"] = {name: _finite(value) for name, value in self.metrics.items()}
-        return {**values, "passed": self.passed}
+        return {**values, "passed": self.passed, "failed": list(self.failed)}
 
     def table(self) -> Table:
         """The criteria for the terminal; remedies where they failed."""
@@ -141,7 +141,7 @@ def criteria_of(
     for kind, threshold, remedy in (
         ("precision", gate.done_precision, MORE_NEAR_MISSES), ("recall", gate.done_recall, MORE_SUCCESSES),
     ):  # fmt: skip
-        value = metrics[f"done_{task}_{kind}"]
+        value = float(metrics[f"done_{task}_{kind}"])
         criteria.append(Criterion(f"done {kind} on rollouts", value, threshold, ">=", value >= threshold, remedy))
     if not gate.require_success_agreement:
         notes.append("Agreement of imagined and real success was not asked for (gate.require_success_agreement).")
@@ -157,16 +157,16 @@ def _agreement(imagined: tuple[int, int], real: tuple[int, int]) -> Criterion:
     gap = imagined[0] / imagined[1] - real[0] / real[1]
     name = f"SFT policy: imagined {imagined[0]}/{imagined[1]} - real {real[0]}/{real[1]} success"
     rule = f"0 inside its 95 % interval, {low:+.2f} to {high:+.2f}"
-    return Criterion(name, gap, None, rule, low <= 0 <= high, POLICY_DATA)
+    return Criterion(name, gap, None, rule, bool(low <= 0 <= high), POLICY_DATA)
 
 
 def _below(name: str, value: float, threshold: float) -> Criterion:
-    return Criterion(name, value, threshold, "<=", value <= threshold, MORE_TRAINING)
+    return Criterion(name, float(value), threshold, "<=", bool(value <= threshold), MORE_TRAINING)
 
 
 def _at(metrics: Mapping[str, float], name: str, step: int) -> float:
     """The metric at a step; NaN where no episode was that long."""
-    return metrics.get(f"{name}_h{step:02d}", float("nan"))
+    return float(metrics.get(f"{name}_h{step:02d}", float("nan")))
 
 
 def _check(models: WorldModels, heldout: EpisodeArrays, task: str) -> None:
@@ -185,4 +185,4 @@ def _check(models: WorldModels, heldout: EpisodeArrays, task: str) -> None:
 
 
 def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return float(value) if math.isfinite(value) else None

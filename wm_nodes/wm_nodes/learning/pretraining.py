@@ -2,7 +2,6 @@
 
 import platform
 from datetime import date
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, TRAINING_SEEDS, collect_heldout_data, collect_training_data
 from wm_nodes.learning.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.learning.gate import model_metrics
-from wm_nodes.learning.text_model_training import train_text_model
+from wm_nodes.learning.text_model_training import DEMONSTRATORS, train_text_model
 from wm_nodes.learning.tokenizer_training import train_tokenizer
 from wm_nodes.learning.world_model_training import tokenise_episodes, train_action_model
 from wm_nodes.recording import read_episodes
@@ -21,19 +20,6 @@ from wm_nodes.world_model import WorldModels, load_model_folder, save_model_fold
 
 MODEL_TASKS = {"reach": ("reach", "push_cube"), "push_cube": ("reach", "push_cube"), "pull_cube": ("pull_cube",)}
 """Tasks that one world model serves, because they share a scene: one done output each."""
-SHIPPED = {"reach": "push_cube", "push_cube": "push_cube"}
-
-
-def shipped_model(task: str) -> Path:
-    """The world model in the package for `task`.
-
-    Raises:
-        FileNotFoundError: none is shipped.
-    """
-    folder = Path(str(resources.files("wm_nodes"))) / "pretrained" / SHIPPED.get(task, task)
-    if not (folder / "manifest.json").is_file():
-        raise FileNotFoundError(f"no world model is shipped for task {task!r}; train one: online_rl.py --from-scratch")
-    return folder
 
 
 def load_arrays(bags: list[Path], config: RunConfig) -> EpisodeArrays:
@@ -47,7 +33,6 @@ def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, comma
     folder = run_dir / "model"
     if (folder / "manifest.json").exists():
         return folder
-    torch.set_num_threads(config.world_model.num_threads)
     bags = collect_training_data(config, run_dir / "data" / "train", progress=progress)
     heldout_bags = collect_heldout_data(config, run_dir / "data" / "heldout", progress=progress)
     episodes = load_arrays(bags, config)
@@ -55,8 +40,10 @@ def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, comma
     data = tokenise_episodes(tokenizer, episodes)
     action, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir, progress=progress)
     texts = tuple(instruction(task) for task in MODEL_TASKS[config.task])
+    golden = episodes.select([i for i, behaviour in enumerate(episodes.behaviours) if behaviour in DEMONSTRATORS])
+    golden_data = tokenise_episodes(tokenizer, golden)
     text, text_metrics = train_text_model(
-        tokenizer, action, episodes, data, texts, config, config.seed, run_dir, progress=progress
+        tokenizer, action, golden, golden_data, texts, config, config.seed, run_dir, progress=progress
     )
     story: dict[str, Any] = {
         "made": {

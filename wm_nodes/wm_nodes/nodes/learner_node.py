@@ -19,6 +19,7 @@ from wm_msgs.msg import EnvSpec, ErrorCode, LearnerMetrics, PolicyVersion, Rewar
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
 from wm_nodes.learning.distributed import Ranks, join
+from wm_nodes.learning.metrics import MetricsWriter
 from wm_nodes.learning.rollouts import Canceled
 from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, load_weights
 from wm_nodes.nodes.backends import existing, make_learner, make_policy
@@ -82,6 +83,8 @@ class LearnerNode(ManagedNode):
             keep_versions=int(self.param("keep_versions")), metadata={"tokenizer_sha256": policy.encoder.sha256},
             ranks=self._ranks,
         )  # fmt: skip
+        self._written = MetricsWriter(self.run_dir, tensorboard=False)
+        self.own(self._written.close)
         self._spec: EnvironmentSpec | None = None
         self._joiner = RolloutJoiner()
         self._versions = self.publish_on("policy/version")
@@ -277,6 +280,9 @@ class LearnerNode(ManagedNode):
         message.names = list(extras)[:64]
         message.values = [extras[name] for name in message.names]
         self._metrics.publish(message)
+        counts = ("mean_return", "success_rate", "dropped_invalid", "dropped_gap", "dropped_stale")
+        scalars = {**metrics, "samples_per_s": samples_per_s, **{name: getattr(progress, name) for name in counts}}
+        self._written.write("ppo", progress.updates, scalars)
 
     # Callbacks.
 

@@ -4,10 +4,10 @@ import os
 import sys
 from collections.abc import Mapping
 from datetime import datetime
-from importlib import resources
 from pathlib import Path
 
 from wm_nodes.config.load import dump_config, load_config
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.ros.graph import Graph, GraphError, build_graph, compose, parse_arguments
 
 
@@ -72,13 +72,10 @@ def _model_dir(given: str, task: str) -> str:
                 f"model_dir {str(folder)!r} holds no manifest.json; give the folder of a trained world model"
             )
         return str(folder)
-    shipped = Path(str(resources.files("wm_nodes"))) / "pretrained" / task
-    if not shipped.is_dir():
-        raise GraphError(
-            f"no world model is shipped for task {task!r}; train one (python3 launch_scripts/online_rl.py "
-            f"--from-scratch --task {task}) and give model_dir:=<run folder>/model"
-        )
-    return str(shipped)
+    try:
+        return str(shipped_model(task))
+    except FileNotFoundError as error:
+        raise GraphError(str(error)) from None
 
 
 def _bag_uri(given: str, scenario: str, run_dir: Path) -> str:

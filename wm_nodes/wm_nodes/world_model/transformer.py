@@ -51,11 +51,13 @@ class RingCache(TemporalCache):
     """Fixed memory for inference, one frame at a time; each of the B environments has its own time.
 
     A frame is kept in slot (its time mod window), and attention always runs over every slot, so an environment's
-    numbers do not depend on when the others were reset.
+    numbers do not depend on when the others were reset. While `peeking`, a frame is seen but its slot is written again by
+    the next one: for trying drafts of a frame before the final one.
     """
 
     def __init__(self, window: int) -> None:
         self._window = window
+        self.peeking = False
         self._keys: Tensor | None = None
         self._values: Tensor | None = None
         self.times_B: Tensor | None = None
@@ -85,7 +87,8 @@ class RingCache(TemporalCache):
         self._keys[rows, slots] = keys_BTSHE[:, 0]
         self._values[rows, slots] = values_BTSHE[:, 0]
         filled = torch.arange(self._window, device=keys_BTSHE.device) <= self.times_B.unsqueeze(1)
-        self.times_B = self.times_B + 1
+        if not self.peeking:
+            self.times_B = self.times_B + 1
         return self._keys, self._values, filled.unsqueeze(1)
 
 

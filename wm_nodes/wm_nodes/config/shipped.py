@@ -1,0 +1,24 @@
+"""The world models inside the package. Standard library only: launch files ask before torch is needed."""
+
+import json
+from importlib import resources
+from pathlib import Path
+
+
+def shipped_model(task: str) -> Path:
+    """The folder of the shipped world model that knows `task`.
+
+    Raises:
+        FileNotFoundError: none does; says how to train one.
+    """
+    base = Path(str(resources.files("wm_nodes"))) / "pretrained"
+    known: list[str] = []
+    for manifest in sorted(base.glob("*/manifest.json")):
+        tasks = json.loads(manifest.read_text())["tasks"]
+        if task in tasks:
+            return manifest.parent
+        known += tasks
+    raise FileNotFoundError(
+        f"no world model is shipped for task {task!r} (shipped: {', '.join(known) or 'none'}); train one with "
+        f"`python3 launch_scripts/online_rl.py --from-scratch --task {task}` and name its folder <run>/model"
+    )
