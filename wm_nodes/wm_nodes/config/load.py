@@ -1,4 +1,4 @@
-"""Presets: base.yaml holds every number, other presets override some of them, the command line overrides those."""
+"""Presets: base.yaml holds every number; task, preset and command line override some of them, in this order."""
 
 from importlib import resources
 from pathlib import Path
@@ -9,6 +9,9 @@ from pydantic import ValidationError
 
 from wm_nodes.config.schema import RunConfig
 
+TASK_PREFIX = "task_"
+"""presets/task_<name>.yaml holds what differs between tasks; it lies between base and the preset."""
+
 
 class ConfigError(ValueError):
     """A setting or preset that does not exist or is out of range."""
@@ -16,7 +19,8 @@ class ConfigError(ValueError):
 
 def preset_names() -> list[str]:
     folder = resources.files("wm_nodes.config") / "presets"
-    return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    names = (Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return sorted(name for name in names if not name.startswith(TASK_PREFIX))
 
 
 def load_config(preset: str = "cpu", overrides: dict[str, Any] | None = None) -> RunConfig:
@@ -30,8 +34,11 @@ def load_config(preset: str = "cpu", overrides: dict[str, Any] | None = None) ->
         ConfigError: names the value, what is allowed, and where to look.
     """
     values = _read_preset("base")
+    chosen = _read_preset(preset)
+    task = (overrides or {}).get("task", chosen.get("task", values["task"]))
+    _merge(values, _read_task(task))
     if preset != "base":
-        _merge(values, _read_preset(preset))
+        _merge(values, chosen)
     for dotted, value in (overrides or {}).items():
         _set_dotted(values, dotted, value)
     try:
@@ -65,6 +72,11 @@ def _read_preset(name: str) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ConfigError(f"preset {name!r} must be a YAML mapping")
     return values
+
+
+def _read_task(task: Any) -> dict[str, Any]:
+    path = resources.files("wm_nodes.config") / "presets" / f"{TASK_PREFIX}{task}.yaml"
+    return (yaml.safe_load(path.read_text()) or {}) if path.is_file() else {}
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any]) -> None:

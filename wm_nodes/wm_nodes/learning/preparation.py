@@ -8,6 +8,7 @@ import torch
 from safetensors.torch import save
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.learning.collecting import collect_plan, demonstration_plan, first_frames_plan
 from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.policies import make_policy, make_reconstruct
 from wm_nodes.learning.sft import demonstrations, train_sft
@@ -17,6 +18,9 @@ from wm_nodes.recording import read_episodes
 from wm_nodes.types import Episode
 
 MAX_STARTS = 512
+NUM_STARTS = 256
+DEMONSTRATION_SEEDS, START_SEEDS = 600_000, 700_000
+SEEDS_PER_RUN = 1000
 
 
 def write_starts(bags: Iterable[Path], path: Path) -> int:
@@ -46,3 +50,23 @@ def train_weak_policy(config: RunConfig, model_dir: Path, demo_bags: Iterable[Pa
     train_sft(policy, demos, config.sft, config.seed, reconstruct=make_reconstruct(model_dir))
     save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
     return policy
+
+
+def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Path, Path]:
+    """Demonstrations, first frames and the weak policy of a run: (starts.safetensors, policies/weak.safetensors).
+
+    What is there already is kept.
+    """
+    spare = max(3, config.sft.num_demonstrations // 3)
+    plan = demonstration_plan(
+        config, config.sft.num_demonstrations + spare, DEMONSTRATION_SEEDS + SEEDS_PER_RUN * config.seed
+    )
+    demos = collect_plan(plan, config, run_dir / "bags" / "demos")
+    starts = run_dir / "starts.safetensors"
+    if not starts.exists():
+        first_frames = first_frames_plan(config, NUM_STARTS, START_SEEDS)
+        write_starts(collect_plan(first_frames, config, run_dir / "bags" / "starts"), starts)
+    weak = run_dir / "policies" / "weak.safetensors"
+    if not weak.exists():
+        train_weak_policy(config, model_dir, demos, weak)
+    return starts, weak

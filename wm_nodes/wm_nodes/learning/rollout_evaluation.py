@@ -8,6 +8,7 @@ first frame is measured in the same way.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from wm_nodes.learning.tokenizer_training import probe_targets
 from wm_nodes.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import ActionModel, done_signal
 from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
 
 HORIZONS = (1, 2, 4, 8, 12, 16)
@@ -44,7 +46,9 @@ class ImaginedEpisodes:
 
 
 @torch.inference_mode()
-def imagine_episodes(tokenizer: Tokenizer, model: ActionModel, episodes: EpisodeArrays) -> ImaginedEpisodes:
+def imagine_episodes(
+    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays
+) -> ImaginedEpisodes:
     """Roll the recorded actions out from the recorded first frames, in batches."""
     parts = [
         _imagine_batch(tokenizer, model, episodes.select(range(i, min(i + BATCH, len(episodes)))))
@@ -54,19 +58,17 @@ def imagine_episodes(tokenizer: Tokenizer, model: ActionModel, episodes: Episode
 
 
 def _imagine_batch(
-    tokenizer: Tokenizer, model: ActionModel, episodes: EpisodeArrays
+    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays
 ) -> tuple[UInt8Array, FloatArray, FloatArray, FloatArray]:
     actions, states = torch.from_numpy(episodes.actions), torch.from_numpy(episodes.states)
-    current = tokenizer.encode(episodes.images[:, 0]).unsqueeze(1)
+    current = tokenizer.encode(episodes.images[:, 0])
     caches = model.trunk.new_ring_caches(len(episodes), current.device)
     frames, signals, spreads, positions = list[Tensor](), list[Tensor](), list[Tensor](), list[Tensor]()
     for t in range(episodes.num_steps):
         with compute_context(current.device):
-            now = slice(t, t + 1)
-            prediction = model(current, actions[:, now], states[:, now], states[:, t + 1 : t + 2], caches)
-        current = tokenizer.normalise(current + prediction.change_BTSD)
-        signal, spread = done_signal(prediction.done_logits_BTKJ[:, 0])
-        image = tokenizer.decode(current[:, 0])
+            current, logits = model.advance(current, actions[:, t], states[:, t], states[:, t + 1], caches)
+        signal, spread = done_signal(logits)
+        image = tokenizer.decode(current)
         frames.append(image)
         signals.append(signal)
         spreads.append(spread)
@@ -76,7 +78,7 @@ def _imagine_batch(
 
 
 def evaluate_rollouts(
-    tokenizer: Tokenizer, model: ActionModel, episodes: EpisodeArrays, *, threshold: float = 0.7
+    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays, *, threshold: float = 0.7
 ) -> dict[str, float]:
     """Metrics by name (see docs/metrics.md); positions in cm, PSNR in dB, `_hNN` at step NN.
 
@@ -104,7 +106,8 @@ def evaluate_rollouts(
     for j, task in enumerate(episodes.tasks):
         happened = (episodes.success[:, 1:, j] & frame_mask).any(1)
         signal = np.where(frame_mask, imagined.signals[..., j], 0).max(1)
-        metrics |= {f"done_{task}_{key}": value for key, value in detection_metrics(signal, happened, threshold).items()}
+        found = detection_metrics(signal, happened, threshold)
+        metrics |= {f"done_{task}_{key}": value for key, value in found.items()}
         metrics[f"done_{task}_uncertainty_p99"] = float(np.quantile(imagined.uncertainty[..., j][frame_mask], 0.99))
     return metrics
 
@@ -123,7 +126,7 @@ def detection_metrics(scores: FloatArray, positive: BoolArray, threshold: float)
     }
 
 
-def auc(scores: NDArray[np.floating], positive: BoolArray) -> float:
+def auc(scores: NDArray[np.floating[Any]], positive: BoolArray) -> float:
     """Probability that a positive outscores a negative, ties counting half; NaN without both kinds."""
     if positive.all() or not positive.any():
         return float("nan")
@@ -189,5 +192,5 @@ def _read_frames(tokenizer: Tokenizer, images_ETHW3: UInt8Array) -> FloatArray:
     return positions
 
 
-def _mean(values: NDArray[np.floating]) -> float:
+def _mean(values: NDArray[np.floating[Any]]) -> float:
     return float(values.mean()) if len(values) else float("nan")

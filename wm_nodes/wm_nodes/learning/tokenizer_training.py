@@ -80,9 +80,8 @@ def train_tokenizer(
         terms["psnr_db"] = -10 * error.detach().square().mean().log10()
         return terms
 
-    loop = TrainingLoop(
-        "tokenizer", codec, LoopSettings(settings.num_iterations, settings.learning_rate, max_seconds=max_seconds), run_dir
-    )
+    schedule = LoopSettings(settings.num_iterations, settings.learning_rate, max_seconds=max_seconds)
+    loop = TrainingLoop("tokenizer", codec, schedule, run_dir)
     metrics = loop.run(loss, progress=progress)
     return codec, metrics
 

@@ -18,6 +18,7 @@ from wm_nodes.learning.episode_arrays import EpisodeArrays
 from wm_nodes.learning.tokenizer_training import probe_loss, probe_targets
 from wm_nodes.learning.training_loop import LoopSettings, TrainingLoop
 from wm_nodes.seeding import numpy_stream, torch_stream
+from wm_nodes.world_model.conditions import ActionCondition
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.tokenizer import Tokenizer
@@ -33,7 +34,11 @@ ENCODING_BATCH = 256
 
 @dataclass(frozen=True)
 class LatentEpisodes:
-    """Tokenised episodes. latents: float16 (E, T + 1, S, D). token_weight: float32 (S,) mean change of each token."""
+    """Tokenised episodes.
+
+    latents: float16 (E, T + 1, S, D). mean_change_S: float32 (S,), mean absolute change of each token since the first
+    frame. states, actions, success, step_mask: as in EpisodeArrays. truth: float32 (E, T + 1, P), m.
+    """
 
     latents: Tensor
     mean_change_S: Tensor
@@ -59,7 +64,7 @@ def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEp
     """Encode every frame once; training never touches pixels again."""
     flat = episodes.images.reshape(-1, *episodes.images.shape[2:])
     pieces = [tokenizer.encode(flat[i : i + ENCODING_BATCH]).half() for i in range(0, len(flat), ENCODING_BATCH)]
-    latents = torch.cat(pieces).clone().unflatten(0, episodes.images.shape[:2])
+    latents = torch.cat(pieces).clone().reshape(*episodes.images.shape[:2], *pieces[0].shape[1:])
     change = (latents[:, 1:].float() - latents[:, :1].float()).abs().mean(-1).mean((0, 1))
     return LatentEpisodes(
         latents=latents,
@@ -127,10 +132,15 @@ def new_action_model(tokenizer: Tokenizer, data: LatentEpisodes, config: RunConf
             state_dim=data.states.shape[-1],
             num_tasks=data.success.shape[-1],
         )
-    states = data.states.flatten(0, 1)
-    model.condition.state_mean.copy_((states.amax(0) + states.amin(0)) / 2)
-    model.condition.state_scale.copy_(((states.amax(0) - states.amin(0)) / 2).clamp_min(1e-3))
+    fit_state_range(model.condition, data)
     return model
+
+
+def fit_state_range(condition: ActionCondition, data: LatentEpisodes) -> None:
+    """Let the condition's states span [-1, 1] over the data."""
+    states = data.states.flatten(0, 1)
+    condition.state_mean.copy_((states.amax(0) + states.amin(0)) / 2)
+    condition.state_scale.copy_(((states.amax(0) - states.amin(0)) / 2).clamp_min(1e-3))
 
 
 def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> int:

@@ -90,4 +90,4 @@ def choose_codes(
 
 def code_targets(bits: Tensor) -> tuple[Tensor, ...]:
     """Indices (...,) of the parts of codes given as bits (..., D): the targets of the cross-entropies."""
-    return tuple(bits_to_indices(part) for part in bits.split(code_parts(bits.shape[-1]), -1))
+    return tuple(bits_to_indices(part) for part in torch.split(bits, list(code_parts(bits.shape[-1])), -1))

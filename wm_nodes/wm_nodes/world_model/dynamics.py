@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from wm_nodes.config.schema import WorldModelConfig
 from wm_nodes.world_model.conditions import ActionCondition
+from wm_nodes.world_model.tokenizer import normalise_tokens
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer, TemporalCache
 
 Caches = list[TemporalCache] | list[RingCache]
@@ -96,6 +97,20 @@ class ActionModel(FrameModel):
         caches: Caches | None = None,
     ) -> Prediction:
         return self.predict(latents_BTSD, self.condition(actions_BTA, states_BTP, next_states_BTP), caches)
+
+    def advance(
+        self,
+        latents_NSD: Tensor,
+        actions_NA: Tensor,
+        states_NP: Tensor,
+        next_states_NP: Tensor,
+        caches: list[RingCache],
+    ) -> tuple[Tensor, Tensor]:
+        """One environment step: latents (N, S, D) of the next frame and its done logits (N, K, J)."""
+        prediction = self(
+            latents_NSD[:, None], actions_NA[:, None], states_NP[:, None], next_states_NP[:, None], caches
+        )
+        return normalise_tokens(latents_NSD + prediction.change_BTSD[:, 0]), prediction.done_logits_BTKJ[:, 0]
 
 
 def done_signal(done_logits_BKJ: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from wm_nodes.config.schema import SimulationConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.text import TextModel
+from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 
 MANIFEST = "manifest.json"
@@ -31,7 +32,7 @@ class WorldModels:
     """tasks: the done head's outputs, in order. text is None where no text model was trained."""
 
     tokenizer: Tokenizer
-    action: ActionModel
+    action: ActionModel | TokenActionModel
     text: TextModel | None
     tasks: tuple[str, ...]
     simulation: SimulationConfig
@@ -55,7 +56,7 @@ class WorldModels:
 def save_model_folder(
     folder: Path,
     tokenizer: Tokenizer,
-    action: ActionModel,
+    action: ActionModel | TokenActionModel,
     text: TextModel | None,
     *,
     tokenizer_config: TokenizerConfig,
@@ -105,7 +106,7 @@ def load_model_folder(folder: Path) -> WorldModels:
     num_tasks = len(manifest["tasks"])
     tokenizer = Tokenizer(tokenizer_config, manifest["height"], manifest["width"])
     sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim}
-    action = ActionModel(
+    action = action_model_class(tokenizer_config.kind)(
         config, action_dim=manifest["action_dim"], state_dim=manifest["state_dim"], num_tasks=num_tasks, **sizes
     )
     _load(folder, "tokenizer", tokenizer, manifest)
@@ -116,6 +117,11 @@ def load_model_folder(folder: Path) -> WorldModels:
         _load(folder, "text", text, manifest)
     simulation = SimulationConfig.model_validate(manifest["simulation"])
     return WorldModels(tokenizer, action, text, tuple(manifest["tasks"]), simulation, manifest)
+
+
+def action_model_class(kind: str) -> type[ActionModel] | type[TokenActionModel]:
+    """The action model that goes with a tokenizer of `kind`."""
+    return TokenActionModel if kind == "lfq" else ActionModel
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

@@ -45,8 +45,8 @@ class ImaginedEnvironment:
     """
 
     def __init__(
-        self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig, *,
-        num_envs: int, seed: int = 0, with_goals: bool = True, exact: bool = False,
+        self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
+        *, num_envs: int, seed: int = 0, with_goals: bool = True, exact: bool = False,
     ) -> None:  # fmt: skip
         self.spec = replace(
             spec, env_id=f"wm/{spec.task}", source=SOURCE_IMAGINED, num_envs=num_envs, ground_truth_names=(),
@@ -133,15 +133,14 @@ class ImaginedEnvironment:
         """Next latents (N, S, D), done signal (N,) and disagreement (N,)."""
         tokenizer = self._models.tokenizer
         with compute_context(tokenizer.device, exact=self._exact):
-            prediction = self._models.action(
-                self._latents.unsqueeze(1),
-                torch.from_numpy(actions).unsqueeze(1),
-                torch.from_numpy(self._states).unsqueeze(1),
-                torch.from_numpy(moved).unsqueeze(1),
+            latents, logits = self._models.action.advance(
+                self._latents,
+                torch.from_numpy(actions),
+                torch.from_numpy(self._states),
+                torch.from_numpy(moved),
                 self._caches,
             )
-        latents = tokenizer.normalise(self._latents + prediction.change_BTSD[:, 0])
-        signal, spread = done_signal(prediction.done_logits_BTKJ[:, 0])
+        signal, spread = done_signal(logits)
         if not torch.isfinite(latents).all():
             raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
         return latents, signal[:, self._task].numpy(), spread[:, self._task].numpy()

@@ -9,7 +9,7 @@ import torch
 
 @cache
 def cpu_has_fast_bfloat16() -> bool:
-    """True where the processor multiplies bfloat16 in hardware (avx512_bf16 or AMX): about twice the speed of float32."""
+    """True where the processor multiplies bfloat16 in hardware (avx512_bf16 or AMX), at about twice the speed."""
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 

@@ -80,7 +80,8 @@ class ImaginedGoals:
     @property
     def goals(self) -> UInt8Array:
         """(B, H, W, 3)"""
-        return self.frames[np.arange(len(self.frames)), self.lengths - 1]
+        chosen: UInt8Array = self.frames[np.arange(len(self.frames)), self.lengths - 1]
+        return chosen
 
 
 @torch.inference_mode()

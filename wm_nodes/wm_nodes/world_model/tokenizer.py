@@ -4,6 +4,9 @@ Shapes: B batch, H W 3 image, S tokens per frame = (H / patch) (W / patch), row 
 ground-truth values.
 """
 
+from itertools import pairwise
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -17,6 +20,11 @@ PROBE_NAMES = ("cube_x", "cube_y", "tool_x", "tool_y", "tool_z", "goal_x", "goal
 """Ground-truth values that the state probe reads off a frame's latents, by their names in GROUND_TRUTH_NAMES."""
 
 
+def normalise_tokens(latents: Tensor) -> Tensor:
+    """Zero mean and unit variance over the last axis, float32: the set that a continuous encoder reaches."""
+    return F.layer_norm(latents.float(), latents.shape[-1:])
+
+
 class ResidualConv(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -26,7 +34,8 @@ class ResidualConv(nn.Module):
         nn.init.zeros_(self.outer.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.outer(F.silu(self.inner(x)))
+        change: Tensor = self.outer(F.silu(self.inner(x)))
+        return x + change
 
 
 class Tokenizer(nn.Module):
@@ -55,13 +64,13 @@ class Tokenizer(nn.Module):
         channels = [max(16, int(config.width * factor)) for factor in (0.375, 0.75, 1.0, 1.0, 1.0)][:levels]
         channels[-1] = config.width
         down: list[nn.Module] = [nn.PixelUnshuffle(4), nn.Conv2d(48, channels[0], 3, padding=1), nn.SiLU()]
-        for previous, current in zip(channels, channels[1:], strict=False):
+        for previous, current in pairwise(channels):
             down += [nn.PixelUnshuffle(2), nn.Conv2d(4 * previous, current, 1), nn.SiLU(), ResidualConv(current)]
         down += [ResidualConv(channels[-1]) for _ in range(config.depth)]
         self.encoder = nn.Sequential(*down, nn.Conv2d(channels[-1], config.latent_dim, 1))
         up: list[nn.Module] = [nn.Conv2d(config.latent_dim, channels[-1], 3, padding=1), nn.SiLU()]
         up += [ResidualConv(channels[-1]) for _ in range(config.depth)]
-        for previous, current in zip(channels[::-1], channels[::-1][1:], strict=False):
+        for previous, current in pairwise(channels[::-1]):
             up += [nn.Conv2d(previous, 4 * current, 1), nn.PixelShuffle(2), nn.SiLU(), ResidualConv(current)]
         self.decoder = nn.Sequential(*up, nn.Conv2d(channels[0], 48, 3, padding=1), nn.PixelShuffle(4))
         self.probe = nn.Sequential(
@@ -85,12 +94,13 @@ class Tokenizer(nn.Module):
 
     def normalise(self, latents: Tensor) -> Tensor:
         """Bring latents (..., D) back onto the set that the encoder reaches; the identity on its own output (lfq)."""
-        return F.layer_norm(latents.float(), (self.latent_dim,)) if self.kind == "continuous" else latents
+        return normalise_tokens(latents) if self.kind == "continuous" else latents
 
     def features(self, pixels_B3HW: Tensor) -> Tensor:
         """Encoder output (B, S, D) before normalisation or quantisation; pixels float in [0, 1]."""
         centred = (pixels_B3HW - self.background) * 2
-        return self.encoder(centred.contiguous(memory_format=torch.channels_last)).flatten(2).transpose(1, 2).float()
+        grid: Tensor = self.encoder(centred.contiguous(memory_format=torch.channels_last))
+        return grid.flatten(2).transpose(1, 2).float()
 
     def bottleneck(self, features_BSD: Tensor) -> Tensor:
         """Latents (B, S, D): normalised values, or signs with the straight-through gradient."""
@@ -116,7 +126,7 @@ class Tokenizer(nn.Module):
         Raises:
             ValueError: another dtype or shape.
         """
-        tensor = torch.as_tensor(images)
+        tensor = images if isinstance(images, Tensor) else torch.from_numpy(np.require(images, requirements=["C", "W"]))
         expected = (self.height, self.width, 3)
         if tensor.dtype != torch.uint8 or tensor.ndim != 4 or tuple(tensor.shape[1:]) != expected:
             raise ValueError(

@@ -51,8 +51,8 @@ class RingCache(TemporalCache):
     """Fixed memory for inference, one frame at a time; each of the B environments has its own time.
 
     A frame is kept in slot (its time mod window), and attention always runs over every slot, so an environment's
-    numbers do not depend on when the others were reset. While `peeking`, a frame is seen but its slot is written again by
-    the next one: for trying drafts of a frame before the final one.
+    numbers do not depend on when the others were reset. While `peeking`, a frame is seen but its slot is written again
+    by the next one: for trying drafts of a frame before the final one.
     """
 
     def __init__(self, window: int) -> None:
@@ -106,7 +106,7 @@ class Attention(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def heads(self, x: Tensor) -> Tensor:
-        return x.unflatten(-1, (self.num_heads, -1))
+        return x.view(*x.shape[:-1], self.num_heads, -1)
 
 
 class SpatialAttention(Attention):
@@ -129,8 +129,8 @@ class TemporalAttention(Attention):
         if x_BTSD.shape[1] == 1:
             mixed = _attend_one_frame(q_BTSHE, keys, values, mask)
         else:
-            permuted = (t.permute(0, 2, 3, 1, 4) for t in (q_BTSHE, keys, values))
-            mixed = attend(*permuted, mask=mask[:, None, None]).permute(0, 3, 1, 2, 4)
+            q, k, v = (t.permute(0, 2, 3, 1, 4) for t in (q_BTSHE, keys, values))
+            mixed = attend(q, k, v, mask[:, None, None]).permute(0, 3, 1, 2, 4)
         out: Tensor = self.out(mixed.flatten(3))
         return out
 
@@ -204,7 +204,8 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tenso
     scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
     if mask is not None:
         scores = scores.masked_fill(~mask, torch.finfo(scores.dtype).min)
-    return scores.softmax(-1) @ v
+    mixed: Tensor = scores.softmax(-1) @ v
+    return mixed
 
 
 def _attend_one_frame(q_B1SHE: Tensor, keys_BKSHE: Tensor, values_BKSHE: Tensor, mask_B1K: Tensor) -> Tensor:
@@ -212,7 +213,8 @@ def _attend_one_frame(q_B1SHE: Tensor, keys_BKSHE: Tensor, values_BKSHE: Tensor,
     scores_BKSH = ((q_B1SHE * q_B1SHE.shape[-1] ** -0.5) * keys_BKSHE).sum(-1)
     if not bool(mask_B1K.all()):
         scores_BKSH = scores_BKSH.masked_fill(~mask_B1K[:, 0, :, None, None], torch.finfo(scores_BKSH.dtype).min)
-    return (scores_BKSH.softmax(1).unsqueeze(-1) * values_BKSHE).sum(1, keepdim=True)
+    mixed: Tensor = (scores_BKSH.softmax(1).unsqueeze(-1) * values_BKSHE).sum(1, keepdim=True)
+    return mixed
 
 
 def _rotary_angles(time_BT: Tensor, num_values: int) -> tuple[Tensor, Tensor]:
