@@ -68,6 +68,18 @@ class TokenizerConfig(Section):
     """Extra weight of pixels that differ from the episode-independent background."""
 
 
+class RefreshConfig(Section):
+    """Second stage of the action model: full-horizon rollouts, with episodes of weak policies added to the data."""
+
+    num_iterations: NonNegativeInt
+    """0: no second stage."""
+    learning_rate: PositiveFloat
+    state_weight: NonNegativeFloat
+    done_weight: NonNegativeFloat
+    policy_episodes: NonNegativeInt
+    """Simulator episodes of each of three cloned policies (learning/pretraining.py), acting with exploration noise."""
+
+
 class WorldModelConfig(Section):
     width: PositiveInt
     depth: PositiveInt
@@ -89,6 +101,7 @@ class WorldModelConfig(Section):
     """Iterations of the text model, warm-started from the action model."""
     state_weight: NonNegativeFloat
     """Weight of the auxiliary loss that reads simulator positions off the predicted frame (0: off)."""
+    refresh: "RefreshConfig"
 
 
 class RewardConfig(Section):

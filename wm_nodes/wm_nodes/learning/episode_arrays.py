@@ -1,5 +1,4 @@
-"""Recorded episodes stacked for training. Shapes: E episodes, T steps of the longest, H W 3 image, J tasks, P truths.
-"""
+"""Recorded episodes stacked for training. Shapes: E episodes, T steps of the longest, H W 3 image, J tasks, P truths."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -56,6 +55,19 @@ class EpisodeArrays:
             self.lengths[index], self.tasks, tuple(self.instructions[i] for i in index),
             tuple(self.behaviours[i] for i in index),
         )  # fmt: skip
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["EpisodeArrays"]) -> "EpisodeArrays":
+        """All episodes of parts that have the same tasks and number of steps."""
+        if len({(part.tasks, part.num_steps) for part in parts}) != 1:
+            raise ValueError(f"parts differ in tasks or steps: {[(part.tasks, part.num_steps) for part in parts]}")
+        arrays = ("images", "states", "actions", "ground_truth", "success", "lengths")
+        return cls(
+            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays},
+            tasks=parts[0].tasks,
+            instructions=tuple(text for part in parts for text in part.instructions),
+            behaviours=tuple(text for part in parts for text in part.behaviours),
+        )
 
 
 def stack_episodes(
