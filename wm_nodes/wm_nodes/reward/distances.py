@@ -2,8 +2,9 @@
 Shapes: N pairs, H W 3 image, F features.
 """
 
+import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +12,9 @@ import torch
 from torch import Tensor
 
 from wm_nodes.types import FloatArray, UInt8Array
+
+CACHED_IMAGES = 1024
+BATCH = 32
 
 
 class Distance(Protocol):
@@ -42,11 +46,14 @@ class EncoderDistance:
 
     encoder: uint8 tensor (N, H, W, 3) -> (N, F). scale: the distance that counts as 1, see `calibrated`.
     identity: names the encoder, e.g. the start of its sha256.
+    Features of the last CACHED_IMAGES images are kept: goals come back every step, and one step's image is the next
+    step's first.
     """
 
     encoder: Callable[[Tensor], Tensor]
     scale: float = 1.0
     identity: str = ""
+    _known: dict[bytes, Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.scale) and self.scale > 0):
@@ -65,12 +72,28 @@ class EncoderDistance:
 
     def __call__(self, images: UInt8Array, others: UInt8Array) -> FloatArray:
         check_pair(images, others)
-        with torch.no_grad():
-            first_NF, second_NF = (
-                self.encoder(torch.from_numpy(np.ascontiguousarray(batch))).float() for batch in (images, others)
-            )
-            distance_N = (first_NF - second_NF).abs().flatten(1).mean(1) / self.scale
+        distance_N = (self._features(images) - self._features(others)).abs().flatten(1).mean(1) / self.scale
         return distance_N.cpu().numpy()
+
+    @torch.no_grad()
+    def _features(self, images: UInt8Array) -> Tensor:
+        keys = [hashlib.blake2b(image.tobytes(), digest_size=16).digest() for image in images]
+        new = list({key: index for index, key in enumerate(keys) if key not in self._known}.items())
+        if new:
+            for (key, _), feature in zip(new, self._encode(images[[index for _, index in new]]), strict=True):
+                self._known[key] = feature
+        found = torch.stack([self._known[key] for key in keys])
+        for key in list(self._known)[: max(0, len(self._known) - CACHED_IMAGES)]:
+            del self._known[key]
+        return found
+
+    def _encode(self, images: UInt8Array) -> Tensor:
+        """Features in batches of one size, the last one filled up: an image's features must not depend on how many
+        others were new, or a recorded reward could not be given again bit by bit."""
+        missing = -len(images) % BATCH
+        filled = np.concatenate([images, np.zeros((missing, *images.shape[1:]), np.uint8)])
+        parts = [self.encoder(torch.from_numpy(filled[i : i + BATCH])).float() for i in range(0, len(filled), BATCH)]
+        return torch.cat(parts)[: len(images)]
 
 
 def check_pair(images: UInt8Array, others: UInt8Array) -> None:
