@@ -112,8 +112,9 @@ def run(arguments: argparse.Namespace) -> Summary:
         imagined_steps_per_s=trained.samples / training_s if training_s else 0.0,
         bag=str(next(iter(sorted((run_dir / "bags").glob("training*"))), "")),
         paired=asdict(paired_difference(real_before.success.tolist(), real_after.success.tolist())),
+        imagined_paired=asdict(paired_difference(imagined_before.success.tolist(), imagined_after.success.tolist())),
         gate=gate.to_dict(), samples=trained.samples, minutes=(time.monotonic() - started) / 60,
-        command="python3 launch_scripts/online_rl.py " + " ".join(sys.argv[1:]), machine=machine_facts(),
+        command=_command(), machine=machine_facts(),
     )  # fmt: skip
     write_summary(run_dir, summary)
     pictures = write_pictures(run_dir, config, model_dir, load_policy(config, model_dir, final), HELDOUT_SEEDS)
@@ -121,6 +122,10 @@ def run(arguments: argparse.Namespace) -> Summary:
     console.print(results_table(summary))
     console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
     return summary
+
+
+def _command() -> str:
+    return "python3 launch_scripts/online_rl.py " + " ".join(sys.argv[1:])
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -176,7 +181,7 @@ class _Stages:
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: _Stages) -> Path:
     if arguments.from_scratch:
         stage(f"world model from scratch: {config.data.num_episodes} simulator episodes, tokenizer, dynamics")
-        return make_model(config, run_dir)
+        return make_model(config, run_dir, command=_command())
     model_dir = arguments.model_dir or shipped_model(config.task)
     stage(f"world model {model_dir}")
     return Path(model_dir).expanduser().absolute()
