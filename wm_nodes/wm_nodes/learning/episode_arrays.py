@@ -1,4 +1,4 @@
-"""Recorded episodes stacked for training. Shapes: E episodes, T steps of the longest, H W 3 image, J tasks, P truths."""
+"""Recorded episodes stacked for training. Shapes: E episodes, T steps, H W 3 image, J tasks, P truths."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

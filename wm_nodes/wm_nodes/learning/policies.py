@@ -116,6 +116,7 @@ def policy_actor(
     def act(observation: Observation, seed: int) -> FloatArray:
         action = policy.act(observation.image, observation.state).actions[0]
         draw = numpy_stream(seed, "exploration", int(observation.episode_step[0])).normal(0, noise, action.shape)
-        return np.clip(action + draw, -1, 1).astype(np.float32)
+        executed: FloatArray = np.clip(action + draw, -1, 1).astype(np.float32)
+        return executed
 
     return act

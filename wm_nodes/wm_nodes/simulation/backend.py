@@ -1,4 +1,4 @@
-"""Rendering device: a GPU where there is one, else Mesa's software device, which needs one repair of ManiSkill 3.0.1."""
+"""Rendering device: a GPU if there is one, else Mesa's software device, which needs one repair of ManiSkill 3.0.1."""
 
 import functools
 

@@ -44,7 +44,8 @@ def sample_style(behaviour: str, rng: np.random.Generator) -> Style:
         case "noisy" | "hover_noisy":
             return Style(noise=rng.uniform(0.1, 0.8), lateral_m=rng.normal(0, 0.008), speed=rng.uniform(0.5, 1.0))
         case "near_miss":
-            return Style(lateral_m=sign * rng.uniform(0.015, 0.06), noise=rng.uniform(0, 0.25), speed=rng.uniform(0.6, 1))
+            lateral_m = sign * rng.uniform(0.015, 0.06)
+            return Style(lateral_m=lateral_m, noise=rng.uniform(0, 0.25), speed=rng.uniform(0.6, 1))
         case "over":
             return Style(height_m=rng.uniform(0.015, 0.07), lateral_m=rng.normal(0, 0.01), noise=rng.uniform(0, 0.3))
         case "short":

@@ -20,12 +20,12 @@ from wm_nodes.seeding import numpy_stream
 from wm_nodes.simulation.environment import ManiSkillEnvironment
 from wm_nodes.simulation.episodes import planned_episode, record_episode, scripted_episode
 from wm_nodes.simulation.planner import DemonstrationPlanner, PlanningError
-from wm_nodes.types import Episode, Observation
+from wm_nodes.types import Episode, FloatArray, Observation
 
 EPISODES_PER_SHARD = 50
 MPLIB_BEHAVIOUR = "expert"
 
-PolicyAct = Callable[[Observation, int], np.ndarray[tuple[int], np.dtype[np.float32]]]
+PolicyAct = Callable[[Observation, int], FloatArray]
 """(observation of one slot, episode seed) -> action (A,)."""
 
 
@@ -123,8 +123,10 @@ def _policy_episodes(env: ManiSkillEnvironment, plan: CollectionPlan) -> Callabl
 
     def act_episode(seed: int, episode_id: int) -> Episode:
         env.reset(seeds=np.array([seed], np.uint64))
-        return record_episode(
-            env, lambda observation, _: policy(observation, seed), plan.policy_label, seed, episode_id, plan.policy_version
-        )
+
+        def act(observation: Observation, _truth: FloatArray) -> FloatArray:
+            return policy(observation, seed)
+
+        return record_episode(env, act, plan.policy_label, seed, episode_id, plan.policy_version)
 
     return act_episode

@@ -24,7 +24,7 @@ GRIPPER_CLOSED = -1.0
 class ManiSkillEnvironment:
     """The simulator. A state is the commanded tool position in the robot base frame, m.
 
-    end_on_success=False lets an episode go on to the step limit: data for a done head, which needs frames after success.
+    end_on_success=False lets an episode go on to the step limit: a done head needs frames after success.
     """
 
     def __init__(

@@ -58,7 +58,8 @@ class DemonstrationPlanner:
             for position in result["position"]:
                 joints = np.concatenate([position, joints[len(position) :]])
                 tools.append(self._forward_kinematics(joints))
-        return np.stack(tools).astype(np.float32)
+        path: FloatArray = np.stack(tools).astype(np.float32)
+        return path
 
     def _forward_kinematics(self, joints: np.ndarray[tuple[int], np.dtype[np.float64]]) -> FloatArray:
         model = self._planner.pinocchio_model
@@ -75,6 +76,7 @@ def follow(path: FloatArray, max_action_m: float) -> Callable[[FloatArray], Floa
         tool = state + ROBOT_BASE
         while reached < len(path) - 1 and np.abs(path[reached + 1] - tool).max() <= max_action_m:
             reached += 1
-        return np.clip((path[reached] - tool) / max_action_m, -1, 1).astype(np.float32)
+        action: FloatArray = np.clip((path[reached] - tool) / max_action_m, -1, 1).astype(np.float32)
+        return action
 
     return act

@@ -5,6 +5,7 @@ place of the wooden table and the ground (visual only), arm links 0 to 6 not dra
 both views and cost two thirds of the rendering), and fingers closed from the start.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -90,7 +91,7 @@ def make_scene(scene: str, config: SimulationConfig) -> BaseEnv:
     return env.unwrapped
 
 
-def render(scene: BaseEnv, cameras: list[str]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+def render(scene: BaseEnv, cameras: Sequence[str]) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """Return uint8 (H, len(cameras) * W, 3), cameras side by side."""
     scene.scene.update_render()
     views = []
