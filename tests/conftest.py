@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from wm_nodes.ros.domain import DomainLock, first_free
+from wm_nodes.ros.environment import graph_environment
 
 ROOT = Path(__file__).resolve().parents[1]
 DOMAINS = range(91, 102)
@@ -23,6 +24,7 @@ def pytest_configure() -> None:
     global _session_lock
     _session_lock = first_free(DOMAINS, "a test run", group="test")
     os.environ["ROS_DOMAIN_ID"] = str(_session_lock.domain)
+    os.environ["AMENT_PREFIX_PATH"] = graph_environment()["AMENT_PREFIX_PATH"]
 
 
 def pytest_unconfigure() -> None:
@@ -48,7 +50,6 @@ def repository() -> Path:
 
 def pytest_sessionfinish() -> None:
     """Remove what killed processes left in /dev/shm; files of living processes are locked and stay."""
-    from wm_nodes.ros.environment import graph_environment
     from wm_nodes.ros.runner import clean_shared_memory
 
     clean_shared_memory(graph_environment())
