@@ -1,0 +1,53 @@
+from pathlib import Path
+
+import pytest
+
+from wm_nodes.config.load import ConfigError, dump_config, load_config, parse_override, preset_names
+from wm_nodes.config.shipped import shipped_model
+
+
+@pytest.mark.parametrize("preset", preset_names())
+@pytest.mark.parametrize("task", ["reach", "push_cube", "pull_cube"])
+def test_every_preset_resolves_for_every_task(preset: str, task: str) -> None:
+    assert load_config(preset, {"task": task}).task == task
+
+
+def test_the_command_line_wins_over_preset_and_task() -> None:
+    assert load_config("cpu", {"task": "reach"}).sft.num_demonstrations == 10
+    assert load_config("smoke", {"task": "reach"}).sft.num_demonstrations == 4
+    assert load_config("smoke", {"task": "reach", "sft.num_demonstrations": 7}).sft.num_demonstrations == 7
+
+
+def test_a_saved_configuration_comes_back_equal(tmp_path: Path) -> None:
+    config = load_config("smoke", {"seed": 3})
+    path = tmp_path / "config.yaml"
+    path.write_text(dump_config(config))
+    assert load_config(str(path)) == config
+
+
+@pytest.mark.parametrize(
+    ("preset", "overrides", "text"),
+    [
+        ("best", {}, r"unknown preset 'best'.*smoke"),
+        ("cpu", {"ppo.clip": -1}, r"ppo\.clip.*greater than 0.*-1"),
+        ("cpu", {"ppo.speed": 1}, r"unknown setting 'ppo\.speed'"),
+        ("cpu", {"task": "fly"}, r"task.*push_cube.*'fly'"),
+    ],
+)
+def test_a_wrong_preset_or_setting_is_one_clear_error(preset: str, overrides: dict[str, object], text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        load_config(preset, overrides)
+
+
+def test_an_override_without_a_value_says_what_it_expects() -> None:
+    assert parse_override("ppo.updates=3") == ("ppo.updates", 3)
+    with pytest.raises(ConfigError, match=r"section\.key=value"):
+        parse_override("ppo.updates")
+
+
+def test_the_shipped_model_is_found_by_task_and_its_files_are_small() -> None:
+    folder = shipped_model("reach")
+    assert folder == shipped_model("push_cube")
+    assert max(path.stat().st_size for path in folder.iterdir()) <= 5 * 2**20
+    with pytest.raises(FileNotFoundError, match=r"pull_cube.*--from-scratch"):
+        shipped_model("pull_cube")
