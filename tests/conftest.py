@@ -24,7 +24,8 @@ def pytest_configure() -> None:
     global _session_lock
     _session_lock = first_free(DOMAINS, "a test run", group="test")
     os.environ["ROS_DOMAIN_ID"] = str(_session_lock.domain)
-    os.environ["AMENT_PREFIX_PATH"] = graph_environment()["AMENT_PREFIX_PATH"]
+    environment = graph_environment()
+    os.environ.update({name: environment[name] for name in ("AMENT_PREFIX_PATH", "PATH")})
 
 
 def pytest_unconfigure() -> None:

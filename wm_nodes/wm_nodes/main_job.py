@@ -5,6 +5,7 @@ Every stage leaves its files in the run folder and is skipped when they are ther
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -79,6 +80,7 @@ def main(argv: Sequence[str]) -> int:
 def run(arguments: argparse.Namespace) -> Summary:
     """The whole job; see main."""
     started = time.monotonic()
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     config, run_dir = _open_run(arguments)
     stage = _Stages(started)
     stage(f"run folder {run_dir}")
@@ -189,7 +191,6 @@ def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stag
 
 def _imagine(config: RunConfig, model_dir: Path, starts: Path, policy: Path, stage: _Stages) -> EvaluationResult:
     """Success in the world model, without action noise, on IMAGINED_EPISODES starts."""
-    torch.set_num_threads(2)
     env = make_imagined_environment(config, model_dir, starts, num_envs=64, seed=config.seed)
     episodes = min(IMAGINED_EPISODES, 8 * config.evaluation.episodes)
     result = evaluate(load_policy(config, model_dir, policy), env, episodes, config.evaluation.first_seed)
@@ -198,8 +199,6 @@ def _imagine(config: RunConfig, model_dir: Path, starts: Path, policy: Path, sta
 
 
 def _operator(runner: Runner) -> Operator:
-    import os
-
     os.environ.update(runner.environment)
     return Operator(alive=runner.check)
 

@@ -43,6 +43,8 @@ def graph_environment(
     env.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROFILE))
     env.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
     env.setdefault("PYTHONUNBUFFERED", "1")
+    # Nodes take turns on few cores; a second thread that waits for a busy core costs more than it gives.
+    env.setdefault("OMP_NUM_THREADS", "1")
     env.setdefault("RCUTILS_COLORIZED_OUTPUT", "0")
     env.update(extra or {})
     return env
