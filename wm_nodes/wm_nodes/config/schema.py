@@ -181,15 +181,6 @@ class EvaluationConfig(Section):
     deterministic: bool
 
 
-class RoundsConfig(Section):
-    count: NonNegativeInt
-    """Online rounds after the first training: collect with the policy, refresh the model, continue."""
-    episodes: PositiveInt
-    """Simulator episodes per round."""
-    refresh_iterations: PositiveInt
-    updates: PositiveInt
-
-
 class RunConfig(Section):
     seed: NonNegativeInt
     task: TaskName
@@ -203,4 +194,3 @@ class RunConfig(Section):
     ppo: PpoConfig
     gate: GateConfig
     evaluation: EvaluationConfig
-    rounds: RoundsConfig

@@ -26,7 +26,7 @@ MORE_TRAINING = (
 )
 MORE_NEAR_MISSES = "collect more near misses (data.behaviours.near_miss), or raise reward.success_threshold"
 MORE_SUCCESSES = "collect more successes (data.behaviours), or lower reward.success_threshold"
-POLICY_DATA = "collect episodes of this policy and refresh the model with them (rounds.count)"
+POLICY_DATA = "refresh the model with more episodes of weak policies (world_model.refresh.policy_episodes)"
 
 
 @dataclass(frozen=True)
