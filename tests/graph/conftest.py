@@ -14,7 +14,7 @@ from graph.harness import Graph, Probe, own_domain
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Graph tests have deadlines, and these machines are shared: one repetition, which the closing report lists as R."""
+    """Graph tests have deadlines on shared machines: one repetition, which the closing report lists as R."""
     for item in items:
         if "graph" in item.path.parts:
             item.add_marker(pytest.mark.flaky(reruns=1))

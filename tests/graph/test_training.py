@@ -100,6 +100,8 @@ def test_training_from_the_recorded_bag_gives_the_weights_of_the_live_training(g
     graph.start("recorder")
     wait_until("the recorder", lambda: probe.value("/wm/recorder", "state") == "active", 60)
     graph.start_training_nodes()
+    for name in ("environment", "reward_evaluator", "policy", "learner"):
+        wait_until(f"the {name}", lambda name=name: probe.value(f"/wm/{name}", "state") == "active", 60)
     time.sleep(DISCOVERY_S)
     assert train(probe, updates=2).termination_reason == Train.Result.FINISHED
     stopped = probe.call(StopRecording, "recorder/stop", StopRecording.Request())
