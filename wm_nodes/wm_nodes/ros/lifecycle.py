@@ -60,7 +60,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.peers = PeerWatch(self.get_fully_qualified_name(), float(self.param("peer_timeout_s")))
         row = topic("run/state")
         self._state_publisher = self.create_publisher(RunState, row.name, row.qos)
-        self._state_subscription = self.create_subscription(RunState, row.name, self._on_run_state, row.qos)
+        self._state_subscription = self.create_subscription(RunState, row.name, self._on_run_state, row.reader_qos)
         self.links = Links(self)
         self._heartbeat_timer = self.create_timer(HEARTBEAT_S, self._on_heartbeat, clock=steady)
         self._diagnostics_timer = self.create_timer(1.0, self._on_diagnostics, clock=steady)
@@ -136,7 +136,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             if grantor is not None:
                 grantor.consumed(tracker)
 
-        subscription = self.create_subscription(row.type, row.name, observe, row.qos)
+        subscription = self.create_subscription(row.type, row.name, observe, row.reader_qos)
         self._entities.append(lambda: self.destroy_subscription(subscription))
         if grantor is not None:
             self._entities.append(grantor.close)

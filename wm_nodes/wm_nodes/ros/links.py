@@ -3,7 +3,7 @@ until nobody misses its first message.
 
 A publisher does not know a subscription that DDS discovery has not brought yet, and what it sends before is lost to it.
 Both ends of a pair must see each other, and only the two nodes can tell; so each tells all, at once and then once a
-second: while readers are being matched, Fast DDS now and then loses the newest sample of a latched topic for good.
+second, so that a node that comes late or was busy has the whole book within that time.
 """
 
 import threading
@@ -127,7 +127,7 @@ class Links:
         self.book = LinkBook(node.get_fully_qualified_name(), node.session)
         self._publisher = StampedPublisher(node, "run/links", node.session)
         row = topic("run/links")
-        self._subscription = node.create_subscription(row.type, row.name, self._on_links, row.qos)
+        self._subscription = node.create_subscription(row.type, row.name, self._on_links, row.reader_qos)
 
     def announce(self, *, again: bool = False) -> None:
         """Tell the others when this node has come to see more, or less, of them; again: in any case."""

@@ -1,6 +1,7 @@
 """The graph's topics: one row each, with message class and QoS. Profiles of recorded topics are those of
 recording/topics.py; here are only what nobody records, and the profiles of viewers."""
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +31,10 @@ from wm_nodes.recording import topics as recorded
 
 CREDIT_WINDOW = recorded.CREDIT_WINDOW
 
+WRITTEN_BY_EVERY_NODE = ("run/state", "run/links")
+EVERY_NODE_DEPTH = 64
+"""More nodes than a graph has, so that a reader that was busy finds the newest word of each."""
+
 
 @dataclass(frozen=True)
 class Topic:
@@ -38,6 +43,16 @@ class Topic:
     name: str
     type: type[Any]
     qos: QoSProfile
+
+    @property
+    def reader_qos(self) -> QoSProfile:
+        """The profile of subscriptions. On a topic without keys a reader's KEEP_LAST depth counts over all writers:
+        where every node writes, depth 1 would leave a reader that was busy with one node's message."""
+        if self.name not in WRITTEN_BY_EVERY_NODE:
+            return self.qos
+        profile = copy(self.qos)
+        profile.depth = EVERY_NODE_DEPTH
+        return profile
 
 
 def profile_of(qos: Qos) -> QoSProfile:
