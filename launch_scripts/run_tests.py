@@ -45,9 +45,10 @@ def _passes(name, command):
 
 
 def _environment():
-    """This host only, one thread per process unless told otherwise; tests/conftest.py picks the ROS domain."""
+    """This host only, no repeated tests, one thread per process unless told otherwise; tests pick the ROS domain."""
     env = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     env.setdefault("OMP_NUM_THREADS", "1")
+    env.pop("WM_TEST_RERUNS", None)
     return env
 
 

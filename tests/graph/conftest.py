@@ -14,10 +14,11 @@ from graph.harness import Graph, Probe, own_domain
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Graph tests have deadlines on shared machines: one repetition, which the closing report lists as R."""
+    """WM_TEST_RERUNS=1 repeats a failed graph test once, for crowded machines; .ci/run leaves it unset, so none is."""
+    reruns = int(os.environ.get("WM_TEST_RERUNS", "0"))
     for item in items:
-        if "graph" in item.path.parts:
-            item.add_marker(pytest.mark.flaky(reruns=1))
+        if reruns and "graph" in item.path.parts:
+            item.add_marker(pytest.mark.flaky(reruns=reruns))
 
 
 @pytest.fixture

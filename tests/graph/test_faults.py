@@ -138,15 +138,20 @@ def test_a_wrong_setting_ends_the_node_with_one_line_that_names_it(
 @pytest.mark.slow
 def test_fifty_start_stop_cycles_leave_no_shared_memory(domain: int) -> None:
     cycle = (
-        "import os, signal, sys\n"
+        "import os, signal\n"
+        "from pathlib import Path\n"
         "from wm_nodes.ros.lifecycle import ManagedNode\n"
         "from wm_nodes.ros.spin import run_node\n"
+        "ever = set()\n"
         "class Cycle(ManagedNode):\n"
         "    def activate(self):\n"
+        "        lines = Path('/proc/self/maps').read_text().splitlines()\n"
+        "        ever.update(line.split()[5] for line in lines if '/dev/shm/' in line)\n"
         "        os.kill(os.getpid(), signal.SIGINT)\n"
         "for _ in range(50):\n"
         "    assert run_node(lambda: Cycle('cycle')) == 0\n"
-        "    print(sum('fast' in name for name in os.listdir('/dev/shm')))\n"
+        "    left = [os.stat(path).st_size for path in ever if os.path.exists(path)]\n"
+        "    print(len(ever), len(left), sum(left))\n"
     )
     before = shm_files()
     env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
@@ -154,5 +159,8 @@ def test_fifty_start_stop_cycles_leave_no_shared_memory(domain: int) -> None:
     assert done.returncode == 0, done.stderr
     ports = range(7400 + 250 * domain, 7400 + 250 * (domain + 1))
     assert not {name for name in shm_files() - before if name in {f"fastrtps_port{port}" for port in ports}}
-    counts = [int(line) for line in done.stdout.split()]
-    assert counts[-1] - counts[0] < len(counts), f"shared-memory files per cycle: {counts}"
+    rows = (map(int, line.split()) for line in done.stdout.splitlines())
+    seen, files, sizes = zip(*rows, strict=True)
+    assert len(files) == 50 and seen[-1] >= 50, "the shared memory of the cycles was not seen"
+    assert files[-1] - files[4] <= 2, f"shared-memory files after each cycle: {files}"
+    assert sizes[-1] - sizes[4] <= 2**20, f"bytes of shared memory after each cycle: {sizes}"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from wm_nodes.recording import read_episodes
 from wm_nodes.reports import read_summary
 
 PROGRAM = "import sys; from wm_nodes.main_job import main; sys.exit(main(sys.argv[1:]))"
@@ -31,6 +32,8 @@ def test_the_main_job_runs_end_to_end_and_leaves_summary_report_and_bag(ros_doma
     assert summary["real_before"]["episodes"] == summary["real_after"]["episodes"] == 4
     assert summary["imagined_steps_per_s"] > 0
     assert list(Path(summary["bag"]).glob("*.mcap"))
+    played = [episode.behaviour for episode in read_episodes(Path(summary["bag"]), namespace="/wm/sim")]
+    assert played.count("before") >= 4 and played.count("after") >= 4
     assert "data:image/png;base64" in (run_dir / "report.html").read_text()
     assert json.loads((run_dir / "gate.json").read_text())["criteria"]
 

@@ -93,6 +93,42 @@ def make_long_environment(config: RunConfig, num_envs: int, seed: int) -> ReachT
     return ReachToy(num_envs, seed, max_episode_steps=100_000)
 
 
+class Faulty(ReachToy):
+    """What goes wrong once: `nan` state, `raise` in the first step, or `goals` that raise in the second reset."""
+
+    def __init__(self, num_envs: int, seed: int, fault: str) -> None:
+        super().__init__(num_envs, seed)
+        self._fault, self._goals = fault, 0
+
+    def step(self, actions: FloatArray) -> StepResult:
+        fault, self._fault = self._fault, ""
+        if fault == "raise":
+            raise RuntimeError("broken motor")
+        result = super().step(actions)
+        if fault == "nan":
+            result.observation.state[0] = np.nan
+        return result
+
+    def goals(self) -> tuple[UInt8Array, BoolArray] | None:
+        self._goals += 1
+        if self._fault == "goals" and self._goals == 2:
+            raise ZeroDivisionError("no goal")
+        return None
+
+
+def make_nan_environment(config: RunConfig, num_envs: int, seed: int) -> Faulty:
+    return Faulty(num_envs, seed, "nan")
+
+
+def make_failing_environment(config: RunConfig, num_envs: int, seed: int) -> Faulty:
+    return Faulty(num_envs, seed, "raise")
+
+
+def make_environment_with_bad_goals(config: RunConfig, num_envs: int, seed: int) -> Faulty:
+    """Its second reset raises where no request's answer is at stake, so in a callback."""
+    return Faulty(num_envs, seed, "goals")
+
+
 def make_policy(config: RunConfig) -> ImagePolicy:
     def encode(images: torch.Tensor) -> torch.Tensor:
         return images.float().reshape(len(images), -1)[:, ::3] / 255

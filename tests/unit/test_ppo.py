@@ -93,6 +93,32 @@ def test_a_rollout_without_a_valid_transition_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("earlier_updates", [0, 1])
+@pytest.mark.parametrize("good_minibatches", [0, 2])
+def test_a_gradient_that_is_not_finite_undoes_the_whole_update(earlier_updates: int, good_minibatches: int) -> None:
+    policy, straight = toy_policy(), toy_policy()
+    learner, undisturbed = (PpoLearner(p, toy_ppo(), seed=0) for p in (policy, straight))
+    for version in range(1, earlier_updates + 1):
+        learner.update(toy_rollout(policy, version))
+        undisturbed.update(toy_rollout(straight, version))
+    rollout, before = toy_rollout(policy, 9), weights(policy)
+    calls = iter(range(1000))
+
+    def poison(gradient: torch.Tensor) -> torch.Tensor:
+        return gradient * (math.nan if next(calls) >= good_minibatches else 1.0)
+
+    handle = next(policy.critic.parameters()).register_hook(poison)
+    with pytest.raises(FloatingPointError, match=r"gradient is not finite.*undone"):
+        learner.update(rollout)
+    handle.remove()
+    assert next(calls) == good_minibatches + 1
+    assert_equal(before, weights(policy))
+    assert learner.updates == earlier_updates
+    learner.update(rollout)
+    undisturbed.update(rollout)
+    assert_equal(weights(policy), weights(straight))
+
+
+@pytest.mark.parametrize("earlier_updates", [0, 1])
 def test_a_canceled_update_leaves_weights_and_optimiser_as_they_were(earlier_updates: int) -> None:
     policy, straight = toy_policy(), toy_policy()
     learner, undisturbed = (PpoLearner(p, toy_ppo(), seed=0) for p in (policy, straight))

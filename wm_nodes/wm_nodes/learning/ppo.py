@@ -6,6 +6,7 @@ loss = E10b clipped policy + value_weight * E10c value - entropy_weight * entrop
 """
 
 import json
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -96,13 +97,14 @@ class PpoLearner:
 
         Raises:
             Canceled: should_stop, asked before every minibatch, said so on some rank; nothing has changed then.
+            FloatingPointError: a loss, a gradient or a new weight is not finite; nothing has changed then.
             ValueError: no valid sample.
         """
         before = {name: tensor.clone() for name, tensor in self.policy.state_dict().items()}
         optimizer_before = json.dumps(None) if not self._optimizer.state else self._optimizer_tensors(clone=True)
         try:
             metrics = self._update(rollout, should_stop)
-        except Canceled:
+        except (Canceled, FloatingPointError):
             self.policy.load_state_dict(before)
             if isinstance(optimizer_before, dict):
                 self._restore_optimizer(optimizer_before)
@@ -163,6 +165,8 @@ class PpoLearner:
                     break
             if stop:
                 break
+        if not all(bool(torch.isfinite(parameter).all()) for parameter in self.policy.parameters()):
+            raise self._not_finite("weight")
         return PpoMetrics(
             **{name: value / trained for name, value in totals.items()},
             learning_rate=config.learning_rate,
@@ -197,8 +201,7 @@ class PpoLearner:
         self.ranks.sum_gradients(self.policy)
         norm = clip_grad_norm_(self.policy.parameters(), config.max_grad_norm)
         if not torch.isfinite(norm):
-            raise FloatingPointError(f"PPO gradient is not finite at update {self.updates}; lower ppo.learning_rate")
-        self._optimizer.step()
+            raise self._not_finite("gradient")
         with torch.no_grad():
             sums = torch.stack([
                 policy_losses.sum(), value_losses.sum(), entropies.sum(), approximate_kl(logprobs, old).sum(),
@@ -207,7 +210,15 @@ class PpoLearner:
         self.ranks.sum_(sums)
         names = ("loss_policy", "loss_value", "entropy", "approx_kl", "kl_reference", "clip_fraction")
         means = dict(zip(names, (sums / len(index)).tolist(), strict=True))
+        if not all(math.isfinite(means[name]) for name in ("loss_policy", "loss_value", "entropy", "kl_reference")):
+            raise self._not_finite("loss")
+        self._optimizer.step()
         return means | {"grad_norm": float(norm)}
+
+    def _not_finite(self, what: str) -> FloatingPointError:
+        return FloatingPointError(
+            f"a PPO {what} is not finite in update {self.updates}, which was undone; lower ppo.learning_rate"
+        )
 
     @torch.no_grad()
     def _samples(self, rollout: Rollout) -> _Samples:

@@ -76,7 +76,8 @@ class AsynchronousEnvironment:
         """Step once; return False when it had to hold for want of an action.
 
         Raises:
-            WireError: BUSY (no credit) and ESTOP, where nothing has changed; NAN_MODEL, after which all are reset.
+            WireError: BUSY (no credit) and ESTOP, where nothing has changed; NAN_MODEL and INTERNAL, after
+                which all are reset.
         """
         action = None
         if self._newest is not None and self._clock() - self._newest[1] <= self._max_age_s():
@@ -95,7 +96,7 @@ class AsynchronousEnvironment:
         try:
             reply = self._served.step(command)
         except WireError as error:
-            if error.code == ErrorCode.NAN_MODEL:
+            if error.code in (ErrorCode.NAN_MODEL, ErrorCode.INTERNAL):
                 self._ended[:] = True
             raise
         self._ended = reply.terminated | reply.truncated

@@ -6,9 +6,9 @@ else. In a composed process a local policy steps it from its worker thread inste
 
 import sys
 import time
+import traceback
 from typing import Any
 
-import numpy as np
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
@@ -137,8 +137,6 @@ class EnvironmentNode(ManagedNode):
 
     def transition(self, transition: Transition) -> None:
         self._transitions.publish(convert.transition_msg(transition))
-        if not np.isfinite(transition.next_states).all():
-            self.diagnostics.count("nan_model", level=diagnostics.ERROR, text="the model produced NaN")
 
     def episode(self, note: EpisodeNote) -> None:
         self._episodes.publish(convert.episode_msg(note, self._spec))
@@ -254,11 +252,12 @@ class EnvironmentNode(ManagedNode):
     def _count_refusal(self, error: WireError, what: str) -> None:
         if error.code != ErrorCode.BUSY:
             bad_numbers = error.code in (ErrorCode.NAN_INPUT, ErrorCode.NAN_MODEL)
-            level = diagnostics.ERROR if bad_numbers else diagnostics.WARN
+            level = diagnostics.ERROR if bad_numbers or error.code == ErrorCode.INTERNAL else diagnostics.WARN
             self.diagnostics.count(f"refused_{what}", level=level, text=f"{what} refused: {error}")
             if bad_numbers:
                 self.diagnostics.count("nan", level=level, text=str(error))
-            self.get_logger().error(f"{what} refused: {error}", throttle_duration_sec=1.0)
+            trace = "".join(traceback.format_exception(error.__cause__)) if error.__cause__ is not None else ""
+            self.get_logger().error(f"{what} refused: {error}\n{trace}".rstrip(), throttle_duration_sec=1.0)
 
 
 def main() -> int:

@@ -72,7 +72,7 @@ class EvaluationNode(ManagedNode):
                 self._holder.policy, environment, int(goal.episodes), int(goal.seed), goal.deterministic,
                 on_progress=report,
             )  # fmt: skip
-            self._fill(result, found)
+            self._fill(result, found, self._config.reward.sparse_weight)
         except PeerLost as error:
             result.termination_reason, result.message = Evaluate.Result.PEER_LOST, f"the environment is lost: {error}"
         except (WireError, ValueError) as error:
@@ -99,10 +99,11 @@ class EvaluationNode(ManagedNode):
         return self._holder.version
 
     @staticmethod
-    def _fill(result: Evaluate.Result, found: EvaluationResult) -> None:
+    def _fill(result: Evaluate.Result, found: EvaluationResult, sparse_weight: float) -> None:
+        """mean_return: of the rule reward, which pays sparse_weight once, at the success that ends an episode."""
         result.episodes, result.successes = found.episodes, found.successes
         result.success_rate, result.success_low, result.success_high = found.success_rate, found.low, found.high
-        result.mean_return, result.mean_length = float("nan"), found.mean_length
+        result.mean_return, result.mean_length = sparse_weight * found.success_rate, found.mean_length
         result.success = convert.to_field(found.success)
         result.length = convert.to_field(found.length)
 

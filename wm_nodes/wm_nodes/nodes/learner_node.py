@@ -52,6 +52,8 @@ PARAMS = (
           read_only=True),
     Param("resume", True, "Continue exactly from the run folder's checkpoint", read_only=True),
     Param("keep_versions", 20, "Weights files kept in run_dir/policies", minimum=1, maximum=100000, read_only=True),
+    Param("tensorboard", False, "Write learner metrics to run_dir/tensorboard too; its import takes seconds",
+          read_only=True),
     Param("join_timeout_s", 5.0, "How long a rollout's last images and rewards may take to arrive", "s",
           minimum=0.1, maximum=600.0),
     Param("recovery_timeout_s", 60.0, "How long a lost node may take to come back before training ends", "s",
@@ -83,8 +85,9 @@ class LearnerNode(ManagedNode):
             keep_versions=int(self.param("keep_versions")), metadata={"tokenizer_sha256": policy.encoder.sha256},
             ranks=self._ranks,
         )  # fmt: skip
-        self._written = MetricsWriter(self.run_dir, tensorboard=False)
+        self._written = MetricsWriter(self.run_dir, tensorboard=bool(self.param("tensorboard")))
         self.own(self._written.close)
+        self._nonfinite_updates = 0
         self._spec: EnvironmentSpec | None = None
         self._joiner = RolloutJoiner()
         self._versions = self.publish_on("policy/version")
@@ -143,7 +146,7 @@ class LearnerNode(ManagedNode):
             result.termination_reason, result.message = Train.Result.PEER_LOST, str(error)
         except Canceled:
             work.check()
-        except (WireError, ValueError, OSError) as error:
+        except (WireError, ValueError, OSError, FloatingPointError) as error:
             result.termination_reason, result.message = Train.Result.FAILED, str(error)
         finally:
             self._joiner.end()
@@ -161,11 +164,18 @@ class LearnerNode(ManagedNode):
 
     def _update(self, work: Work, goal: Train.Goal, update: int, rollout: Rollout, dropped: Dropped) -> None:
         began = time.perf_counter()
-        metrics = self._training.update(rollout, dropped, lambda: work.stopped)
+        try:
+            metrics = self._training.update(rollout, dropped, lambda: work.stopped)
+        except FloatingPointError as error:
+            self._nonfinite_updates += 1
+            self.diagnostics.count("nonfinite_updates", level=diagnostics.ERROR, text=str(error))
+            self._publish_metrics({}, float("nan"))
+            raise
         self.diagnostics.latency("update", time.perf_counter() - began)
         self._announce()
         samples_per_s = float(rollout.valid_TN.sum()) / max(time.perf_counter() - began, 1e-9)
         self._publish_metrics(metrics, samples_per_s)
+        self._write_metrics(metrics, samples_per_s)
         progress = self._training.progress
         work.feedback(
             Train.Feedback(
@@ -276,10 +286,14 @@ class LearnerNode(ManagedNode):
         message.header.stamp = self.get_clock().now().to_msg()
         for name in METRICS:
             setattr(message, name, metrics.get(name, float("nan")))
+        metrics = metrics | {"nonfinite_updates": float(self._nonfinite_updates)}
         extras = {name: value for name, value in metrics.items() if name not in METRICS}
         message.names = list(extras)[:64]
         message.values = [extras[name] for name in message.names]
         self._metrics.publish(message)
+
+    def _write_metrics(self, metrics: dict[str, float], samples_per_s: float) -> None:
+        progress = self._training.progress
         counts = ("mean_return", "success_rate", "dropped_invalid", "dropped_gap", "dropped_stale")
         scalars = {**metrics, "samples_per_s": samples_per_s, **{name: getattr(progress, name) for name in counts}}
         self._written.write("ppo", progress.updates, scalars)

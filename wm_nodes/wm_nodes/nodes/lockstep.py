@@ -7,7 +7,8 @@ Stamps count observations: observation k has stamp k * control period, so that e
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -24,7 +25,7 @@ from wm_nodes.ros.wire import (
     WireError,
 )
 from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import BoolArray, Environment, FloatArray, Observation, UInt8Array, UInt64Array
+from wm_nodes.types import BoolArray, Environment, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 
 UNIT_TOLERANCE = 1e-6
 
@@ -48,6 +49,8 @@ class _Slot:
     episode_id: int = 0
     seed: int = 0
     running: bool = False
+    aborted: bool = False
+    """Ended from outside (estop, error, stop): nothing it does counts until it is reset."""
     length: int = 0
     version_first: int = 0
     version_last: int = 0
@@ -75,7 +78,7 @@ class LockstepEnvironment:
         self._period_ns = round(self.spec.control_period_s * 1e9)
         self._num_observations = 0
         self._last_step_id = 0
-        self._last_reply: Reply | None = None
+        self._last_reply: Reply | WireError | None = None
         self._current: Observation | None = None
         self._slots = [_Slot() for _ in range(self.spec.num_envs)]
 
@@ -87,7 +90,7 @@ class LockstepEnvironment:
         """Reset the masked environments. Publishes the new frame and one transition without action.
 
         Raises:
-            WireError: NOT_FOUND for another task, ESTOP, or what before_step refuses.
+            WireError: NOT_FOUND for another task, ESTOP, INTERNAL, or what before_step refuses.
         """
         with self._lock:
             if command.task and command.task != self.spec.task:
@@ -103,7 +106,8 @@ class LockstepEnvironment:
             stamp_before = self._stamp_ns()
             self._end_episodes(mask, EpisodeEvent.REASON_RESET, stamp_before)
             self._behaviour = command.behaviour or self._behaviour
-            self._current = self.environment.reset(mask, seeds)
+            with self._environment_errors():
+                self._current = self.environment.reset(mask, seeds)
             stamp = self._advance()
             reply = self._reply(stamp, command.with_image)
             self._last_reply = None
@@ -116,8 +120,9 @@ class LockstepEnvironment:
         """Step once; the same step_id again returns the stored answer.
 
         Raises:
-            WireError: SPEC_MISMATCH, OUT_OF_ORDER, BAD_SHAPE, NAN_INPUT, OUT_OF_RANGE, ESTOP, NAN_MODEL, or what
-                before_step refuses. The environment is unchanged, except after NAN_MODEL.
+            WireError: SPEC_MISMATCH, OUT_OF_ORDER, BAD_SHAPE, NAN_INPUT, OUT_OF_RANGE, ESTOP, NAN_MODEL, INTERNAL, or
+                what before_step refuses. The environment is unchanged, except after NAN_MODEL and INTERNAL (an
+                exception of the environment): the episodes these name are over and must be reset.
         """
         with self._lock:
             if command.session != self.session:
@@ -132,6 +137,8 @@ class LockstepEnvironment:
                     f"spec_hash {command.spec_hash[:12]!r} is not {self.spec.spec_hash[:12]!r}; ask env/get_spec",
                 )
             if self._last_reply is not None and command.step_id == self._last_step_id:
+                if isinstance(self._last_reply, WireError):
+                    raise self._last_reply
                 return self._last_reply
             if command.step_id != self.next_step_id:
                 raise WireError(
@@ -149,7 +156,7 @@ class LockstepEnvironment:
     def end_episodes(self, reason: int) -> None:
         """End all running episodes, e.g. when the node stops or the estop is set."""
         with self._lock:
-            self._end_episodes(np.ones(self.spec.num_envs, bool), reason, self._stamp_ns())
+            self._abort(np.ones(self.spec.num_envs, bool), reason, self._stamp_ns())
 
     def close(self) -> None:
         self.environment.close()
@@ -158,23 +165,30 @@ class LockstepEnvironment:
         started = time.perf_counter()
         before, before_stamp = self._current, self._stamp_ns()
         assert before is not None
-        result = self.environment.step(actions)
-        valid = result.valid.copy()
+        with self._environment_errors():
+            result = self.environment.step(actions)
         mask = command.reset_mask
+        broken = self._running() & ~_finite(result)
+        if mask is not None:
+            broken &= ~mask
+        self._abort(broken, EpisodeEvent.REASON_ERROR, before_stamp)
+        valid = result.valid & self._running()
         observation = result.observation
         if mask is not None and mask.any():
             self._end_episodes(mask, EpisodeEvent.REASON_RESET, before_stamp)
-            observation = self.environment.reset(mask, seeds)
+            with self._environment_errors():
+                observation = self.environment.reset(mask, seeds)
             valid &= ~mask
         self._current = observation
         stamp = self._advance()
         self._last_step_id = command.step_id
+        aborted = self._aborted() if mask is None else self._aborted() & ~mask
         success = np.where(valid, result.success_probability, 0).astype(np.float32)
         truth = np.where(valid[:, None], result.ground_truth, self._truth()).astype(np.float32)
         reply = replace(
             self._reply(stamp, command.with_image),
             terminated=result.terminated & valid,
-            truncated=result.truncated & valid,
+            truncated=result.truncated & valid | aborted,
             success_probability=success,
             uncertainty=result.uncertainty,
             step_s=time.perf_counter() - started,
@@ -193,7 +207,7 @@ class LockstepEnvironment:
                 logprobs=zeros if command.logprobs is None else command.logprobs,
                 values=zeros if command.values is None else command.values,
                 terminated=reply.terminated,
-                truncated=reply.truncated,
+                truncated=result.truncated & valid,
                 valid=valid,
                 episode_ids=before.episode_id,
                 episode_steps=before.episode_step,
@@ -208,14 +222,13 @@ class LockstepEnvironment:
         if mask is not None and mask.any():
             self._start_episodes(mask, seeds, stamp)
         self._last_reply = reply
-        broken = ~np.isfinite(observation.state).all(1) | ~np.isfinite(success)
-        if (broken & valid).any():
-            self._end_episodes(broken, EpisodeEvent.REASON_ERROR, stamp)
-            raise WireError(
+        if broken.any():
+            self._last_reply = WireError(
                 ErrorCode.NAN_MODEL,
-                f"the model produced NaN in environments {np.flatnonzero(broken & valid).tolist()} at step "
-                f"{command.step_id}; reset them",
+                f"the model produced NaN in environments {np.flatnonzero(broken).tolist()} at step {command.step_id}; "
+                "their episodes are over, reset them",
             )
+            raise self._last_reply
         return reply
 
     def check_actions(self, flat: FloatArray) -> FloatArray:
@@ -236,6 +249,31 @@ class LockstepEnvironment:
                 f"action {worst:g} lies outside [-1, 1]; actions are normalised, divide by EnvSpec.action_scale",
             )
         return actions
+
+    @contextmanager
+    def _environment_errors(self) -> Iterator[None]:
+        """Turn what the environment raises into NAN_MODEL or INTERNAL, after ending all episodes."""
+        try:
+            yield
+        except Exception as error:
+            self._abort(np.ones(self.spec.num_envs, bool), EpisodeEvent.REASON_ERROR, self._stamp_ns())
+            for slot in self._slots:
+                slot.aborted = True
+            code = ErrorCode.NAN_MODEL if isinstance(error, FloatingPointError) else ErrorCode.INTERNAL
+            text = f"the environment failed: {type(error).__name__}: {error}; all episodes are over, reset them"
+            raise WireError(code, text) from error
+
+    def _running(self) -> BoolArray:
+        return np.array([slot.running for slot in self._slots])
+
+    def _aborted(self) -> BoolArray:
+        return np.array([slot.aborted for slot in self._slots])
+
+    def _abort(self, mask: BoolArray, reason: int, stamp: int) -> None:
+        """End running episodes from outside: their environments do nothing valid until they are reset."""
+        for i in np.flatnonzero(mask & self._running()):
+            self._end(int(i), EpisodeEvent.OUTCOME_UNKNOWN, reason, stamp)
+            self._slots[i].aborted = True
 
     def _gate(self) -> None:
         if self.estop:
@@ -331,3 +369,9 @@ class LockstepEnvironment:
             policy_version_first=slot.version_first, policy_version_last=slot.version_last,
         )  # fmt: skip
         self._sink.episode(note)
+
+
+def _finite(result: StepResult) -> BoolArray:
+    """(N,): state and success probability are numbers."""
+    finite: BoolArray = np.isfinite(result.observation.state).all(1) & np.isfinite(result.success_probability)
+    return finite

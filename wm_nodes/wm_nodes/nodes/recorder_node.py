@@ -18,6 +18,7 @@ from wm_nodes.nodes.bag_qos import recorded_qos
 from wm_nodes.recording import BagError, RawBagWriter, RecordingError, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.recording.cdr import session_and_seq
+from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.credit import CreditGrantor
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -60,7 +61,8 @@ class RecorderNode(ManagedNode):
         for name, row in self._rows.items():
             grantor = None
             if row.qos.history == HistoryPolicy.KEEP_ALL:
-                grantor = CreditGrantor(self, name)
+                base = _base(name)
+                grantor = CreditGrantor(self, base, below=name.removesuffix(base))
                 self.own(grantor.close)
             subscription = self.create_subscription(
                 row.type, name, partial(self._on_message, name, grantor), _lossless(row.qos), raw=True
@@ -76,7 +78,7 @@ class RecorderNode(ManagedNode):
 
     def activate(self) -> None:
         if self.param("record_at_start"):
-            self._start(str(self.param("bag_uri")))
+            self._start(self._free_uri(str(self.param("bag_uri"))))
 
     def deactivate(self, reason: str) -> None:
         self._stop()
@@ -156,14 +158,28 @@ class RecorderNode(ManagedNode):
         return path, messages, total
 
     def _facts(self) -> dict[str, str]:
-        """custom_data taken from what was recorded: spec, model, policy versions."""
+        """custom_data taken from what was recorded: spec (the namespace's own before sim's), policy versions."""
         facts: dict[str, str] = {}
-        for name, data in self._latched.items():
-            if _base(name) == topics.SPEC.name:
-                spec, _ = m.spec_of(m.deserialize(data, topics.SPEC.msgtype))
-                facts["wm.spec_json"] = m.spec_to_json(spec)
-                facts["wm.world_model_sha256"] = spec.world_model_sha256
+        specs = [name for name in self._latched if _base(name) == topics.SPEC.name]
+        if specs:
+            spec, _ = m.spec_of(m.deserialize(self._latched[min(specs, key=len)], topics.SPEC.msgtype))
+            facts["wm.spec_json"] = m.spec_to_json(spec)
+            facts["wm.world_model_sha256"] = spec.world_model_sha256
         return {**facts, "wm.policy_versions": json.dumps(sorted(self._versions))}
+
+    def _free_uri(self, uri: str) -> str:
+        """`uri`, or with _1, _2 ... behind it where an earlier recording, finished or killed, has that name."""
+        if not uri:
+            return uri
+        for number in range(10_000):
+            name = f"{uri.rstrip('/')}_{number}" if number else uri
+            path = self.run_dir / name
+            if not path.exists() and not path.with_name(path.name + PARTIAL_SUFFIX).exists():
+                break
+        if name != uri:
+            self.get_logger().warning(f"bag {uri} exists from an earlier recording; recording to {name}")
+            self.diagnostics.count("renamed_bags", text=f"bag {uri} exists; recording to {name}")
+        return name
 
     def _next_path(self) -> Path:
         folder = self.run_dir / "bags"

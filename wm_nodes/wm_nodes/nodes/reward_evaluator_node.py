@@ -6,6 +6,7 @@ from collections import OrderedDict
 from typing import Any
 
 import numpy as np
+from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image
 
 from wm_msgs.msg import EnvSpec, ErrorCode, RewardSummary, TaskGoal, TransitionBatch
@@ -61,9 +62,10 @@ class RewardEvaluatorNode(ManagedNode):
         self.listen("env/goal", self._on_goal, while_inactive=True)
         self.listen("env/transition", self._on_transition, credit=True)
         self.serve(EvaluateReward, "reward/evaluate", self._on_evaluate)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
         timers = (
-            self.create_timer(0.1, self._judge_waiting),
-            self.create_timer(float(self.param("summary_period_s")), self._publish_summary),
+            self.create_timer(0.1, self._judge_waiting, clock=steady),
+            self.create_timer(float(self.param("summary_period_s")), self._publish_summary, clock=steady),
         )
         for timer in timers:
             self.own(self.destroy_timer, timer)

@@ -34,6 +34,7 @@ class Learner(Protocol):
         """Train on one rollout; return metrics, a mapping or a dataclass of numbers.
 
         Raises learning.rollouts.Canceled when should_stop said so; the weights are then as they were before.
+        Raises FloatingPointError when a loss, gradient or weight is not finite; likewise.
         """
         ...
 
@@ -94,7 +95,7 @@ class PolicyTraining:
         """Make one update and one new version; return the metrics.
 
         Raises:
-            Canceled: nothing has changed. ValueError: the rollout cannot be trained on.
+            Canceled, FloatingPointError: nothing has changed. ValueError: the rollout cannot be trained on.
         """
         began = time.perf_counter()
         broadcast_rollout(rollout, self._ranks)
@@ -173,7 +174,7 @@ def follow(policy: ImagePolicy, learner: Learner, run_dir: Path, ranks: Ranks) -
     while (rollout := broadcast_rollout(None, ranks)) is not None:
         try:
             learner.update(rollout)
-        except (Canceled, ValueError):
+        except (Canceled, ValueError, FloatingPointError):
             continue
 
 

@@ -74,10 +74,12 @@ class Bag:
         return sum(connection.msgcount for connection in self.connections if connection.topic == topic)
 
     def namespace(self, wanted: str | None) -> str:
-        """The namespace of the environment to read: `wanted`, or the only one, or /wm among several."""
+        """The namespace of the environment to read: `wanted`, or the only one; among several the one that the others
+        lie below (/wm before /wm/sim), else /wm."""
         suffix = f"/{topics.TRANSITION.name}"
         found = sorted({c.topic.removesuffix(suffix) for c in self.connections if c.topic.endswith(suffix)})
-        choice = wanted if wanted is not None else found[0] if len(found) == 1 else topics.DEFAULT_NAMESPACE
+        is_root = bool(found) and all(name.startswith(f"{found[0]}/") for name in found[1:])
+        choice = wanted if wanted is not None else found[0] if is_root else topics.DEFAULT_NAMESPACE
         if choice not in found:
             raise BagError(
                 f"bag {self.path} has no {choice}{suffix}; environments recorded: {found or 'none'}; "

@@ -1,6 +1,9 @@
-"""From given launch arguments to a graph on disk: run folder, configuration, model; shared by both starters."""
+"""From given launch arguments to a graph on disk: run folder, configuration, model; shared by both starters.
 
-import os
+`python -m wm_nodes.ros.arguments <scenario>`: arguments as JSON on stdin, the graph as JSON on stdout.
+"""
+
+import json
 import sys
 from collections.abc import Mapping
 from datetime import datetime
@@ -38,6 +41,8 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
         values["model_dir"] = _model_dir(values["model_dir"], config.task)
     if values.get("starts_file") == "":
         values["starts_file"] = str(Path(values["model_dir"]) / "starts.safetensors")
+    if values["params_file"]:
+        values["params_file"] = _existing(values["params_file"], "params_file")
     if "bag_uri" in values:
         values["bag_uri"] = _bag_uri(values["bag_uri"], scenario, run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
@@ -59,11 +64,6 @@ def prepare(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, s
     return graph, values
 
 
-def interpreter(values: Mapping[str, str]) -> str:
-    """The Python that runs the nodes."""
-    return values.get("python") or os.environ.get("WM_PYTHON") or sys.executable
-
-
 def _model_dir(given: str, task: str) -> str:
     if given:
         folder = Path(given).expanduser().absolute()
@@ -78,6 +78,13 @@ def _model_dir(given: str, task: str) -> str:
         raise GraphError(str(error)) from None
 
 
+def _existing(given: str, name: str) -> str:
+    path = Path(given).expanduser().absolute()
+    if not path.is_file():
+        raise GraphError(f"{name} {given!r} does not exist")
+    return str(path)
+
+
 def _bag_uri(given: str, scenario: str, run_dir: Path) -> str:
     if scenario == "replay_offline":
         if not given:
@@ -85,3 +92,17 @@ def _bag_uri(given: str, scenario: str, run_dir: Path) -> str:
         if not Path(given).expanduser().exists():
             raise GraphError(f"bag_uri {given!r} does not exist")
     return str(Path(given).expanduser().absolute()) if given else str(run_dir / "bags" / scenario)
+
+
+def main() -> int:
+    try:
+        graph, _ = prepare(sys.argv[1], json.load(sys.stdin))
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(graph.to_json())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

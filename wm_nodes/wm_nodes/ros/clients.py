@@ -210,26 +210,30 @@ class LocalEnvironmentClient:
 
     @property
     def session(self) -> int:
-        return int(self._served().session)
+        return int(self._present().session)
 
     def handshake(self, timeout_s: float, check: Check) -> EnvironmentSpec:
         wait_until(lambda: self._served() is not None, timeout_s, check, "the local environment")
-        spec: EnvironmentSpec = self._served().spec
+        spec: EnvironmentSpec = self._present().spec
         return spec
 
     def reset(self, command: ResetCommand, check: Check) -> Reply:
-        return self._retry(lambda: self._served().reset(command), check)
+        return self._retry(lambda: self._present().reset(command), check)
 
     def step(self, command: StepCommand, check: Check) -> Reply:
-        return self._retry(lambda: self._served().step(command), check)
+        return self._retry(lambda: self._present().step(command), check)
+
+    def _present(self) -> Any:
+        served = self._served()
+        if served is None:
+            raise PeerLost("the local environment was cleaned up")
+        return served
 
     def _retry(self, attempt: Callable[[], Reply], check: Check) -> Reply:
         deadline = time.monotonic() + self._timeout_s
         while True:
             try:
                 return attempt()
-            except AttributeError:
-                raise PeerLost("the local environment was cleaned up") from None
             except WireError as error:
                 if error.code != ErrorCode.BUSY or time.monotonic() >= deadline:
                     raise

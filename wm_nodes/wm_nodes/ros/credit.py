@@ -70,13 +70,15 @@ class CreditLedger:
 class CreditGrantor:
     """The consumer's side for one stream: grants a window ahead of what was consumed.
 
+    below: relative namespace of the producer with a slash at its end, e.g. "sim/"; empty: the node's own.
+
     Grants go out each quarter window, and once a second, so that a restarted producer learns of its consumers.
     """
 
-    def __init__(self, node: "ManagedNode", topic_name: str, window: int = CREDIT_WINDOW) -> None:
+    def __init__(self, node: "ManagedNode", topic_name: str, window: int = CREDIT_WINDOW, *, below: str = "") -> None:
         self._node, self._topic_name, self._window = node, topic_name, window
         row = topic("flow/credit")
-        self._publisher = node.create_publisher(Credit, row.name, row.qos)
+        self._publisher = node.create_publisher(Credit, below + row.name, row.qos)
         self._timer = node.create_timer(REPEAT_S, self._repeat, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._tracker: GapTracker | None = None
         self._since_grant = 0

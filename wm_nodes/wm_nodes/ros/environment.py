@@ -1,12 +1,37 @@
 """The environment variables in which nodes run. Standard library only."""
 
 import os
+import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 
 PROFILE = Path(__file__).with_name("fastdds_profile.xml")
 """Fast DDS: shared-memory segment of 32 MiB, messages up to 8 MiB (larger images would be lost, or wait 12 ms)."""
+
+PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+SEGMENT_BYTES = 40 * 2**20
+"""Shared memory that one process may take with the profile."""
+
+_USUAL_NODES = 8
+
+
+def interpreter(values: Mapping[str, str]) -> str:
+    """The Python that runs the nodes: argument `python`, else $WM_PYTHON, else this one."""
+    return values.get("python") or os.environ.get("WM_PYTHON") or sys.executable
+
+
+def set_node_defaults() -> None:
+    """Give a node that no launcher started the launchers' defaults: this host only, and the Fast DDS profile.
+
+    Called before rclpy.init. What is set stays; an empty profile variable (the runner's word for "/dev/shm is too
+    small") is removed.
+    """
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    if os.environ.get(PROFILE_VARIABLE) == "":
+        del os.environ[PROFILE_VARIABLE]
+    elif Path("/dev/shm").is_dir() and shutil.disk_usage("/dev/shm").free >= _USUAL_NODES * SEGMENT_BYTES:
+        os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE))
 
 
 def graph_environment(
@@ -40,7 +65,7 @@ def graph_environment(
                 _prepend(env, "PYTHONPATH", modules)
     env.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     env.setdefault("ROS_DOMAIN_ID", "0")
-    env.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(PROFILE))
+    env.setdefault(PROFILE_VARIABLE, str(PROFILE))
     env.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
     env.setdefault("PYTHONUNBUFFERED", "1")
     # Nodes take turns on few cores; a second thread that waits for a busy core costs more than it gives.

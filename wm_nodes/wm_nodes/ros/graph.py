@@ -9,9 +9,16 @@ import difflib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 ParameterValue = bool | int | float | str | list[str]
 TRUTHS = ("true", "false")
+ENVIRONMENT_TOPICS = ("env/spec", "env/image", "env/transition", "env/goal", "episode")
+GRAPH_TOPICS = (
+    *ENVIRONMENT_TOPICS, "reward", "action", "policy/version", "reward/summary", "learner/metrics", "run/state",
+)  # fmt: skip
+"""What the recorder records of its own namespace: the recorder's default."""
+
 COMPOSABLE = ("environment", "policy", "reward_evaluator", "learner", "recorder", "evaluation")
 """Nodes that wm_nodes.nodes.compose can carry."""
 
@@ -35,11 +42,16 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("task", "push_cube", "Task, when config_file is empty", ("reach", "push_cube", "pull_cube")),
     LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
     LaunchArgument("run_dir", "", "Folder for weights, bags and logs; empty: runs/<time>-<scenario>"),
-    LaunchArgument("namespace", "wm", "ROS namespace of the graph; several runs need several"),
+    LaunchArgument("namespace", "wm", "ROS namespace of the graph; several graphs on one host need several domains"),
     LaunchArgument("model_dir", "", "World-model folder; empty: the one shipped for the task"),
     LaunchArgument("starts_file", "", "First frames to imagine from; empty: starts.safetensors in model_dir"),
     LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
-    LaunchArgument("backend", "world_model", "What the environment node steps", ("world_model", "maniskill")),
+    LaunchArgument("backend", "world_model", "What the environment node steps",
+                   ("world_model", "maniskill", "factory")),
+    LaunchArgument("backend_factory", "", "module:callable(config, num_envs, seed) -> Environment (backend factory)"),
+    LaunchArgument("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir"),
+    LaunchArgument("reward_factory", "", "module:callable(config) -> RewardModel instead of `reward`"),
+    LaunchArgument("params_file", "", "ROS parameter file (YAML) for all nodes; it wins over the other arguments"),
     LaunchArgument("mode", "lockstep", "Who keeps time: the policy's steps, or the environment's clock",
                    ("lockstep", "asynchronous")),
     LaunchArgument("reward", "", "Reward model; empty: endogenous if imagined, else rule", ("", "endogenous", "rule")),
@@ -67,7 +79,7 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
 _BY_NAME = {argument.name: argument for argument in ARGUMENTS}
 _COMMON = (
     "preset", "task", "config_file", "run_dir", "namespace", "executor", "autostart", "use_sim_time", "log_level",
-    "compose", "domain_id", "discovery_range", "python",
+    "compose", "domain_id", "discovery_range", "python", "params_file",
 )  # fmt: skip
 
 
@@ -92,6 +104,8 @@ class NodeSpec:
     """The nodes that a composed process carries."""
     parameter_file: str = ""
     """Where the starter keeps carried_parameters() of a composed process."""
+    extra_parameters: str = ""
+    """A parameter file of the user; read last, so it wins."""
     environment: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -123,9 +137,11 @@ class NodeSpec:
 
         Values are YAML; JSON quoting keeps text a string.
         """
+        more = ["--params-file", self.extra_parameters] if self.extra_parameters else []
         if self.inside:
-            return ["--params-file", self.parameter_file]
-        return [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={json.dumps(value)}")]
+            return ["--params-file", self.parameter_file, *more]
+        given = [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={json.dumps(value)}")]
+        return [*given, *more]
 
     def carried_parameters(self) -> str:
         """The text of parameter_file: JSON, which is YAML."""
@@ -160,6 +176,17 @@ class Graph:
     def to_json(self) -> str:
         return json.dumps(dataclasses.asdict(self), indent=1)
 
+    @classmethod
+    def from_json(cls, text: str) -> "Graph":
+        """The graph that to_json() wrote."""
+        values = json.loads(text)
+        return cls(values["name"], tuple(_node_from(node) for node in values["nodes"]), values["environment"])
+
+
+def _node_from(values: dict[str, Any]) -> NodeSpec:
+    inside = tuple(_node_from(node) for node in values["inside"])
+    return NodeSpec(**{**values, "inside": inside, "arguments": tuple(values["arguments"])})
+
 
 def compose(graph: Graph, parameter_file: str) -> Graph:
     """The same graph with the nodes of its namespace in one process, where `wm_nodes.nodes.compose` can carry them.
@@ -175,6 +202,7 @@ def compose(graph: Graph, parameter_file: str) -> Graph:
     one = NodeSpec(
         "wm_nodes.nodes.compose", "composed", namespace, log_level=inside[0].log_level,
         arguments=tuple(node.name for node in inside), inside=tuple(inside), parameter_file=parameter_file,
+        extra_parameters=inside[0].extra_parameters,
     )  # fmt: skip
     return dataclasses.replace(graph, nodes=(one, *(node for node in graph.nodes if node not in inside)))
 
@@ -233,7 +261,10 @@ def _node(
         "use_sim_time": arguments["use_sim_time"] == "true",
     }
     module, values = f"wm_nodes.nodes.{name}_node", {**common, **parameters}
-    return NodeSpec(module, name, namespace, values, ranks=ranks, log_level=arguments["log_level"])
+    return NodeSpec(
+        module, name, namespace, values, ranks=ranks, log_level=arguments["log_level"],
+        extra_parameters=arguments["params_file"],
+    )  # fmt: skip
 
 
 def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "num_envs", below: str = "") -> NodeSpec:
@@ -243,36 +274,47 @@ def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "nu
         "seed": _integer(arguments, "seed", 0),
         "mode": arguments.get("mode", "lockstep") if not below else "lockstep",
     }
+    if backend == "factory":
+        if not arguments["backend_factory"]:
+            raise GraphError("backend:=factory needs backend_factory:=module:callable")
+        parameters["backend_factory"] = arguments["backend_factory"]
     if backend == "world_model":
         parameters |= {"model_dir": arguments["model_dir"], "starts_file": arguments["starts_file"]}
     return _node(arguments, "environment", parameters, below=below)
 
 
 def _simulator_and_evaluation(arguments: Mapping[str, str]) -> list[NodeSpec]:
-    evaluation = {"model_dir": arguments["model_dir"], "env_namespace": "sim"}
+    evaluation = {**_weights(arguments), "env_namespace": "sim"}
     return [
         _environment(arguments, "maniskill", count="simulator_envs", below="sim"),
         _node(arguments, "evaluation", evaluation),
     ]
 
 
-def _recorder(arguments: Mapping[str, str]) -> list[NodeSpec]:
-    return [_node(arguments, "recorder", {"bag_uri": arguments["bag_uri"]})] if arguments["record"] == "true" else []
+def _recorder(arguments: Mapping[str, str], *, simulator: bool = False) -> list[NodeSpec]:
+    """simulator: also record the episodes of the environment in namespace sim."""
+    if arguments["record"] != "true":
+        return []
+    below = [f"sim/{name}" for name in ENVIRONMENT_TOPICS] if simulator else []
+    return [_node(arguments, "recorder", {"bag_uri": arguments["bag_uri"], "topics": [*GRAPH_TOPICS, *below]})]
 
 
 def _weights(arguments: Mapping[str, str]) -> dict[str, ParameterValue]:
-    return {"model_dir": arguments["model_dir"], "initial_policy": arguments["initial_policy"]}
+    names = ("model_dir", "initial_policy", "policy_factory")
+    return {name: arguments[name] for name in names}
 
 
 def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[str, ...] = ()) -> list[NodeSpec]:
     """consumers: further nodes that must not miss the first messages of a rollout."""
     reward = arguments["reward"] or ("endogenous" if backend == "world_model" else "rule")
-    recorder = _recorder(arguments)
+    recorder = _recorder(arguments, simulator=arguments.get("simulator") == "true")
     policy = {**_weights(arguments), "mode": arguments.get("mode", "lockstep")}
     awaited = ["environment", "reward_evaluator", *(node.name for node in recorder), *consumers]
     return [
         _environment(arguments, backend),
-        _node(arguments, "reward_evaluator", {"reward": reward, "model_dir": arguments["model_dir"]}),
+        _node(arguments, "reward_evaluator", {
+            "reward": reward, "reward_factory": arguments["reward_factory"], "model_dir": arguments["model_dir"],
+        }),
         _node(arguments, "policy", {**policy, "await_nodes": awaited}),
         *recorder,
     ]
@@ -299,7 +341,7 @@ def _replay_offline(arguments: Mapping[str, str]) -> Graph:
 
 
 def _evaluate(arguments: Mapping[str, str]) -> Graph:
-    return Graph("evaluate", (*_simulator_and_evaluation(arguments), *_recorder(arguments)))
+    return Graph("evaluate", (*_simulator_and_evaluation(arguments), *_recorder(arguments, simulator=True)))
 
 
 @dataclass(frozen=True)
@@ -314,12 +356,15 @@ class Scenario:
 
 _TRAINING = (
     *_COMMON, "model_dir", "starts_file", "initial_policy", "reward", "num_envs", "simulator_envs", "simulator", "seed",
-    "learner_ranks", "record", "bag_uri",
+    "learner_ranks", "record", "bag_uri", "policy_factory", "reward_factory",
 )  # fmt: skip
 _ROLLOUT = (
     "model_dir", "starts_file", "initial_policy", "backend", "mode", "reward", "num_envs", "seed", "record", "bag_uri",
+    "backend_factory", "policy_factory", "reward_factory",
 )  # fmt: skip
-_EVALUATE = (*_COMMON, "model_dir", "simulator_envs", "seed", "record", "bag_uri")
+_EVALUATE = (
+    *_COMMON, "model_dir", "initial_policy", "policy_factory", "simulator_envs", "seed", "record", "bag_uri",
+)  # fmt: skip
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
@@ -328,7 +373,7 @@ SCENARIOS: dict[str, Scenario] = {
                  _online_training),
         Scenario("rollout_record", "Let a policy act and record it", (*_COMMON, *_ROLLOUT), _rollout_record),
         Scenario("replay_offline", "Play a bag to the learner",
-                 (*_COMMON, "model_dir", "initial_policy", "bag_uri"), _replay_offline),
+                 (*_COMMON, "model_dir", "initial_policy", "policy_factory", "bag_uri"), _replay_offline),
         Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
         Scenario("composed", "online_training with all nodes in one process", _TRAINING, _online_training),
     )

@@ -1,12 +1,17 @@
 """The face of a scenario for `ros2 launch`: needs the ROS 2 packages launch and launch_ros (apt), nothing of rclpy.
 
+ros2 runs under the system's Python, which has neither our pydantic nor torch: the graph is made by the nodes'
+interpreter (ros.arguments, in a process of its own), and this module imports only the standard library.
+
 PyPI's `launch` 0.1.3 is an unrelated project of the same name.
 """
 
+import json
+import subprocess
+from collections.abc import Mapping
 from typing import Any
 
-from wm_nodes.ros import arguments as launch_arguments
-from wm_nodes.ros.environment import graph_environment
+from wm_nodes.ros.environment import graph_environment, interpreter
 from wm_nodes.ros.graph import Graph, NodeSpec, argument_table
 
 
@@ -43,8 +48,26 @@ def _start(scenario: str, context: Any) -> list[Any]:
     given = {
         argument.name: LaunchConfiguration(argument.name).perform(context) for argument in argument_table(scenario)
     }
-    graph, values = launch_arguments.prepare(scenario, given)
-    return node_actions(graph, launch_arguments.interpreter(values))
+    python = interpreter(given)
+    return node_actions(prepared(scenario, given, python), python)
+
+
+def prepared(scenario: str, given: Mapping[str, str], python: str) -> Graph:
+    """ros.arguments.prepare in the nodes' interpreter.
+
+    Raises:
+        RuntimeError: its last line of error, and what to set where a module is missing.
+    """
+    command = [python, "-m", "wm_nodes.ros.arguments", scenario]
+    done = subprocess.run(
+        command, input=json.dumps(dict(given)), env=graph_environment(python=python), capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    if done.returncode:
+        text = (done.stderr.strip().splitlines() or ["no output"])[-1].removeprefix("error: ")
+        hint = "" if done.returncode == 2 else f"; {python} is not the nodes' Python: set WM_PYTHON, or python:="
+        raise RuntimeError(f"{text}{hint}")
+    return Graph.from_json(done.stdout)
 
 
 def node_actions(graph: Graph, python: str) -> list[Any]:
@@ -57,7 +80,9 @@ def _action(node: NodeSpec, python: str, environment: dict[str, str]) -> Any:
     from launch.actions import Shutdown
     from launch_ros.actions import Node
 
-    named = {} if node.inside else {"name": node.name, "parameters": [dict(node.parameters)] if node.parameters else []}
+    files = [node.extra_parameters] if node.extra_parameters else []
+    values = [dict(node.parameters)] if node.parameters else []
+    named = {} if node.inside else {"name": node.name, "parameters": [*values, *files]}
     by_node = node.parameter_arguments() if node.inside else []
     return Node(
         executable=python, arguments=node.program(), namespace=node.namespace,

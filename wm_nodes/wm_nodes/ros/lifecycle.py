@@ -1,5 +1,9 @@
 """The base of every node: lifecycle, described parameters, diagnostics, heartbeat, sequence numbers, clean stop."""
 
+import math
+import os
+import socket
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -41,8 +45,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     def __init__(self, name: str, params: Sequence[Param] = (), **node_arguments: Any) -> None:
         super().__init__(name, **node_arguments)
         self.session = new_session()
+        """A new one at every configure: what is numbered (seq, step ids, stamps) starts again with it."""
         self.failed = False
         """True: the process should end with a non-zero exit code."""
+        self._identity = f"process {os.getpid()} on {socket.gethostname()} since {time.time():.6f}"
         self._active = False
         self._entities: list[Callable[[], object]] = []
         self._trackers: dict[str, GapTracker] = {}
@@ -180,6 +186,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     # Lifecycle callbacks of rclpy.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.session = new_session()
         result = self._attempt("configure", self.configure)
         if result == TransitionCallbackReturn.FAILURE:
             self._release()
@@ -196,7 +203,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         result = self._attempt("deactivate", lambda: self.deactivate("deactivated"))
-        self._active = False
+        if result == TransitionCallbackReturn.SUCCESS:
+            self._active = False
         return result
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -251,16 +259,32 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.on_gap(name, missing)
 
     def _on_run_state(self, message: RunState) -> None:
-        if message.state in (RunState.FINISHED, RunState.FAILED):
+        if message.node == self.get_fully_qualified_name():
+            self._check_name(message)
+        elif message.state in (RunState.FINISHED, RunState.FAILED):
             self.peers.left(message.node)
             self.links.book.forget(message.node)
-        elif not self.peers.heard(message.node):
+            self.diagnostics.clear_condition(f"peer {message.node}")
+        elif self.peers.heard(message.node):
+            self.diagnostics.clear_condition(f"peer {message.node}")
+
+    def _check_name(self, message: RunState) -> None:
+        """End this node where another one of its name was there before: both would answer the same services.
+
+        Only a living process sends a heartbeat, so what a killed one left in the ROS graph does not count.
+        """
+        if message.state not in (RunState.IDLE, RunState.RUNNING) or message.detail == self._identity or self.failed:
             return
-        self.diagnostics.clear_condition(f"peer {message.node}")
+        if _since(message.detail) < _since(self._identity):
+            self.failed = True
+            self.get_logger().error(
+                f"another {message.node} is there already ({message.detail}): stop it, or give this one another "
+                "namespace (-r __ns:=...) or ROS_DOMAIN_ID"
+            )
 
     def _on_heartbeat(self) -> None:
         self.peers.timeout_s = float(self.param("peer_timeout_s"))
-        self._publish_state(RunState.RUNNING if self._active else RunState.IDLE, "")
+        self._publish_state(RunState.RUNNING if self._active else RunState.IDLE, self._identity)
         self.links.announce()
         for name in self.peers.check():
             text = f"{name} is lost: silent for more than {self.peers.timeout_s:g} s; restart it"
@@ -296,3 +320,12 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self._diagnostics_publisher.publish(message)
         except InvalidHandle:
             return
+
+
+def _since(identity: str) -> float:
+    """When a process of this name began, in s since 1970; never, where another program wrote the heartbeat."""
+    _, found, text = identity.rpartition(" since ")
+    try:
+        return float(text) if found else math.inf
+    except ValueError:
+        return math.inf

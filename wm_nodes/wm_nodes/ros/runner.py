@@ -18,7 +18,7 @@ from typing import TextIO
 
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.domain import DomainInUseError, DomainLock
-from wm_nodes.ros.environment import PROFILE, graph_environment
+from wm_nodes.ros.environment import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES, graph_environment, interpreter
 from wm_nodes.ros.graph import Graph, GraphError, describe_arguments
 from wm_nodes.ros.processes import NodeProcess
 from wm_nodes.ros.readiness import NotReadyError, wait_ready
@@ -26,8 +26,6 @@ from wm_nodes.ros.readiness import NotReadyError, wait_ready
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 GRACE_S = 5.0
 """Time for an orderly end after SIGINT, and again after SIGTERM."""
-SEGMENT_BYTES = 40 * 2**20
-"""Shared memory that one process may take with our Fast DDS profile."""
 
 
 class NodeDiedError(RuntimeError):
@@ -204,11 +202,11 @@ class Runner:
 
     def _fit_shared_memory(self) -> None:
         """Leave the big segment out where /dev/shm (64 MiB in many containers) cannot hold one for each process."""
-        if self.environment.get("FASTRTPS_DEFAULT_PROFILES_FILE") != str(PROFILE) or not Path("/dev/shm").is_dir():
+        if self.environment.get(PROFILE_VARIABLE) != str(PROFILE) or not Path("/dev/shm").is_dir():
             return
         free, needed = shutil.disk_usage("/dev/shm").free, SEGMENT_BYTES * len(self.graph.nodes)
         if free < needed:
-            del self.environment["FASTRTPS_DEFAULT_PROFILES_FILE"]
+            self.environment[PROFILE_VARIABLE] = ""
             self._say(
                 f"/dev/shm has {free >> 20} MiB free, {needed >> 20} MiB wanted: going on with small segments; images "
                 "above 300 kB may be lost (docker run --shm-size=1g cures it)"
@@ -242,8 +240,8 @@ def main(scenario: str, argv: Sequence[str] | None = None) -> int:
         given[name] = value
     try:
         graph, values = launch_arguments.prepare(scenario, given)
-        return run(graph, Path(values["run_dir"]), launch_arguments.interpreter(values))
-    except (GraphError, DomainInUseError, ValueError, NotReadyError) as error:
+        return run(graph, Path(values["run_dir"]), interpreter(values))
+    except (GraphError, DomainInUseError, ValueError, OSError, NotReadyError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 

@@ -7,6 +7,7 @@ import gc
 import logging
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -16,6 +17,8 @@ import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+
+from wm_nodes.ros.environment import set_node_defaults
 
 EXECUTORS = ("events", "single", "multi")
 SPIN_ONCE_S = 0.1
@@ -70,13 +73,26 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def _marking_failed(nodes: list[Any]) -> Iterator[None]:
+    """Log an exception that nobody expected, with its trace, and mark the nodes as failed, so that they still stop."""
+    try:
+        yield
+    except Exception:
+        for node in nodes:
+            node.failed = True
+        nodes[0].get_logger().fatal(f"unexpected error; stopping\n{traceback.format_exc()}")
+
+
 def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = None) -> int:
     """Create nodes, start them, spin until a signal, stop them, shut down. Return the exit code.
 
     Each node is an rclpy node with start() -> bool and stop(), as ros.lifecycle.ManagedNode is. The first node's
-    `executor` parameter chooses the executor. A start that fails gives exit code 1 after one line of error.
+    `executor` parameter chooses the executor. A start that fails gives exit code 1 after one line of error;
+    an exception out of a callback gives it after its trace, and the nodes still stop in order.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
+    set_node_defaults()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Any] = []
     code = 0
@@ -86,11 +102,13 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
             executor = make_executor(executor_kind(nodes[0]))
             for node in nodes:
                 executor.add_node(node)
-            if all(node.start() for node in nodes):
-                spin(executor, until=lambda: stopped() or any(node.failed for node in nodes))
-            code = int(any(node.failed for node in nodes))
+            with _marking_failed(nodes):
+                if all(node.start() for node in nodes):
+                    spin(executor, until=lambda: stopped() or any(node.failed for node in nodes))
             for node in reversed(nodes):
-                node.stop()
+                with _marking_failed([node]):
+                    node.stop()
+            code = int(any(node.failed for node in nodes))
             for node in nodes:
                 executor.remove_node(node)
                 node.destroy_node()

@@ -8,8 +8,8 @@ from mani_skill.envs.utils.system import backend as maniskill_backend
 SOFTWARE_DEVICE = "pci:0"
 
 
-class NoRendererError(RuntimeError):
-    """No Vulkan device can render."""
+class NoRendererError(OSError):
+    """No Vulkan device can render. An OSError, so that nodes and commands report it as one line."""
 
 
 @functools.cache

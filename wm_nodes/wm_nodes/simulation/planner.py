@@ -18,7 +18,7 @@ PLANNER_TIME_STEP_S = 0.02
 TOOL_LINK = "panda_hand_tcp"
 
 
-class PlanningError(RuntimeError):
+class PlanningError(ValueError):
     """MPLib found no path."""
 
 
