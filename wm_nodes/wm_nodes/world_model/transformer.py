@@ -17,7 +17,7 @@ class TemporalCache:
     """Keys and values of past frames for one block. Subclasses decide where they are kept."""
 
     def extend(self, keys_BTSHE: Tensor, values_BTSHE: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Add T frames; return all keys, values (B, K, S, H, E) and the mask (B or 1, T, K), True where visible."""
+        """Add T frames; return the keys, values (B, K, S, H, E) and the mask (B or 1, T, K), True where visible."""
         raise NotImplementedError
 
     def rotation(self, num_frames: int) -> Tensor:
@@ -50,9 +50,10 @@ class GrowingCache(TemporalCache):
 class RingCache(TemporalCache):
     """Fixed memory for inference, one frame at a time; each of the B environments has its own time.
 
-    A frame is kept in slot (its time mod window), and attention always runs over every slot, so an environment's
-    numbers do not depend on when the others were reset. While `peeking`, a frame is seen but its slot is written again
-    by the next one: for trying drafts of a frame before the final one.
+    A frame is kept in slot (its time mod window). Attention runs over the slots that any environment has filled; those
+    that one has not filled yet weigh exactly 0 and come after its own, so that its numbers do not depend on when the
+    others were reset. While `peeking`, a frame is seen but its slot is written again by the next one: for trying drafts
+    of a frame before the final one.
     """
 
     def __init__(self, window: int) -> None:
@@ -60,16 +61,19 @@ class RingCache(TemporalCache):
         self.peeking = False
         self._keys: Tensor | None = None
         self._values: Tensor | None = None
+        self._num_filled = 0
         self.times_B: Tensor | None = None
 
     def start(self, batch: int, device: torch.device) -> None:
         self.times_B = torch.zeros(batch, dtype=torch.long, device=device)
+        self._num_filled = 0
 
     def restart(self, mask_B: Tensor) -> None:
         """Forget the history of the environments in `mask_B`."""
         if self.times_B is None:
             raise RuntimeError("start the cache before restarting parts of it")
         self.times_B = torch.where(mask_B, 0, self.times_B)
+        self._num_filled = min(self._window, int(self.times_B.max()))
 
     def rotation(self, num_frames: int) -> Tensor:
         if num_frames != 1 or self.times_B is None:
@@ -86,10 +90,12 @@ class RingCache(TemporalCache):
         slots, rows = self.times_B % self._window, torch.arange(batch, device=keys_BTSHE.device)
         self._keys[rows, slots] = keys_BTSHE[:, 0]
         self._values[rows, slots] = values_BTSHE[:, 0]
-        filled = torch.arange(self._window, device=keys_BTSHE.device) <= self.times_B.unsqueeze(1)
+        visible = min(self._window, self._num_filled + 1)
+        filled = torch.arange(visible, device=keys_BTSHE.device) <= self.times_B.unsqueeze(1)
         if not self.peeking:
             self.times_B = self.times_B + 1
-        return self._keys, self._values, filled.unsqueeze(1)
+            self._num_filled = visible
+        return self._keys[:, :visible], self._values[:, :visible], filled.unsqueeze(1)
 
 
 class Attention(nn.Module):

@@ -1,0 +1,110 @@
+"""Speed, side by side in one run: DDS against one process, the world model against the simulator, stage by stage."""
+
+import argparse
+import json
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.table import Table
+
+from wm_nodes.benchmark.graph import measure_graph
+from wm_nodes.benchmark.inputs import Effort, console, prepare_model
+from wm_nodes.benchmark.simulator import IMAGINED_ENVS, measure_simulator
+from wm_nodes.benchmark.stages import measure_stages
+from wm_nodes.config.load import load_config, preset_names
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.reports import machine_facts
+from wm_nodes.reports.summary import plain, write_whole
+
+FULL, QUICK = Effort(12, 5000, 5, 30), Effort(3, 500, 2, 8)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Measure, show the table, write --json. Return the exit code: 0 done, 2 a clear error."""
+    arguments = _parser().parse_args(argv)
+    effort = QUICK if arguments.quick else FULL
+    try:
+        config = load_config(arguments.preset, {"seed": arguments.seed})
+        with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as folder:
+            found = measure(config, effort, Path(folder), arguments.model_dir)
+    except (ValueError, OSError, RuntimeError) as error:
+        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        return 2
+    found |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed}
+    show(found)
+    if arguments.json:
+        write_whole(arguments.json, json.dumps(plain(found), indent=1) + "\n")
+        console.print(f"written {arguments.json}", highlight=False)
+    return 0
+
+
+def measure(config: RunConfig, effort: Effort, folder: Path, model_dir: Path | None = None) -> dict[str, Any]:
+    """All four parts. Keys: graph_overhead, step_growth, imagined_over_simulator, imagined_steps_per_s, and details."""
+    torch.set_num_threads(len(os.sched_getaffinity(0)))
+    model, starts, description = prepare_model(config, folder, model_dir)
+    console.print(f"world model: {description}; {torch.get_num_threads()} torch threads", highlight=False)
+    found: dict[str, Any] = {"model": description, "torch_threads": torch.get_num_threads()}
+    found |= measure_graph(config, effort, folder, model, starts)
+    found |= measure_simulator(config, effort, model, starts)
+    found["stages"] = measure_stages(config, effort, model, starts)
+    return {**found, "machine": machine_facts(), "date": time.strftime("%Y-%m-%d"), "platform": platform.platform()}
+
+
+def show(found: dict[str, Any]) -> None:
+    """The tables on the screen."""
+    graph, simulator, facts = found["graph"], found["simulator"], found["machine"]
+    table = Table(title=f"{facts['processor']}, {facts['cores']} cores, {found['date']}", caption=found["model"])
+    for name in ("", "value", "goal", "measured"):
+        table.add_column(name, justify="right" if name == "value" else "left")
+    table.add_row(
+        "graph_overhead", f"{found['graph_overhead']:.3f}", "<= 1.10",
+        f"{graph['num_envs']} x {graph['image']} step: {graph['dds_step_ms']:.1f} ms over DDS, "
+        f"{graph['in_process_step_ms']:.1f} ms in one process, {graph['threads_each']} thread each",
+    )  # fmt: skip
+    table.add_row(
+        "step_growth",
+        f"{found['step_growth']:.3f}",
+        "about 1",
+        f"{graph['growth_steps']} steps, first and last tenth: {graph['growth_first_ms']:.2f} and "
+        f"{graph['growth_last_ms']:.2f} ms (10 % quantiles: {graph['growth_first_p10_ms']:.2f} and "
+        f"{graph['growth_last_p10_ms']:.2f} ms)",
+    )
+    ratio = found["imagined_over_simulator"]
+    simulated = simulator.get("simulator_steps_per_s")
+    table.add_row(
+        "imagined_over_simulator",
+        "-" if ratio is None else f"{ratio:.1f}",
+        ">= 10",
+        simulator["missing"]
+        if ratio is None
+        else f"ManiSkill with rendering, {simulator['simulator_processes']} processes: {simulated:.1f} steps/s",
+    )
+    table.add_row(
+        "imagined_steps_per_s",
+        f"{found['imagined_steps_per_s']:.0f}",
+        ">= 250",
+        f"{simulator['imagined_envs']} environments with {simulator['reward']} reward",
+    )
+    console.print(table)
+    stages = Table(title=f"one batch of {IMAGINED_ENVS}")
+    for name in ("stage", "ms", "peak memory, MiB"):
+        stages.add_column(name, justify="left" if name == "stage" else "right")
+    for name, values in found["stages"].items():
+        stages.add_row(name, f"{values['ms']:.1f}", f"{values['peak_mib']:.1f}")
+    console.print(stages)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="benchmark.py", description=__doc__)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the numbers there")
+    parser.add_argument("--quick", action="store_true", help="a tenth of the work, for a first look; less exact")
+    parser.add_argument("--preset", default="cpu", help=f"model size: one of {', '.join(preset_names())}, or a .yaml")
+    parser.add_argument("--model-dir", type=Path, help="world model to measure instead of the shipped one")
+    parser.add_argument("--seed", type=int, default=0)
+    return parser

@@ -1,0 +1,128 @@
+"""The same step over DDS and in this process, with as many threads on both sides."""
+
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from wm_nodes.benchmark.inputs import Effort, console, interleave, time_episode, time_steps
+from wm_nodes.config.load import dump_config
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.learning.policies import make_imagined_environment
+from wm_nodes.types import Environment
+
+GRAPH_ENVS, GRAPH_THREADS = 16, 1
+"""One torch thread per node is the graph's default; the loop in one process gets as many."""
+
+TIMEOUT_S = 60.0
+DOMAINS = range(60, 102)
+
+
+def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, starts: Path) -> dict[str, Any]:
+    """graph_overhead: median step over DDS / median step in this process, 16 environments of the default model.
+    step_growth: median of the last tenth / of the first tenth of many steps of an environment that costs nothing."""
+    from wm_nodes.ros.domain import first_free
+    from wm_nodes.ros.graph import Graph, NodeSpec, ParameterValue
+    from wm_nodes.ros.runner import Runner
+
+    config_file = folder / "config.yaml"
+    config_file.write_text(dump_config(config))
+    common: dict[str, ParameterValue] = {
+        "config_file": str(config_file), "run_dir": str(folder), "num_envs": GRAPH_ENVS, "seed": config.seed,
+    }  # fmt: skip
+    served: dict[str, ParameterValue] = {"backend": "world_model", "model_dir": str(model), "starts_file": str(starts)}
+    still: dict[str, ParameterValue] = {
+        "backend": "factory", "backend_factory": "wm_nodes.benchmark.still:make_still_environment",
+    }  # fmt: skip
+    module = "wm_nodes.nodes.environment_node"
+    graph_nodes = (
+        NodeSpec(module, "environment", "/wm", {**common, **served}),
+        NodeSpec(module, "environment", "/wm/still", {**common, **still}),
+    )
+    console.print("graph: starting two environment nodes", highlight=False)
+    with ExitStack() as stack:
+        lock = first_free(DOMAINS, "the benchmark", group="graph")
+        stack.callback(lock.release)
+        environment = {"ROS_DOMAIN_ID": str(lock.domain), "OMP_NUM_THREADS": str(GRAPH_THREADS)}
+        graph = Graph("benchmark", graph_nodes, environment)
+        runner = stack.enter_context(Runner(graph, log=None, log_dir=folder / "logs", use_domain_lock=False))
+        runner.wait_ready(TIMEOUT_S)
+        remote, still_remote = stack.enter_context(
+            remote_environments(runner.environment, folder, ("", "still"), runner.check)
+        )
+        local = make_imagined_environment(config, model, starts, num_envs=GRAPH_ENVS, seed=config.seed)
+        console.print("graph: step over DDS against the same step in one process", highlight=False)
+        with torch_threads(GRAPH_THREADS):
+            over_dds, in_process = interleave(
+                [lambda block: time_episode(remote, block), lambda block: time_episode(local, block)],
+                effort.overhead_blocks,
+            )
+        console.print(f"graph: {effort.growth_steps} steps of a costless environment", highlight=False)
+        growth_s = time_steps(still_remote, effort.growth_steps)
+    tenth = max(1, len(growth_s) // 10)
+    first, last = float(np.median(growth_s[:tenth])), float(np.median(growth_s[-tenth:]))
+    fastest = [1e3 * float(np.quantile(part, 0.1)) for part in (growth_s[:tenth], growth_s[-tenth:])]
+    dds, alone = float(np.median(np.concatenate(over_dds))), float(np.median(np.concatenate(in_process)))
+    return {
+        "graph_overhead": dds / alone,
+        "step_growth": last / first,
+        "graph": {
+            "num_envs": GRAPH_ENVS, "threads_each": GRAPH_THREADS,
+            "image": f"{local.spec.height}x{local.spec.width}", "dds_step_ms": 1e3 * dds,
+            "in_process_step_ms": 1e3 * alone, "steps_each": int(sum(map(len, over_dds))),
+            "growth_steps": len(growth_s), "growth_first_ms": 1e3 * first, "growth_last_ms": 1e3 * last,
+            "growth_first_p10_ms": fastest[0], "growth_last_p10_ms": fastest[1],
+        },
+    }  # fmt: skip
+
+
+@contextmanager
+def remote_environments(
+    environment: dict[str, str], folder: Path, prefixes: Sequence[str], alive: Callable[[], None]
+) -> Iterator[list[Environment]]:
+    """Environment nodes through DDS, from a node of this process whose executor has a thread of its own."""
+    os.environ.update(environment)
+    import rclpy
+    from rclpy.parameter import Parameter
+    from rclpy.signals import SignalHandlerOptions
+
+    from wm_nodes.nodes.remote_environment import RemoteEnvironment
+    from wm_nodes.ros.clients import RosEnvironmentClient
+    from wm_nodes.ros.lifecycle import ManagedNode
+    from wm_nodes.ros.spin import make_executor, spin
+
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    run_dir = Parameter("run_dir", value=str(folder))
+    node = ManagedNode("benchmark", namespace="/wm", parameter_overrides=[run_dir])
+    executor = make_executor("events")
+    executor.add_node(node)
+    stop = threading.Event()
+    thread = threading.Thread(target=spin, args=(executor, stop.is_set), daemon=True)
+    thread.start()
+    try:
+        clients = [RosEnvironmentClient(node, prefix, TIMEOUT_S) for prefix in prefixes]
+        yield [RemoteEnvironment(client, alive, timeout_s=TIMEOUT_S, behaviour="benchmark") for client in clients]
+    finally:
+        node.stop()
+        stop.set()
+        thread.join()
+        executor.remove_node(node)
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Compute with `count` threads in this process."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

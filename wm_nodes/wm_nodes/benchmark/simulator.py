@@ -1,0 +1,149 @@
+"""World model against simulator, each with the same cores: torch threads there, one process per core here.
+
+No episode ends early on either side, so that every step of every environment counts.
+"""
+
+import multiprocessing as mp
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from wm_nodes.benchmark.inputs import Effort, actions_of, console, interleave, seeds_of
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.learning.policies import make_endogenous_reward, make_imagined_environment
+from wm_nodes.learning.rollouts import reward_input
+from wm_nodes.reward import RewardModel, RuleReward
+from wm_nodes.types import Environment
+
+IMAGINED_ENVS, SIMULATOR_ENVS = 64, 4
+WORKER_TIMEOUT_S = 300.0
+
+
+def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Path) -> dict[str, Any]:
+    """imagined_steps_per_s: environment steps with reward, 64 imagined environments, a torch thread per core;
+    imagined_over_simulator: over those of ManiSkill with rendering and rule reward, a process per core. Resets are not
+    counted on either side."""
+    from wm_nodes.simulation.backend import NoRendererError, render_backend
+
+    endless = config.model_copy(update={"reward": config.reward.model_copy(update={"success_threshold": 1.0})})
+    imagined = make_imagined_environment(endless, model, starts, num_envs=IMAGINED_ENVS, seed=config.seed)
+    reward = make_endogenous_reward(config, model)
+    cores = sorted(os.sched_getaffinity(0))
+    missing = ""
+    try:
+        render_backend(config.simulation.render_device)
+    except NoRendererError as error:
+        missing = str(error)
+        console.print(f"simulator left out: {error}", highlight=False)
+    console.print(f"world model against ManiSkill with rendering, {len(cores)} cores each", highlight=False)
+    with simulator_workers(config, [] if missing else cores) as workers:
+        contenders = [lambda block: rate_episode(imagined, reward, block).steps_per_s]
+        if workers:
+            contenders.append(lambda block: rate_workers(workers, block))
+        rates = [float(np.median(blocks)) for blocks in interleave(contenders, effort.simulator_blocks)]
+    details: dict[str, Any] = {
+        "imagined_envs": IMAGINED_ENVS, "imagined_threads": torch.get_num_threads(),
+        "imagined_goals": imagined.goals() is not None, "dense_weight": config.reward.dense_weight,
+        "simulator_envs": SIMULATOR_ENVS, "simulator_processes": len(workers), "cores": len(cores), "missing": missing,
+        "reward": reward.name,
+    }  # fmt: skip
+    if not missing:
+        details["simulator_steps_per_s"] = rates[1]
+    return {
+        "imagined_steps_per_s": rates[0],
+        "imagined_over_simulator": None if missing else rates[0] / rates[1],
+        "simulator": details,
+    }
+
+
+@contextmanager
+def simulator_workers(config: RunConfig, cores: list[int]) -> Iterator[list[Connection]]:
+    """One process per core with SIMULATOR_ENVS scenes each; idle until a block number comes."""
+    context = mp.get_context("spawn")
+    ends: list[Connection] = []
+    processes = []
+    try:
+        for core in cores:
+            here, there = context.Pipe()
+            process = context.Process(target=_serve_blocks, args=(config, core, there), daemon=True)
+            process.start()
+            there.close()
+            ends.append(here)
+            processes.append(process)
+        yield ends
+    finally:
+        for end in ends:
+            end.close()
+        for process in processes:
+            process.join(10)
+            if process.is_alive():
+                process.terminate()
+
+
+def _serve_blocks(config: RunConfig, core: int, commands: Connection) -> None:
+    """Rate every block that is asked for, until the other end closes."""
+    os.sched_setaffinity(0, {core})
+    torch.set_num_threads(1)
+    from wm_nodes.simulation.environment import ManiSkillEnvironment
+
+    env = ManiSkillEnvironment(
+        config.task, config.simulation, num_envs=SIMULATOR_ENVS, seed=config.seed + core, end_on_success=False
+    )
+    rule = RuleReward(config.reward.sparse_weight)
+    try:
+        while True:
+            commands.send(rate_episode(env, rule, commands.recv()))
+    except EOFError:
+        env.close()
+
+
+def rate_workers(workers: list[Connection], block: int) -> float:
+    """Steps per second of all workers at once, each with scenes of its own.
+
+    Raises:
+        RuntimeError: a worker ended or is silent for WORKER_TIMEOUT_S.
+    """
+    for index, worker in enumerate(workers):
+        worker.send(block * len(workers) + index)
+    total = 0.0
+    for worker in workers:
+        try:
+            if not worker.poll(WORKER_TIMEOUT_S):
+                raise RuntimeError(f"a simulator process gave no answer for {WORKER_TIMEOUT_S:g} s; is memory short?")
+            total += worker.recv().steps_per_s
+        except EOFError:
+            raise RuntimeError("a simulator process ended; its error is above") from None
+    return total
+
+
+@dataclass(frozen=True)
+class Rate:
+    """steps_per_s: environment steps that counted, per second of stepping."""
+
+    steps_per_s: float
+
+
+def rate_episode(env: Environment, reward: RewardModel, block: int) -> Rate:
+    """Reset, then step with rewards to the step limit; environments that have ended do not count.
+
+    Every goal counts as found: a reward without a goal would be skipped, and look fast.
+    """
+    observation = env.reset(None, seeds_of(env.spec, block))
+    steps = 0
+    start = time.perf_counter()
+    for actions in actions_of(env.spec, block, env.spec.max_episode_steps):
+        imagined = env.goals()
+        goals = None if imagined is None else (imagined[0], np.ones_like(imagined[1]))
+        result = env.step(actions)
+        reward.evaluate(reward_input(observation, result, goals))
+        observation = result.observation
+        steps += int(result.valid.sum())
+    return Rate(steps / (time.perf_counter() - start))
