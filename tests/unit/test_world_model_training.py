@@ -16,7 +16,9 @@ from wm_nodes.learning.rollout_evaluation import auc, detection_metrics, evaluat
 from wm_nodes.learning.tokenizer_training import train_tokenizer
 from wm_nodes.learning.training_loop import LoopSettings, TrainingLoop
 from wm_nodes.learning.world_model_training import (
+    RolloutTerms,
     bootstrap_masks,
+    decoded_losses,
     done_losses,
     rollout_steps_at,
     token_weights,
@@ -128,6 +130,34 @@ def test_auc_counts_ties_half_and_detection_counts_episodes() -> None:
     found = detection_metrics(scores, positive, 0.6)
     assert (found["precision"], found["recall"], found["agreement"]) == (1.0, 0.5, 0.75)
     assert np.isnan(detection_metrics(scores, np.zeros(4, bool), 0.95)["precision"])
+
+
+def test_decoded_losses_are_smallest_for_the_true_latents_and_reach_the_predictions_only() -> None:
+    config, episodes = config_of(tokenizer__num_iterations=40), arrays(12)
+    tokenizer, _ = train_tokenizer(episodes, config, 0, None, progress=False)
+    tokenizer.requires_grad_(False)
+    data = tokenise_episodes(tokenizer, episodes)
+    index = torch.arange(12)
+
+    def losses(latents: torch.Tensor) -> dict[str, torch.Tensor]:
+        terms = RolloutTerms(latents, torch.zeros(()), torch.zeros(()))
+        return decoded_losses(terms, tokenizer, data, index, torch.Generator().manual_seed(0))
+
+    true = data.latents[:, 1:].float().requires_grad_()
+    right, wrong = losses(true), losses(true.detach().roll(1, 0))
+    assert right.keys() == wrong.keys() == {"pixel", "recoded", "recoded_state"}
+    assert all(right[key] < wrong[key] for key in right)
+    sum(right.values()).backward()
+    touched = (true.grad != 0).flatten(2).any(-1)
+    assert touched.any(1).all() and int(touched.sum()) <= 2 * 12
+    assert all(p.grad is None for p in tokenizer.parameters())
+
+
+def test_a_finished_stage_still_tells_its_last_metrics(tmp_path: Path) -> None:
+    made = TrainingLoop("toy", torch.nn.Linear(3, 2), LoopSettings(3, 0.1), tmp_path)
+    metrics = made.run(lambda i: {"loss": made.model.weight.square().sum()}, progress=False)
+    again = TrainingLoop("toy", torch.nn.Linear(3, 2), LoopSettings(3, 0.1), tmp_path)
+    assert again.run(lambda i: {}, progress=False) == metrics
 
 
 @pytest.mark.slow

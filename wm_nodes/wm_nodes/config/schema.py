@@ -46,6 +46,8 @@ class DataConfig(Section):
     """Relative share of each behaviour (expert, noisy, near_miss, biased, waypoint, random, reach, ...)."""
     num_workers: PositiveInt
     """Collecting processes."""
+    policy_episodes: NonNegativeInt
+    """Episodes of each weak cloned policy (learning/pretraining.py) added to the world model's data; 0: none."""
 
 
 class TokenizerConfig(Section):
@@ -68,18 +70,6 @@ class TokenizerConfig(Section):
     """Extra weight of pixels that differ from the episode-independent background."""
 
 
-class RefreshConfig(Section):
-    """Second stage of the action model: full-horizon rollouts, with episodes of weak policies added to the data."""
-
-    num_iterations: NonNegativeInt
-    """0: no second stage."""
-    learning_rate: PositiveFloat
-    state_weight: NonNegativeFloat
-    done_weight: NonNegativeFloat
-    policy_episodes: NonNegativeInt
-    """Simulator episodes of each of three cloned policies (learning/pretraining.py), acting with exploration noise."""
-
-
 class WorldModelConfig(Section):
     width: PositiveInt
     depth: PositiveInt
@@ -100,8 +90,9 @@ class WorldModelConfig(Section):
     text_num_iterations: PositiveInt
     """Iterations of the text model, warm-started from the action model."""
     state_weight: NonNegativeFloat
-    """Weight of the auxiliary loss that reads simulator positions off the predicted frame (0: off)."""
-    refresh: "RefreshConfig"
+    """Weight of the auxiliary losses on simulator positions, of the predicted frame and of the model's own reading."""
+    decoded_weight: NonNegativeFloat
+    """Weight of the losses on predicted frames after decoding, and after encoding them again (0: off)."""
 
 
 class RewardConfig(Section):

@@ -1,7 +1,7 @@
 """Does this world model deserve that a policy is trained in it? Judged on held-out real episodes, before any update.
 
 The numbers come from rollout_evaluation: recorded actions rolled out open-loop from recorded first frames. Positions
-are read off the imagined pictures by the tokenizer's state probe; "copying" reads them off the first frame instead.
+are read off the imagined pictures by the judge's own probe; "copying" reads them off the first frame instead.
 """
 
 import math
@@ -26,7 +26,7 @@ MORE_TRAINING = (
 )
 MORE_NEAR_MISSES = "collect more near misses (data.behaviours.near_miss), or raise reward.success_threshold"
 MORE_SUCCESSES = "collect more successes (data.behaviours), or lower reward.success_threshold"
-POLICY_DATA = "refresh the model with more episodes of weak policies (world_model.refresh.policy_episodes)"
+POLICY_DATA = "refresh the model with more episodes of weak policies (data.policy_episodes)"
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,8 @@ class GateReport:
 
 def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> dict[str, float]:
     """Rollouts of held-out actions against what really happened; see rollout_evaluation."""
-    return evaluate_rollouts(models.tokenizer, models.action, heldout, threshold=config.reward.success_threshold)
+    threshold = config.reward.success_threshold
+    return evaluate_rollouts(models.tokenizer, models.action, heldout, threshold=threshold, probe=models.probe)
 
 
 def judge_model(

@@ -2,12 +2,14 @@
 
 Shapes: E episodes, T steps, S tokens, D values per token, J tasks, P probed values (PROBE_NAMES).
 
-Positions are read off pictures: predicted frames are decoded, encoded again and given to the tokenizer's state probe,
-which was trained on real frames only. Its own error on real held-out frames is reported as the floor, and copying the
-first frame is measured in the same way.
+Positions are read off pictures, by the judge's own probe (world_model/position_probe.py), which was trained on real
+frames only and through which no loss of the world model ever passed. Where a model folder has none, predicted frames
+are encoded again and read by the tokenizer's probe. The reader's own error on real held-out frames is reported as the
+floor, and copying the first frame is measured in the same way.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from wm_nodes.learning.episode_arrays import EpisodeArrays
 from wm_nodes.learning.tokenizer_training import probe_targets
 from wm_nodes.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import ActionModel, done_signal
+from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
@@ -36,13 +39,12 @@ class ImaginedEpisodes:
     """Rollouts of recorded actions from recorded first frames.
 
     frames: uint8 (E, T, H, W, 3), frames 1..T. signals: float32 (E, T, J), pessimistic done probability of frames 1..T.
-    uncertainty: float32 (E, T, J). positions: float32 (E, T, P), read off `frames`, m.
+    uncertainty: float32 (E, T, J).
     """
 
     frames: UInt8Array
     signals: FloatArray
     uncertainty: FloatArray
-    positions: FloatArray
 
 
 @torch.inference_mode()
@@ -59,26 +61,29 @@ def imagine_episodes(
 
 def _imagine_batch(
     tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays
-) -> tuple[UInt8Array, FloatArray, FloatArray, FloatArray]:
+) -> tuple[UInt8Array, FloatArray, FloatArray]:
     actions, states = torch.from_numpy(episodes.actions), torch.from_numpy(episodes.states)
     current = tokenizer.encode(episodes.images[:, 0])
     caches = model.trunk.new_ring_caches(len(episodes), current.device)
-    frames, signals, spreads, positions = list[Tensor](), list[Tensor](), list[Tensor](), list[Tensor]()
+    frames, signals, spreads = list[Tensor](), list[Tensor](), list[Tensor]()
     for t in range(episodes.num_steps):
         with compute_context(current.device):
             current, logits = model.advance(current, actions[:, t], states[:, t], states[:, t + 1], caches)
         signal, spread = done_signal(logits)
-        image = tokenizer.decode(current)
-        frames.append(image)
+        frames.append(tokenizer.decode(current))
         signals.append(signal)
         spreads.append(spread)
-        positions.append(tokenizer.read_state(tokenizer.encode(image)))
-    stacked = (torch.stack(listed, 1).numpy() for listed in (frames, signals, spreads, positions))
+    stacked = (torch.stack(listed, 1).numpy() for listed in (frames, signals, spreads))
     return tuple(stacked)  # type: ignore[return-value]
 
 
 def evaluate_rollouts(
-    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays, *, threshold: float = 0.7
+    tokenizer: Tokenizer,
+    model: ActionModel | TokenActionModel,
+    episodes: EpisodeArrays,
+    *,
+    threshold: float = 0.7,
+    probe: PositionProbe | None = None,
 ) -> dict[str, float]:
     """Metrics by name (see docs/metrics.md); positions in cm, PSNR in dB, `_hNN` at step NN.
 
@@ -88,7 +93,8 @@ def evaluate_rollouts(
     """
     imagined = imagine_episodes(tokenizer, model, episodes)
     truth = probe_targets(episodes.ground_truth)
-    real = _read_frames(tokenizer, episodes.images)
+    read = probe.read if probe else partial(_read_frames, tokenizer)
+    real, told = read(episodes.images), read(imagined.frames)
     moved = np.linalg.norm(truth[:, -1, OBJECT] - truth[:, 0, OBJECT], axis=-1) > MOVED_M
     metrics: dict[str, float] = {"episodes": float(len(episodes)), "moved_share": float(moved.mean())}
     for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
@@ -97,7 +103,7 @@ def evaluate_rollouts(
             continue
         label = f"h{horizon:02d}"
         metrics |= _picture_metrics(tokenizer, imagined, episodes, rows, horizon, label)
-        estimates = {"rollout": imagined.positions[:, horizon - 1], "floor": real[:, horizon], "copy": real[:, 0]}
+        estimates = {"rollout": told[:, horizon - 1], "floor": real[:, horizon], "copy": real[:, 0]}
         for name, columns, chosen in (
             ("object", OBJECT, rows), ("object_moved", OBJECT, rows & moved), ("tool", TOOL, rows),
         ):  # fmt: skip

@@ -1,5 +1,5 @@
 """Train WM_txt on demonstrations: from a first frame and an instruction, the golden trajectory. Shapes: B episodes,
-T steps, S tokens, D values per token, J tasks."""
+T steps, S tokens, D values per token, J tasks, P probed values."""
 
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning.episode_arrays import EpisodeArrays
+from wm_nodes.learning.tokenizer_training import probe_loss
 from wm_nodes.learning.training_loop import LoopSettings, TrainingLoop
 from wm_nodes.learning.world_model_training import HUBER_DELTA, LatentEpisodes, done_losses, token_weights
 from wm_nodes.seeding import numpy_stream
@@ -58,13 +59,20 @@ def train_text_model(
         target = data.latents[index][:, : steps + 1].float()
         mask = (torch.arange(steps) < length[:, None]).float()
         with compute_context(tokenizer.device):
-            latents, logits = _rollout(model, tokenizer, target[:, 0], instructions[task], steps)
+            latents, positions, logits = _rollout(model, tokenizer, target[:, 0], instructions[task], steps)
         weight = token_weights(target, data.mean_change_S) * mask[..., None]
         errors = F.huber_loss(latents, target[:, 1:], delta=HUBER_DELTA, reduction="none").mean(-1)
         terms = {"latent": (errors * weight).sum() / weight.sum()}
         labels = data.success[index][:, 1 : steps + 1].float()
         terms["done"] = done_losses(logits, labels, mask[:, :, None].expand(-1, -1, settings.num_done_heads))
-        terms["loss"] = terms["latent"] + settings.done_weight * terms["done"]
+        known = torch.where(mask[..., None] > 0, data.truth[index][:, 1 : steps + 1], torch.nan).flatten(0, 1)
+        terms["state"] = probe_loss(tokenizer, tokenizer.read_state_normalised(latents.flatten(0, 1)), known)
+        terms["position"] = probe_loss(tokenizer, positions.flatten(0, 1), known)
+        terms["loss"] = (
+            terms["latent"]
+            + settings.done_weight * terms["done"]
+            + settings.state_weight * (terms["state"] + terms["position"])
+        )
         return terms
 
     loop = TrainingLoop(
@@ -93,13 +101,14 @@ def _is_meant(behaviour: str, task: str) -> bool:
 
 def _rollout(
     model: TextModel, tokenizer: Tokenizer, first: Tensor, instruction: str, steps: int
-) -> tuple[Tensor, Tensor]:
-    """Imagined latents (B, T, S, D) and done logits (B, T, K, J) of frames 1..T."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Imagined latents (B, T, S, D), positions (B, T, P) and done logits (B, T, K, J) of frames 1..T."""
     caches = model.trunk.new_caches()
-    current, frames, logits = first.unsqueeze(1), list[Tensor](), list[Tensor]()
+    current, frames, positions, logits = first.unsqueeze(1), list[Tensor](), list[Tensor](), list[Tensor]()
     for _ in range(steps):
         prediction = model(current, instruction, caches)
         current = tokenizer.normalise(current + prediction.change_BTSD)
         frames.append(current)
+        positions.append(prediction.positions_BTQ)
         logits.append(prediction.done_logits_BTKJ)
-    return torch.cat(frames, 1), torch.cat(logits, 1)
+    return torch.cat(frames, 1), torch.cat(positions, 1), torch.cat(logits, 1)

@@ -71,7 +71,7 @@ class TrainingLoop:
     def run(self, loss_function: LossFunction, *, progress: bool = True) -> dict[str, float]:
         """Train to the last iteration, load the averaged weights into the model, and return the last metrics."""
         start = last_saved = time.monotonic()
-        metrics: dict[str, float] = {}
+        metrics = self._logged()
         bar = tqdm(total=self.settings.num_iterations, initial=self.iteration, desc=self.name, disable=not progress)
         self.model.train()
         while self.iteration < self.settings.num_iterations:
@@ -145,6 +145,14 @@ class TrainingLoop:
             {"state": states, "param_groups": self.optimizer.state_dict()["param_groups"]}
         )
         self.iteration = int(header["__metadata__"]["iteration"])
+
+    def _logged(self) -> dict[str, float]:
+        """The last metrics of a run that is resumed; empty at its start."""
+        path = None if self.run_dir is None else self.run_dir / f"metrics_{self.name}.jsonl"
+        if self.iteration == 0 or path is None or not path.exists():
+            return {}
+        last: dict[str, float] = json.loads(path.read_text().splitlines()[-1])
+        return {key: value for key, value in last.items() if key not in ("iteration", "seconds")}
 
     def _log(self, metrics: Mapping[str, float], seconds: float) -> None:
         if self.run_dir is None:

@@ -1,5 +1,5 @@
 """Train the world models by rolling them out. Shapes: B episodes, T steps, S tokens, D values per token, K done heads,
-J tasks, P probed values.
+J tasks, P probed values, R decoded frames.
 
 Multi-step training: from real frames the model runs on its own predictions, back-propagating through every step, and is
 compared with the recorded frames all along. A frame is real at the start and then every `rollout_steps` steps, at a
@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning.episode_arrays import EpisodeArrays
-from wm_nodes.learning.tokenizer_training import probe_loss, probe_targets
+from wm_nodes.learning.tokenizer_training import foreground_weight, probe_loss, probe_targets
 from wm_nodes.learning.training_loop import LoopSettings, TrainingLoop
 from wm_nodes.seeding import numpy_stream, torch_stream
 from wm_nodes.world_model.conditions import ActionCondition
@@ -30,6 +30,8 @@ MAX_TOKEN_WEIGHT = 4.0
 BOOTSTRAP_SHARE = 0.7
 """Each done head learns from its own random share of the episodes, so that heads disagree where data are thin."""
 ENCODING_BATCH = 256
+DECODED_FRAMES = 2
+"""Predicted frames of each episode that are decoded and encoded again in an iteration (decoded_losses)."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +39,10 @@ class LatentEpisodes:
     """Tokenised episodes.
 
     latents: float16 (E, T + 1, S, D). mean_change_S: float32 (S,), mean absolute change of each token since the first
-    frame. states, actions, success, step_mask: as in EpisodeArrays. truth: float32 (E, T + 1, P), m.
+    frame. images, states, actions, success, step_mask: as in EpisodeArrays. truth: float32 (E, T + 1, P), m.
     """
 
+    images: Tensor
     latents: Tensor
     mean_change_S: Tensor
     states: Tensor
@@ -54,19 +57,24 @@ class LatentEpisodes:
 
 @dataclass(frozen=True)
 class RolloutTerms:
-    """What a training rollout gave: next_latents (B, T, S, D) and done_logits (B, T, K, J), both of frames 1..T."""
+    """What a training rollout gave, of frames 1..T.
+
+    next_latents (B, T, S, D). positions (B, T, P), in the probe's units. done_logits (B, T, K, J).
+    """
 
     next_latents: Tensor
+    positions: Tensor
     done_logits: Tensor
 
 
 def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEpisodes:
-    """Encode every frame once; training never touches pixels again."""
+    """Encode every frame once."""
     flat = episodes.images.reshape(-1, *episodes.images.shape[2:])
     pieces = [tokenizer.encode(flat[i : i + ENCODING_BATCH]).half() for i in range(0, len(flat), ENCODING_BATCH)]
     latents = torch.cat(pieces).clone().reshape(*episodes.images.shape[:2], *pieces[0].shape[1:])
     change = (latents[:, 1:].float() - latents[:, :1].float()).abs().mean(-1).mean((0, 1))
     return LatentEpisodes(
+        images=torch.from_numpy(episodes.images),
         latents=latents,
         mean_change_S=change,
         states=torch.from_numpy(episodes.states),
@@ -92,8 +100,9 @@ def train_action_model(
 ) -> tuple[ActionModel, dict[str, float]]:
     """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
 
-    Loss (E4): latents + world_model.done_weight * done + world_model.state_weight * positions read off the predicted
-    frames by the frozen probe of the tokenizer. `model` continues from given weights (refresh).
+    Loss (E4): latents + world_model.done_weight * done + world_model.state_weight * positions (those the model says,
+    and those the tokenizer's frozen probe reads off the predicted latents) + world_model.decoded_weight *
+    decoded_losses. `model` continues from given weights (online rounds).
     """
     data = episodes if isinstance(episodes, LatentEpisodes) else tokenise_episodes(tokenizer, episodes)
     settings = config.world_model
@@ -109,9 +118,14 @@ def train_action_model(
         index = torch.from_numpy(rows)
         with compute_context(tokenizer.device):
             terms = unroll(trained, tokenizer, data, index, steps, torch_stream(seed, f"{name}_noise", iteration))
-            return rollout_losses(terms, tokenizer, data, index, heads[index], config, done_loss) | {
-                "rollout_steps": torch.tensor(float(steps))
-            }
+            losses = rollout_losses(terms, tokenizer, data, index, heads[index], config, done_loss)
+            if settings.decoded_weight:
+                generator = torch_stream(seed, f"{name}_decoded", iteration)
+                losses |= decoded_losses(terms, tokenizer, data, index, generator)
+                losses["loss"] = losses["loss"] + settings.decoded_weight * sum(
+                    losses[key] for key in ("pixel", "recoded", "recoded_state")
+                )
+            return losses | {"rollout_steps": torch.tensor(float(steps))}
 
     loop = TrainingLoop(
         name, trained, LoopSettings(settings.num_iterations, settings.learning_rate, max_seconds=max_seconds), run_dir
@@ -169,18 +183,20 @@ def unroll(
     condition = model.condition(actions, states[:, :-1], states[:, 1:])
     if bool(anchors.all()):
         prediction = model.predict(noisy, condition)
-        return RolloutTerms(tokenizer.normalise(noisy + prediction.change_BTSD), prediction.done_logits_BTKJ)
+        one_step = tokenizer.normalise(noisy + prediction.change_BTSD)
+        return RolloutTerms(one_step, prediction.positions_BTQ, prediction.done_logits_BTKJ)
     caches = model.trunk.new_caches()
-    frames, logits = list[Tensor](), list[Tensor]()
+    frames, positions, logits = list[Tensor](), list[Tensor](), list[Tensor]()
     current = noisy[:, :1]
     for t in range(num_steps):
         prediction = model.predict(current, condition[:, t : t + 1], caches)
         frame = tokenizer.normalise(current + prediction.change_BTSD)
         frames.append(frame)
+        positions.append(prediction.positions_BTQ)
         logits.append(prediction.done_logits_BTKJ)
         if t + 1 < num_steps:
             current = torch.where(anchors[:, t + 1, None, None, None], noisy[:, t + 1 : t + 2], frame)
-    return RolloutTerms(torch.cat(frames, 1), torch.cat(logits, 1))
+    return RolloutTerms(torch.cat(frames, 1), torch.cat(positions, 1), torch.cat(logits, 1))
 
 
 def rollout_losses(
@@ -203,11 +219,41 @@ def rollout_losses(
     probed = tokenizer.read_state_normalised(terms.next_latents.flatten(0, 1))
     truth = torch.where(mask[..., None] > 0, data.truth[index][:, 1:], torch.nan).flatten(0, 1)
     losses["state"] = probe_loss(tokenizer, probed, truth)
+    losses["position"] = probe_loss(tokenizer, terms.positions.flatten(0, 1), truth)
     settings = config.world_model
     losses["loss"] = (
-        losses["latent"] + settings.done_weight * losses["done"] + settings.state_weight * losses["state"]
+        losses["latent"]
+        + settings.done_weight * losses["done"]
+        + settings.state_weight * (losses["state"] + losses["position"])
     )
     return losses
+
+
+def decoded_losses(
+    terms: RolloutTerms, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, generator: torch.Generator
+) -> dict[str, Tensor]:
+    """What the policy will see: DECODED_FRAMES predicted frames of each episode are decoded and encoded again.
+
+    pixel: foreground-weighted L1 against the recorded image. recoded: as the latent loss, after the round trip.
+    recoded_state: positions that the frozen probe reads after the round trip. Between encoder images, latents that
+    predict well may still decode to a blur from which nobody can read positions.
+    """
+    steps = (
+        torch.rand(len(index), DECODED_FRAMES, generator=generator) * data.step_mask[index].sum(1, keepdim=True)
+    ).long()
+    rows = torch.arange(len(index)).unsqueeze(1).expand_as(steps).flatten()
+    steps, episodes = steps.flatten(), index[rows]
+    wanted = tokenizer.to_pixels(data.images[episodes, steps + 1])
+    pixels_R3HW = tokenizer.decode_pixels(terms.next_latents[rows, steps])
+    weight = foreground_weight(wanted, tokenizer.background, 4.0)
+    recoded = tokenizer.bottleneck(tokenizer.features(pixels_R3HW.clamp(0, 1)))
+    errors = F.huber_loss(recoded, data.latents[episodes, steps + 1].float(), delta=HUBER_DELTA, reduction="none")
+    probed = tokenizer.read_state_normalised(recoded)
+    return {
+        "pixel": (weight * (pixels_R3HW - wanted).abs()).mean() / weight.mean(),
+        "recoded": errors.mean(),
+        "recoded_state": probe_loss(tokenizer, probed, data.truth[episodes, steps + 1]),
+    }
 
 
 def token_weights(latents_BTSD: Tensor, mean_change_S: Tensor) -> Tensor:

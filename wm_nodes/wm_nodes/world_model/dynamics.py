@@ -1,11 +1,11 @@
 """The next-frame model over continuous latents, eq. (1): (x_t+1, d_t+1) from frames 0..t and a condition.
 
 Shapes: B batch, T frames, S tokens per frame, D values per token, N condition tokens, K done heads, J tasks,
-A action, P state.
+A action, P state, Q probed positions (PROBE_NAMES).
 
 Economy: the trunk reads frame t and its condition once, and from the same features come frame t + 1 (as a residual on
-frame t) and the done signal of frame t + 1. A terminal frame therefore costs no extra pass. The first frame has no done
-signal; episodes start unfinished.
+frame t), the positions of its objects, and the done signal of frame t + 1. A terminal frame therefore costs no extra
+pass. The first frame has no done signal; episodes start unfinished.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from wm_nodes.config.schema import WorldModelConfig
 from wm_nodes.world_model.conditions import ActionCondition
-from wm_nodes.world_model.tokenizer import normalise_tokens
+from wm_nodes.world_model.tokenizer import PROBE_NAMES, normalise_tokens
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer, TemporalCache
 
 Caches = list[TemporalCache] | list[RingCache]
@@ -24,27 +24,44 @@ Caches = list[TemporalCache] | list[RingCache]
 @dataclass(frozen=True)
 class Prediction:
     """change_BTSD: added to the latents of frame t to give frame t + 1, before normalisation.
-    done_logits_BTKJ: of frame t + 1, per head and task."""
+    positions_BTQ: of frame t + 1, in the probe's units (zero mean, unit variance). done_logits_BTKJ: of frame t + 1,
+    per head and task."""
 
     change_BTSD: Tensor
+    positions_BTQ: Tensor
     done_logits_BTKJ: Tensor
 
 
 class DoneHeads(nn.Module):
-    """K independent MLPs on the frame's pooled temporal features; the minimum over heads is the done signal."""
+    """K independent MLPs on the frame's pooled temporal features; the minimum over heads is the done signal.
 
-    def __init__(self, width: int, num_heads: int, num_tasks: int) -> None:
+    `num_positions` > 0: a head beside them reads positions off the same features, and the done heads see what it reads
+    (without a gradient, so that it stays an estimate of positions). Success is a rule about positions.
+    """
+
+    def __init__(self, width: int, num_heads: int, num_tasks: int, num_positions: int = 0) -> None:
         super().__init__()
-        self.num_heads, self.num_tasks = num_heads, num_tasks
+        self.num_heads, self.num_tasks, self.num_positions = num_heads, num_tasks, num_positions
+        inputs = 3 * width + num_positions
+        self.positions = (
+            nn.Sequential(nn.Linear(3 * width, width), nn.SiLU(), nn.Linear(width, num_positions))
+            if num_positions
+            else None
+        )
         self.heads = nn.ModuleList(
-            nn.Sequential(nn.Linear(3 * width, width), nn.SiLU(), nn.Linear(width, num_tasks)) for _ in range(num_heads)
+            nn.Sequential(nn.Linear(inputs, width), nn.SiLU(), nn.Linear(width, num_tasks)) for _ in range(num_heads)
         )
         for head in self.heads:
             nn.init.constant_(head[-1].bias, -2.0)  # type: ignore[index]
 
-    def forward(self, tokens_BTSD: Tensor, register_BTD: Tensor) -> Tensor:
+    def forward(self, tokens_BTSD: Tensor, register_BTD: Tensor) -> tuple[Tensor, Tensor]:
+        """Done logits (B, T, K, J) and positions (B, T, num_positions), float32."""
         pooled = torch.cat((tokens_BTSD.mean(2), tokens_BTSD.amax(2), register_BTD), -1)
-        return torch.stack([head(pooled) for head in self.heads], 2).float()
+        positions = pooled[..., :0].float()
+        if self.positions is not None:
+            positions = self.positions(pooled).float()
+            pooled = torch.cat((pooled, positions.detach().to(pooled.dtype)), -1)
+        return torch.stack([head(pooled) for head in self.heads], 2).float(), positions
 
 
 class FrameModel(nn.Module):
@@ -61,7 +78,7 @@ class FrameModel(nn.Module):
         self.change = nn.Linear(width, latent_dim)
         nn.init.zeros_(self.change.weight)
         nn.init.zeros_(self.change.bias)
-        self.done = DoneHeads(width, config.num_done_heads, num_tasks)
+        self.done = DoneHeads(width, config.num_done_heads, num_tasks, len(PROBE_NAMES))
 
     def predict(self, latents_BTSD: Tensor, condition_BTND: Tensor, caches: Caches | None = None) -> Prediction:
         """Predict frame t + 1 for each of T given frames; later frames never influence earlier predictions."""
@@ -69,7 +86,8 @@ class FrameModel(nn.Module):
         register = self.register.to(tokens.dtype).expand(*tokens.shape[:2], 1, -1)
         features = self.trunk(torch.cat((tokens, register), 2), condition_BTND, caches)
         tokens, register = features[:, :, :-1], features[:, :, -1]
-        return Prediction(self.change(tokens).float(), self.done(tokens, register))
+        logits, positions = self.done(tokens, register)
+        return Prediction(self.change(tokens).float(), positions, logits)
 
 
 class ActionModel(FrameModel):

@@ -14,12 +14,18 @@ from torch import Tensor, nn
 
 from wm_nodes.config.schema import SimulationConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.world_model.dynamics import ActionModel
+from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.text import TextModel
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 
 MANIFEST = "manifest.json"
-FILES = {"tokenizer": "tokenizer.safetensors", "action": "action_model.safetensors", "text": "text_model.safetensors"}
+FILES = {
+    "tokenizer": "tokenizer.safetensors",
+    "action": "action_model.safetensors",
+    "text": "text_model.safetensors",
+    "probe": "position_probe.safetensors",
+}
 FORMAT = 1
 
 
@@ -29,7 +35,8 @@ class ModelFolderError(ValueError):
 
 @dataclass(frozen=True)
 class WorldModels:
-    """tasks: the done head's outputs, in order. text is None where no text model was trained."""
+    """tasks: the done head's outputs, in order. text is None where no text model was trained. probe: the judge's, None
+    where the model was saved without it."""
 
     tokenizer: Tokenizer
     action: ActionModel | TokenActionModel
@@ -37,6 +44,7 @@ class WorldModels:
     tasks: tuple[str, ...]
     simulation: SimulationConfig
     manifest: Mapping[str, Any]
+    probe: PositionProbe | None = None
 
     @property
     def sha256(self) -> str:
@@ -64,11 +72,12 @@ def save_model_folder(
     simulation: SimulationConfig,
     tasks: tuple[str, ...],
     story: Mapping[str, Any],
+    probe: PositionProbe | None = None,
 ) -> Path:
     """Write the models as float16 and the manifest; `story`: data, seeds, commands, metrics, machine, date."""
     folder.mkdir(parents=True, exist_ok=True)
     hashes: dict[str, str] = {}
-    modules: dict[str, nn.Module | None] = {"tokenizer": tokenizer, "action": action, "text": text}
+    modules: dict[str, nn.Module | None] = {"tokenizer": tokenizer, "action": action, "text": text, "probe": probe}
     for key, module in modules.items():
         if module is None:
             (folder / FILES[key]).unlink(missing_ok=True)
@@ -115,8 +124,12 @@ def load_model_folder(folder: Path) -> WorldModels:
     if "text" in manifest["sha256"]:
         text = TextModel(config, vocabulary=tuple(manifest["vocabulary"]), num_tasks=num_tasks, **sizes)
         _load(folder, "text", text, manifest)
+    probe = None
+    if "probe" in manifest["sha256"]:
+        probe = PositionProbe(manifest["height"], manifest["width"])
+        _load(folder, "probe", probe, manifest)
     simulation = SimulationConfig.model_validate(manifest["simulation"])
-    return WorldModels(tokenizer, action, text, tuple(manifest["tasks"]), simulation, manifest)
+    return WorldModels(tokenizer, action, text, tuple(manifest["tasks"]), simulation, manifest, probe)
 
 
 def action_model_class(kind: str) -> type[ActionModel] | type[TokenActionModel]:

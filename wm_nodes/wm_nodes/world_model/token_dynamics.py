@@ -74,7 +74,7 @@ class TokenActionModel(nn.Module):
             head(tokens).float().scatter_add(-1, code.unsqueeze(-1), bias.expand(*code.shape, 1))
             for head, code, bias in zip(self.heads, code_targets(bits_BTSD), self.copy_bias, strict=True)
         )
-        return TokenPrediction(logits, self.done(tokens, register))
+        return TokenPrediction(logits, self.done(tokens, register)[0])
 
     def advance(
         self,

@@ -1,0 +1,44 @@
+"""The judge's probe: it reads positions off pictures that it was not trained on, and nothing else depends on it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pushing_scene import episode, success
+
+from wm_nodes.config.load import load_config
+from wm_nodes.learning.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.learning.position_probe_training import train_position_probe
+from wm_nodes.learning.tokenizer_training import probe_targets
+from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.tokenizer import PROBE_NAMES
+
+CUBE = [PROBE_NAMES.index(name) for name in ("cube_x", "cube_y")]
+
+
+def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
+    return stack_episodes([episode(first_seed + i) for i in range(count)], ("push_cube", "reach"), success)
+
+
+def test_a_trained_probe_reads_positions_of_episodes_it_has_not_seen(tmp_path: Path) -> None:
+    config = load_config("base", {"tokenizer.num_iterations": 500, "tokenizer.batch_size": 32})
+    probe, metrics = train_position_probe(arrays(120), config, 0, tmp_path, progress=False)
+    assert metrics["error_m"] < 0.02
+    unseen = arrays(16, 10_000)
+    truth = probe_targets(unseen.ground_truth)
+    assert probe.read(unseen.images).shape == truth.shape
+    guess = np.linalg.norm(truth[..., CUBE] - truth[..., CUBE].mean((0, 1)), axis=-1).mean()
+    found = np.linalg.norm((probe.read(unseen.images) - truth)[..., CUBE], axis=-1).mean()
+    assert found < 0.35 * guess
+
+
+def test_episodes_without_ground_truth_are_refused() -> None:
+    known = arrays(2)
+    unknown = EpisodeArrays(**{**known.__dict__, "ground_truth": np.full_like(known.ground_truth, np.nan)})
+    with pytest.raises(ValueError, match="no recorded frame has ground truth"):
+        train_position_probe(unknown, load_config("base", {}), 0, None, progress=False)
+
+
+def test_images_of_another_size_are_refused_with_both_sizes() -> None:
+    with pytest.raises(ValueError, match=r"32, 32, 3\), got \(1, 64, 32, 3\)"):
+        PositionProbe(32, 32).read(np.zeros((1, 64, 32, 3), np.uint8))

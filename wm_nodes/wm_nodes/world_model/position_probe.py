@@ -1,0 +1,64 @@
+"""Reads positions off pictures, for judging a world model. Shapes: B images, H W 3 image, P positions (PROBE_NAMES).
+
+It shares nothing with the world model: other weights, other layers, trained on recorded images only, and no training
+loss ever passes through it. A world model cannot learn to please it.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from wm_nodes.types import FloatArray, UInt8Array
+from wm_nodes.world_model.tokenizer import PROBE_NAMES
+
+CHANNELS = (24, 48, 64, 64)
+HIDDEN = 128
+BATCH = 256
+
+
+class PositionProbe(nn.Module):
+    """A small convolutional regressor, without pooling, so that places stay places."""
+
+    def __init__(self, height: int, width: int) -> None:
+        super().__init__()
+        self.height, self.width = height, width
+        layers: list[nn.Module] = []
+        previous = 3
+        for channels in CHANNELS:
+            layers += [nn.Conv2d(previous, channels, 5, stride=2, padding=2), nn.SiLU()]
+            previous = channels
+        side = [-(-size // 2 ** len(CHANNELS)) for size in (height, width)]
+        self.features = nn.Sequential(*layers, nn.Flatten())
+        self.regress = nn.Sequential(
+            nn.Linear(previous * side[0] * side[1], HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, len(PROBE_NAMES))
+        )
+        self.mean: Tensor
+        self.std: Tensor
+        self.register_buffer("mean", torch.zeros(len(PROBE_NAMES)))
+        self.register_buffer("std", torch.ones(len(PROBE_NAMES)))
+
+    def forward(self, pixels_B3HW: Tensor) -> Tensor:
+        """Positions (B, P) with zero mean and unit variance over the data; pixels float in [0, 1]."""
+        out: Tensor = self.regress(self.features(2 * pixels_B3HW - 1))
+        return out
+
+    @torch.inference_mode()
+    def read(self, images: UInt8Array | Tensor) -> FloatArray:
+        """Positions (..., P), m, of uint8 images (..., H, W, 3).
+
+        Raises:
+            ValueError: images of another size.
+        """
+        tensor = torch.as_tensor(images)
+        if tuple(tensor.shape[-3:]) != (self.height, self.width, 3):
+            raise ValueError(
+                f"images must be (..., {self.height}, {self.width}, 3), got {tuple(tensor.shape)}; the probe was "
+                "trained for another camera set-up, see the model folder's manifest.json"
+            )
+        flat = tensor.reshape(-1, *tensor.shape[-3:])
+        parts = [
+            self(flat[i : i + BATCH].permute(0, 3, 1, 2).to(self.mean.device).float() / 255) * self.std + self.mean
+            for i in range(0, len(flat), BATCH)
+        ]
+        positions: FloatArray = torch.cat(parts).cpu().numpy().reshape(*tensor.shape[:-3], -1).astype(np.float32)
+        return positions
