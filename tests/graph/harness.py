@@ -192,7 +192,8 @@ class Graph:
     def start_training_nodes(self, **learner: Any) -> None:
         """environment, policy, reward_evaluator and learner, as in a training run."""
         self.start_environment()
-        self.start_policy()
+        recorder = [name.rpartition("/")[2] for name in self.processes if name == "/wm/recorder"]
+        self.start_policy(await_nodes=["environment", "reward_evaluator", "learner", *recorder])
         self.start_reward()
         self.start_learner(**learner)
 

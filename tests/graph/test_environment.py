@@ -10,7 +10,7 @@ from std_msgs.msg import Bool
 
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
-from wm_nodes.ros import convert
+from wm_nodes.ros import calls, convert
 from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand, WireError
 from wm_nodes.specs import EnvironmentSpec
 
@@ -36,12 +36,12 @@ class Client:
         return replace(command, **changes)
 
     def step(self, command: StepCommand) -> Reply:
-        response = self.probe.call(StepBatch, "env/step", convert.step_request(command))
-        return convert.step_reply(response, self.spec, self.session)
+        response = self.probe.call(StepBatch, "env/step", calls.step_request(command))
+        return calls.step_reply(response, self.spec, self.session)
 
     def reset(self, **arguments: Any) -> Reply:
-        request = convert.reset_request(ResetCommand(**arguments))
-        return convert.reset_reply(self.probe.call(ResetBatch, "env/reset", request), self.spec)
+        request = calls.reset_request(ResetCommand(**arguments))
+        return calls.reset_reply(self.probe.call(ResetBatch, "env/reset", request), self.spec)
 
 
 @pytest.fixture

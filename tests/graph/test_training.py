@@ -17,9 +17,6 @@ from wm_msgs.srv import GetWeights, InferAction, SaveCheckpoint, StopRecording
 from wm_nodes.ros import convert
 
 pytestmark = pytest.mark.graph
-DISCOVERY_S = 4.0
-"""Processes on one host need about this long until every publisher knows every reader (ros_interface, 4.7); what is
-published before is not recorded, and the toy trains in less than a second."""
 
 
 def train(probe: Probe, **goal: Any) -> Train.Result:
@@ -98,11 +95,7 @@ def test_training_over_dds_gives_the_weights_of_the_same_loop_in_one_process(tmp
 
 def test_training_from_the_recorded_bag_gives_the_weights_of_the_live_training(graph: Graph, probe: Probe) -> None:
     graph.start("recorder")
-    wait_until("the recorder", lambda: probe.value("/wm/recorder", "state") == "active", 60)
     graph.start_training_nodes()
-    for name in ("environment", "reward_evaluator", "policy", "learner"):
-        wait_until(f"the {name}", lambda name=name: probe.value(f"/wm/{name}", "state") == "active", 60)
-    time.sleep(DISCOVERY_S)
     assert train(probe, updates=2).termination_reason == Train.Result.FINISHED
     stopped = probe.call(StopRecording, "recorder/stop", StopRecording.Request())
     assert stopped.gaps == 0

@@ -2,6 +2,9 @@
 
 import json
 import os
+import re
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -123,3 +126,13 @@ def test_each_file_of_a_split_bag_is_a_complete_indexed_mcap(tmp_path: Path) -> 
             assert names == ["wm.start", "rosbag2"]
             for channel in summary.channels.values():
                 assert set(channel.metadata) == {"offered_qos_profiles", "topic_type_hash"}
+
+
+@pytest.mark.skipif(shutil.which("ros2") is None, reason="ROS 2's command line tools come from apt, not from pip")
+def test_ros2_bag_info_lists_every_topic_with_its_number_of_messages(tmp_path: Path) -> None:
+    path = bag_of_three(tmp_path / "bag")
+    shown = subprocess.run(["ros2", "bag", "info", str(path)], capture_output=True, text=True, timeout=60, check=True)
+    with Reader(path) as reader:
+        for connection in reader.connections:
+            pattern = rf"Topic: {connection.topic} \| Type: {connection.msgtype} \| Count: {connection.msgcount} "
+            assert re.search(pattern, shown.stdout), shown.stdout

@@ -15,7 +15,7 @@ pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
 from wm_msgs.msg import ErrorCode
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.reward import RewardResult
-from wm_nodes.ros import convert
+from wm_nodes.ros import calls, convert
 from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand, Transition, WireError
 from wm_nodes.specs import EnvironmentSpec
 
@@ -121,10 +121,10 @@ def test_transitions_steps_and_resets_survive_the_wire() -> None:
         session=3, step_id=4, spec_hash="h", actions=sent.actions.reshape(-1), policy_version=9,
         logprobs=sent.logprobs, values=sent.values, reset_mask=sent.valid, reset_seeds=sent.episode_ids,
     )  # fmt: skip
-    back = convert.step_command(convert.step_request(command), spec())
+    back = calls.step_command(calls.step_request(command), spec())
     for name, value in vars(command).items():
         np.testing.assert_array_equal(getattr(back, name), value, err_msg=name)
-    assert convert.reset_command(convert.reset_request(ResetCommand()), spec()) == ResetCommand()
+    assert calls.reset_command(calls.reset_request(ResetCommand()), spec()) == ResetCommand()
 
 
 def test_a_reply_survives_the_wire() -> None:
@@ -136,7 +136,7 @@ def test_a_reply_survives_the_wire() -> None:
         truncated=t.truncated, episode_ids=t.episode_ids, success_probability=t.values, uncertainty=t.values,
         step_s=0.5,
     )  # fmt: skip
-    found = convert.step_reply(convert.fill_step_response(StepBatch.Response(), reply, spec()), spec(), 1)
+    found = calls.step_reply(calls.fill_step_response(StepBatch.Response(), reply, spec()), spec(), 1)
     for name, value in vars(reply).items():
         np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
 

@@ -1,28 +1,36 @@
-"""environment: serves one batch of environments in lock-step, and publishes what happens in it.
+"""environment: serves one batch of environments, in lock-step or on its own clock, and publishes what happens in it.
 
 The environment runs in the executor's thread: a step delays this node's other callbacks by its own duration, nothing
 else. In a composed process a local policy steps it from its worker thread instead.
 """
 
 import sys
+import time
 from typing import Any
 
 import numpy as np
+from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool
 
-from wm_msgs.msg import Credit, EpisodeEvent, ErrorCode
+from wm_msgs.msg import ActionBatch, Credit, EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
+from wm_nodes.nodes.asynchronous import AsynchronousEnvironment
 from wm_nodes.nodes.backends import BACKENDS, make_environment
 from wm_nodes.nodes.lockstep import LockstepEnvironment
-from wm_nodes.ros import convert, diagnostics
+from wm_nodes.nodes.views import PARAMS as VIEW_PARAMS
+from wm_nodes.nodes.views import Views
+from wm_nodes.ros import calls, convert, diagnostics
 from wm_nodes.ros.credit import CreditLedger
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
-from wm_nodes.ros.qos import VIEW, topic
+from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import EpisodeNote, Goals, Transition, WireError
 from wm_nodes.types import UInt8Array
+
+MODES = ("lockstep", "asynchronous")
 
 PARAMS = (
     Param("backend", "world_model", "What is stepped", read_only=True, choices=BACKENDS),
@@ -32,18 +40,27 @@ PARAMS = (
     Param("starts_file", "", "starts.safetensors: real first frames, for backend world_model", read_only=True),
     Param("num_envs", 1, "Environments stepped together (N)", read_only=True, minimum=1, maximum=4096),
     Param("seed", 0, "Root seed of resets without a given seed", read_only=True, minimum=0),
-    Param("view_env", -1, "Also publish this environment's image alone on env/image/view while someone looks; -1: none",
-          minimum=-1, maximum=4095),
-    Param("view_period_s", 0.066, "Least time between two env/image/view", "s", minimum=0.0, maximum=10.0),
+    Param("mode", "lockstep", "Stepped by requests on env/step, or by the node's clock with the newest of `action`",
+          read_only=True, choices=MODES),
+    Param("control_period_s", 0.0, "Time between two steps in mode asynchronous; 0: that of the environment", "s",
+          read_only=True, minimum=0.0, maximum=60.0),
+    Param("max_action_age_s", 0.3, "Mode asynchronous: an action is used until the observation it answers is older "
+          "than this; then the environment holds", "s", minimum=0.001, maximum=60.0),
+    Param("publish_clock", False, "Publish /clock: the stamp of each observation", read_only=True),
+    *VIEW_PARAMS,
 )  # fmt: skip
 
 
 class EnvironmentNode(ManagedNode):
-    """Services env/step, env/reset, env/get_spec; topics env/image, env/transition, env/spec, env/goal, episode."""
+    """Services env/step, env/reset, env/get_spec; topics env/image, env/transition, env/spec, env/goal, episode.
+
+    In mode asynchronous it follows `action`.
+    """
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("environment", PARAMS, **node_arguments)
         self.served: LockstepEnvironment | None = None
+        self._timer: Timer | None = None
 
     def configure(self) -> None:
         environment = make_environment(
@@ -56,10 +73,9 @@ class EnvironmentNode(ManagedNode):
         self._spec = environment.spec
         row = topic("env/image")
         self._images = self.create_publisher(Image, row.name, row.qos)
-        self._view = self.create_publisher(Image, "env/image/view", VIEW)
-        self._last_view_s = 0.0
-        for publisher in (self._images, self._view):
-            self.own(self.destroy_publisher, publisher)
+        self.own(self.destroy_publisher, self._images)
+        self._views = Views(self)
+        self._clock_publisher = self._make_clock()
         self._transitions = self.publish_on("env/transition")
         self._episodes = self.publish_on("episode")
         self._goals = self.publish_on("env/goal")
@@ -70,8 +86,26 @@ class EnvironmentNode(ManagedNode):
         self.serve(ResetBatch, "env/reset", self._on_reset)
         self.serve(GetEnvSpec, "env/get_spec", self._on_get_spec)
         self.publish_on("env/spec").publish(convert.spec_msg(self._spec, self.get_clock().now().nanoseconds))
+        self._asynchronous: AsynchronousEnvironment | None = None
+        if self.param("mode") == "asynchronous":
+            self._asynchronous = AsynchronousEnvironment(self.served, lambda: float(self.param("max_action_age_s")))
+            self.listen("action", self._on_action)
+
+    def activate(self) -> None:
+        if self._asynchronous is None:
+            return
+        try:
+            self._asynchronous.start()
+        except WireError as error:
+            raise ValueError(f"the first reset failed: {error}") from None
+        period_s = float(self.param("control_period_s")) or self._spec.control_period_s
+        self._period_s = period_s
+        self._timer = self.create_timer(period_s, self._on_tick)
 
     def deactivate(self, reason: str) -> None:
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+            self._timer = None
         if self.served is not None:
             self.served.end_episodes(EpisodeEvent.REASON_DEACTIVATED)
 
@@ -92,13 +126,11 @@ class EnvironmentNode(ManagedNode):
     # Sink of the lock-step environment.
 
     def image(self, images: UInt8Array, stamp_ns: int) -> None:
-        self._images.publish(convert.mosaic_msg(images, stamp_ns, self._spec))
-        shown = int(self.param("view_env"))
-        now_s = self.get_clock().now().nanoseconds / 1e9
-        if 0 <= shown < len(images) and now_s - self._last_view_s >= float(self.param("view_period_s")):
-            self._last_view_s = now_s
-            if self._view.get_subscription_count():
-                self._view.publish(convert.image_msg(images[shown], stamp_ns, self._spec.encoding))
+        message = convert.mosaic_msg(images, stamp_ns, self._spec)
+        if self._clock_publisher is not None:
+            self._clock_publisher.publish(Clock(clock=message.header.stamp))
+        self._images.publish(message)
+        self._views.show(images, message)
 
     def goals(self, goals: Goals) -> None:
         self._goals.publish(convert.goal_msg(goals, self._spec))
@@ -116,19 +148,25 @@ class EnvironmentNode(ManagedNode):
     def _on_step(self, request: StepBatch.Request, response: StepBatch.Response) -> StepBatch.Response:
         try:
             served = self._ready()
-            reply = served.step(convert.step_command(request, self._spec))
+            if self._asynchronous is not None:
+                raise WireError(
+                    ErrorCode.OUT_OF_ORDER,
+                    "this environment steps by its own clock; publish on `action`, or start it with mode:=lockstep",
+                )
+            reply = served.step(calls.step_command(request, self._spec))
         except WireError as error:
             return self._refusal(response, error, "step")
         self.diagnostics.latency("step", reply.step_s)
-        return convert.fill_step_response(response, reply, self._spec)
+        return calls.fill_step_response(response, reply, self._spec)
 
     def _on_reset(self, request: ResetBatch.Request, response: ResetBatch.Response) -> ResetBatch.Response:
         try:
             served = self._ready()
-            reply = served.reset(convert.reset_command(request, self._spec))
+            command = calls.reset_command(request, self._spec)
+            reply = served.reset(command) if self._asynchronous is None else self._asynchronous.reset(command)
         except WireError as error:
             return self._refusal(response, error, "reset")
-        return convert.fill_reset_response(response, reply, self._spec)
+        return calls.fill_reset_response(response, reply, self._spec)
 
     def _on_get_spec(self, request: GetEnvSpec.Request, response: GetEnvSpec.Response) -> GetEnvSpec.Response:
         if not self.active:
@@ -136,6 +174,31 @@ class EnvironmentNode(ManagedNode):
         response.spec = convert.spec_msg(self._spec, self.get_clock().now().nanoseconds)
         response.spec.session = self.session
         return response
+
+    def _on_action(self, message: ActionBatch) -> None:
+        assert self._asynchronous is not None
+        if message.mode == ActionBatch.MODE_HOLD:
+            self._asynchronous.hold()
+            return
+        try:
+            self._asynchronous.offer(convert.action_of(message, self._spec))
+        except WireError as error:
+            self._count_refusal(error, "action")
+
+    def _on_tick(self) -> None:
+        assert self._asynchronous is not None
+        began = time.perf_counter()
+        try:
+            if not self._asynchronous.tick():
+                self.diagnostics.count("action_timeouts", text="no fresh action; the environment holds")
+        except WireError as error:
+            if error.code != ErrorCode.ESTOP:
+                self._count_refusal(error, "step")
+            return
+        spent = time.perf_counter() - began
+        self.diagnostics.latency("step", spent)
+        if spent > self._period_s:
+            self.diagnostics.count("overruns", text=f"a step took {spent:.3f} s, the control period is less")
 
     def _on_credit(self, message: Credit) -> None:
         self._ledger.note(message)
@@ -173,7 +236,22 @@ class EnvironmentNode(ManagedNode):
             self.diagnostics.count("waits_for_credit", level=diagnostics.OK)
             raise WireError(ErrorCode.BUSY, f"waiting for {', '.join(holding)} to take in seq {next_seq - 1}; retry")
 
+    def _make_clock(self) -> Any:
+        """The publisher of /clock, or None where nobody wants it."""
+        if not self.param("publish_clock"):
+            return None
+        if self.param("use_sim_time"):
+            raise ValueError("use_sim_time with publish_clock: the node would wait for its own clock; unset one")
+        row = topic("/clock")
+        publisher = self.create_publisher(row.type, row.name, row.qos)
+        self.own(self.destroy_publisher, publisher)
+        return publisher
+
     def _refusal(self, response: Any, error: WireError, what: str) -> Any:
+        self._count_refusal(error, what)
+        return convert.fill_error(response, error)
+
+    def _count_refusal(self, error: WireError, what: str) -> None:
         if error.code != ErrorCode.BUSY:
             bad_numbers = error.code in (ErrorCode.NAN_INPUT, ErrorCode.NAN_MODEL)
             level = diagnostics.ERROR if bad_numbers else diagnostics.WARN
@@ -181,7 +259,6 @@ class EnvironmentNode(ManagedNode):
             if bad_numbers:
                 self.diagnostics.count("nan", level=level, text=str(error))
             self.get_logger().error(f"{what} refused: {error}", throttle_duration_sec=1.0)
-        return convert.fill_error(response, error)
 
 
 def main() -> int:

@@ -141,7 +141,7 @@ class LockstepEnvironment:
                 )
             if self._current is None:
                 raise WireError(ErrorCode.OUT_OF_ORDER, "never reset; call env/reset first")
-            actions = self._checked_actions(command.actions)
+            actions = self.check_actions(command.actions)
             seeds = self._seeds(command.reset_seeds)
             self._gate()
             return self._step(command, actions, seeds)
@@ -218,7 +218,8 @@ class LockstepEnvironment:
             )
         return reply
 
-    def _checked_actions(self, flat: FloatArray) -> FloatArray:
+    def check_actions(self, flat: FloatArray) -> FloatArray:
+        """Return actions as float32 (N, A). Raises WireError: BAD_SHAPE, NAN_INPUT, OUT_OF_RANGE."""
         shape = (self.spec.num_envs, self.spec.action_dim)
         if flat.size != shape[0] * shape[1]:
             raise WireError(

@@ -1,4 +1,5 @@
-"""policy: acts in the environment for a number of lock-steps (action rollout), and follows the learner's versions."""
+"""policy: acts in the environment, for a number of lock-steps (action rollout) or on what it sees (mode asynchronous),
+and follows the learner's versions."""
 
 import sys
 import time
@@ -13,6 +14,7 @@ from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
 from wm_msgs.srv import InferAction, LoadPolicy
 from wm_nodes.learning.rollouts import action_noise, reset_seeds
 from wm_nodes.nodes.backends import existing, make_policy
+from wm_nodes.nodes.pilot import Pilot
 from wm_nodes.nodes.policy_holder import PolicyHolder, read_weights
 from wm_nodes.policy import PolicyOutput
 from wm_nodes.recording.layout import Tiles
@@ -21,6 +23,7 @@ from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
+from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
 from wm_nodes.specs import EnvironmentSpec
@@ -38,6 +41,13 @@ PARAMS = (
           minimum=0.1, maximum=600.0),
     Param("version_timeout_s", 10.0, "Deadline for the policy version that a goal asks for to arrive", "s",
           minimum=0.1, maximum=600.0),
+    Param("mode", "lockstep", "Act in rollouts, by env/step, or on every observation that comes, by `action`",
+          read_only=True, choices=("lockstep", "asynchronous")),
+    Param("deterministic", True, "Mode asynchronous: act without noise"),
+    Param("await_nodes", ["environment"], "Nodes of the namespace that must be active, and matched with all others, "
+          "before a rollout begins; whoever else is active is waited for too", read_only=True),
+    Param("match_timeout_s", 20.0, "Deadline for that; then the rollout goes on, and is reported as incomplete", "s",
+          minimum=0.0, maximum=600.0),
 )  # fmt: skip
 
 
@@ -65,12 +75,16 @@ class PolicyNode(ManagedNode):
                 raise ValueError(f"initial_policy {path}: {error}") from None
         self._spec: EnvironmentSpec | None = None
         self._last_reply: Reply | None = None
+        self._given_up: set[str] = set()
         timeout_s = float(self.param("step_timeout_s"))
         self._environment: EnvironmentClient = (
             RosEnvironmentClient(self, timeout_s=timeout_s) if self._local_environment is None
             else LocalEnvironmentClient(self._local_environment, timeout_s)
         )  # fmt: skip
-        self._actions = self.publish_on("action")
+        self._pilot: Pilot | None = None
+        if self.param("mode") == "asynchronous":
+            self._pilot = Pilot(self, self._holder, self._publish_actions)
+        self._actions = self.publish_on("action", LIVE_ACTION if self._pilot else None)
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("policy/version", self._on_version, while_inactive=True)
         self.serve(InferAction, "policy/infer", self._on_infer)
@@ -78,12 +92,21 @@ class PolicyNode(ManagedNode):
         self._rollouts = WorkerAction(self, Rollout, "rollout", self._rollout, self._describe)
         self.own(self._rollouts.destroy)
 
+    def activate(self) -> None:
+        if self._pilot is not None:
+            self._pilot.start()
+
     def deactivate(self, reason: str) -> None:
         self._rollouts.stop(reason)
+        if self._pilot is not None:
+            self._pilot.stop()
+            self._actions.publish(ActionBatch(mode=ActionBatch.MODE_HOLD))
 
     def update_diagnostics(self) -> None:
         if hasattr(self, "_holder"):
             self.diagnostics.gauge("policy_version", self._holder.version)
+            if self._pilot is not None:
+                self.diagnostics.gauge("skipped_observations", self._pilot.skipped)
 
     # The rollout, in a worker thread.
 
@@ -105,11 +128,14 @@ class PolicyNode(ManagedNode):
 
     def _act(self, work: Work, result: Rollout.Result) -> None:
         goal: Rollout.Goal = work.request
+        if self._pilot is not None:
+            raise ValueError("in mode asynchronous the policy acts on what it sees; start it with mode:=lockstep")
         if goal.steps < 1:
             raise ValueError(f"steps must be at least 1, got {goal.steps}")
         spec = self._environment.handshake(float(self.param("handshake_timeout_s")), work.check)
         self._check_spec(spec)
         self._await_version(goal.policy_version, work)
+        self._await_links(work)
         version = self._holder.version
         reply = self._first_observation(goal, spec, version, work)
         result.policy_version, result.env_session = version, reply.session
@@ -130,7 +156,7 @@ class PolicyNode(ManagedNode):
                     ErrorCode.STALE_POLICY, f"version {acting} was loaded while {goal.policy_version} had to act"
                 )
             step_id = reply.step_id + 1
-            self._publish_actions(reply, step_id, output, acting, infer_s)
+            self._publish_actions(reply.stamp_ns, step_id, output, acting, infer_s)
             began = time.perf_counter()
             reply = self._environment.step(
                 StepCommand(
@@ -181,11 +207,23 @@ class PolicyNode(ManagedNode):
                 )
             work.sleep(0.01)
 
-    def _publish_actions(
-        self, reply: Reply, step_id: int, output: PolicyOutput, version: int, infer_s: float
-    ) -> None:
+    def _await_links(self, work: Work) -> None:
+        """Wait until no node of the graph can miss the rollout's first messages (see ros.links)."""
+        namespace = self.get_namespace().rstrip("/")
+        awaited = [f"{namespace}/{name}" for name in self.param("await_nodes") if name]
+        deadline = time.monotonic() + float(self.param("match_timeout_s"))
+        while lacking := set(self.links.book.missing(awaited)) - self._given_up:
+            if time.monotonic() >= deadline:
+                text = f"data flow although {'; '.join(sorted(lacking))}: first messages may be missed"
+                self.get_logger().warning(text)
+                self.diagnostics.count("unmatched_nodes", len(lacking), text=text)
+                self._given_up |= lacking
+                return
+            work.sleep(0.02)
+
+    def _publish_actions(self, stamp_ns: int, step_id: int, output: PolicyOutput, version: int, infer_s: float) -> None:
         message = self._action_message(output, version, infer_s)
-        message.header = convert.header(reply.stamp_ns)
+        message.header = convert.header(stamp_ns)
         message.step_id = step_id
         self._actions.publish(message)
 
@@ -210,6 +248,8 @@ class PolicyNode(ManagedNode):
     def _on_spec(self, message: EnvSpec) -> None:
         try:
             self._spec = convert.spec_from_msg(message)
+            if self._pilot is not None:
+                self._pilot.spec = self._spec
         except WireError as error:
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
 

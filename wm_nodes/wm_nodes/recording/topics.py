@@ -1,5 +1,6 @@
-"""The recorded topics: relative name, type and QoS. QoS comes from this table, never from discovery, so that it is
-right in the bag even where a publisher was not seen yet. Equal to the table of ros/qos.py (a parity test says so)."""
+"""The recorded topics: relative name, type and QoS. The graph publishes with these profiles too (ros/qos.py builds on
+this table), and a bag's QoS comes from here, never from discovery, so that it is right even where a publisher was not
+seen yet."""
 
 from dataclasses import dataclass
 
@@ -11,6 +12,15 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
+
+CREDIT_WINDOW = 16
+"""Messages that a keep-all stream may be ahead of its slowest consumer."""
+
+IMAGE_DEPTH = 2 * CREDIT_WINDOW
+"""The images of a full credit window fit into the writer and into the reader twice, so a paced consumer loses none."""
+
+POLICY_LEASE_S = 3
+"""A policy/version publisher that is silent for longer counts as gone."""
 
 _UNSET = QosTime(0, 0)
 
@@ -30,11 +40,17 @@ def _qos(*, depth: int = 0, latched: bool = False, lease_s: int = 0) -> Qos:
     )
 
 
-IMAGE = _qos(depth=32)
+IMAGE = _qos(depth=IMAGE_DEPTH)
+"""A reliable writer matches reliable readers (learner, recorder) and best-effort ones (RViz, rqt)."""
+
 KEEP_ALL = _qos()
+"""Transitions, rewards, episode events. Its queue has no limit: bounded by credit, never by dropping."""
+
 LATCHED = _qos(depth=1, latched=True)
-POLICY = _qos(depth=1, latched=True, lease_s=3)
-GOALS = _qos(depth=18, latched=True)
+POLICY = _qos(depth=1, latched=True, lease_s=POLICY_LEASE_S)
+GOALS = _qos(depth=CREDIT_WINDOW + 2, latched=True)
+"""Latched, but deep: an evaluator that lags by a full credit window still gets the goals of every episode."""
+
 NEWEST = _qos(depth=1)
 METRICS = _qos(depth=10)
 

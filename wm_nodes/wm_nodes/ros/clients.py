@@ -11,7 +11,7 @@ from rclpy.task import Future
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
-from wm_nodes.ros import convert
+from wm_nodes.ros import calls, convert
 from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
 from wm_nodes.specs import EnvironmentSpec
 
@@ -132,7 +132,7 @@ class RosEnvironmentClient:
 
     def reset(self, command: ResetCommand, check: Check) -> Reply:
         spec = self._known_spec()
-        request = convert.reset_request(command)
+        request = calls.reset_request(command)
 
         def attempt(left_s: float) -> Reply:
             # Twice the same reset gives the same observation; a server that has not matched this client's reader yet
@@ -143,7 +143,7 @@ class RosEnvironmentClient:
                 if left_s <= self._timeout_s / 2:
                     raise
                 raise WireError(ErrorCode.BUSY, "sent again") from None
-            return convert.reset_reply(response, spec)
+            return calls.reset_reply(response, spec)
 
         reply = self._retry(attempt, check)
         if reply.session != self._session:
@@ -152,7 +152,7 @@ class RosEnvironmentClient:
 
     def step(self, command: StepCommand, check: Check) -> Reply:
         spec = self._known_spec()
-        request = convert.step_request(command)
+        request = calls.step_request(command)
 
         def attempt(left_s: float) -> Reply:
             try:
@@ -162,7 +162,7 @@ class RosEnvironmentClient:
                     raise
                 self._node.diagnostics.count("step_retries", level=0)
                 raise WireError(ErrorCode.BUSY, "sent again") from None
-            return convert.step_reply(response, spec, self._session)
+            return calls.step_reply(response, spec, self._session)
 
         try:
             return self._retry(attempt, check)

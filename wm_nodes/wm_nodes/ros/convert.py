@@ -1,5 +1,5 @@
-"""numpy to messages and back, never through the slow uint8[] path. Shapes: N environments, A action, S state,
-P ground truth, H W 3 image, R reward components.
+"""What topics carry: numpy to messages and back, never through the slow uint8[] path; services are in ros.calls.
+Shapes: N environments, A action, S state, P ground truth, H W 3 image, R reward components.
 
 Assigning an ndarray to a message's array field takes 21 ms for 197 kB and fails under ROS_PYTHON_CHECK_FIELDS=1; an
 array.array takes 10 us and is right in both modes. Reading back is np.frombuffer: a view, no copy.
@@ -15,23 +15,22 @@ from numpy.typing import DTypeLike, NDArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from wm_msgs.msg import EnvSpec, EpisodeEvent, ErrorCode, RewardBatch, TaskGoal, TileLayout, TransitionBatch
-from wm_msgs.srv import ResetBatch, StepBatch
+from wm_msgs.msg import (
+    ActionBatch,
+    EnvSpec,
+    EpisodeEvent,
+    ErrorCode,
+    RewardBatch,
+    TaskGoal,
+    TileLayout,
+    TransitionBatch,
+)
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.messages import BASE_FRAME, CAMERA_FRAME, spec_of
 from wm_nodes.reward.base import RewardResult
-from wm_nodes.ros.wire import (
-    EpisodeNote,
-    Goals,
-    Reply,
-    ResetCommand,
-    Rewards,
-    StepCommand,
-    Transition,
-    WireError,
-)
+from wm_nodes.ros.wire import EpisodeNote, Goals, Rewards, TimedAction, Transition, WireError
 from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import BoolArray, FloatArray, UInt8Array, UInt64Array
+from wm_nodes.types import BoolArray, FloatArray, UInt8Array
 
 NS_PER_S = 1_000_000_000
 _TYPECODES = {"float32": "f", "float64": "d", "uint8": "B", "uint32": "I", "uint64": "Q", "bool": "B"}
@@ -58,21 +57,35 @@ def from_field(field: Any, dtype: DTypeLike) -> NDArray[Any]:
 
 def floats(field: Any, shape: Sequence[int], name: str) -> FloatArray:
     """Return a float32 view of the given shape; raise WireError(BAD_SHAPE) where the length differs."""
-    return _shaped(from_field(field, np.float32), shape, name)
+    return shaped(from_field(field, np.float32), shape, name)
 
 
 def flags(field: Any, count: int, name: str) -> BoolArray:
     """Return bool (count,) from uint8 flags."""
-    values: UInt8Array = _shaped(from_field(field, np.uint8), (count,), name)
+    values: UInt8Array = shaped(from_field(field, np.uint8), (count,), name)
     return np.not_equal(values, 0)
 
 
-def _shaped(values: NDArray[Any], shape: Sequence[int], name: str) -> NDArray[Any]:
+def shaped(values: NDArray[Any], shape: Sequence[int], name: str) -> NDArray[Any]:
+    """Return values in a shape; raise WireError(BAD_SHAPE) where the length differs."""
     if values.size != int(np.prod(shape)):
         raise WireError(
             ErrorCode.BAD_SHAPE, f"{name} has {values.size} values, expected {tuple(shape)}; compare with env/spec"
         )
     return values.reshape(shape)
+
+
+def set_optional(message: Any, **arrays: NDArray[Any] | None) -> None:
+    """Set array fields; None leaves one empty."""
+    for name, values in arrays.items():
+        if values is not None:
+            setattr(message, name, to_field(values))
+
+
+def fill_error(response: Any, error: WireError) -> Any:
+    """Refuse a request in its answer."""
+    response.error_code, response.message = error.code, str(error)
+    return response
 
 
 def time_msg(stamp_ns: int) -> Time:
@@ -174,135 +187,6 @@ def spec_from_msg(message: EnvSpec) -> EnvironmentSpec:
     return spec
 
 
-# Step and reset
-
-
-def step_request(command: StepCommand) -> StepBatch.Request:
-    request = StepBatch.Request(
-        session=command.session, step_id=command.step_id, spec_hash=command.spec_hash,
-        policy_version=command.policy_version, observation=int(command.with_image),
-    )  # fmt: skip
-    request.action = to_field(command.actions)
-    _set_optional(request, log_prob=command.logprobs, value=command.values, reset_mask=command.reset_mask,
-                  reset_seed=command.reset_seeds)  # fmt: skip
-    return request
-
-
-def step_command(request: StepBatch.Request, spec: EnvironmentSpec) -> StepCommand:
-    """Raises WireError(BAD_SHAPE) where an array has another length than the spec says."""
-    count = spec.num_envs
-    return StepCommand(
-        session=request.session,
-        step_id=request.step_id,
-        spec_hash=request.spec_hash,
-        actions=floats(request.action, (count * spec.action_dim,), "action"),
-        policy_version=request.policy_version,
-        logprobs=floats(request.log_prob, (count,), "log_prob") if len(request.log_prob) else None,
-        values=floats(request.value, (count,), "value") if len(request.value) else None,
-        reset_mask=flags(request.reset_mask, count, "reset_mask") if len(request.reset_mask) else None,
-        reset_seeds=_seeds(request.reset_seed, count, "reset_seed"),
-        with_image=request.observation == StepBatch.Request.OBSERVATION_MOSAIC,
-    )
-
-
-def reset_request(command: ResetCommand) -> ResetBatch.Request:
-    request = ResetBatch.Request(task=command.task, behaviour=command.behaviour, observation=int(command.with_image))
-    _set_optional(request, mask=command.mask, seed=command.seeds)
-    return request
-
-
-def reset_command(request: ResetBatch.Request, spec: EnvironmentSpec) -> ResetCommand:
-    return ResetCommand(
-        mask=flags(request.mask, spec.num_envs, "mask") if len(request.mask) else None,
-        seeds=_seeds(request.seed, spec.num_envs, "seed"),
-        task=request.task,
-        behaviour=request.behaviour,
-        with_image=request.observation == StepBatch.Request.OBSERVATION_MOSAIC,
-    )
-
-
-def fill_step_response(response: StepBatch.Response, reply: Reply, spec: EnvironmentSpec) -> StepBatch.Response:
-    response.step_id = reply.step_id
-    response.step_ms = reply.step_s * 1e3
-    response.terminated, response.truncated = to_field(reply.terminated), to_field(reply.truncated)
-    response.success_probability = to_field(reply.success_probability)
-    response.model_uncertainty = to_field(reply.uncertainty)
-    return _fill_common(response, reply, spec)
-
-
-def fill_reset_response(response: ResetBatch.Response, reply: Reply, spec: EnvironmentSpec) -> ResetBatch.Response:
-    response.session, response.next_step_id = reply.session, reply.step_id + 1
-    return _fill_common(response, reply, spec)
-
-
-def _fill_common(response: Any, reply: Reply, spec: EnvironmentSpec) -> Any:
-    response.error_code = ErrorCode.OK
-    response.stamp = time_msg(reply.stamp_ns)
-    response.state = to_field(reply.states)
-    response.episode_id = to_field(reply.episode_ids)
-    if reply.images is not None:
-        response.observation = mosaic_msg(reply.images, reply.stamp_ns, spec)
-    return response
-
-
-def step_reply(response: StepBatch.Response, spec: EnvironmentSpec, session: int) -> Reply:
-    """Raises WireError with the response's error code, or BAD_SHAPE."""
-    _raise_for(response)
-    count = spec.num_envs
-    return Reply(
-        session=session,
-        step_id=response.step_id,
-        stamp_ns=time_ns(response.stamp),
-        images=images_of(response.observation, spec) if len(response.observation.data) else None,
-        states=floats(response.state, (count, spec.state_dim), "state"),
-        terminated=flags(response.terminated, count, "terminated"),
-        truncated=flags(response.truncated, count, "truncated"),
-        episode_ids=_shaped(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
-        success_probability=floats(response.success_probability, (count,), "success_probability"),
-        uncertainty=floats(response.model_uncertainty, (count,), "model_uncertainty"),
-        step_s=response.step_ms / 1e3,
-    )
-
-
-def reset_reply(response: ResetBatch.Response, spec: EnvironmentSpec) -> Reply:
-    """Raises WireError with the response's error code, or BAD_SHAPE."""
-    _raise_for(response)
-    count = spec.num_envs
-    zeros = np.zeros(count, np.float32)
-    return Reply(
-        session=response.session,
-        step_id=response.next_step_id - 1,
-        stamp_ns=time_ns(response.stamp),
-        images=images_of(response.observation, spec) if len(response.observation.data) else None,
-        states=floats(response.state, (count, spec.state_dim), "state"),
-        terminated=zeros != 0,
-        truncated=zeros != 0,
-        episode_ids=_shaped(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
-        success_probability=zeros,
-        uncertainty=zeros,
-    )
-
-
-def fill_error(response: Any, error: WireError) -> Any:
-    response.error_code, response.message = error.code, str(error)
-    return response
-
-
-def _raise_for(response: Any) -> None:
-    if response.error_code != ErrorCode.OK:
-        raise WireError(response.error_code, response.message)
-
-
-def _seeds(field: Any, count: int, name: str) -> UInt64Array | None:
-    return _shaped(from_field(field, np.uint64), (count,), name) if len(field) else None
-
-
-def _set_optional(message: Any, **arrays: NDArray[Any] | None) -> None:
-    for name, values in arrays.items():
-        if values is not None:
-            setattr(message, name, to_field(values))
-
-
 # Transitions, goals, episodes, rewards
 
 
@@ -312,7 +196,7 @@ def transition_msg(transition: Transition) -> TransitionBatch:
         header=header(transition.stamp_ns), next_stamp=time_msg(transition.next_stamp_ns), step_id=transition.step_id,
         num_envs=len(transition.valid), source=transition.source,
     )  # fmt: skip
-    _set_optional(
+    set_optional(
         message, action=transition.actions, state=transition.states, next_state=transition.next_states,
         log_prob=transition.logprobs, value=transition.values, terminated=transition.terminated,
         truncated=transition.truncated, valid=transition.valid, episode_id=transition.episode_ids,
@@ -340,14 +224,28 @@ def transition_of(message: TransitionBatch, spec: EnvironmentSpec) -> Transition
         terminated=flags(message.terminated, count, "terminated"),
         truncated=flags(message.truncated, count, "truncated"),
         valid=flags(message.valid, count, "valid"),
-        episode_ids=_shaped(from_field(message.episode_id, np.uint64), (count,), "episode_id"),
-        episode_steps=_shaped(from_field(message.episode_step, np.uint32), (count,), "episode_step"),
-        policy_versions=_shaped(from_field(message.policy_version, np.uint64), (count,), "policy_version"),
+        episode_ids=shaped(from_field(message.episode_id, np.uint64), (count,), "episode_id"),
+        episode_steps=shaped(from_field(message.episode_step, np.uint32), (count,), "episode_step"),
+        policy_versions=shaped(from_field(message.policy_version, np.uint64), (count,), "policy_version"),
         success_probability=floats(message.success_probability, (count,), "success_probability"),
         uncertainty=floats(message.model_uncertainty, (count,), "model_uncertainty"),
         ground_truth=from_field(message.ground_truth, np.float32).reshape(count, -1),
         source=message.source,
         session=message.session,
+    )
+
+
+def action_of(message: ActionBatch, spec: EnvironmentSpec) -> TimedAction:
+    """Raises WireError(BAD_SHAPE) where an array does not fit the spec, or for a chunk of several actions."""
+    count = spec.num_envs
+    if message.chunk_length > 1:
+        raise WireError(ErrorCode.BAD_SHAPE, f"action is a chunk of {message.chunk_length}; send one at a time")
+    return TimedAction(
+        actions=floats(message.action, (count * spec.action_dim,), "action"),
+        stamp_ns=time_ns(message.header.stamp),
+        policy_version=message.policy_version,
+        logprobs=floats(message.log_prob, (count,), "log_prob") if len(message.log_prob) else None,
+        values=floats(message.value, (count,), "value") if len(message.value) else None,
     )
 
 
@@ -364,7 +262,7 @@ def goals_of(message: TaskGoal, spec: EnvironmentSpec) -> Goals:
         stamp_ns=time_ns(message.header.stamp),
         images=images_of(message.goal_image, spec) if len(message.goal_image.data) else None,
         found=flags(message.goal_found, spec.num_envs, "goal_found"),
-        episode_ids=_shaped(from_field(message.episode_id, np.uint64), (spec.num_envs,), "episode_id"),
+        episode_ids=shaped(from_field(message.episode_id, np.uint64), (spec.num_envs,), "episode_id"),
     )
 
 
@@ -377,9 +275,7 @@ def episode_msg(note: EpisodeNote, spec: EnvironmentSpec) -> EpisodeEvent:
     )  # fmt: skip
 
 
-def reward_msg(
-    transition: Transition, result: RewardResult, *, name: str, version: int, eval_s: float
-) -> RewardBatch:
+def reward_msg(transition: Transition, result: RewardResult, *, name: str, version: int, eval_s: float) -> RewardBatch:
     """The rewards of one transition; session and seq are set by the publisher."""
     components = list(result.components)
     message = RewardBatch(
@@ -387,7 +283,7 @@ def reward_msg(
         num_envs=len(result.total), component_names=components, invalid_reason=result.invalid_reason,
         reward_version=version, reward_name=name, eval_ms=eval_s * 1e3,
     )  # fmt: skip
-    _set_optional(message, total=result.total, dense=result.dense, sparse=result.sparse, success=result.success,
+    set_optional(message, total=result.total, dense=result.dense, sparse=result.sparse, success=result.success,
                   valid=result.valid)  # fmt: skip
     if components:
         message.components = to_field(np.stack([result.components[key] for key in components], axis=1))
@@ -403,6 +299,6 @@ def rewards_of(message: RewardBatch) -> Rewards:
         step_id=message.step_id,
         total=floats(message.total, (count,), "total"),
         valid=flags(message.valid, count, "valid"),
-        success=_shaped(from_field(message.success, np.uint8), (count,), "success"),
+        success=shaped(from_field(message.success, np.uint8), (count,), "success"),
         invalid_reason=message.invalid_reason,
     )

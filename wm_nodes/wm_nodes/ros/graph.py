@@ -40,6 +40,8 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("starts_file", "", "First frames to imagine from; empty: starts.safetensors in model_dir"),
     LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
     LaunchArgument("backend", "world_model", "What the environment node steps", ("world_model", "maniskill")),
+    LaunchArgument("mode", "lockstep", "Who keeps time: the policy's steps, or the environment's clock",
+                   ("lockstep", "asynchronous")),
     LaunchArgument("reward", "", "Reward model; empty: endogenous if imagined, else rule", ("", "endogenous", "rule")),
     LaunchArgument("num_envs", "0", "Environments stepped together; 0: ppo.num_envs of the configuration"),
     LaunchArgument("simulator_envs", "4", "Environments of the simulator that evaluates"),
@@ -239,6 +241,7 @@ def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "nu
         "backend": backend,
         "num_envs": _integer(arguments, count, 1, 4096),
         "seed": _integer(arguments, "seed", 0),
+        "mode": arguments.get("mode", "lockstep") if not below else "lockstep",
     }
     if backend == "world_model":
         parameters |= {"model_dir": arguments["model_dir"], "starts_file": arguments["starts_file"]}
@@ -261,19 +264,26 @@ def _weights(arguments: Mapping[str, str]) -> dict[str, ParameterValue]:
     return {"model_dir": arguments["model_dir"], "initial_policy": arguments["initial_policy"]}
 
 
-def _rollout_nodes(arguments: Mapping[str, str], backend: str) -> list[NodeSpec]:
+def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[str, ...] = ()) -> list[NodeSpec]:
+    """consumers: further nodes that must not miss the first messages of a rollout."""
     reward = arguments["reward"] or ("endogenous" if backend == "world_model" else "rule")
+    recorder = _recorder(arguments)
+    policy = {**_weights(arguments), "mode": arguments.get("mode", "lockstep")}
+    awaited = ["environment", "reward_evaluator", *(node.name for node in recorder), *consumers]
     return [
         _environment(arguments, backend),
         _node(arguments, "reward_evaluator", {"reward": reward, "model_dir": arguments["model_dir"]}),
-        _node(arguments, "policy", _weights(arguments)),
-        *_recorder(arguments),
+        _node(arguments, "policy", {**policy, "await_nodes": awaited}),
+        *recorder,
     ]
 
 
 def _online_training(arguments: Mapping[str, str]) -> Graph:
     ranks = _integer(arguments, "learner_ranks", 1, 1024)
-    nodes = [*_rollout_nodes(arguments, "world_model"), _node(arguments, "learner", _weights(arguments), ranks=ranks)]
+    nodes = [
+        *_rollout_nodes(arguments, "world_model", ("learner",)),
+        _node(arguments, "learner", _weights(arguments), ranks=ranks),
+    ]
     if arguments["simulator"] == "true":
         nodes += _simulator_and_evaluation(arguments)
     return Graph("online_training", tuple(nodes))
@@ -306,7 +316,9 @@ _TRAINING = (
     *_COMMON, "model_dir", "starts_file", "initial_policy", "reward", "num_envs", "simulator_envs", "simulator", "seed",
     "learner_ranks", "record", "bag_uri",
 )  # fmt: skip
-_ROLLOUT = ("model_dir", "starts_file", "initial_policy", "backend", "reward", "num_envs", "seed", "record", "bag_uri")
+_ROLLOUT = (
+    "model_dir", "starts_file", "initial_policy", "backend", "mode", "reward", "num_envs", "seed", "record", "bag_uri",
+)  # fmt: skip
 _EVALUATE = (*_COMMON, "model_dir", "simulator_envs", "seed", "record", "bag_uri")
 
 SCENARIOS: dict[str, Scenario] = {

@@ -9,6 +9,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 
 from wm_msgs.msg import RunState
 from wm_nodes.config.load import ConfigError, load_config
@@ -16,32 +18,16 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.credit import CreditGrantor
 from wm_nodes.ros.diagnostics import Diagnostics
+from wm_nodes.ros.introspection import introspect
+from wm_nodes.ros.links import Links
 from wm_nodes.ros.params import COMMON, Param, declare
 from wm_nodes.ros.peers import HEARTBEAT_S, PeerWatch
+from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.sequence import GapTracker, Stamper, new_session
+from wm_nodes.ros.sequence import GapTracker, new_session
 
 REFUSALS = (ConfigError, ValueError, OSError, KeyError, ImportError)
 """What a bad setting raises: reported as one line, the node stays where it was. Anything else is a bug: with trace."""
-
-
-class StampedPublisher:
-    """A publisher of one row of the QoS table that numbers its messages (session, seq)."""
-
-    def __init__(self, node: "ManagedNode", name: str, at: str | None = None) -> None:
-        row = topic(name)
-        self._publisher = node.create_publisher(row.type, at or row.name, row.qos)
-        self._stamper = Stamper(node.session)
-
-    @property
-    def next_seq(self) -> int:
-        return self._stamper.next_seq
-
-    def publish(self, message: Any) -> int:
-        """Number and publish a message; return its seq."""
-        seq = self._stamper.stamp(message)
-        self._publisher.publish(message)
-        return seq
 
 
 class ManagedNode(LifecycleNode):  # type: ignore[misc]
@@ -60,7 +46,9 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._active = False
         self._entities: list[Callable[[], object]] = []
         self._trackers: dict[str, GapTracker] = {}
+        self._introspected: list[Any] = []
         declare(self, (*COMMON, *params))
+        self.add_post_set_parameters_callback(self._after_set)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         run_dir = self.run_dir if self.param("run_dir") else None
         row = topic("/diagnostics")
@@ -72,7 +60,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.peers = PeerWatch(self.get_fully_qualified_name(), float(self.param("peer_timeout_s")))
         row = topic("run/state")
         self._state_publisher = self.create_publisher(RunState, row.name, row.qos)
-        self._state_subscription = self.create_subscription(RunState, row.name, self._on_run_state, row.qos)
+        self._state_subscription = self.create_subscription(RunState, row.name, self._on_run_state, row.reader_qos)
+        self.links = Links(self)
         self._heartbeat_timer = self.create_timer(HEARTBEAT_S, self._on_heartbeat, clock=steady)
         self._diagnostics_timer = self.create_timer(1.0, self._on_diagnostics, clock=steady)
 
@@ -121,10 +110,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             raise ValueError(f"{self.get_name()}: config_file {path!r} does not exist")
         return load_config(path)
 
-    def publish_on(self, name: str) -> StampedPublisher:
-        """A numbering publisher for a row of the QoS table, destroyed at cleanup."""
-        publisher = StampedPublisher(self, name)
-        self._entities.append(lambda: self.destroy_publisher(publisher._publisher))
+    def publish_on(self, name: str, qos: QoSProfile | None = None) -> StampedPublisher:
+        """A numbering publisher for a row of the QoS table (or another profile), destroyed at cleanup."""
+        publisher = StampedPublisher(self, name, self.session, qos)
+        self._entities.append(lambda: self.destroy_publisher(publisher.publisher))
         return publisher
 
     def listen(
@@ -147,7 +136,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             if grantor is not None:
                 grantor.consumed(tracker)
 
-        subscription = self.create_subscription(row.type, row.name, observe, row.qos)
+        subscription = self.create_subscription(row.type, row.name, observe, row.reader_qos)
         self._entities.append(lambda: self.destroy_subscription(subscription))
         if grantor is not None:
             self._entities.append(grantor.close)
@@ -159,6 +148,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     def serve(self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service until cleanup."""
         service = self.create_service(service_type, name, callback)
+        introspect(self, service, str(self.param("service_introspection")))
+        self._introspected.append(service)
         self._entities.append(lambda: self.destroy_service(service))
 
     def own(self, destroy: Callable[..., object], *arguments: Any) -> None:
@@ -246,6 +237,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         return result
 
     def _release(self) -> None:
+        self._introspected.clear()
         while self._entities:
             self._entities.pop()()
         self._trackers.clear()
@@ -261,6 +253,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     def _on_run_state(self, message: RunState) -> None:
         if message.state in (RunState.FINISHED, RunState.FAILED):
             self.peers.left(message.node)
+            self.links.book.forget(message.node)
         elif not self.peers.heard(message.node):
             return
         self.diagnostics.clear_condition(f"peer {message.node}")
@@ -268,13 +261,22 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     def _on_heartbeat(self) -> None:
         self.peers.timeout_s = float(self.param("peer_timeout_s"))
         self._publish_state(RunState.RUNNING if self._active else RunState.IDLE, "")
+        self.links.announce()
         for name in self.peers.check():
             text = f"{name} is lost: silent for more than {self.peers.timeout_s:g} s; restart it"
             self.get_logger().error(text)
             self.diagnostics.set_condition(f"peer {name}", diagnostics.ERROR, text)
+            self.links.book.forget(name)
             self.on_peer_lost(name)
 
+    def _after_set(self, changes: Sequence[Parameter]) -> None:
+        for change in changes:
+            if change.name == "service_introspection":
+                for service in self._introspected:
+                    introspect(self, service, change.value)
+
     def _on_diagnostics(self) -> None:
+        self.links.announce(again=True)
         self.update_diagnostics()
         self.diagnostics.gauge("state", self._state_machine.current_state[1])
         for name, tracker in self._trackers.items():

@@ -72,6 +72,8 @@ COMMON = (
           choices=("events", "single", "multi")),
     Param("peer_timeout_s", 3.0, "A node of the graph that is silent for longer is reported as lost", "s",
           minimum=1.0, maximum=60.0),
+    Param("service_introspection", "off", "Publish the node's service calls on <service>/_service_event",
+          choices=("off", "metadata", "contents")),
 )  # fmt: skip
 """Parameters that every node of the graph has."""
 

@@ -1,13 +1,16 @@
-"""The QoS table: one profile per stream class, one row per topic."""
+"""The graph's topics: one row each, with message class and QoS. Profiles of recorded topics are those of
+recording/topics.py; here are only what nobody records, and the profiles of viewers."""
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Qos
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Bool
 
 from wm_msgs.msg import (
@@ -16,6 +19,7 @@ from wm_msgs.msg import (
     EnvSpec,
     EpisodeEvent,
     LearnerMetrics,
+    NodeLinks,
     PolicyVersion,
     RewardBatch,
     RewardSummary,
@@ -23,15 +27,13 @@ from wm_msgs.msg import (
     TaskGoal,
     TransitionBatch,
 )
+from wm_nodes.recording import topics as recorded
 
-CREDIT_WINDOW = 16
-"""Messages that a keep-all stream may be ahead of its slowest consumer."""
+CREDIT_WINDOW = recorded.CREDIT_WINDOW
 
-IMAGE_DEPTH = 2 * CREDIT_WINDOW
-"""The images of a full credit window fit into the writer and into the reader twice, so a paced consumer loses none."""
-
-POLICY_LEASE_S = 3.0
-"""A policy/version publisher that is silent for longer counts as gone."""
+WRITTEN_BY_EVERY_NODE = ("run/state", "run/links")
+EVERY_NODE_DEPTH = 64
+"""More nodes than a graph has, so that a reader that was busy finds the newest word of each."""
 
 
 @dataclass(frozen=True)
@@ -42,56 +44,67 @@ class Topic:
     type: type[Any]
     qos: QoSProfile
 
+    @property
+    def reader_qos(self) -> QoSProfile:
+        """The profile of subscriptions. On a topic without keys a reader's KEEP_LAST depth counts over all writers:
+        where every node writes, depth 1 would leave a reader that was busy with one node's message."""
+        if self.name not in WRITTEN_BY_EVERY_NODE:
+            return self.qos
+        profile = copy(self.qos)
+        profile.depth = EVERY_NODE_DEPTH
+        return profile
 
-def _profile(reliability: ReliabilityPolicy, durability: DurabilityPolicy, depth: int) -> QoSProfile:
-    """depth 0: keep all."""
-    history = HistoryPolicy.KEEP_LAST if depth else HistoryPolicy.KEEP_ALL
-    return QoSProfile(reliability=reliability, durability=durability, history=history, depth=depth)
+
+def profile_of(qos: Qos) -> QoSProfile:
+    """The rclpy profile of a row of recording/topics.py."""
+    profile = QoSProfile(
+        reliability=ReliabilityPolicy[qos.reliability.name], durability=DurabilityPolicy[qos.durability.name],
+        history=HistoryPolicy[qos.history.name], depth=qos.depth, liveliness=LivelinessPolicy[qos.liveliness.name],
+    )  # fmt: skip
+    if qos.liveliness_lease_duration.sec:
+        profile.liveliness_lease_duration = Duration(seconds=qos.liveliness_lease_duration.sec)
+    return profile
 
 
-_RELIABLE, _BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
-_VOLATILE, _LATCHED = DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL
+def _recorded(topic: recorded.Topic, message: type[Any]) -> Topic:
+    return Topic(topic.name, message, profile_of(topic.qos))
 
-IMAGE = _profile(_RELIABLE, _VOLATILE, IMAGE_DEPTH)
-"""A reliable writer matches reliable readers (learner, recorder) and best-effort ones (RViz, rqt)."""
 
-VIEW = _profile(_BEST_EFFORT, _VOLATILE, 1)
+LATCHED = profile_of(recorded.LATCHED)
+METRICS = profile_of(recorded.METRICS)
+
+VIEW = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
 """For viewers: never holds anything back."""
 
-KEEP_ALL = _profile(_RELIABLE, _VOLATILE, 0)
-"""Transitions, rewards, episode events. Its queue has no limit: bounded by credit, never by dropping."""
-
-ACTION = _profile(_RELIABLE, _VOLATILE, 1)
-LATCHED = _profile(_RELIABLE, _LATCHED, 1)
-POLICY = QoSProfile(
-    reliability=_RELIABLE, durability=_LATCHED, history=HistoryPolicy.KEEP_LAST, depth=1,
-    liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=POLICY_LEASE_S),
-)  # fmt: skip
-GOAL = _profile(_RELIABLE, _LATCHED, CREDIT_WINDOW + 2)
-"""Latched, but deep: an evaluator that lags by a full credit window still gets the goals of every episode."""
-
-METRICS = _profile(_RELIABLE, _VOLATILE, 10)
-CREDIT = _profile(_RELIABLE, _VOLATILE, 10)
+COMPRESSED = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=2)
+CLOCK = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
+CREDIT = METRICS
 """Deeper than one: several consumers publish on the same topic."""
 
-RUN_STATE = _profile(_RELIABLE, _LATCHED, 1)
-CLOCK = _profile(_BEST_EFFORT, _VOLATILE, 1)
+ACTION_LIFESPAN_S = 1.0
+LIVE_ACTION = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1,
+    lifespan=Duration(seconds=ACTION_LIFESPAN_S),
+)  # fmt: skip
+"""Actions that are carried out when they arrive (asynchronous mode): a stale one is worthless and is not delivered."""
 
 TOPICS: dict[str, Topic] = {
     topic.name: topic
     for topic in (
-        Topic("env/image", Image, IMAGE),
-        Topic("env/transition", TransitionBatch, KEEP_ALL),
-        Topic("env/spec", EnvSpec, LATCHED),
-        Topic("env/goal", TaskGoal, GOAL),
-        Topic("reward", RewardBatch, KEEP_ALL),
-        Topic("reward/summary", RewardSummary, METRICS),
-        Topic("episode", EpisodeEvent, KEEP_ALL),
-        Topic("action", ActionBatch, ACTION),
-        Topic("policy/version", PolicyVersion, POLICY),
-        Topic("learner/metrics", LearnerMetrics, METRICS),
+        _recorded(recorded.IMAGES, Image),
+        _recorded(recorded.TRANSITION, TransitionBatch),
+        _recorded(recorded.SPEC, EnvSpec),
+        _recorded(recorded.GOAL, TaskGoal),
+        _recorded(recorded.REWARD, RewardBatch),
+        _recorded(recorded.REWARD_SUMMARY, RewardSummary),
+        _recorded(recorded.EPISODE, EpisodeEvent),
+        _recorded(recorded.ACTION, ActionBatch),
+        _recorded(recorded.POLICY_VERSION, PolicyVersion),
+        _recorded(recorded.LEARNER_METRICS, LearnerMetrics),
+        _recorded(recorded.RUN_STATE, RunState),
+        Topic("env/image/compressed", CompressedImage, COMPRESSED),
         Topic("flow/credit", Credit, CREDIT),
-        Topic("run/state", RunState, RUN_STATE),
+        Topic("run/links", NodeLinks, LATCHED),
         Topic("safety/estop", Bool, LATCHED),
         Topic("/diagnostics", DiagnosticArray, METRICS),
         Topic("/clock", Clock, CLOCK),

@@ -73,6 +73,20 @@ class Reply:
 
 
 @dataclass(frozen=True)
+class TimedAction:
+    """ActionBatch, for an environment that steps on its own clock. actions: (N * A,). logprobs, values: (N,) or None.
+
+    stamp_ns: of the observation it answers; 0: it answers none (a person's), and its age counts from arrival.
+    """
+
+    actions: FloatArray
+    stamp_ns: int
+    policy_version: int = 0
+    logprobs: FloatArray | None = None
+    values: FloatArray | None = None
+
+
+@dataclass(frozen=True)
 class Transition:
     """TransitionBatch. ground_truth: (N, P), or (N, 0) where unknown."""
 

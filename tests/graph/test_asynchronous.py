@@ -1,0 +1,103 @@
+"""The environment on its own clock, and the policy that acts on what it sees, over DDS."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from graph.harness import Graph, Probe, wait_until
+from rosgraph_msgs.msg import Clock
+
+from wm_msgs.action import Rollout
+from wm_msgs.msg import ActionBatch, ErrorCode
+from wm_msgs.srv import StepBatch
+from wm_nodes.ros import calls, convert
+from wm_nodes.ros.qos import topic
+from wm_nodes.ros.wire import StepCommand
+
+pytestmark = pytest.mark.graph
+N = 2
+
+
+def value(probe: Probe, key: str, node: str = "/wm/environment") -> int:
+    return int(probe.value(node, key) or 0)
+
+
+def held(transition: Any) -> bool:
+    return not any(transition.action)
+
+
+def test_the_environment_keeps_its_own_time_holds_without_actions_and_counts_it(graph: Graph, probe: Probe) -> None:
+    transitions, events = probe.listen("env/transition"), probe.listen("episode")
+    graph.start_environment(num_envs=N, mode="asynchronous", control_period_s=0.05)
+    wait_until("steps without any request", lambda: len(transitions) > 20)
+    assert all(held(message) and not any(message.policy_version) for message in transitions)
+    assert all(message.state == message.next_state for message in transitions if all(message.valid))
+    assert {after.step_id - before.step_id for before, after in pairwise(list(transitions))} == {1}
+    wait_until("the count of held steps", lambda: value(probe, "action_timeouts") > 10)
+    wait_until("ended and restarted episodes", lambda: len({event.episode_id for event in events}) > N)
+    command = StepCommand(0, 1, "", np.zeros(3 * N, np.float32))
+    refused = probe.call(StepBatch, "env/step", calls.step_request(command))
+    assert refused.error_code == ErrorCode.OUT_OF_ORDER
+    assert "mode:=lockstep" in refused.message
+
+
+def test_a_fresh_action_moves_a_stale_or_bad_one_does_not(graph: Graph, probe: Probe) -> None:
+    transitions = probe.listen("env/transition")
+    actions = probe.publisher("action")
+    graph.start_environment(num_envs=N, mode="asynchronous", control_period_s=0.1, max_action_age_s=1.0)
+    wait_until("the environment", lambda: len(transitions) > 2 and actions.get_subscription_count())
+
+    def send(fill: float, stamp: Any, **changes: Any) -> None:
+        message = ActionBatch(num_envs=N, action_dim=3, chunk_length=1, policy_version=4, **changes)
+        message.header.stamp = stamp
+        message.action = convert.to_field(np.full(3 * N, fill, np.float32))
+        actions.publish(message)
+
+    send(0.25, transitions[-1].next_stamp)
+    moved = wait_until("a step with the action", lambda: [t for t in transitions if not held(t) and all(t.valid)])[0]
+    assert set(moved.action) == {0.25}
+    assert set(moved.policy_version) == {4}
+    np.testing.assert_allclose(np.subtract(moved.next_state, moved.state), 0.25 * 0.03, atol=1e-6)
+    wait_until("to hold when the action is old", lambda: held(transitions[-1]))
+    moves = sum(not held(t) for t in transitions)
+    send(0.5, transitions[0].header.stamp)
+    wait_until("the stale one's count", lambda: value(probe, "refused_action") == 1)
+    send(np.nan, transitions[-1].next_stamp)
+    wait_until("the bad one's count", lambda: value(probe, "refused_action") == 2)
+    send(0.5, transitions[-1].next_stamp, mode=ActionBatch.MODE_HOLD)
+    seen = len(transitions)
+    wait_until("further steps", lambda: len(transitions) > seen + 3)
+    assert sum(not held(t) for t in transitions) == moves
+
+
+def test_the_policy_acts_on_images_in_real_time_and_says_hold_when_it_stops(graph: Graph, probe: Probe) -> None:
+    transitions, actions = probe.listen("env/transition"), probe.listen("action")
+    graph.start_environment(num_envs=N, mode="asynchronous", control_period_s=0.1, max_action_age_s=2.0)
+    policy = graph.start_policy(mode="asynchronous")
+    wait_until("actions", lambda: len(actions) > 10, 60)
+    wait_until("steps with them", lambda: sum(not held(t) for t in transitions) > 10)
+    stamps = {convert.time_ns(t.next_stamp) for t in transitions}
+    assert sum(convert.time_ns(a.header.stamp) in stamps for a in actions) > 5
+    moved = next(t for t in reversed(transitions) if not held(t))
+    assert any(np.array_equal(moved.action, a.action) for a in actions)
+    client = probe.action(Rollout, "rollout")
+    refused = probe.finish(probe.send(client, Rollout.Goal(steps=3)))
+    assert refused.termination_reason == Rollout.Result.FAILED
+    assert "mode:=lockstep" in refused.message
+    policy.terminate()
+    assert policy.wait(20) == 0
+    wait_until("the hold", lambda: actions[-1].mode == ActionBatch.MODE_HOLD)
+    wait_until("a held step", lambda: held(transitions[-1]))
+
+
+def test_the_clock_shows_the_stamp_of_each_observation(graph: Graph, probe: Probe) -> None:
+    ticks: list[int] = []
+    row = topic("/clock")
+    probe.node.create_subscription(Clock, row.name, lambda m: ticks.append(convert.time_ns(m.clock)), row.qos)
+    transitions = probe.listen("env/transition")
+    graph.start_environment(num_envs=N, mode="asynchronous", control_period_s=0.05, publish_clock=True)
+    wait_until("ticks", lambda: len(ticks) > 5 and len(transitions) > 5)
+    stamps = {convert.time_ns(t.next_stamp) for t in list(transitions)}
+    assert ticks == sorted(ticks)
+    assert len(stamps & set(ticks)) >= 3
