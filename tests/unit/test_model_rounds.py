@@ -1,4 +1,4 @@
-"""Online rounds without a graph: a policy's episodes from the simulator, a refreshed model, which of the two is kept."""
+"""Online rounds without a graph: a policy's episodes from the simulator, a refreshed model, which one is kept."""
 
 import math
 from dataclasses import replace
@@ -6,32 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from model_folders import make_model_folder
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning import model_rounds
 from wm_nodes.learning.model_rounds import Comparison, Verdict, compare_models, is_worse, refresh_model
-from wm_nodes.learning.policies import ACTION_DIM, STATE_DIM, make_policy
-from wm_nodes.learning.pretraining import MODEL_TASKS, load_arrays
+from wm_nodes.learning.policies import make_policy
+from wm_nodes.learning.pretraining import load_arrays
 from wm_nodes.learning.weights import save_weights
 from wm_nodes.recording import read_episodes
-from wm_nodes.world_model import Tokenizer, load_model_folder, save_model_folder
-from wm_nodes.world_model.folder import action_model_class
-
-TASKS = MODEL_TASKS["push_cube"]
-
-
-def make_folder(folder: Path, config: RunConfig) -> Path:
-    tokenizer = Tokenizer(config.tokenizer, 64, 128)
-    action = action_model_class(config.tokenizer.kind)(
-        config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim, action_dim=ACTION_DIM,
-        state_dim=STATE_DIM, num_tasks=len(TASKS),
-    )  # fmt: skip
-    return save_model_folder(
-        folder, tokenizer, action, None, tokenizer_config=config.tokenizer, world_model_config=config.world_model,
-        simulation=config.simulation, tasks=TASKS, story={"made": {"seed": 0}},
-    )  # fmt: skip
+from wm_nodes.world_model import load_model_folder
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +26,7 @@ def config() -> RunConfig:
 
 @pytest.fixture(scope="module")
 def model_dir(config: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(0)
-    return make_folder(tmp_path_factory.mktemp("model"), config)
+    return make_model_folder(tmp_path_factory.mktemp("model"), config)
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +94,6 @@ def test_a_verdict_names_what_got_worse() -> None:
 
 def test_quantised_models_are_refused_with_the_remedy(config: RunConfig, tmp_path: Path) -> None:
     quantised = config.model_copy(update={"tokenizer": config.tokenizer.model_copy(update={"kind": "lfq"})})
-    folder = make_folder(tmp_path / "model", quantised)
+    folder = make_model_folder(tmp_path / "model", quantised)
     with pytest.raises(ValueError, match=r"tokenizer\.kind lfq.*--rounds 1"):
         refresh_model(quantised, folder, [], tmp_path / "new")

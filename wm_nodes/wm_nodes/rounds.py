@@ -2,7 +2,9 @@
 
 Each round has a folder of its own, <run>/rounds/<k>: the learner's checkpoint, the policy's versions, the evaluations,
 the bags of the policy and the refreshed model. `result.json` is written last; a round that has it is skipped. One round
-(the default) trains in the run folder itself and collects nothing.
+(the default) trains in the run folder itself and collects nothing. The policy goes on from round to round; the learner
+starts anew in each: its optimiser, its critic-only updates (ppo.value_warmup_updates), and the policy that
+ppo.kl_reference_weight keeps it close to, which is the one the round started from.
 """
 
 import json
@@ -17,6 +19,7 @@ from rich.table import Table
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.job import Job, Start, Trained, console, imagined_success, rate, read_success, train_round
 from wm_nodes.learning.files import write_atomic
+from wm_nodes.learning.metrics import join_metrics
 from wm_nodes.learning.model_rounds import (
     Verdict,
     check_refreshable,
@@ -66,9 +69,7 @@ def split_updates(updates: int, rounds: int) -> list[int]:
         ValueError: a round would make none.
     """
     if rounds > 1 and updates < rounds:
-        raise ValueError(
-            f"ppo.updates is {updates}, which does not go round {rounds} rounds; raise it or lower --rounds"
-        )
+        raise ValueError(f"ppo.updates is {updates}, fewer than {rounds} rounds; raise it or lower --rounds")
     share, remainder = divmod(updates, rounds)
     return [share + (number < remainder) for number in range(rounds)]
 
@@ -95,6 +96,8 @@ def run_rounds(job: Job, model_dir: Path, policy: Path, judge: Judge) -> Rounds:
             table.append(_finish(job, start, trained, number, last=number == len(shares)))
             model_dir = start.folder / "model" if table[-1]["verdict"].get("accepted") else model_dir
     first, last = starts[0], starts[-1]
+    if table:
+        join_metrics([start.folder for start in starts], job.run_dir)
     return Rounds(
         policy, last.model_dir, read_success(first.folder, "real_before"), read_success(last.folder, "real_after"),
         read_success(first.folder, "imagined_before"), read_success(last.folder, "imagined_after"),
