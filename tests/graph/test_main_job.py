@@ -7,8 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from model_folders import make_model_folder
+from safetensors.numpy import save_file
 
 from wm_nodes.learning.metrics import read_metrics
 from wm_nodes.reports import read_summary
@@ -39,14 +41,22 @@ def test_the_main_job_runs_end_to_end_and_leaves_summary_report_and_bag(ros_doma
     assert json.loads((run_dir / "gate.json").read_text())["criteria"]
 
 
+def write_some_starts(path: Path) -> None:
+    """Grey first frames: enough for a model without quality, and no simulator is needed for them."""
+    path.parent.mkdir()
+    images, states = np.full((8, 64, 128, 3), 128, np.uint8), np.tile(np.float32([0.6, 0.0, 0.1]), (8, 1))
+    save_file({"images": images, "states": states}, path)
+
+
 @pytest.mark.slow
 def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what_is_lost(
     ros_domain: int, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
     model = make_model_folder(tmp_path / "model")
+    write_some_starts(run_dir / "starts.safetensors")
     arguments = ["--preset", "smoke", "--force", "--rounds", "2", "--model-dir", str(model), "--run-dir", str(run_dir),
-                 "--set", "evaluation.episodes=2"]  # fmt: skip
+                 "--set", "evaluation.episodes=2", "--set", "data.num_workers=1", "--compose"]  # fmt: skip
     done = start(arguments, ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     first, last = read_summary(run_dir)["rounds"]
