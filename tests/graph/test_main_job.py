@@ -1,15 +1,21 @@
 """The main job as a user starts it, smallest preset: simulator, world model, seven node processes, report."""
 
+import hashlib
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from model_folders import make_model_folder
+from safetensors.numpy import save_file
 
+from wm_nodes.learning.metrics import read_metrics
 from wm_nodes.recording import read_episodes
 from wm_nodes.reports import read_summary
+from wm_nodes.world_model import load_model_folder
 
 PROGRAM = "import sys; from wm_nodes.main_job import main; sys.exit(main(sys.argv[1:]))"
 RATES = ("real_before", "real_after", "imagined_before", "imagined_after")
@@ -36,6 +42,48 @@ def test_the_main_job_runs_end_to_end_and_leaves_summary_report_and_bag(ros_doma
     assert played.count("before") >= 4 and played.count("after") >= 4
     assert "data:image/png;base64" in (run_dir / "report.html").read_text()
     assert json.loads((run_dir / "gate.json").read_text())["criteria"]
+
+
+def write_some_starts(path: Path) -> None:
+    """Grey first frames: enough for a model without quality, and no simulator is needed for them."""
+    path.parent.mkdir()
+    images, states = np.full((8, 64, 128, 3), 128, np.uint8), np.tile(np.float32([0.6, 0.0, 0.1]), (8, 1))
+    save_file({"images": images, "states": states}, path)
+
+
+@pytest.mark.slow
+def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what_is_lost(
+    ros_domain: int, tmp_path: Path
+) -> None:
+    run_dir = tmp_path / "run"
+    model = make_model_folder(tmp_path / "model")
+    write_some_starts(run_dir / "starts.safetensors")
+    arguments = ["--preset", "smoke", "--force", "--rounds", "2", "--model-dir", str(model), "--run-dir", str(run_dir),
+                 "--set", "evaluation.episodes=2", "--set", "data.num_workers=1", "--compose"]  # fmt: skip
+    done = start(arguments, ros_domain)
+    assert done.returncode == 0, done.stdout + done.stderr
+    first, last = read_summary(run_dir)["rounds"]
+    assert (first["number"], last["number"], first["updates"], last["updates"]) == (1, 2, 1, 1)
+    assert first["verdict"]["rows"] and not last["verdict"]
+    assert (last["model_sha256"] != first["model_sha256"]) == first["verdict"]["accepted"]
+    assert load_model_folder(run_dir / "rounds" / "1" / "model").sha256 != first["model_sha256"]
+    assert "Online rounds" in (run_dir / "report.html").read_text()
+    assert [line["step"] for line in read_metrics(run_dir, "ppo")] == [1, 2]
+    measured = (run_dir / "rounds" / "1" / "evaluations" / "real_before.json").read_text()
+    weak = hashlib.sha256((run_dir / "policies" / "weak.safetensors").read_bytes()).hexdigest()
+    assert json.loads(measured)["identity"] == {"policy_sha256": weak}
+    for lost in ("trained.json", "evaluations/real_before.json"):  # as if stopped after the last update of round 1
+        (run_dir / "rounds" / "1" / lost).unlink()
+    finished = {path: path.stat().st_mtime_ns for path in (run_dir / "rounds" / "2").rglob("*") if path.is_file()}
+    done = start(arguments, ros_domain)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "training the policy in the world model: 0 updates" in done.stdout
+    assert done.stdout.count("starting the graph") == 1
+    assert (run_dir / "rounds" / "1" / "evaluations" / "real_before.json").read_text() == measured
+    assert {
+        path: path.stat().st_mtime_ns for path in (run_dir / "rounds" / "2").rglob("*") if path.is_file()
+    } == finished
+    assert [line["step"] for line in read_metrics(run_dir, "ppo")] == [1, 2]
 
 
 def test_a_wrong_setting_ends_with_one_clear_line(ros_domain: int, tmp_path: Path) -> None:

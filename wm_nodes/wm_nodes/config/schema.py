@@ -165,6 +165,25 @@ class GateConfig(Section):
     """The SFT policy's imagined success must agree with its real success within the joint 95 % interval."""
 
 
+class RoundsConfig(Section):
+    """Online rounds: train in the model, collect with the policy in the simulator, refresh the model, go on."""
+
+    num_rounds: Annotated[int, Field(ge=1, le=20)]
+    """1: off. ppo.updates are split over the rounds."""
+    episodes_per_round: Annotated[int, Field(ge=1, le=5000)]
+    """Simulator episodes of the round's policy that the model is refreshed on."""
+    heldout_episodes: Annotated[int, Field(ge=1, le=5000)]
+    """Further ones, never trained on, on which the new model is compared with the old one."""
+    replay_episodes: PositiveInt
+    """Scripted simulator episodes mixed into every refresh, against forgetting."""
+    refresh_iterations: PositiveInt
+    learning_rate: PositiveFloat
+    """Peak learning rate of a refresh."""
+    tolerance: NonNegativeFloat
+    """A new model is no worse while no error ratio grows by more than this share and no done precision or recall falls
+    by more than this."""
+
+
 class EvaluationConfig(Section):
     episodes: PositiveInt
     first_seed: NonNegativeInt
@@ -184,4 +203,5 @@ class RunConfig(Section):
     sft: SftConfig
     ppo: PpoConfig
     gate: GateConfig
+    rounds: RoundsConfig
     evaluation: EvaluationConfig

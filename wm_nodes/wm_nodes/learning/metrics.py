@@ -2,10 +2,12 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
+
+from wm_nodes.learning.files import write_atomic
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -54,6 +56,19 @@ class MetricsWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def join_metrics(folders: Sequence[Path], run_dir: Path) -> None:
+    """Write <run_dir>/metrics.jsonl from those of consecutive trainings, their steps counted on."""
+    lines, steps = list[str](), dict[str, int]()
+    for folder in folders:
+        offset = dict(steps)
+        for line in read_metrics(folder):
+            section = str(line["section"])
+            step = offset.get(section, 0) + int(str(line["step"]))
+            steps[section] = max(step, steps.get(section, 0))
+            lines.append(json.dumps({**line, "step": step}))
+    write_atomic(run_dir / FILE_NAME, "".join(f"{line}\n" for line in lines).encode())
 
 
 def read_metrics(run_dir: Path, section: str | None = None) -> list[dict[str, object]]:

@@ -104,18 +104,24 @@ def make_imagined_environment(
 
 
 def policy_actor(
-    config: RunConfig, model_dir: Path, weights: Path, noise: float = 0.0
+    config: RunConfig, model_dir: Path, weights: Path, noise: float | None = 0.0
 ) -> Callable[[Observation, int], FloatArray]:
     """act(observation of one slot, episode seed) -> action (A,), for collecting with a policy in a worker process.
 
-    noise: standard deviation of extra action noise, normalised units; its stream is (seed, step).
+    noise: standard deviation of the action noise, normalised units; None: the policy's own, as in training. Its stream
+        is (seed, step).
     """
     torch.set_num_threads(1)
     policy = load_policy(config, model_dir, weights)
 
     def act(observation: Observation, seed: int) -> FloatArray:
+        stream = numpy_stream(seed, "exploration", int(observation.episode_step[0]))
+        if noise is None:
+            own = stream.standard_normal((1, ACTION_DIM)).astype(np.float32)
+            sampled: FloatArray = policy.act(observation.image, observation.state, noise=own).actions[0]
+            return sampled
         action = policy.act(observation.image, observation.state).actions[0]
-        draw = numpy_stream(seed, "exploration", int(observation.episode_step[0])).normal(0, noise, action.shape)
+        draw = stream.normal(0, noise, action.shape)
         executed: FloatArray = np.clip(action + draw, -1, 1).astype(np.float32)
         return executed
 

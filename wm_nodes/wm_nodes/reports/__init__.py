@@ -8,9 +8,9 @@ from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture, write_report
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import Rate, Summary, read_summary, write_summary
-from wm_nodes.reports.tables import results_table
+from wm_nodes.reports.tables import results_table, rounds_table
 
 __all__ = [
     "Picture", "Rate", "Summary", "curves", "film_strip", "machine_facts", "read_summary", "results_table",
-    "write_report", "write_summary",
+    "rounds_table", "write_report", "write_summary",
 ]  # fmt: skip

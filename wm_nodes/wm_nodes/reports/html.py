@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.reports.summary import Summary, write_whole
-from wm_nodes.reports.tables import result_rows, verdict
+from wm_nodes.reports.tables import ROUND_COLUMNS, result_rows, round_rows, verdict
 
 FILE_NAME = "report.html"
 
@@ -58,6 +58,7 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
         f"{summary.samples} imagined environment steps at {summary.imagined_steps_per_s:.0f} per second, "
         f"{summary.minutes:.1f} minutes in all</p>",
         "<h2>Success</h2>", _results(summary),
+        *_rounds(summary),
         "<h2>Gate: did the world model deserve it?</h2>", _gate(summary.gate),
         *_pictures(pictures),
         "<h2>Look closer, do it again</h2>", _again(run_dir, summary),
@@ -91,6 +92,19 @@ def _results(summary: Summary) -> str:
         f'<div class="wide"><table><tr><th></th>{head}</tr>{"".join(lines)}</table></div>'
         '<p class="faint">Intervals of rates: Wilson. Interval of the real difference: the same seeds before and after '
         "(Tango's score interval). Imagined success is what the world model claims; only real success counts.</p>"
+    )
+
+
+def _rounds(summary: Summary) -> Iterable[str]:
+    if not summary.rounds:
+        return
+    head = "".join(f"<th>{escape(name)}</th>" for name in ROUND_COLUMNS)
+    lines = ("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in round_rows(summary))
+    yield (
+        f'<h2>Online rounds</h2><div class="wide"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
+        '<p class="faint">After each round but the last, the policy acted in the simulator and the world model went on '
+        "training on what it saw there. The refreshed model is taken only where it is no worse on held-out episodes. "
+        "Imagined rates are those of the model that the round trained in.</p>"
     )
 
 

@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,9 @@ class Summary:
         difference, low and high (and more); empty where not measured.
     gate: GateReport.to_dict(). samples: environment steps trained on. minutes: of the whole run.
     command: as typed. machine: facts by name.
+    rounds: of a run in online rounds, one mapping for each: number, updates, samples, imagined_before, imagined, real
+        (successes, episodes, low, high, rate), verdict (accepted, reason, rows; empty after the last). The imagined
+        rates of a round are those of the model it trained in, so imagined_before and _after above may be of two models.
     """
 
     task: str
@@ -57,6 +60,7 @@ class Summary:
     minutes: float = float("nan")
     command: str = ""
     machine: Mapping[str, str] = field(default_factory=dict)
+    rounds: Sequence[Mapping[str, Any]] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; a number that is not finite becomes None."""

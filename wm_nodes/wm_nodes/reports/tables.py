@@ -65,6 +65,34 @@ def results_table(summary: Summary) -> Table:
     return table
 
 
+ROUND_COLUMNS = ("round", "updates", "imagined before", "imagined after", "real after", "refreshed model")
+
+
+def round_rows(summary: Summary) -> list[tuple[str, ...]]:
+    """One row of texts for each online round, under ROUND_COLUMNS."""
+    rows = []
+    for found in summary.rounds:
+        verdict = found["verdict"]
+        words = "" if not verdict else f"{'taken' if verdict['accepted'] else 'old one kept'}: {verdict['reason']}"
+        rates = (_share(found[name]) for name in ("imagined_before", "imagined", "real"))
+        rows.append((str(found["number"]), str(found["updates"]), *rates, words))
+    return rows
+
+
+def rounds_table(summary: Summary) -> Table:
+    """The online rounds for the terminal."""
+    table = Table(title="online rounds: success in the model of the round, and in the simulator")
+    for name in ROUND_COLUMNS:
+        table.add_column(name, justify="left" if name == ROUND_COLUMNS[-1] else "right")
+    for row in round_rows(summary):
+        table.add_row(*row)
+    return table
+
+
+def _share(rate: Mapping[str, Any]) -> str:
+    return f"{100 * rate['rate']:.1f} % ({rate['successes']}/{rate['episodes']})"
+
+
 def _rate(rate: Rate) -> Cell:
     return Cell(
         f"{rate.successes} / {rate.episodes}", f"{100 * rate.rate:.1f} %",

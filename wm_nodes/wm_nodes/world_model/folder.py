@@ -103,6 +103,25 @@ def save_model_folder(
     return folder
 
 
+def save_refreshed_folder(
+    folder: Path, source: Path, action: ActionModel, world_model_config: WorldModelConfig, story: Mapping[str, Any]
+) -> Path:
+    """Write the folder `source` again with another action model; every other file is copied byte for byte.
+
+    Tasks, scene and sizes stay those of the source's manifest; `story` goes on top of it. The manifest comes last.
+    """
+    manifest = read_manifest(source)
+    folder.mkdir(parents=True, exist_ok=True)
+    for key in manifest["sha256"].keys() - {"action"}:
+        _write(folder / FILES[key], (Path(source) / FILES[key]).read_bytes())
+    data = save({name: _compact(tensor) for name, tensor in action.state_dict().items()})
+    _write(folder / FILES["action"], data)
+    hashes = manifest["sha256"] | {"action": hashlib.sha256(data).hexdigest()}
+    manifest |= {"world_model": world_model_config.model_dump(), "sha256": hashes, **story}
+    _write(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
+    return folder
+
+
 def load_model_folder(folder: Path) -> WorldModels:
     """Load and verify a model folder; weights come back as float32, in evaluation mode, without gradients.
 

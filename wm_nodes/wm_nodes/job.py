@@ -1,0 +1,221 @@
+"""One training in the world model as a ROS graph: its folder, what is measured in it, and what a resume finds there.
+
+Whatever took long is kept as a file with the identity of what it was measured on, so that a run that is started again
+goes on where it stopped, and never takes a trained policy for the one it began with.
+"""
+
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from tqdm import tqdm
+
+from wm_nodes.config.load import dump_config
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.learning.evaluation import evaluate
+from wm_nodes.learning.files import write_atomic
+from wm_nodes.learning.policies import load_policy, make_imagined_environment, models_of
+from wm_nodes.learning.statistics import wilson_interval
+from wm_nodes.reports import Rate
+from wm_nodes.ros import arguments as launch_arguments
+from wm_nodes.ros.operator import Operator
+from wm_nodes.ros.runner import Runner
+from wm_nodes.types import BoolArray
+
+IMAGINED_EPISODES = 256
+READY_S = 120.0
+TRAINED = "trained.json"
+
+console = Console()
+
+
+class Stages:
+    """Prints what is being done, with the minutes since the start."""
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+
+    @property
+    def minutes(self) -> float:
+        return (time.monotonic() - self._started) / 60
+
+    def __call__(self, text: str) -> None:
+        minutes, seconds = divmod(int(60 * self.minutes), 60)
+        console.print(f"[dim]{minutes:3d}:{seconds:02d}[/] {text}", highlight=False)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all trainings of a run share. starts: first frames to imagine from."""
+
+    config: RunConfig
+    run_dir: Path
+    starts: Path
+    stage: Stages
+    domain_id: str = ""
+    compose: bool = False
+    verbose: bool = False
+
+
+@dataclass(frozen=True)
+class Start:
+    """What one training begins with. folder: its own run folder. label: for bags and messages, e.g. "round 2"."""
+
+    folder: Path
+    model_dir: Path
+    policy: Path
+    config: RunConfig
+    label: str = ""
+
+    @property
+    def updates(self) -> int:
+        return self.config.ppo.updates
+
+
+@dataclass(frozen=True)
+class Trained:
+    """version: of the last weights. samples: transitions trained on. samples_per_s: of the last uninterrupted part."""
+
+    version: int
+    updates: int
+    samples: int
+    samples_per_s: float
+    bag: str
+
+    def policy(self, folder: Path) -> Path:
+        return folder / "policies" / f"policy_{self.version:06d}.safetensors"
+
+
+def train_round(job: Job, start: Start, judge: Callable[[BoolArray], None] | None = None) -> Trained:
+    """Train start.policy in start.model_dir and measure it in the simulator ; finished parts are kept.
+
+    Args:
+        judge: called with the starting policy's real success before any update; may raise to refuse the training.
+    """
+    marker = start.folder / TRAINED
+    if marker.is_file():
+        job.stage(f"{start.label or 'training'} is done already ({marker})")
+        return Trained(**json.loads(marker.read_text()))
+    start.folder.mkdir(parents=True, exist_ok=True)
+    (start.folder / "config.yaml").write_text(dump_config(start.config))
+    name = "_".join(["training", *start.label.split(), time.strftime("%H%M%S")])
+    bag = job.run_dir / "bags" / name
+    graph, _ = launch_arguments.prepare("online_training", {
+        "config_file": str(start.folder / "config.yaml"), "run_dir": str(start.folder),
+        "model_dir": str(start.model_dir), "starts_file": str(job.starts), "initial_policy": str(start.policy),
+        "seed": str(start.config.seed), "bag_uri": str(bag), "domain_id": job.domain_id,
+        "compose": "true" if job.compose else "false",
+    })  # fmt: skip
+    job.stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
+    with Runner(graph, log_dir=start.folder / "logs", log=sys.stdout if job.verbose else None) as runner:
+        runner.wait_ready(READY_S)
+        os.environ.update(runner.environment)
+        with Operator(alive=runner.check) as operator:
+            if judge is not None:
+                judge(_real(operator, job, start, "before", start.policy))
+            before, began = _progress(start.folder), time.monotonic()
+            remaining = max(0, start.updates - int(before["updates"]))
+            job.stage(f"training the policy in the world model: {remaining} updates")
+            if remaining:
+                _train(operator, remaining)
+            after, seconds = _progress(start.folder), time.monotonic() - began
+            samples = int(after["samples"]) - int(before["samples"])
+            trained = Trained(
+                int(after["version"]), int(after["updates"]), int(after["samples"]), samples / seconds, str(bag)
+            )
+            _real(operator, job, start, "after", trained.policy(start.folder))
+    write_atomic(marker, json.dumps(asdict(trained), indent=1).encode())
+    return trained
+
+
+def read_success(folder: Path, name: str) -> BoolArray:
+    """A kept evaluation, (E,) in seed order. name: real_ or imagined_, then before or after."""
+    values = json.loads((folder / "evaluations" / f"{name}.json").read_text())
+    return np.asarray(values["success"], bool)
+
+
+def imagined_success(job: Job, folder: Path, label: str, model_dir: Path, policy: Path) -> BoolArray:
+    """Success in the world model, without action noise, on IMAGINED_EPISODES starts, (E,)."""
+    episodes = min(IMAGINED_EPISODES, 8 * job.config.evaluation.episodes)
+
+    def measure() -> BoolArray:
+        env = make_imagined_environment(job.config, model_dir, job.starts, num_envs=64, seed=job.config.seed)
+        return evaluate(
+            load_policy(job.config, model_dir, policy), env, episodes, job.config.evaluation.first_seed
+        ).success
+
+    identity = {"policy_sha256": file_sha256(policy), "model_sha256": models_of(model_dir).sha256}
+    success = kept(folder / "evaluations" / f"imagined_{label}.json", identity, measure)
+    job.stage(f"imagined success of {policy.stem}: {int(success.sum())}/{len(success)}")
+    return success
+
+
+def kept(path: Path, identity: Mapping[str, str], measure: Callable[[], BoolArray]) -> BoolArray:
+    """Success of episodes, (E,), from `path` when it was measured on the same things, else measured and written."""
+    if path.is_file():
+        values: dict[str, Any] = json.loads(path.read_text())
+        if values["identity"] == dict(identity):
+            return np.asarray(values["success"], bool)
+    success = measure()
+    low, high = wilson_interval(int(success.sum()), len(success))
+    content = {"identity": dict(identity), "success": success.astype(int).tolist(), "low": low, "high": high}
+    write_atomic(path, json.dumps(content).encode())
+    return success
+
+
+def rate(success: BoolArray) -> Rate:
+    low, high = wilson_interval(int(success.sum()), len(success))
+    return Rate(int(success.sum()), len(success), low, high)
+
+
+def file_sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _real(operator: Operator, job: Job, start: Start, label: str, policy: Path) -> BoolArray:
+    """Success of a weights file in the simulator, on the seeds of the configuration."""
+    settings = job.config.evaluation
+
+    def measure() -> BoolArray:
+        with tqdm(total=settings.episodes, desc=f"real episodes {label}", unit="episode", leave=False) as bar:
+
+            def show(done: int, share: float) -> None:
+                bar.update(done - bar.n)
+                bar.set_postfix(success=f"{share:.2f}")
+
+            return operator.evaluate(
+                episodes=settings.episodes, seed=settings.first_seed, deterministic=settings.deterministic,
+                label=label, policy_uri=str(policy), on_progress=show,
+            ).success  # fmt: skip
+
+    success = kept(start.folder / "evaluations" / f"real_{label}.json", {"policy_sha256": file_sha256(policy)}, measure)
+    found = rate(success)
+    job.stage(
+        f"real success {label} training: {found.successes}/{found.episodes} (95 % {found.low:.2f} to {found.high:.2f})"
+    )
+    return success
+
+
+def _train(operator: Operator, updates: int) -> None:
+    with tqdm(total=updates, desc="PPO in the world model", unit="update") as bar:
+
+        def show(feedback: Any) -> None:
+            bar.update(feedback.update - bar.n)
+            bar.set_postfix(imagined_success=f"{feedback.success_rate:.2f}", mean_return=f"{feedback.mean_return:.2f}")
+
+        operator.train(updates, show)
+        bar.update(updates - bar.n)
+
+
+def _progress(folder: Path) -> dict[str, Any]:
+    """Counts of the learner's newest checkpoint, which is on disk before its version is announced."""
+    progress: dict[str, Any] = json.loads((folder / "checkpoints" / "learner.json").read_text())["progress"]
+    return progress
