@@ -13,7 +13,7 @@ def test_every_preset_resolves_for_every_task(preset: str, task: str) -> None:
 
 
 def test_the_command_line_wins_over_preset_and_task() -> None:
-    assert load_config("cpu", {"task": "reach"}).sft.num_demonstrations == 10
+    assert load_config("cpu", {"task": "reach"}).sft.num_demonstrations == 9
     assert load_config("smoke", {"task": "reach"}).sft.num_demonstrations == 4
     assert load_config("smoke", {"task": "reach", "sft.num_demonstrations": 7}).sft.num_demonstrations == 7
 

@@ -29,7 +29,7 @@ class ScriptedTextModel(TextModel):
         self.step += 1
         change = torch.zeros_like(latents_BTSD)
         change[..., 0] = 1.0
-        return Prediction(change, logits)
+        return Prediction(change, logits.new_zeros(len(logits), 1, 0), logits)
 
 
 def make_tokenizer() -> Tokenizer:
