@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from typing import Any
 
 import pytest
@@ -43,6 +44,7 @@ def test_a_killed_recorder_records_again_beside_what_it_left(graph: Graph, probe
     graph.start_training_nodes()
     client = probe.action(Train, "train")
     assert probe.finish(probe.send(client, Train.Goal(updates=1))).termination_reason == Train.Result.FINISHED
+    time.sleep(2.0)  # a kill may cost the recorder's last second
     graph.kill("/wm/recorder")
     wait_until("the report", lambda: any("/wm/recorder is lost" in t for t in probe.seen_errors["/wm/learner"]), 5.0)
     probe.diagnostics.pop("/wm/recorder", None)
