@@ -191,6 +191,19 @@ def test_the_recorder_reports_exactly_the_gaps_there_were(domain: int, tmp_path:
     assert drops == {"/wm/env/transition": {"lost": 3, "gaps": [[7, 3, 2], [7, 7, 1]]}}
 
 
+def test_a_stopped_recorder_first_takes_what_was_sent_to_it(domain: int, tmp_path: Path, peer: Start) -> None:
+    recorder = peer(domain, "recorder_node", tmp_path, bag_uri="bag", min_free_mib=16)
+    graph = live_graph(8)
+    publish(recorder, Graph(make_spec(num_envs=NUM_ENVS)))  # one message: discovery has finished
+    recorder.process.send_signal(signal.SIGSTOP)
+    sent = publish(recorder, graph)
+    recorder.process.send_signal(signal.SIGTERM)
+    recorder.process.send_signal(signal.SIGCONT)
+    assert recorder.process.wait(20) == 0
+    found = recorded(tmp_path / "bag")
+    assert {name: messages[-len(sent[name]) :] for name, messages in found.items()} == padded(sent)
+
+
 def test_a_killed_recorder_loses_at_most_the_last_second(domain: int, tmp_path: Path, peer: Start) -> None:
     recorder = peer(domain, "recorder_node", tmp_path, bag_uri="bag", min_free_mib=16)
     graph = live_graph(400)

@@ -92,14 +92,20 @@ def test_a_rollout_without_a_valid_transition_is_an_error() -> None:
         PpoLearner(policy, toy_ppo(), seed=0).update(replace(rollout, valid_TN=np.zeros_like(rollout.valid_TN)))
 
 
+def twins(updates: int) -> tuple[PpoLearner, PpoLearner]:
+    """Two learners of equal policies after the same updates."""
+    learners = PpoLearner(toy_policy(), toy_ppo(), seed=0), PpoLearner(toy_policy(), toy_ppo(), seed=0)
+    for learner in learners:
+        for version in range(1, updates + 1):
+            learner.update(toy_rollout(learner.policy, version))
+    return learners
+
+
 @pytest.mark.parametrize("earlier_updates", [0, 1])
 @pytest.mark.parametrize("good_minibatches", [0, 2])
 def test_a_gradient_that_is_not_finite_undoes_the_whole_update(earlier_updates: int, good_minibatches: int) -> None:
-    policy, straight = toy_policy(), toy_policy()
-    learner, undisturbed = (PpoLearner(p, toy_ppo(), seed=0) for p in (policy, straight))
-    for version in range(1, earlier_updates + 1):
-        learner.update(toy_rollout(policy, version))
-        undisturbed.update(toy_rollout(straight, version))
+    learner, undisturbed = twins(earlier_updates)
+    policy, straight = learner.policy, undisturbed.policy
     rollout, before = toy_rollout(policy, 9), weights(policy)
     calls = iter(range(1000))
 
@@ -120,11 +126,8 @@ def test_a_gradient_that_is_not_finite_undoes_the_whole_update(earlier_updates: 
 
 @pytest.mark.parametrize("earlier_updates", [0, 1])
 def test_a_canceled_update_leaves_weights_and_optimiser_as_they_were(earlier_updates: int) -> None:
-    policy, straight = toy_policy(), toy_policy()
-    learner, undisturbed = (PpoLearner(p, toy_ppo(), seed=0) for p in (policy, straight))
-    for version in range(1, earlier_updates + 1):
-        learner.update(toy_rollout(policy, version))
-        undisturbed.update(toy_rollout(straight, version))
+    learner, undisturbed = twins(earlier_updates)
+    policy, straight = learner.policy, undisturbed.policy
     rollout, before = toy_rollout(policy, 9), weights(policy)
     answers = iter([False, False, True])
     with pytest.raises(Canceled):

@@ -141,7 +141,7 @@ def test_decoded_losses_are_smallest_for_the_true_latents_and_reach_the_predicti
 
     def losses(latents: torch.Tensor) -> dict[str, torch.Tensor]:
         terms = RolloutTerms(latents, torch.zeros(()), torch.zeros(()))
-        return decoded_losses(terms, tokenizer, data, index, torch.Generator().manual_seed(0))
+        return decoded_losses(terms, tokenizer, data, index, config, torch.Generator().manual_seed(0))
 
     true = data.latents[:, 1:].float().requires_grad_()
     right, wrong = losses(true), losses(true.detach().roll(1, 0))

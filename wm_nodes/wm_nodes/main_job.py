@@ -20,7 +20,7 @@ from wm_nodes.config.load import ConfigError, dump_config, load_config, parse_ov
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.job import Job, Stages, console, rate
-from wm_nodes.learning.collecting import HELDOUT_SEEDS, collect_plan, scripted_plan
+from wm_nodes.learning.collecting import HELDOUT_SEEDS, collect_plan, gate_plan
 from wm_nodes.learning.gate import judge_model
 from wm_nodes.learning.pictures import write_pictures
 from wm_nodes.learning.policies import load_policy
@@ -158,8 +158,7 @@ def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stag
 def _judge(job: Job, model_dir: Path, force: bool, imagined: BoolArray, real: BoolArray) -> None:
     """Write gate.json and print it; raise GateRefused where the model failed and `force` is not set."""
     config = job.config
-    heldout = scripted_plan(config, min(config.gate.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
-    bags = collect_plan(heldout, config, job.run_dir / "bags" / "heldout")
+    bags = collect_plan(gate_plan(config), config, job.run_dir / "bags" / "heldout")
     report = judge_model(
         load_model_folder(model_dir), load_arrays(bags, config), config,
         (int(imagined.sum()), len(imagined)), (int(real.sum()), len(real)),

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from wm_nodes.config.load import dump_config, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.learning.collecting import HELDOUT_SEEDS, collect_plan, scripted_plan
+from wm_nodes.learning.collecting import collect_plan, gate_plan
 from wm_nodes.learning.evaluation import EvaluationResult, evaluate
 from wm_nodes.learning.gate import judge_model
 from wm_nodes.learning.policies import load_policy, make_endogenous_reward, make_imagined_environment, models_of
@@ -157,9 +157,7 @@ def _train(
 
 
 def _heldout(config: RunConfig, folder: Path) -> Any:
-    number = min(config.gate.num_episodes, config.data.num_heldout)
-    plan = scripted_plan(config, number, HELDOUT_SEEDS)
-    return load_arrays(collect_plan(plan, config, folder / "heldout"), config)
+    return load_arrays(collect_plan(gate_plan(config), config, folder / "heldout"), config)
 
 
 def _measure(policy: ImagePolicy, env: Environment, config: RunConfig) -> EvaluationResult:

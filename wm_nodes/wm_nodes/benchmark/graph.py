@@ -1,8 +1,7 @@
 """The same step over DDS and in this process, with as many threads on both sides."""
 
 import os
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from wm_nodes.benchmark.inputs import Effort, console, interleave, time_episode,
 from wm_nodes.config.load import dump_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning.policies import make_imagined_environment
-from wm_nodes.types import Environment
 
 GRAPH_ENVS, GRAPH_THREADS = 16, 1
 """One torch thread per node is the graph's default; the loop in one process gets as many."""
@@ -26,6 +24,7 @@ DOMAINS = range(60, 102)
 def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, starts: Path) -> dict[str, Any]:
     """graph_overhead: median step over DDS / median step in this process, 16 environments of the default model.
     step_growth: median of the last tenth / of the first tenth of many steps of an environment that costs nothing."""
+    from wm_nodes.nodes.remote_environment import remote_environments
     from wm_nodes.ros.domain import first_free
     from wm_nodes.ros.graph import Graph, NodeSpec, ParameterValue
     from wm_nodes.ros.runner import Runner
@@ -52,8 +51,9 @@ def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, 
         graph = Graph("benchmark", graph_nodes, environment)
         runner = stack.enter_context(Runner(graph, log=None, log_dir=folder / "logs", use_domain_lock=False))
         runner.wait_ready(TIMEOUT_S)
+        os.environ.update(runner.environment)
         remote, still_remote = stack.enter_context(
-            remote_environments(runner.environment, folder, ("", "still"), runner.check)
+            remote_environments("benchmark", folder, ("", "still"), runner.check, timeout_s=TIMEOUT_S)
         )
         local = make_imagined_environment(config, model, starts, num_envs=GRAPH_ENVS, seed=config.seed)
         console.print("graph: step over DDS against the same step in one process", highlight=False)
@@ -79,42 +79,6 @@ def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, 
             "growth_first_p10_ms": fastest[0], "growth_last_p10_ms": fastest[1],
         },
     }  # fmt: skip
-
-
-@contextmanager
-def remote_environments(
-    environment: dict[str, str], folder: Path, prefixes: Sequence[str], alive: Callable[[], None]
-) -> Iterator[list[Environment]]:
-    """Environment nodes through DDS, from a node of this process whose executor has a thread of its own."""
-    os.environ.update(environment)
-    import rclpy
-    from rclpy.parameter import Parameter
-    from rclpy.signals import SignalHandlerOptions
-
-    from wm_nodes.nodes.remote_environment import RemoteEnvironment
-    from wm_nodes.ros.clients import RosEnvironmentClient
-    from wm_nodes.ros.lifecycle import ManagedNode
-    from wm_nodes.ros.spin import make_executor, spin
-
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    run_dir = Parameter("run_dir", value=str(folder))
-    node = ManagedNode("benchmark", namespace="/wm", parameter_overrides=[run_dir])
-    executor = make_executor("events")
-    executor.add_node(node)
-    stop = threading.Event()
-    thread = threading.Thread(target=spin, args=(executor, stop.is_set), daemon=True)
-    thread.start()
-    try:
-        clients = [RosEnvironmentClient(node, prefix, TIMEOUT_S) for prefix in prefixes]
-        yield [RemoteEnvironment(client, alive, timeout_s=TIMEOUT_S, behaviour="benchmark") for client in clients]
-    finally:
-        node.stop()
-        stop.set()
-        thread.join()
-        executor.remove_node(node)
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
 
 
 @contextmanager

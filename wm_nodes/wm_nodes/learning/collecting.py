@@ -23,6 +23,11 @@ def collect_heldout_data(config: RunConfig, folder: Path, *, progress: bool = Tr
     return collect_plan(scripted_plan(config, config.data.num_heldout, HELDOUT_SEEDS), config, folder, progress)
 
 
+def gate_plan(config: RunConfig) -> CollectionPlan:
+    """The held-out episodes that the gate judges a model on."""
+    return scripted_plan(config, min(config.gate.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
+
+
 def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
     scene_task = "push_cube" if config.task == "reach" else config.task  # one scene, one data set, two tasks
     return CollectionPlan(

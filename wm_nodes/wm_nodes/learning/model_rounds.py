@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
-from wm_nodes.learning.collecting import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
+from wm_nodes.learning.collecting import TRAINING_SEEDS, collect_plan, gate_plan, scripted_plan
 from wm_nodes.learning.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.learning.gate import CONTACT_FREE, model_metrics
 from wm_nodes.learning.policies import policy_actor
@@ -105,10 +105,9 @@ def collect_round(
 def collect_replay(config: RunConfig, run_dir: Path, *, progress: bool = True) -> tuple[list[Path], list[Path]]:
     """Scripted simulator episodes of a run, collected once: (replay for every refresh, held out as for the gate)."""
     replay = scripted_plan(config, config.rounds.replay_episodes, TRAINING_SEEDS)
-    heldout = scripted_plan(config, min(config.gate.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
     return (
         collect_plan(replay, config, run_dir / "bags" / "replay", progress),
-        collect_plan(heldout, config, run_dir / "bags" / "heldout", progress),
+        collect_plan(gate_plan(config), config, run_dir / "bags" / "heldout", progress),
     )
 
 

@@ -121,7 +121,7 @@ def train_action_model(
             losses = rollout_losses(terms, tokenizer, data, index, heads[index], config, done_loss)
             if settings.decoded_weight:
                 generator = torch_stream(seed, f"{name}_decoded", iteration)
-                losses |= decoded_losses(terms, tokenizer, data, index, generator)
+                losses |= decoded_losses(terms, tokenizer, data, index, config, generator)
                 losses["loss"] = losses["loss"] + settings.decoded_weight * sum(
                     losses[key] for key in ("pixel", "recoded", "recoded_state")
                 )
@@ -230,7 +230,12 @@ def rollout_losses(
 
 
 def decoded_losses(
-    terms: RolloutTerms, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, generator: torch.Generator
+    terms: RolloutTerms,
+    tokenizer: Tokenizer,
+    data: LatentEpisodes,
+    index: Tensor,
+    config: RunConfig,
+    generator: torch.Generator,
 ) -> dict[str, Tensor]:
     """What the policy will see: DECODED_FRAMES predicted frames of each episode are decoded and encoded again.
 
@@ -245,7 +250,7 @@ def decoded_losses(
     steps, episodes = steps.flatten(), index[rows]
     wanted = tokenizer.to_pixels(data.images[episodes, steps + 1])
     pixels_R3HW = tokenizer.decode_pixels(terms.next_latents[rows, steps])
-    weight = foreground_weight(wanted, tokenizer.background, 4.0)
+    weight = foreground_weight(wanted, tokenizer.background, config.tokenizer.foreground_weight)
     recoded = tokenizer.bottleneck(tokenizer.features(pixels_R3HW.clamp(0, 1)))
     errors = F.huber_loss(recoded, data.latents[episodes, steps + 1].float(), delta=HUBER_DELTA, reduction="none")
     probed = tokenizer.read_state_normalised(recoded)

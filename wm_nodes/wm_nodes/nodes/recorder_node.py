@@ -28,6 +28,8 @@ from wm_nodes.ros.sequence import GapTracker
 from wm_nodes.ros.spin import run_node
 
 FLUSH_S = 0.25
+QUIET_S = 0.3
+"""After a stop, the bag is completed when no message has come for this long."""
 MIB = 2**20
 SEQUENCED = {topic.name for topic in topics.ALL_TOPICS if topic.sequenced}
 DEFAULT_TOPICS = [topic.name for topic in topics.ALL_TOPICS]
@@ -52,6 +54,7 @@ class RecorderNode(ManagedNode):
         self._latched: dict[str, bytes] = {}
         self._versions: set[int] = set()
         self._time_ns = 0
+        self._last_message_s = 0.0
 
     def configure(self) -> None:
         self._rows = {name: _row(name) for name in self.param("topics")}
@@ -86,6 +89,9 @@ class RecorderNode(ManagedNode):
     def cleanup(self) -> None:
         self._stop()
 
+    def settled(self, stop_s: float) -> bool:
+        return self._bag is None or time.monotonic() - max(stop_s, self._last_message_s) > QUIET_S
+
     def update_diagnostics(self) -> None:
         self.diagnostics.gauge("bag", self._bag.path if self._bag is not None else "none")
         self.diagnostics.gauge("paused", self._paused)
@@ -96,6 +102,7 @@ class RecorderNode(ManagedNode):
     # Recording.
 
     def _on_message(self, name: str, grantor: CreditGrantor | None, data: bytes) -> None:
+        self._last_message_s = time.monotonic()
         tracker = self._gaps.get(name)
         if tracker is not None:
             missing = tracker.observe(*session_and_seq(data))

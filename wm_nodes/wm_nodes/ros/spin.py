@@ -7,6 +7,7 @@ import gc
 import logging
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -23,6 +24,9 @@ from wm_nodes.ros.environment import set_node_defaults
 EXECUTORS = ("events", "single", "multi")
 SPIN_ONCE_S = 0.1
 """Longest wait inside one spin_once; a signal is seen after at most this long."""
+
+SETTLE_S = 2.0
+"""Longest time that nodes which still take messages may hold up the end."""
 
 SWITCH_INTERVAL_S = 0.0005
 """Python's thread switch interval: ten times shorter than the default, so that a busy worker delays callbacks less."""
@@ -84,12 +88,23 @@ def _marking_failed(nodes: list[Any]) -> Iterator[None]:
         nodes[0].get_logger().fatal(f"unexpected error; stopping\n{traceback.format_exc()}")
 
 
+def _settle(executor: Executor, nodes: list[Any]) -> None:
+    began_s = time.monotonic()
+    spin(
+        executor,
+        until=lambda: (
+            time.monotonic() - began_s > SETTLE_S or all(node.failed or node.settled(began_s) for node in nodes)
+        ),
+    )
+
+
 def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = None) -> int:
     """Create nodes, start them, spin until a signal, stop them, shut down. Return the exit code.
 
-    Each node is an rclpy node with start() -> bool and stop(), as ros.lifecycle.ManagedNode is. The first node's
-    `executor` parameter chooses the executor. A start that fails gives exit code 1 after one line of error;
-    an exception out of a callback gives it after its trace, and the nodes still stop in order.
+    Each node is an rclpy node with start() -> bool, settled() and stop(), as ros.lifecycle.ManagedNode is. After the
+    signal it spins until all nodes are settled, for at most SETTLE_S. The first node's `executor` parameter chooses the
+    executor. A start that fails gives exit code 1 after one line of error; an exception out of a callback gives it
+    after its trace, and the nodes still stop in order.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     set_node_defaults()
@@ -105,6 +120,7 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
             with _marking_failed(nodes):
                 if all(node.start() for node in nodes):
                     spin(executor, until=lambda: stopped() or any(node.failed for node in nodes))
+                    _settle(executor, nodes)
             for node in reversed(nodes):
                 with _marking_failed([node]):
                     node.stop()

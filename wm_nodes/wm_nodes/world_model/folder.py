@@ -82,9 +82,7 @@ def save_model_folder(
         if module is None:
             (folder / FILES[key]).unlink(missing_ok=True)
             continue
-        data = save({name: _compact(tensor) for name, tensor in module.state_dict().items()})
-        _write(folder / FILES[key], data)
-        hashes[key] = hashlib.sha256(data).hexdigest()
+        hashes[key] = _write_module(folder / FILES[key], module)
     manifest = {
         "format": FORMAT,
         "tasks": list(tasks),
@@ -114,9 +112,7 @@ def save_refreshed_folder(
     folder.mkdir(parents=True, exist_ok=True)
     for key in manifest["sha256"].keys() - {"action"}:
         _write(folder / FILES[key], (Path(source) / FILES[key]).read_bytes())
-    data = save({name: _compact(tensor) for name, tensor in action.state_dict().items()})
-    _write(folder / FILES["action"], data)
-    hashes = manifest["sha256"] | {"action": hashlib.sha256(data).hexdigest()}
+    hashes = manifest["sha256"] | {"action": _write_module(folder / FILES["action"], action)}
     manifest |= {"world_model": world_model_config.model_dump(), "sha256": hashes, **story}
     _write(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
     return folder
@@ -195,6 +191,13 @@ def _shape(tensor: Tensor | None) -> str:
 
 def _compact(tensor: Tensor) -> Tensor:
     return tensor.detach().cpu().to(torch.float16 if tensor.is_floating_point() else tensor.dtype).contiguous()
+
+
+def _write_module(path: Path, module: nn.Module) -> str:
+    """Write a module as float16; return the file's sha256."""
+    data = save({name: _compact(tensor) for name, tensor in module.state_dict().items()})
+    _write(path, data)
+    return hashlib.sha256(data).hexdigest()
 
 
 def _write(path: Path, data: bytes) -> None:
