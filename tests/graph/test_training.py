@@ -93,24 +93,83 @@ def test_training_over_dds_gives_the_weights_of_the_same_loop_in_one_process(tmp
     toy.assert_trained_in_one_process(tmp_path / "graph" / "policies" / "policy_000003.safetensors", updates=2)
 
 
-def test_training_from_the_recorded_bag_gives_the_weights_of_the_live_training(graph: Graph, probe: Probe) -> None:
+def recorded_training(graph: Graph, probe: Probe, updates: int) -> Path:
+    """Train live beside a recorder; return the bag."""
     graph.start("recorder")
     graph.start_training_nodes()
-    assert train(probe, updates=2).termination_reason == Train.Result.FINISHED
+    assert train(probe, updates=updates).termination_reason == Train.Result.FINISHED
     stopped = probe.call(StopRecording, "recorder/stop", StopRecording.Request())
     assert stopped.gaps == 0
+    return graph.folder / stopped.bag_uri
+
+
+def test_training_from_the_bag_and_from_its_replay_gives_the_weights_of_the_live_training(
+    graph: Graph, probe: Probe
+) -> None:
+    bag = recorded_training(graph, probe, updates=4)
+    live = weights_in(graph.folder)
+    for source in ("from_bags", "from_replay"):
+        with own_domain() as domain:
+            offline, other = Graph(domain, graph.folder.parent / source), Probe(domain)
+            try:
+                offline.start_learner(replay_rate=1e6)
+                if source == "from_replay":
+                    offline.start("player", play_at_start=False)
+                result = train(other, updates=4, bag_uris=[str(bag)], **{source: True})
+                assert result.termination_reason == Train.Result.FINISHED, result.message
+                assert weights_in(offline.folder) == live
+                result = train(other, updates=1, bag_uris=[str(bag)], **{source: True})
+                assert result.termination_reason == Train.Result.FAILED
+                assert "0 rollouts" in result.message
+                assert "version 5" in result.message
+            finally:
+                other.close()
+                offline.stop()
+
+
+def test_a_replay_that_starts_with_the_learner_trains_and_a_short_one_says_so(graph: Graph, probe: Probe) -> None:
+    bag = recorded_training(graph, probe, updates=2)
     live = weights_in(graph.folder)
     with own_domain() as domain:
-        offline, other = Graph(domain, graph.folder.parent / "offline"), Probe(domain)
+        config = graph.config.model_copy(update={"ppo": graph.config.ppo.model_copy(update={"updates": 2})})
+        offline, other = Graph(domain, graph.folder.parent / "offline", config), Probe(domain)
         try:
-            offline.start_learner()
-            bag = graph.folder / stopped.bag_uri
-            result = train(other, updates=2, from_bags=True, bag_uris=[str(bag)])
-            assert result.termination_reason == Train.Result.FINISHED, result.message
+            metrics = other.listen("learner/metrics")
+            offline.start("player", play_at_start=False)
+            offline.start_learner(replay_rate=1e6, replay_at_start=bag)
+            wait_until("two updates", lambda: len(metrics) == 2, 60)
+            assert weights_in(offline.folder) == live
         finally:
             other.close()
             offline.stop()
-    assert weights_in(offline.folder) == live
+        short, other = Graph(domain, graph.folder.parent / "short"), Probe(domain)
+        try:
+            short.start("player", play_at_start=False)
+            short.start_learner(replay_rate=1e6)
+            result = train(other, updates=3, from_replay=True, bag_uris=[str(bag)])
+            assert (result.termination_reason, result.updates) == (Train.Result.EXHAUSTED, 2)
+            assert "2 rollouts" in result.message
+            missing = train(other, updates=1, from_replay=True, bag_uris=["no_such_bag"])
+            assert missing.termination_reason == Train.Result.FAILED
+            assert "no_such_bag" in missing.message
+        finally:
+            other.close()
+            short.stop()
+
+
+@pytest.mark.parametrize(
+    ("goal", "text"),
+    [
+        ({"updates": 0}, "updates is 0"),
+        ({"updates": 1, "from_bags": True}, "bag_uris is empty"),
+        ({"updates": 1, "from_bags": True, "from_replay": True}, "choose one"),
+    ],
+)
+def test_a_goal_that_asks_for_nothing_is_refused(graph: Graph, probe: Probe, goal: dict[str, Any], text: str) -> None:
+    graph.start_learner()
+    result = train(probe, **goal)
+    assert result.termination_reason == Train.Result.FAILED
+    assert text in result.message
 
 
 @pytest.mark.kills  # torchrun answers SIGINT with a non-zero code

@@ -64,6 +64,26 @@ class Bench:
         return [(note.env_index, note.reason) for note in self.notes if note.kind == EpisodeEvent.KIND_END]
 
 
+def test_an_episode_reset_without_a_seed_names_the_seed_that_makes_it_again() -> None:
+    bench = Bench()
+    bench.served.reset(ResetCommand())
+    drawn = bench.transitions[-1].states.copy()
+    seeds = np.array([note.seed for note in bench.notes if note.kind == EpisodeEvent.KIND_START][-N:], np.uint64)
+    assert len(set(seeds.tolist())) == N
+    bench.served.reset(ResetCommand(seeds=seeds))
+    assert (bench.transitions[-1].states == drawn).all()
+    other = Bench()
+    other.served.reset(ResetCommand())
+    assert (other.transitions[-1].states == drawn).all()
+
+
+def test_a_log_prob_or_value_that_nobody_named_is_nan() -> None:
+    bench = Bench()
+    bench.served.step(bench.command())
+    assert np.isnan(bench.transitions[-1].logprobs).all()
+    assert np.isnan(bench.transitions[-1].values).all()
+
+
 def test_nan_of_the_model_is_an_error_again_on_retry_and_nothing_of_it_is_valid_until_the_reset() -> None:
     bench = Bench()
     bench.environment.nan = True

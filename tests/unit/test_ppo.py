@@ -92,6 +92,16 @@ def test_a_rollout_without_a_valid_transition_is_an_error() -> None:
         PpoLearner(policy, toy_ppo(), seed=0).update(replace(rollout, valid_TN=np.zeros_like(rollout.valid_TN)))
 
 
+@pytest.mark.parametrize("field", ["logprobs_TN", "values_TN"])
+def test_a_rollout_of_unknown_log_probs_or_values_is_refused(field: str) -> None:
+    policy = toy_policy()
+    rollout = toy_rollout(policy)
+    numbers = getattr(rollout, field).copy()
+    numbers[np.nonzero(rollout.valid_TN)[0][0], np.nonzero(rollout.valid_TN)[1][0]] = np.nan
+    with pytest.raises(ValueError, match=r"1 of .* valid transitions have no log_prob or value"):
+        PpoLearner(policy, toy_ppo(), seed=0).update(replace(rollout, **{field: numbers}))
+
+
 def twins(updates: int) -> tuple[PpoLearner, PpoLearner]:
     """Two learners of equal policies after the same updates."""
     learners = PpoLearner(toy_policy(), toy_ppo(), seed=0), PpoLearner(toy_policy(), toy_ppo(), seed=0)

@@ -237,7 +237,8 @@ def test_a_full_disk_is_one_clear_error_and_what_was_flushed_is_recoverable(tmp_
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, handler)
     assert writer.num_episodes > 0
-    assert len(list(read_episodes(recover(tmp_path / "bag.partial").bag))) == writer.num_episodes
+    found = len(list(read_episodes(recover(tmp_path / "bag.partial").bag)))
+    assert writer.num_episodes <= found <= writer.num_episodes + 1  # the refused one may be there to its last byte
 
 
 def test_a_closed_or_unknown_topic_write_is_refused(tmp_path: Path) -> None:

@@ -5,9 +5,11 @@ import pytest
 
 pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
 
+from rclpy.clock import Clock
+
 from wm_msgs.msg import Credit
 from wm_nodes.nodes.joiner import ImageCache, RolloutJoiner
-from wm_nodes.ros.credit import SILENT_S, CreditLedger
+from wm_nodes.ros.credit import SILENT_S, CreditGrantor, CreditLedger
 from wm_nodes.ros.peers import PeerWatch
 from wm_nodes.ros.sequence import GapTracker
 from wm_nodes.ros.wire import Rewards, Transition
@@ -37,6 +39,47 @@ def test_the_producer_waits_for_every_consumer_and_drops_the_silent_one() -> Non
     assert ledger.drop_silent(11, now=100.0 + SILENT_S) == []
     assert ledger.drop_silent(11, now=100.1 + SILENT_S) == ["slow"]
     assert ledger.holding(20) == []
+
+
+class GrantingNode:
+    """What a CreditGrantor asks of a node."""
+
+    def __init__(self) -> None:
+        self.sent: list[Credit] = []
+        self.publish = self.sent.append
+
+    def create_publisher(self, *arguments: object) -> "GrantingNode":
+        return self
+
+    def create_timer(self, *arguments: object, **named: object) -> None: ...
+
+    def get_fully_qualified_name(self) -> str:
+        return "/wm/learner"
+
+    def get_clock(self) -> Clock:
+        return Clock()
+
+
+def test_a_withheld_grant_is_repeated_but_does_not_grow_until_it_is_given_again() -> None:
+    node = GrantingNode()
+    grantor, tracker = CreditGrantor(node, "env/transition", window=8), GapTracker()  # type: ignore[arg-type]
+
+    def consume(session: int, *seqs: int) -> None:
+        for seq in seqs:
+            tracker.observe(session, seq)
+            grantor.consumed(tracker)
+
+    consume(1, 0)
+    grantor.withhold(True)
+    consume(1, 1, 2, 3, 4)
+    assert {credit.granted_seq for credit in node.sent} == {8}
+    assert node.sent[-1].received_seq == 4
+    consume(2, 0, 1)
+    assert (node.sent[-1].stream_session, node.sent[-1].granted_seq) == (2, 9)
+    consume(2, 2, 3)
+    assert node.sent[-1].granted_seq == 9
+    grantor.withhold(False)
+    assert node.sent[-1].granted_seq == 11
 
 
 def test_a_silent_peer_is_lost_once_and_a_leaving_one_is_not() -> None:

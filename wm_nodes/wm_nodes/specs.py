@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,6 +18,12 @@ GROUND_TRUTH_NAMES = (
     "cube_start_x", "cube_start_y",
 )  # fmt: skip
 """Simulator truth of the table-top scenes, in this order. Positions in m, yaw in rad, world frame."""
+
+POLICY_FIELDS = (
+    "height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale", "state_names",
+    "state_units", "control_period_s",
+)  # fmt: skip
+"""What a policy depends on."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +72,8 @@ class EnvironmentSpec:
 
     def policy_hash(self) -> str:
         """sha256 over what a policy depends on; equal for an imagined and a simulated environment of one scene."""
-        keys = ("height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale",
-                "state_names", "state_units", "control_period_s")  # fmt: skip
         fields = asdict(self)
-        return _hash({k: fields[k] for k in keys})
+        return _hash({k: fields[k] for k in POLICY_FIELDS})
 
 
 def as_sent(value: float) -> float:
@@ -76,13 +81,22 @@ def as_sent(value: float) -> float:
     return float(str(np.float32(value)))
 
 
-def _hash(fields: dict[str, Any]) -> str:
-    def sent(value: Any) -> Any:
-        if isinstance(value, float):
-            return as_sent(value)
-        return [sent(item) for item in value] if isinstance(value, (tuple, list)) else value
+def differences(
+    found: EnvironmentSpec, expected: EnvironmentSpec, names: Sequence[str] = POLICY_FIELDS
+) -> list[tuple[str, Any, Any]]:
+    """Return (field, found, expected) for the named fields that disagree, as values that were sent."""
+    pairs = [(name, _sent(getattr(found, name)), _sent(getattr(expected, name))) for name in names]
+    return [(name, is_, should) for name, is_, should in pairs if is_ != should]
 
-    text = json.dumps({name: sent(value) for name, value in fields.items()}, sort_keys=True)
+
+def _sent(value: Any) -> Any:
+    if isinstance(value, float):
+        return as_sent(value)
+    return tuple(_sent(item) for item in value) if isinstance(value, (tuple, list)) else value
+
+
+def _hash(fields: dict[str, Any]) -> str:
+    text = json.dumps({name: _sent(value) for name, value in fields.items()}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 

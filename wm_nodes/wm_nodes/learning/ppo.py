@@ -98,7 +98,7 @@ class PpoLearner:
         Raises:
             Canceled: should_stop, asked before every minibatch, said so on some rank; nothing has changed then.
             FloatingPointError: a loss, a gradient or a new weight is not finite; nothing has changed then.
-            ValueError: no valid sample.
+            ValueError: no valid sample, or samples whose log_prob or value is unknown (NaN).
         """
         before = {name: tensor.clone() for name, tensor in self.policy.state_dict().items()}
         optimizer_before = json.dumps(None) if not self._optimizer.state else self._optimizer_tensors(clone=True)
@@ -227,6 +227,12 @@ class PpoLearner:
         if not bool(valid_TN.any()):
             raise ValueError(
                 "the rollout has no valid transition: every reward or step was invalid; see the reward's reason"
+            )
+        unknown = rollout.valid_TN & ~(np.isfinite(rollout.logprobs_TN) & np.isfinite(rollout.values_TN))
+        if unknown.any():
+            raise ValueError(
+                f"{unknown.sum()} of {rollout.valid_TN.sum()} valid transitions have no log_prob or value; PPO trains "
+                "on rollouts of a policy that publishes both"
             )
         flat = (steps * num_envs, -1)
         features = self.policy.features(rollout.images_TN.reshape(-1, *rollout.images_TN.shape[2:]))

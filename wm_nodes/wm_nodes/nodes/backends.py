@@ -8,11 +8,14 @@ import importlib
 from pathlib import Path
 from typing import Any
 
+from wm_msgs.msg import ErrorCode
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning.distributed import Ranks
 from wm_nodes.nodes.training import Learner
 from wm_nodes.policy import ImagePolicy
 from wm_nodes.reward import RewardModel
+from wm_nodes.ros.wire import WireError
+from wm_nodes.specs import EnvironmentSpec, differences, simulation_spec
 from wm_nodes.types import Environment
 
 BACKENDS = ("world_model", "maniskill", "factory")
@@ -87,6 +90,23 @@ def make_policy(config: RunConfig, model_dir: str, factory: str = "") -> ImagePo
 
     policy = make_model_policy(config, folder)
     return policy
+
+
+def expected_spec(config: RunConfig, model_dir: str, policy_factory: str) -> EnvironmentSpec | None:
+    """The robot and cameras that the policy of make_policy was made for; None for a factory's, which tells nothing."""
+    if policy_factory or not model_dir:
+        return None
+    return simulation_spec(config.task, "", config.simulation, 1)
+
+
+def refuse_other(found: EnvironmentSpec, expected: EnvironmentSpec, whose: str) -> None:
+    """Raise WireError(SPEC_MISMATCH) unless both agree on cameras, sizes, actions and state."""
+    wrong = differences(found, expected)
+    if wrong:
+        text = "; ".join(f"{name} {is_!r}, {whose} {should!r}" for name, is_, should in wrong)
+        raise WireError(
+            ErrorCode.SPEC_MISMATCH, f"environment {found.env_id} has {text}; start both with the same config_file"
+        )
 
 
 def make_learner(policy: ImagePolicy, config: RunConfig, factory: str = "", ranks: Ranks | None = None) -> Learner:

@@ -68,7 +68,7 @@ class EnvironmentNode(ManagedNode):
             seed=int(self.param("seed")), model_dir=str(self.param("model_dir")),
             starts_file=str(self.param("starts_file")), factory=str(self.param("backend_factory")),
         )  # fmt: skip
-        self.served = LockstepEnvironment(environment, self.session, self)
+        self.served = LockstepEnvironment(environment, self.session, self, seed=int(self.param("seed")))
         self.served.before_step = self._require_credit
         self._spec = environment.spec
         row = topic("env/image")

@@ -28,6 +28,9 @@ class ImageCache:
     def get(self, stamp_ns: int) -> UInt8Array | None:
         return self._images.get(stamp_ns)
 
+    def items(self) -> list[tuple[int, UInt8Array]]:
+        return list(self._images.items())
+
     def drop_before(self, stamp_ns: int) -> None:
         while self._images and next(iter(self._images)) < stamp_ns:
             self._images.popitem(last=False)

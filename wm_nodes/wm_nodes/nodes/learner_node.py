@@ -9,12 +9,13 @@ from typing import Any
 
 import rclpy
 from rclpy.action import ActionClient
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
+from wm_msgs.action import Replay, Train
 from wm_msgs.action import Rollout as RolloutAction
-from wm_msgs.action import Train
 from wm_msgs.msg import EnvSpec, ErrorCode, LearnerMetrics, PolicyVersion, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
@@ -22,14 +23,14 @@ from wm_nodes.learning.distributed import Ranks, join
 from wm_nodes.learning.metrics import MetricsWriter
 from wm_nodes.learning.rollouts import Canceled
 from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, load_weights
-from wm_nodes.nodes.backends import existing, make_learner, make_policy
+from wm_nodes.nodes.backends import existing, expected_spec, make_learner, make_policy, refuse_other
 from wm_nodes.nodes.joiner import Dropped, RolloutJoiner
 from wm_nodes.nodes.policy_holder import weights_uri
+from wm_nodes.nodes.replayed import ReplayJoiner
+from wm_nodes.nodes.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
 from wm_nodes.nodes.training import PolicyTraining, follow
-from wm_nodes.recording import read_rollouts
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
-from wm_nodes.ros.clients import run_goal
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import COMMON, Param, declare
 from wm_nodes.ros.spin import run_node
@@ -38,9 +39,6 @@ from wm_nodes.specs import EnvironmentSpec
 from wm_nodes.types import Rollout
 
 MAX_CHUNK_BYTES = 4 << 20
-RETRY_S = 0.5
-MAX_GAP_RETRIES = 2
-TRAINING_PEERS = ("environment", "policy", "reward_evaluator")
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
@@ -56,6 +54,9 @@ PARAMS = (
           read_only=True),
     Param("join_timeout_s", 5.0, "How long a rollout's last images and rewards may take to arrive", "s",
           minimum=0.1, maximum=600.0),
+    Param("replay_at_start", "", "Bag that a player replays and that is trained from (ppo.updates) as soon as active",
+          read_only=True),
+    Param("replay_rate", 1.0, "Rate asked of the player: recorded seconds per second", minimum=1e-3, maximum=1e6),
     Param("recovery_timeout_s", 60.0, "How long a lost node may take to come back before training ends", "s",
           minimum=0.0, maximum=3600.0),
 )  # fmt: skip
@@ -89,22 +90,30 @@ class LearnerNode(ManagedNode):
         self.own(self._written.close)
         self._nonfinite_updates = 0
         self._spec: EnvironmentSpec | None = None
+        self._expected_spec = expected_spec(
+            self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
+        )
         self._joiner = RolloutJoiner()
+        self._replayed = ReplayJoiner(self._withhold)
         self._versions = self.publish_on("policy/version")
         self._metrics = self.publish_on("learner/metrics")
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("env/image", self._on_image)
-        self.listen("env/transition", self._on_transition, credit=True)
+        self._credit = self.listen("env/transition", self._on_transition, credit=True)
         self.listen("reward", self._on_reward)
         self.serve(SaveCheckpoint, "learner/save", self._on_save)
         self.serve(GetWeights, "learner/get_weights", self._on_get_weights)
         self._rollouts = ActionClient(self, RolloutAction, "rollout")
         self.own(self._rollouts.destroy)
+        self._replay = ActionClient(self, Replay, "replay")
+        self.own(self._replay.destroy)
         self._action = WorkerAction(self, Train, "train", self._train, self._describe)
         self.own(self._action.destroy)
 
     def activate(self) -> None:
         self._announce()
+        if self.param("replay_at_start"):
+            self._train_from_replay(str(self.param("replay_at_start")))
 
     def deactivate(self, reason: str) -> None:
         self._action.stop(reason)
@@ -120,6 +129,20 @@ class LearnerNode(ManagedNode):
             for name in ("updates", "version", "samples", "dropped_invalid", "dropped_gap", "dropped_stale"):
                 self.diagnostics.gauge(name, getattr(progress, name))
 
+    def _train_from_replay(self, uri: str) -> None:
+        """Send this node's own action a goal, as soon as its server is there."""
+        client = ActionClient(self, Train, "train")
+        self.own(client.destroy)
+        goal = Train.Goal(updates=self._config.ppo.updates, from_replay=True, bag_uris=[uri])
+
+        def send() -> None:
+            if self.active and client.server_is_ready():
+                timer.cancel()
+                client.send_goal_async(goal)
+
+        timer = self.create_timer(0.1, send, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.own(self.destroy_timer, timer)
+
     # Training, in a worker thread.
 
     def _train(self, work: Work) -> Train.Result:
@@ -127,21 +150,21 @@ class LearnerNode(ManagedNode):
         began = time.monotonic()
         first_samples = self._training.progress.samples
         result = Train.Result(termination_reason=Train.Result.FINISHED)
-        source = self._bag_rollouts(goal) if goal.from_bags else None
+        source: RolloutSource | None = None
         try:
+            source = self._source(work, goal)
             for update in range(int(goal.updates)):
                 work.check()
                 if self._over_limit(goal, began, first_samples):
                     result.termination_reason = Train.Result.LIMIT
                     break
-                if source is None:
-                    rollout, dropped = self._collect(work)
-                elif (following := next(source, None)) is not None:
-                    rollout, dropped = following
-                else:
-                    result.message = f"the bags hold {update} rollouts of the trained versions, not {goal.updates}"
+                following = source.next()
+                if following is None:
+                    result.termination_reason = Train.Result.EXHAUSTED if update else Train.Result.FAILED
+                    result.message = self._exhausted(goal, update, source.left_out)
                     break
-                self._update(work, goal, update, rollout, dropped)
+                self._count_dropped(following[1])
+                self._update(work, goal, update, *following)
         except PeerLost as error:
             result.termination_reason, result.message = Train.Result.PEER_LOST, str(error)
         except Canceled:
@@ -149,11 +172,48 @@ class LearnerNode(ManagedNode):
         except (WireError, ValueError, OSError, FloatingPointError) as error:
             result.termination_reason, result.message = Train.Result.FAILED, str(error)
         finally:
-            self._joiner.end()
+            if source is not None:
+                source.close()
         if result.termination_reason in (Train.Result.PEER_LOST, Train.Result.FAILED):
             self.get_logger().error(f"training ended: {result.message}")
             self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=result.message)
+        elif result.message:
+            self.get_logger().warning(f"training ended: {result.message}")
+        else:
+            self.get_logger().info(f"training ended after update {self._training.progress.updates}")
         return self._fill(result)
+
+    def _source(self, work: Work, goal: Train.Goal) -> RolloutSource:
+        """Raises ValueError for a goal that asks for nothing, or for two sources."""
+        if not goal.updates:
+            raise ValueError("updates is 0; ask for at least 1")
+        if goal.from_bags and goal.from_replay:
+            raise ValueError("from_bags and from_replay are both set; choose one")
+        progress, num_steps = self._training.progress, self._config.ppo.num_steps
+        if goal.from_bags:
+            paths = bag_paths(goal.bag_uris, self.run_dir)
+            return BagRollouts(paths, progress, num_steps=num_steps, expected=self._expected_spec)
+        if goal.from_replay:
+            uris = [str(path) for path in bag_paths(goal.bag_uris, self.run_dir)] if goal.bag_uris else []
+            return ReplayedRollouts(self, work, progress, self._replayed, self._replay, uris, num_steps=num_steps)
+        return LiveRollouts(
+            self, work, progress, self._joiner, self._rollouts, num_steps=num_steps, seed=self._config.seed
+        )
+
+    def _exhausted(self, goal: Train.Goal, made: int, left_out: list[str]) -> str:
+        source = "the bags hold" if goal.from_bags else "the replay held"
+        steps, version = self._config.ppo.num_steps, self._training.progress.version
+        text = (
+            f"{source} {made} rollouts of {steps} lock-steps (ppo.num_steps) by the versions that were trained, not "
+            f"{goal.updates}; the next needed is of version {version}: start from the recorded run's first weights"
+        )
+        more = f", and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+        return text + (f"; left out: {'; '.join(left_out[:3])}{more}" if left_out else "")
+
+    def _count_dropped(self, dropped: Dropped) -> None:
+        for key, number in (("invalid", dropped.invalid), ("gap", dropped.gap), ("stale", dropped.stale)):
+            if number:
+                self.diagnostics.count(f"dropped_{key}", number, text=f"{number} transitions dropped: {key}")
 
     def _over_limit(self, goal: Train.Goal, began: float, first_samples: int) -> bool:
         samples = self._training.progress.samples - first_samples
@@ -184,73 +244,6 @@ class LearnerNode(ManagedNode):
                 samples_per_s=samples_per_s, policy_version=progress.version, progress=(update + 1) / goal.updates,
             )
         )
-
-    def _collect(self, work: Work) -> tuple[Rollout, Dropped]:
-        """One rollout of the newest version. A lost node may come back: the same seed gives the same rollout again.
-
-        Raises:
-            PeerLost: not within recovery_timeout_s.
-        """
-        give_up = time.monotonic() + float(self.param("recovery_timeout_s"))
-        gaps = 0
-        while True:
-            try:
-                return self._attempt_rollout(work, accept_gaps=gaps > MAX_GAP_RETRIES)
-            except PeerLost as error:
-                text = str(error)
-                gaps += 1
-                self.diagnostics.count("repeated_rollouts", text=f"rollout repeated: {text}")
-                self.get_logger().warning(f"rollout repeated: {text}")
-                if time.monotonic() > give_up:
-                    raise PeerLost(f"{text}; nothing came back for {self.param('recovery_timeout_s'):g} s") from None
-            work.sleep(RETRY_S)
-
-    def _attempt_rollout(self, work: Work, *, accept_gaps: bool) -> tuple[Rollout, Dropped]:
-        version = self._training.progress.version
-        goal = RolloutAction.Goal(
-            policy_version=version, steps=self._config.ppo.num_steps, seed=self._config.seed, reset=True,
-            behaviour="policy",
-        )  # fmt: skip
-        self._check_peers()
-        self._joiner.begin()
-        found: RolloutAction.Result = run_goal(
-            self._rollouts, goal, accept_s=5.0, check=work.check, alive=self._check_peers
-        )
-        if found.termination_reason == RolloutAction.Result.FAILED:
-            raise WireError(ErrorCode.INTERNAL, f"the policy node failed: {found.message}")
-        if found.termination_reason != RolloutAction.Result.FINISHED:
-            raise PeerLost(found.message or "the rollout was cut short")
-        span = (found.env_session, found.first_step_id, found.last_step_id)
-        deadline = time.monotonic() + float(self.param("join_timeout_s"))
-        while missing := self._joiner.missing(*span):
-            work.check()
-            if time.monotonic() > deadline:
-                self.diagnostics.count("incomplete_steps", len(missing), text=f"{len(missing)} lock-steps incomplete")
-                if accept_gaps:
-                    break
-                raise PeerLost(f"images or rewards of {len(missing)} lock-steps did not arrive; is every node active?")
-            self._joiner.wait(0.1)
-        rollout, dropped = self._joiner.take(found.first_step_id, found.last_step_id, version)
-        for key, number in (("invalid", dropped.invalid), ("gap", dropped.gap), ("stale", dropped.stale)):
-            if number:
-                self.diagnostics.count(f"dropped_{key}", number, text=f"{number} transitions dropped: {key}")
-        return rollout, dropped
-
-    def _check_peers(self) -> None:
-        namespace = self.get_namespace().rstrip("/")
-        lost = [name for name in self.peers.lost if name.removeprefix(f"{namespace}/") in TRAINING_PEERS]
-        if lost:
-            raise PeerLost(f"{', '.join(lost)} is silent")
-
-    def _bag_rollouts(self, goal: Train.Goal) -> Any:
-        """Rollouts of the bags that were made by the version that is trained now; others are stale."""
-        for uri in goal.bag_uris:
-            path = existing(uri if Path(uri).is_absolute() else str(self.run_dir / uri), "bag_uris")
-            for rollout in read_rollouts(path):
-                if rollout.policy_version == self._training.progress.version:
-                    yield rollout, Dropped()
-                else:
-                    self._training.progress.dropped_stale += int(rollout.valid_TN.sum())
 
     def _fill(self, result: Train.Result) -> Train.Result:
         progress = self._training.progress
@@ -300,36 +293,52 @@ class LearnerNode(ManagedNode):
 
     # Callbacks.
 
+    def _withhold(self, withheld: bool) -> None:
+        if self._credit is not None:
+            self._credit.withhold(withheld)
+
+    @property
+    def _collecting(self) -> RolloutJoiner | ReplayJoiner | None:
+        """Where messages go now: the source that the running goal trains from; None between goals and with bags."""
+        return next((joiner for joiner in (self._joiner, self._replayed) if joiner.collecting), None)
+
     def _on_spec(self, message: EnvSpec) -> None:
         try:
             self._spec = convert.spec_from_msg(message)
+            if self._expected_spec is not None:
+                refuse_other(self._spec, self._expected_spec, "the learner's policy needs")
             self._joiner.enter_session(message.session)
+            self._replayed.enter_session(message.session)
         except WireError as error:
+            self._spec = None
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
 
     def _on_image(self, message: Image) -> None:
-        if self._spec is None or not self._joiner.collecting:
+        joiner = self._collecting
+        if self._spec is None or joiner is None:
             return
         try:
             images = convert.images_of(message, self._spec)
         except WireError as error:
             self.diagnostics.count("refused_images", text=str(error))
             return
-        self._joiner.put_image(convert.time_ns(message.header.stamp), images)
+        joiner.put_image(convert.time_ns(message.header.stamp), images)
 
     def _on_transition(self, message: TransitionBatch) -> None:
-        if self._spec is None or not self._joiner.collecting:
+        joiner = self._collecting
+        if self._spec is None or joiner is None:
             return
         try:
-            self._joiner.put_transition(convert.transition_of(message, self._spec))
+            joiner.put_transition(convert.transition_of(message, self._spec))
         except WireError as error:
             self.diagnostics.count("refused_transitions", text=str(error))
 
     def _on_reward(self, message: RewardBatch) -> None:
-        if not self._joiner.collecting:
+        joiner = self._collecting
+        if joiner is None:
             return
         try:
-            self._joiner.put_rewards(convert.rewards_of(message))
+            joiner.put_rewards(convert.rewards_of(message))
         except WireError as error:
             self.diagnostics.count("refused_rewards", text=str(error))
 

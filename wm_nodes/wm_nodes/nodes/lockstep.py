@@ -24,6 +24,7 @@ from wm_nodes.ros.wire import (
     Transition,
     WireError,
 )
+from wm_nodes.seeding import numpy_stream
 from wm_nodes.specs import EnvironmentSpec
 from wm_nodes.types import BoolArray, Environment, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 
@@ -64,9 +65,12 @@ class LockstepEnvironment:
         session: of the serving node; a command of another session is refused.
         sink: gets every published item.
         behaviour: label of the episode events until a reset names another.
+        seed: root of the resets that name no seeds (stream `reset`, number of the draw).
     """
 
-    def __init__(self, environment: Environment, session: int, sink: Sink, behaviour: str = "policy") -> None:
+    def __init__(
+        self, environment: Environment, session: int, sink: Sink, behaviour: str = "policy", seed: int = 0
+    ) -> None:
         self.environment, self.session = environment, session
         self.spec: EnvironmentSpec = environment.spec
         self.estop = False
@@ -74,6 +78,7 @@ class LockstepEnvironment:
         """Called before every change; raises WireError to refuse it (no credit, not active)."""
         self._sink = sink
         self._behaviour = behaviour
+        self._seed, self._draws = seed, 0
         self._lock = threading.Lock()
         self._period_ns = round(self.spec.control_period_s * 1e9)
         self._num_observations = 0
@@ -161,7 +166,7 @@ class LockstepEnvironment:
     def close(self) -> None:
         self.environment.close()
 
-    def _step(self, command: StepCommand, actions: FloatArray, seeds: UInt64Array | None) -> Reply:
+    def _step(self, command: StepCommand, actions: FloatArray, seeds: UInt64Array) -> Reply:
         started = time.perf_counter()
         before, before_stamp = self._current, self._stamp_ns()
         assert before is not None
@@ -195,7 +200,7 @@ class LockstepEnvironment:
         )
         self._publish_observation(stamp, goals_changed=mask is not None and bool(mask.any()))
         count = self.spec.num_envs
-        zeros = np.zeros(count, np.float32)
+        unknown = np.full(count, np.nan, np.float32)
         self._sink.transition(
             Transition(
                 stamp_ns=before_stamp,
@@ -204,8 +209,8 @@ class LockstepEnvironment:
                 actions=actions,
                 states=before.state,
                 next_states=observation.state,
-                logprobs=zeros if command.logprobs is None else command.logprobs,
-                values=zeros if command.values is None else command.values,
+                logprobs=unknown if command.logprobs is None else command.logprobs,
+                values=unknown if command.values is None else command.values,
                 terminated=reply.terminated,
                 truncated=result.truncated & valid,
                 valid=valid,
@@ -280,8 +285,12 @@ class LockstepEnvironment:
             raise WireError(ErrorCode.ESTOP, "the emergency stop is set; publish false on safety/estop to go on")
         self.before_step()
 
-    def _seeds(self, seeds: UInt64Array | None) -> UInt64Array | None:
-        if seeds is not None and seeds.shape != (self.spec.num_envs,):
+    def _seeds(self, seeds: UInt64Array | None) -> UInt64Array:
+        """The given seeds (N,), else drawn ones, so that every episode event names the seed that made it."""
+        if seeds is None:
+            self._draws += 1
+            return numpy_stream(self._seed, "reset", self._draws).integers(0, 2**32, self.spec.num_envs, np.uint64)
+        if seeds.shape != (self.spec.num_envs,):
             raise WireError(ErrorCode.BAD_SHAPE, f"{len(seeds)} seeds for {self.spec.num_envs} environments")
         return seeds
 
@@ -306,12 +315,12 @@ class LockstepEnvironment:
     def _reset_transition(self, stamp: int) -> Transition:
         assert self._current is not None
         count = self.spec.num_envs
-        zeros, none = np.zeros(count, np.float32), np.zeros(count, bool)
+        zeros, none, unknown = np.zeros(count, np.float32), np.zeros(count, bool), np.full(count, np.nan, np.float32)
         current = self._current
         return Transition(
             stamp_ns=stamp, next_stamp_ns=stamp, step_id=self._last_step_id,
             actions=np.zeros((count, self.spec.action_dim), np.float32), states=current.state,
-            next_states=current.state, logprobs=zeros, values=zeros, terminated=none, truncated=none, valid=none,
+            next_states=current.state, logprobs=unknown, values=unknown, terminated=none, truncated=none, valid=none,
             episode_ids=current.episode_id, episode_steps=current.episode_step,
             policy_versions=np.zeros(count, np.uint64), success_probability=zeros, uncertainty=zeros,
             ground_truth=self._truth(), source=self.spec.source,
@@ -331,11 +340,11 @@ class LockstepEnvironment:
             images, found = (None, np.zeros(self.spec.num_envs, bool)) if goals is None else goals
             self._sink.goals(Goals(stamp, images, found, self._current.episode_id))
 
-    def _start_episodes(self, mask: BoolArray, seeds: UInt64Array | None, stamp: int) -> None:
+    def _start_episodes(self, mask: BoolArray, seeds: UInt64Array, stamp: int) -> None:
         assert self._current is not None
         for i in np.flatnonzero(mask):
             self._slots[i] = _Slot(
-                episode_id=int(self._current.episode_id[i]), seed=0 if seeds is None else int(seeds[i]), running=True
+                episode_id=int(self._current.episode_id[i]), seed=int(seeds[i]), running=True
             )
             self._note(int(i), EpisodeEvent.KIND_START, EpisodeEvent.OUTCOME_UNKNOWN, EpisodeEvent.REASON_NONE, stamp)
 

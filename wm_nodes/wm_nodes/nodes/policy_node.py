@@ -13,7 +13,7 @@ from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
 from wm_msgs.srv import InferAction, LoadPolicy
 from wm_nodes.learning.rollouts import action_noise, reset_seeds
-from wm_nodes.nodes.backends import existing, make_policy
+from wm_nodes.nodes.backends import existing, expected_spec, make_policy, refuse_other
 from wm_nodes.nodes.pilot import Pilot
 from wm_nodes.nodes.policy_holder import PolicyHolder, read_weights
 from wm_nodes.policy import PolicyOutput
@@ -64,9 +64,8 @@ class PolicyNode(ManagedNode):
         self._local_environment = local_environment
 
     def configure(self) -> None:
-        self._holder = PolicyHolder(
-            make_policy(self.run_config(), str(self.param("model_dir")), str(self.param("policy_factory")))
-        )
+        given = self.run_config(), str(self.param("model_dir")), str(self.param("policy_factory"))
+        self._holder, self._expected_spec = PolicyHolder(make_policy(*given)), expected_spec(*given)
         if self.param("initial_policy"):
             path = existing(str(self.param("initial_policy")), "initial_policy")
             try:
@@ -195,6 +194,8 @@ class PolicyNode(ManagedNode):
                 f"environment {spec.env_id} has {found} state and action values, the policy {expected}; "
                 "start both with the same config_file",
             )
+        if self._expected_spec is not None:
+            refuse_other(spec, self._expected_spec, "the policy needs")
         self._spec = spec
 
     def _await_version(self, version: int, work: Work) -> None:

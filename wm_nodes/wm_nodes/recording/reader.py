@@ -1,7 +1,7 @@
 """Episodes back out of a bag: written by EpisodeBagWriter, or recorded live. They stream; only the episodes in progress
 are in memory."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,11 @@ from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.lockstep import MAX_LAG, LockSteps, RecordedStep
 from wm_nodes.recording.messages import KIND_END
-from wm_nodes.specs import EnvironmentSpec, as_sent
+from wm_nodes.specs import POLICY_FIELDS, EnvironmentSpec, differences
 from wm_nodes.types import Episode, FloatArray, UInt8Array
+
+EPISODE_FIELDS = (*POLICY_FIELDS, "ground_truth_names")
+"""What training a world model depends on."""
 
 
 @dataclass
@@ -90,23 +93,16 @@ def read_episodes(
                 yield episode
 
 
-def check_spec(found: EnvironmentSpec, expected: EnvironmentSpec, *, where: str) -> None:
-    """Raise BagError unless both agree on all that a policy or world model depends on."""
-    names = ("height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale",
-             "state_names", "state_units", "control_period_s", "ground_truth_names")  # fmt: skip
-    pairs = [(name, _sent(getattr(found, name)), _sent(getattr(expected, name))) for name in names]
-    wrong = [f"{name} {is_!r} instead of {should!r}" for name, is_, should in pairs if is_ != should]
+def check_spec(
+    found: EnvironmentSpec, expected: EnvironmentSpec, *, where: str, names: Sequence[str] = EPISODE_FIELDS
+) -> None:
+    """Raise BagError unless both agree on the named fields."""
+    wrong = [f"{name} {is_!r} instead of {should!r}" for name, is_, should in differences(found, expected, names)]
     if wrong:
         raise BagError(
             f"{where} was recorded with {'; '.join(wrong)}; collect again with this configuration, or run with the "
             "configuration that recorded the bag"
         )
-
-
-def _sent(value: Any) -> Any:
-    if isinstance(value, float):
-        return as_sent(value)
-    return tuple(_sent(item) for item in value) if isinstance(value, tuple) else value
 
 
 class _EpisodeJoiner:

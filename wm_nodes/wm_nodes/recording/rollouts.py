@@ -12,7 +12,7 @@ from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.lockstep import LockSteps, RecordedStep
 from wm_nodes.recording.reader import BagReport, check_spec
-from wm_nodes.specs import EnvironmentSpec
+from wm_nodes.specs import POLICY_FIELDS, EnvironmentSpec
 from wm_nodes.types import Rollout
 
 
@@ -31,6 +31,7 @@ def read_rollouts(
 
     Args:
         num_steps: lock-steps per rollout; others are incomplete. None takes any length.
+        expected: refuse a bag of another camera, size, action or state than this spec.
         report: given, rollouts that lost a step, an image or a reward are counted there; else they raise.
 
     Raises:
@@ -40,7 +41,7 @@ def read_rollouts(
     with Bag(path) as bag:
         steps = LockSteps(bag, namespace=namespace)
         if expected is not None:
-            check_spec(steps.spec, expected, where=str(path))
+            check_spec(steps.spec, expected, where=str(path), names=POLICY_FIELDS)
         if not bag.count(topics.absolute(steps.namespace, topics.REWARD)):
             raise BagError(f"bag {path} has no rewards; record the topic {topics.REWARD.name}, or re-evaluate them")
         for group in _rollout_groups(steps):

@@ -73,6 +73,7 @@ class CreditGrantor:
     below: relative namespace of the producer with a slash at its end, e.g. "sim/"; empty: the node's own.
 
     Grants go out each quarter window, and once a second, so that a restarted producer learns of its consumers.
+    While `withheld`, the newest grant of the session is repeated: the producer waits and knows that someone is there.
     """
 
     def __init__(self, node: "ManagedNode", topic_name: str, window: int = CREDIT_WINDOW, *, below: str = "") -> None:
@@ -82,6 +83,8 @@ class CreditGrantor:
         self._timer = node.create_timer(REPEAT_S, self._repeat, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._tracker: GapTracker | None = None
         self._since_grant = 0
+        self._granted: tuple[int, int] | None = None
+        self.withheld = False
 
     def consumed(self, tracker: GapTracker) -> None:
         """Note that one message of the stream was dealt with; `tracker` has already observed it."""
@@ -91,15 +94,24 @@ class CreditGrantor:
         if first or self._since_grant >= self._window // 4:
             self.grant()
 
+    def withhold(self, withheld: bool) -> None:
+        """Stop granting more, or go on."""
+        if withheld != self.withheld:
+            self.withheld = withheld
+            self.grant()
+
     def grant(self) -> None:
         """Publish the present grant; nothing before the first message."""
         if self._tracker is None or self._tracker.session is None:
             return
         self._since_grant = 0
+        session = self._tracker.session
+        if not (self.withheld and self._granted is not None and self._granted[0] == session):
+            self._granted = session, self._tracker.last_seq + self._window
         message = Credit(
             consumer=self._node.get_fully_qualified_name(), topic=self._topic_name,
-            stream_session=self._tracker.session, received_seq=self._tracker.last_seq,
-            granted_seq=self._tracker.last_seq + self._window, lost_total=self._tracker.lost,
+            stream_session=session, received_seq=self._tracker.last_seq, granted_seq=self._granted[1],
+            lost_total=self._tracker.lost,
         )  # fmt: skip
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)

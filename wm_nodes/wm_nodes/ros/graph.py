@@ -62,6 +62,8 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("learner_ranks", "1", "Learner processes under torchrun"),
     LaunchArgument("record", "true", "Also start the recorder", TRUTHS),
     LaunchArgument("bag_uri", "", "Bag folder to write or to play; empty: <run_dir>/bags/<scenario>"),
+    LaunchArgument("rate", "1.0", "Recorded seconds per second; the learner's pace limits it"),
+    LaunchArgument("train", "true", "Train from what is played; false: only play, training waits for a goal", TRUTHS),
     LaunchArgument("executor", "events", "Which rclpy executor spins the nodes", ("events", "single", "multi")),
     LaunchArgument("autostart", "true", "Nodes activate themselves; false: a lifecycle manager does", TRUTHS),
     LaunchArgument("use_sim_time", "false", "Nodes take their time from /clock", TRUTHS),
@@ -234,6 +236,16 @@ def build_graph(scenario: str, arguments: Mapping[str, str]) -> Graph:
     return dataclasses.replace(graph, environment=environment)
 
 
+def _number(arguments: Mapping[str, str], name: str, low: float, high: float) -> float:
+    try:
+        value = float(arguments[name])
+    except ValueError:
+        raise GraphError(f"{name} must be a number, got {arguments[name]!r}") from None
+    if not low <= value <= high:
+        raise GraphError(f"{name} must lie in {low:g}..{high:g}, got {arguments[name]}")
+    return value
+
+
 def _integer(arguments: Mapping[str, str], name: str, low: int, high: int = 2**31) -> int:
     try:
         value = int(arguments[name])
@@ -336,8 +348,13 @@ def _rollout_record(arguments: Mapping[str, str]) -> Graph:
 
 
 def _replay_offline(arguments: Mapping[str, str]) -> Graph:
-    player = _node(arguments, "player", {"bag_uri": arguments["bag_uri"]})
-    return Graph("replay_offline", (player, _node(arguments, "learner", _weights(arguments))))
+    rate = _number(arguments, "rate", 1e-3, 1e6)
+    trains = arguments["train"] == "true"
+    player = _node(
+        arguments, "player", {"bag_uri": arguments["bag_uri"], "play_at_start": not trains, "rate": rate}
+    )
+    learner = {**_weights(arguments), "replay_rate": rate, "replay_at_start": arguments["bag_uri"] if trains else ""}
+    return Graph("replay_offline", (player, _node(arguments, "learner", learner)))
 
 
 def _evaluate(arguments: Mapping[str, str]) -> Graph:
@@ -372,8 +389,9 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario("online_training", "Train a policy in the world model; evaluate it in the simulator", _TRAINING,
                  _online_training),
         Scenario("rollout_record", "Let a policy act and record it", (*_COMMON, *_ROLLOUT), _rollout_record),
-        Scenario("replay_offline", "Play a bag to the learner",
-                 (*_COMMON, "model_dir", "initial_policy", "policy_factory", "bag_uri"), _replay_offline),
+        Scenario("replay_offline", "Play a bag; the learner trains from what is played",
+                 (*_COMMON, "model_dir", "initial_policy", "policy_factory", "bag_uri", "rate",
+                  "train"), _replay_offline),
         Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
         Scenario("composed", "online_training with all nodes in one process", _TRAINING, _online_training),
     )

@@ -124,10 +124,11 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def listen(
         self, name: str, callback: Callable[[Any], None], *, credit: bool = False, while_inactive: bool = False
-    ) -> None:
+    ) -> CreditGrantor | None:
         """Subscribe to a row of the QoS table until cleanup. Messages with (session, seq) are checked for gaps.
 
-        credit: grant the producer messages as they are consumed (see ros.credit); for keep-all streams.
+        credit: grant the producer messages as they are consumed (see ros.credit); for keep-all streams. The grantor is
+            returned.
         while_inactive: latched topics, whose message must not be missed before activation.
         """
         row = topic(name)
@@ -146,6 +147,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._entities.append(lambda: self.destroy_subscription(subscription))
         if grantor is not None:
             self._entities.append(grantor.close)
+        return grantor
 
     def tracker(self, name: str) -> GapTracker:
         """The gap counts of a topic this node listens to."""
