@@ -17,7 +17,7 @@ from recording_samples import make_spec
 from wm_msgs.action import Evaluate, Replay, Train
 from wm_nodes.learning.weights import save_weights
 from wm_nodes.recording import BagReport, read_episodes, read_rollouts, recover
-from wm_nodes.ros.graph import ENVIRONMENT_TOPICS, GRAPH_TOPICS
+from wm_nodes.ros.scenarios import ENVIRONMENT_TOPICS, GRAPH_TOPICS
 
 pytestmark = pytest.mark.graph
 

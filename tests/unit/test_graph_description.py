@@ -13,17 +13,9 @@ import pytest
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.domain import DomainInUseError, DomainLock
 from wm_nodes.ros.environment import PROFILE, graph_environment
-from wm_nodes.ros.graph import (
-    ARGUMENTS,
-    SCENARIOS,
-    Graph,
-    GraphError,
-    NodeSpec,
-    build_graph,
-    describe_arguments,
-    parse_arguments,
-)  # fmt: skip
+from wm_nodes.ros.graph import Graph, GraphError, NodeSpec
 from wm_nodes.ros.runner import Runner, main
+from wm_nodes.ros.scenarios import ARGUMENTS, SCENARIOS, build_graph, describe_arguments, parse_arguments  # fmt: skip
 
 
 @pytest.fixture

@@ -8,8 +8,9 @@ import pytest
 
 from wm_nodes.recording import topics
 from wm_nodes.ros import arguments as launch_arguments
-from wm_nodes.ros.graph import GRAPH_TOPICS, Graph, GraphError
+from wm_nodes.ros.graph import Graph, GraphError
 from wm_nodes.ros.launch_face import prepared
+from wm_nodes.ros.scenarios import GRAPH_TOPICS
 
 BLOCKED = "pydantic", "yaml", "numpy", "torch", "rclpy", "wm_msgs", "rosbags", "mcap"
 IMPORT = """

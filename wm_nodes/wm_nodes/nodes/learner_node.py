@@ -16,15 +16,15 @@ from sensor_msgs.msg import Image
 
 from wm_msgs.action import Replay, Train
 from wm_msgs.action import Rollout as RolloutAction
-from wm_msgs.msg import EnvSpec, ErrorCode, LearnerMetrics, PolicyVersion, RewardBatch, TransitionBatch
+from wm_msgs.msg import EnvSpec, ErrorCode, PolicyVersion, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
 from wm_nodes.learning.distributed import Ranks, join
-from wm_nodes.learning.metrics import MetricsWriter
 from wm_nodes.learning.rollouts import Canceled
 from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, load_weights
 from wm_nodes.nodes.backends import existing, expected_spec, make_learner, make_policy, refuse_other
 from wm_nodes.nodes.joiner import Dropped, RolloutJoiner
+from wm_nodes.nodes.learner_report import LearnerReport
 from wm_nodes.nodes.policy_holder import weights_uri
 from wm_nodes.nodes.replayed import ReplayJoiner
 from wm_nodes.nodes.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
@@ -61,13 +61,6 @@ PARAMS = (
           minimum=0.0, maximum=3600.0),
 )  # fmt: skip
 
-METRICS = (
-    "loss_policy", "loss_value", "entropy", "approx_kl", "kl_reference", "clip_fraction", "grad_norm", "learning_rate",
-    "explained_variance",
-)  # fmt: skip
-"""Metrics with their own field in LearnerMetrics; all others travel as names and values."""
-
-
 class LearnerNode(ManagedNode):
     """Action train; services learner/save, learner/get_weights; publishes policy/version, learner/metrics."""
 
@@ -86,9 +79,8 @@ class LearnerNode(ManagedNode):
             keep_versions=int(self.param("keep_versions")), metadata={"tokenizer_sha256": policy.encoder.sha256},
             ranks=self._ranks,
         )  # fmt: skip
-        self._written = MetricsWriter(self.run_dir, tensorboard=bool(self.param("tensorboard")))
-        self.own(self._written.close)
-        self._nonfinite_updates = 0
+        self._report = LearnerReport(self, tensorboard=bool(self.param("tensorboard")))
+        self.own(self._report.close)
         self._spec: EnvironmentSpec | None = None
         self._expected_spec = expected_spec(
             self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
@@ -96,7 +88,6 @@ class LearnerNode(ManagedNode):
         self._joiner = RolloutJoiner()
         self._replayed = ReplayJoiner(self._withhold)
         self._versions = self.publish_on("policy/version")
-        self._metrics = self.publish_on("learner/metrics")
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("env/image", self._on_image)
         self._credit = self.listen("env/transition", self._on_transition, credit=True)
@@ -227,16 +218,13 @@ class LearnerNode(ManagedNode):
         try:
             metrics = self._training.update(rollout, dropped, lambda: work.stopped)
         except FloatingPointError as error:
-            self._nonfinite_updates += 1
-            self.diagnostics.count("nonfinite_updates", level=diagnostics.ERROR, text=str(error))
-            self._publish_metrics({}, float("nan"))
+            self._report.nonfinite(self._training.progress, error)
             raise
         self.diagnostics.latency("update", time.perf_counter() - began)
         self._announce()
         samples_per_s = float(rollout.valid_TN.sum()) / max(time.perf_counter() - began, 1e-9)
-        self._publish_metrics(metrics, samples_per_s)
-        self._write_metrics(metrics, samples_per_s)
         progress = self._training.progress
+        self._report.updated(progress, metrics, samples_per_s)
         work.feedback(
             Train.Feedback(
                 update=update + 1, samples=progress.samples, mean_return=progress.mean_return,
@@ -267,29 +255,6 @@ class LearnerNode(ManagedNode):
         if len(packed.data) <= INLINE_LIMIT_BYTES:
             message.inline_data = convert.bytes_field(packed.data)
         self._versions.publish(message)
-
-    def _publish_metrics(self, metrics: dict[str, float], samples_per_s: float) -> None:
-        progress = self._training.progress
-        message = LearnerMetrics(
-            update=progress.updates, policy_version=progress.version, samples=progress.samples,
-            mean_return=progress.mean_return, success_rate=progress.success_rate, samples_per_s=samples_per_s,
-            dropped_invalid=progress.dropped_invalid, dropped_gap=progress.dropped_gap,
-            dropped_stale=progress.dropped_stale,
-        )  # fmt: skip
-        message.header.stamp = self.get_clock().now().to_msg()
-        for name in METRICS:
-            setattr(message, name, metrics.get(name, float("nan")))
-        metrics = metrics | {"nonfinite_updates": float(self._nonfinite_updates)}
-        extras = {name: value for name, value in metrics.items() if name not in METRICS}
-        message.names = list(extras)[:64]
-        message.values = [extras[name] for name in message.names]
-        self._metrics.publish(message)
-
-    def _write_metrics(self, metrics: dict[str, float], samples_per_s: float) -> None:
-        progress = self._training.progress
-        counts = ("mean_return", "success_rate", "dropped_invalid", "dropped_gap", "dropped_stale")
-        scalars = {**metrics, "samples_per_s": samples_per_s, **{name: getattr(progress, name) for name in counts}}
-        self._written.write("ppo", progress.updates, scalars)
 
     # Callbacks.
 

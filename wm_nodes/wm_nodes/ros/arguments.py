@@ -11,7 +11,8 @@ from pathlib import Path
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.ros.graph import Graph, GraphError, build_graph, compose, parse_arguments
+from wm_nodes.ros.graph import Graph, GraphError, compose
+from wm_nodes.ros.scenarios import build_graph, parse_arguments
 
 
 def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None) -> dict[str, str]:

@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from wm_nodes.ros.environment import graph_environment, interpreter
-from wm_nodes.ros.graph import Graph, NodeSpec, argument_table
+from wm_nodes.ros.graph import Graph, NodeSpec
+from wm_nodes.ros.scenarios import argument_table
 
 
 def launch_description(scenario: str) -> Any:

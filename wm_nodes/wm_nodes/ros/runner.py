@@ -19,9 +19,10 @@ from typing import TextIO
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.domain import DomainInUseError, DomainLock
 from wm_nodes.ros.environment import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES, graph_environment, interpreter
-from wm_nodes.ros.graph import Graph, GraphError, describe_arguments
+from wm_nodes.ros.graph import Graph, GraphError
 from wm_nodes.ros.processes import NodeProcess
 from wm_nodes.ros.readiness import NotReadyError, wait_ready
+from wm_nodes.ros.scenarios import describe_arguments
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 GRACE_S = 5.0
