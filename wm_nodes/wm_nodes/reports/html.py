@@ -158,8 +158,8 @@ def _again(run_dir: Path, summary: Summary) -> str:
         parts.append(f"<p>The command behind this page:</p><pre>{escape(summary.command)}</pre>")
     if summary.bag and len(summary.rounds) < 2:
         replay = (
-            f"python3 launch_scripts/replay_offline.launch.py bag_uri:={summary.bag} config_file:={run_dir}/config.yaml "
-            f"initial_policy:={run_dir}/policies/weak.safetensors rate:=100"
+            f"python3 launch_scripts/replay_offline.launch.py bag_uri:={summary.bag} "
+            f"config_file:={run_dir}/config.yaml initial_policy:={run_dir}/policies/weak.safetensors rate:=100"
         )
         parts.append(
             "<p>Play the bag to a learner, which trains from it to the same weights, file for file (in a run folder of "
