@@ -119,10 +119,20 @@ def test_a_consumer_without_credit_holds_the_environment_up_until_it_is_dropped(
     [
         ({"backend": "gazebo"}, "backend must be one of world_model, maniskill, factory; got 'gazebo'"),
         ({"num_env": 3}, "unknown parameter 'num_env'; did you mean 'num_envs'?"),
+        (
+            {"qos_overrides./wm/env/image.publisher.depth": 2},
+            "'qos_overrides./wm/env/image.publisher.depth' would change nothing: QoS is one table for graph and bags; "
+            "change the topic's row in wm_nodes/recording/topics.py",
+        ),
         ({"num_envs": 0}, "num_envs must be at least 1; got 0"),
         ({"backend": "factory", "backend_factory": "nowhere:make"}, "No module named 'nowhere'"),
         ({"backend": "world_model"}, "model_dir"),
         ({"config_file": "/nowhere.yaml"}, "'/nowhere.yaml' does not exist"),
+        (
+            {"backend": "factory", "backend_factory": "toy:make_environment_of_large_images", "num_envs": 257},
+            "num_envs=257 images of 256 x 512 px make one env/image of 106954752 bytes, more than the 100663296 that "
+            "DDS carries in time; lower num_envs or simulation.image_size",
+        ),
         ({"executor": "fast"}, "executor must be one of events, single, multi; got 'fast'"),
     ],
 )
@@ -133,6 +143,11 @@ def test_a_wrong_setting_ends_the_node_with_one_line_that_names_it(
     log = graph.log("/wm/environment")
     assert words in log
     assert "Traceback" not in log
+
+
+def test_the_largest_image_is_not_refused(graph: Graph, probe: Probe) -> None:
+    graph.start_environment("toy:make_environment_of_large_images", num_envs=256)
+    wait_until("the node", lambda: probe.value("/wm/environment", "state") == "active", 60)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import resource
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,10 @@ from lifecycle_msgs.srv import ChangeState
 
 from wm_msgs.action import Train
 from wm_msgs.msg import EpisodeEvent, ErrorCode
-from wm_msgs.srv import ResetBatch
+from wm_msgs.srv import ResetBatch, StartRecording, StopRecording
+from wm_nodes.learning.ppo import PpoLearner
+from wm_nodes.nodes.training import restore
+from wm_nodes.recording import BagError, recover
 from wm_nodes.ros import calls
 from wm_nodes.ros.wire import ResetCommand, WireError
 
@@ -118,13 +122,24 @@ def test_transitions_without_images_are_declared_invalid_although_the_simulated_
     wait_until("a summary", lambda: summaries)
 
 
-@pytest.mark.kills
-def test_a_full_disk_stops_recording_with_one_error_and_the_node_lives_on(graph: Graph, probe: Probe) -> None:
+def full_disk(process: subprocess.Popen[bytes], limit_bytes: float = resource.RLIM_INFINITY) -> None:
+    """No file of the process may grow beyond the limit any more: writes fail with OSError, as on a full disk."""
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (int(limit_bytes), resource.RLIM_INFINITY))
+
+
+def test_a_full_disk_stops_recording_with_one_error_nothing_flushed_is_lost_and_the_node_lives_on(
+    graph: Graph, probe: Probe
+) -> None:
     graph.start_environment()
     client = Client(probe)
     process = graph.start("recorder", bag_uri="bags/full")
     wait_until("recording", lambda: "recording to" in graph.log("/wm/recorder"))
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+    partial = graph.folder / "bags" / "full.partial"
+    size = _size(partial)
+    start = client.reset()
+    client.step(client.command(start.step_id + 1))
+    wait_until("both transitions on the disk", lambda: _size(partial) > size and _count(partial, "env/transition") == 2)
+    full_disk(process, max(_size(partial), 10_000))
 
     def failed() -> bool:
         start = client.reset()
@@ -134,7 +149,57 @@ def test_a_full_disk_stops_recording_with_one_error_and_the_node_lives_on(graph:
     wait_until("the error", failed, 30)
     assert process.poll() is None
     wait_until("ERROR", lambda: any("recording stopped" in text for text in probe.seen_errors["/wm/recorder"]))
-    assert "Traceback" not in graph.log("/wm/recorder")
+    log = graph.log("/wm/recorder")
+    assert "free disk space" in log
+    assert log.count("recording stopped") == 1
+    assert "Traceback" not in log
+    bag = graph.folder / "bags" / "full"
+    assert _count(bag if bag.exists() else partial, "env/transition") >= 2
+    full_disk(process)
+    again = probe.call(StartRecording, "recorder/start", StartRecording.Request(bag_uri="bags/again"))
+    assert (again.error_code, again.message) == (ErrorCode.OK, "")
+    client.reset()
+    wait_until("messages", lambda: _count(graph.folder / "bags" / "again.partial", "env/transition") >= 1)
+    assert probe.call(StopRecording, "recorder/stop", StopRecording.Request()).messages >= 1
+
+
+def _size(folder: Path) -> int:
+    return sum(file.stat().st_size for file in folder.glob("*.mcap"))
+
+
+def _count(folder: Path, topic: str) -> int:
+    """Messages of a topic that a recovery of the folder brings back, complete or not."""
+    with tempfile.TemporaryDirectory() as scratch:
+        try:
+            return recover(folder, output=Path(scratch) / "bag").topics.get(f"/wm/{topic}", 0)
+        except BagError:
+            return 0
+
+
+def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpoint_loads(
+    graph: Graph, probe: Probe
+) -> None:
+    graph.start_environment()
+    graph.start_policy(await_nodes=["environment", "reward_evaluator", "learner"])
+    graph.start_reward()
+    learner = graph.start_learner()
+    assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
+    checkpoint = graph.folder / "checkpoints" / "learner.json"
+    complete = checkpoint.read_bytes()
+    full_disk(learner, 10_000)
+    failed = train(probe, updates=1)
+    assert failed.termination_reason == Train.Result.FAILED
+    assert "cannot write" in failed.message and "free some space" in failed.message
+    assert learner.poll() is None
+    assert "Traceback" not in graph.log("/wm/learner")
+    assert checkpoint.read_bytes() == complete
+    toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000002.safetensors", updates=1)
+    full_disk(learner)
+    policy = toy.make_policy(graph.config)
+    assert restore(policy, PpoLearner(policy, graph.config.ppo, seed=graph.config.seed), checkpoint).version == 2
+    again = train(probe, updates=1)
+    assert (again.termination_reason, again.policy_version) == (Train.Result.FINISHED, 4)
+    toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000004.safetensors", updates=3)
 
 
 def test_the_main_job_without_a_renderer_ends_with_one_line(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """A tiny deterministic environment and policy: real objects for the graph, small enough for two cores."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,13 @@ def make_environment(config: RunConfig, num_envs: int, seed: int) -> ReachToy:
 def make_long_environment(config: RunConfig, num_envs: int, seed: int) -> ReachToy:
     """Episodes that outlast every test."""
     return ReachToy(num_envs, seed, max_episode_steps=100_000)
+
+
+def make_environment_of_large_images(config: RunConfig, num_envs: int, seed: int) -> ReachToy:
+    """Says 256 x 512 px, 384 KiB, per environment; never drawn."""
+    environment = ReachToy(num_envs, seed)
+    environment.spec = replace(environment.spec, height=256, width=512)
+    return environment
 
 
 class Faulty(ReachToy):

@@ -17,13 +17,25 @@ from wm_nodes.ros.wire import Rewards, Transition
 N = 2
 
 
-def test_gaps_are_counted_exactly_and_a_new_session_or_a_late_start_is_none() -> None:
+def test_gaps_are_counted_exactly_and_a_late_start_is_none() -> None:
     tracker = GapTracker()
     assert [tracker.observe(1, seq) for seq in (5, 6, 9, 9, 8, 10)] == [0, 0, 2, 0, 0, 0]
-    assert tracker.observe(2, 40) == 0
-    assert tracker.observe(2, 42) == 1
-    assert (tracker.lost, tracker.repeated, tracker.sessions) == (3, 2, 2)
-    assert tracker.gaps == [(1, 7, 2), (2, 41, 1)]
+    assert (tracker.lost, tracker.repeated, tracker.sessions) == (2, 2, 1)
+    assert tracker.gaps == [(1, 7, 2)]
+
+
+def test_a_session_that_began_while_listening_is_expected_from_its_first_message() -> None:
+    tracker = GapTracker()
+    assert [tracker.observe(2, 40), tracker.observe(3, 0), tracker.observe(4, 2), tracker.observe(4, 3)] == [0, 0, 2, 0]
+    assert tracker.observe(1, 7) == 0, "it began before this consumer joined"
+    assert (tracker.lost, tracker.sessions, tracker.gaps) == (2, 4, [(4, 0, 2)])
+
+
+def test_publishers_that_take_turns_lose_nothing_and_a_gap_in_one_of_them_is_counted_once() -> None:
+    tracker = GapTracker()
+    turns = [(1, 5), (2, 0), (1, 6), (2, 1), (1, 8), (2, 2)]
+    assert [tracker.observe(*turn) for turn in turns] == [0, 0, 0, 0, 1, 0]
+    assert (tracker.session, tracker.last_seq, tracker.sessions) == (2, 2, 2)
 
 
 def test_the_producer_waits_for_every_consumer_and_drops_the_silent_one() -> None:

@@ -21,11 +21,15 @@ class StillEnvironment:
         self._start = np.tile(middle.astype(np.float32), (spec.num_envs, 1))
         self._states = self._start.copy()
         self._steps = np.zeros(spec.num_envs, np.uint32)
+        self._ids = np.zeros(spec.num_envs, np.uint64)
+        self._num_resets = 0
 
     def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
         chosen = np.ones(self.spec.num_envs, bool) if mask is None else mask
         self._states[chosen] = self._start[chosen]
         self._steps[chosen] = 0
+        self._ids[chosen] = self._num_resets + 1 + np.arange(chosen.sum(), dtype=np.uint64)
+        self._num_resets += int(chosen.sum())
         return self._observation()
 
     def step(self, actions: FloatArray) -> StepResult:
@@ -44,8 +48,7 @@ class StillEnvironment:
         self._steps[:] = 0
 
     def _observation(self) -> Observation:
-        ids = np.arange(1, self.spec.num_envs + 1, dtype=np.uint64)
-        return Observation(self._images, self._states.copy(), ids, self._steps.copy())
+        return Observation(self._images, self._states.copy(), self._ids.copy(), self._steps.copy())
 
 
 def make_still_environment(config: RunConfig, num_envs: int, seed: int) -> StillEnvironment:

@@ -18,9 +18,10 @@ def write_atomic(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except OSError:
+    except OSError as error:
         temporary.unlink(missing_ok=True)
-        raise
+        text = f"cannot write {path}: {error.strerror}; free some space there, or take another folder"
+        raise OSError(error.errno, text) from error
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)

@@ -70,7 +70,16 @@ def make_reconstruct(model_dir: Path) -> Callable[[UInt8Array], UInt8Array]:
 
 
 def make_endogenous_reward(config: RunConfig, model_dir: Path) -> EndogenousReward:
-    """Reward E8 with the distance of the frozen tokenizer's features."""
+    """Reward E8 with the distance of the frozen tokenizer's features.
+
+    Raises:
+        ValueError: reward.mode progress, whose golden trajectories no environment publishes: env/goal holds one frame.
+    """
+    if config.reward.mode == "progress" and config.reward.dense_weight:
+        raise ValueError(
+            "reward.mode progress needs golden trajectories, and environments publish the goal frame only; choose "
+            "delta or abs, or set reward.dense_weight to 0 (EndogenousReward itself takes RewardInput.golden)"
+        )
     models = models_of(Path(model_dir))
 
     def features(images: Tensor) -> Tensor:

@@ -28,9 +28,13 @@ from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import EpisodeNote, Goals, Transition, WireError
+from wm_nodes.specs import EnvironmentSpec
 from wm_nodes.types import UInt8Array
 
 MODES = ("lockstep", "asynchronous")
+
+MAX_MOSAIC_BYTES = 96 * 2**20
+"""Largest env/image that was tried: it arrives, in about a second. Writer and readers keep up to 32 of them."""
 
 PARAMS = (
     Param("backend", "world_model", "What is stepped", read_only=True, choices=BACKENDS),
@@ -68,6 +72,13 @@ class EnvironmentNode(ManagedNode):
             seed=int(self.param("seed")), model_dir=str(self.param("model_dir")),
             starts_file=str(self.param("starts_file")), factory=str(self.param("backend_factory")),
         )  # fmt: skip
+        if (size := mosaic_bytes(environment.spec)) > MAX_MOSAIC_BYTES:
+            environment.close()
+            raise ValueError(
+                f"num_envs={environment.spec.num_envs} images of {environment.spec.height} x {environment.spec.width} "
+                f"px make one env/image of {size} bytes, more than the {MAX_MOSAIC_BYTES} that DDS carries in time; "
+                "lower num_envs or simulation.image_size"
+            )
         self.served = LockstepEnvironment(environment, self.session, self, seed=int(self.param("seed")))
         self.served.before_step = self._require_credit
         self._spec = environment.spec
@@ -258,6 +269,12 @@ class EnvironmentNode(ManagedNode):
                 self.diagnostics.count("nan", level=level, text=str(error))
             trace = "".join(traceback.format_exception(error.__cause__)) if error.__cause__ is not None else ""
             self.get_logger().error(f"{what} refused: {error}\n{trace}".rstrip(), throttle_duration_sec=1.0)
+
+
+def mosaic_bytes(spec: EnvironmentSpec) -> int:
+    """Bytes of one env/image: all environments' tiles, empty ones included."""
+    height, width = convert.tiles_of(spec).mosaic_shape
+    return height * width * spec.channels
 
 
 def main() -> int:

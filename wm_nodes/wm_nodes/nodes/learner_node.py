@@ -143,6 +143,8 @@ class LearnerNode(ManagedNode):
         result = Train.Result(termination_reason=Train.Result.FINISHED)
         source: RolloutSource | None = None
         try:
+            if self._training.ensure_saved():
+                self._announce()
             source = self._source(work, goal)
             for update in range(int(goal.updates)):
                 work.check()

@@ -73,6 +73,7 @@ class PolicyNode(ManagedNode):
             except WireError as error:
                 raise ValueError(f"initial_policy {path}: {error}") from None
         self._spec: EnvironmentSpec | None = None
+        self._announced: PolicyVersion | None = None
         self._last_reply: Reply | None = None
         self._given_up: set[str] = set()
         timeout_s = float(self.param("step_timeout_s"))
@@ -200,6 +201,9 @@ class PolicyNode(ManagedNode):
 
     def _await_version(self, version: int, work: Work) -> None:
         deadline = time.monotonic() + float(self.param("version_timeout_s"))
+        announced = self._announced
+        if announced is not None and announced.version == version != self._holder.version:
+            self._holder.follow(announced, self.run_dir)  # policy/load has replaced it since
         while version and self._holder.version != version:
             if time.monotonic() > deadline:
                 raise WireError(
@@ -258,6 +262,7 @@ class PolicyNode(ManagedNode):
         try:
             if self._holder.follow(message, self.run_dir):
                 self.diagnostics.clear_condition("policy version")
+            self._announced = message
         except (WireError, ValueError) as error:
             self.get_logger().error(f"{error}; still acting with version {self._holder.version}")
             self.diagnostics.count("refused_versions", level=diagnostics.OK)

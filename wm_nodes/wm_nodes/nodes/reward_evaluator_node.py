@@ -122,12 +122,12 @@ class RewardEvaluatorNode(ManagedNode):
         if self._spec is None:
             self.diagnostics.count("before_spec", text="a transition came before env/spec; it gets no reward")
             return
-        self._enter_session(message.session)
         try:
             transition = convert.transition_of(message, self._spec)
         except WireError as error:
             self._count_refused("transition", error)
             return
+        self._enter_session(message.session)
         if not transition.is_reset and transition.valid.any():
             self._waiting.append((time.monotonic(), transition))
             self._judge_waiting()

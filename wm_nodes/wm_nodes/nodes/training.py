@@ -76,6 +76,7 @@ class PolicyTraining:
         self.progress = Progress()
         self._keep_versions, self._metadata = keep_versions, dict(metadata)
         self.packed: PackedWeights
+        self._saved = True
         if resume and self.checkpoint.is_file():
             self._restore()
         else:
@@ -96,6 +97,7 @@ class PolicyTraining:
 
         Raises:
             Canceled, FloatingPointError: nothing has changed. ValueError: the rollout cannot be trained on.
+            OSError: the update was made, but its files were not written; ensure_saved() tries again.
         """
         began = time.perf_counter()
         broadcast_rollout(rollout, self._ranks)
@@ -109,12 +111,21 @@ class PolicyTraining:
         progress.dropped_gap += dropped.gap
         progress.dropped_stale += dropped.stale
         progress.mean_return, progress.success_rate = statistics.mean_return, statistics.success_rate
-        self.save_checkpoint()
-        self._write_version()
+        self._saved = False
+        self.ensure_saved()
         metrics = _numbers(found)
         metrics["update_s"] = time.perf_counter() - began
         metrics["episodes"] = float(statistics.episodes)
         return metrics
+
+    def ensure_saved(self) -> bool:
+        """Write the files of the newest version if a full disk, say, kept them from it; return whether it did."""
+        if self._saved:
+            return False
+        self.save_checkpoint()
+        self._write_version()
+        self._saved = True
+        return True
 
     def close(self) -> None:
         """Let the other ranks end."""

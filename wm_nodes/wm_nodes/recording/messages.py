@@ -81,7 +81,7 @@ def spec_message(spec: EnvironmentSpec, time_ns: int, session: int) -> Any:
     """wm_msgs/EnvSpec of a spec."""
     tiles = Tiles.of(spec.num_envs, spec.height, spec.width)
     layout = message_type("wm_msgs/msg/TileLayout")(
-        rows=tiles.rows, cols=tiles.cols, tile_height=spec.height, tile_width=spec.width, preview=False
+        rows=tiles.rows, cols=tiles.cols, tile_height=spec.height, tile_width=spec.width
     )
     return message_type("wm_msgs/msg/EnvSpec")(
         header=header(time_ns, BASE_FRAME),

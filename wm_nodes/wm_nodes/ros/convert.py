@@ -211,7 +211,10 @@ def transition_of(message: TransitionBatch, spec: EnvironmentSpec) -> Transition
     """Raises WireError(BAD_SHAPE) where an array does not fit the spec."""
     count = spec.num_envs
     if message.num_envs != count:
-        raise WireError(ErrorCode.BAD_SHAPE, f"transition of {message.num_envs} environments, env/spec says {count}")
+        raise WireError(
+            ErrorCode.BAD_SHAPE,
+            f"transition of {message.num_envs} environments, env/spec says {count}; send a row for each",
+        )
     return Transition(
         stamp_ns=time_ns(message.header.stamp),
         next_stamp_ns=time_ns(message.next_stamp),

@@ -113,7 +113,12 @@ def declare(node: Node, params: Sequence[Param]) -> None:
 def _refuse_unknown(node: Node) -> None:
     """rclpy ignores overrides of undeclared parameters silently; a misspelt name must not start a run."""
     for name in node._parameter_overrides:
-        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
+        if name.startswith("qos_overrides.") and not node.has_parameter(name):
+            raise ParameterError(
+                f"{node.get_name()}: parameter {name!r} would change nothing: QoS is one table for graph and bags; "
+                "change the topic's row in wm_nodes/recording/topics.py"
+            )
+        if not node.has_parameter(name):
             known = sorted(declared for declared in node._parameters if "." not in declared)
             close = difflib.get_close_matches(name, known, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"

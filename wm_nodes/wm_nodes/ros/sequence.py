@@ -28,7 +28,8 @@ class Stamper:
 class GapTracker:
     """Counts the sequence numbers that one consumer of one topic missed.
 
-    The first message of a session sets the starting point: what was sent before a consumer joined is not a gap.
+    The first session sets the starting point: what was sent before a consumer joined is not a gap. A session that began
+    after it is expected from 0. Publishers may take turns: each session goes on where it was.
     """
 
     session: int | None = None
@@ -40,14 +41,16 @@ class GapTracker:
     sessions: int = 0
     gaps: list[tuple[int, int, int]] = field(default_factory=list)
     """(session, first missing seq, number of missing seqs), newest last; at most 1000 kept."""
+    _last_seqs: dict[int, int] = field(default_factory=dict, repr=False)
 
     def observe(self, session: int, seq: int) -> int:
-        """Note one message; return how many were missed directly before it (0: none, or a new session)."""
+        """Note one message; return how many of its session were missed directly before it."""
         self.received += 1
-        if session != self.session:
-            self.session, self.last_seq = session, seq
+        if session not in self._last_seqs:
+            joined_late = not self._last_seqs or session < min(self._last_seqs)
+            self._last_seqs[session] = seq - 1 if joined_late else -1
             self.sessions += 1
-            return 0
+        self.session, self.last_seq = session, self._last_seqs[session]
         if seq <= self.last_seq:
             self.repeated += 1
             return 0
@@ -56,5 +59,5 @@ class GapTracker:
             self.lost += missing
             self.gaps.append((session, self.last_seq + 1, missing))
             del self.gaps[:-1000]
-        self.last_seq = seq
+        self.last_seq = self._last_seqs[session] = seq
         return missing

@@ -1,0 +1,177 @@
+"""The contract of wm_nodes.types.Environment, kept by the simulator, the imagined environment and the benchmark's."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_folders import make_model_folder
+
+from wm_nodes.benchmark.still import StillEnvironment
+from wm_nodes.config.load import load_config
+from wm_nodes.seeding import numpy_stream
+from wm_nodes.specs import simulation_spec
+from wm_nodes.types import Environment, FloatArray, Observation, StepResult
+from wm_nodes.world_model import ImaginedEnvironment, WorldModels, load_model_folder
+
+N, LIMIT = 2, 3
+BASE = load_config("smoke")
+CONFIG = BASE.model_copy(update={"simulation": BASE.simulation.model_copy(update={"max_episode_steps": LIMIT})})
+SPEC = simulation_spec(CONFIG.task, "push", CONFIG.simulation, N)
+SEEDS = np.array([11, 12], np.uint64)
+Make = Callable[[int], Environment]
+
+
+def make_simulator(seed: int) -> Environment:
+    from wm_nodes.simulation.environment import ManiSkillEnvironment
+
+    return ManiSkillEnvironment(CONFIG.task, CONFIG.simulation, num_envs=N, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> WorldModels:
+    return load_model_folder(make_model_folder(tmp_path_factory.mktemp("model") / "model", CONFIG))
+
+
+@pytest.fixture(params=["maniskill", "imagined", "still"])
+def make(request: pytest.FixtureRequest, models: WorldModels) -> Iterator[Make]:
+    """Builds the environment under test from a root seed; what it built is closed."""
+    built: list[Environment] = []
+
+    def build(seed: int) -> Environment:
+        if request.param == "maniskill":
+            environment = make_simulator(seed)
+        elif request.param == "imagined":
+            rng = numpy_stream(0, "contract")
+            images = rng.integers(0, 256, (5, SPEC.height, SPEC.width, 3), np.uint8)
+            states = rng.uniform(0.5, 0.7, (5, 3)).astype(np.float32)
+            reward = CONFIG.reward.model_copy(update={"success_threshold": 1.0, "uncertainty_limit": 0.0})
+            environment = ImaginedEnvironment(models, SPEC, (images, states), reward, num_envs=N, seed=seed)
+        else:
+            environment = StillEnvironment(SPEC)
+        built.append(environment)
+        return environment
+
+    yield build
+    for environment in built:
+        environment.close()
+
+
+def ends(environment: Environment) -> bool:
+    """Whether episodes end; the benchmark's never do."""
+    return not isinstance(environment, StillEnvironment)
+
+
+def actions(step: int) -> FloatArray:
+    return numpy_stream(step, "actions").uniform(-0.3, 0.3, (N, SPEC.action_dim)).astype(np.float32)
+
+
+def assert_observation(observation: Observation, environment: Environment) -> None:
+    spec = environment.spec
+    found = {name: (value.dtype, value.shape) for name, value in vars(observation).items()}
+    assert found == {
+        "image": (np.uint8, (N, spec.height, spec.width, 3)), "state": (np.float32, (N, spec.state_dim)),
+        "episode_id": (np.uint64, (N,)), "episode_step": (np.uint32, (N,)),
+    }  # fmt: skip
+    assert np.isfinite(observation.state).all()
+
+
+def assert_equal(first: Observation, second: Observation, rows: slice = slice(None)) -> None:
+    np.testing.assert_array_equal(first.image[rows], second.image[rows])
+    np.testing.assert_array_equal(first.state[rows], second.state[rows])
+    np.testing.assert_array_equal(first.episode_step[rows], second.episode_step[rows])
+
+
+def run_to_the_limit(environment: Environment) -> list[StepResult]:
+    return [environment.step(actions(step)) for step in range(LIMIT)]
+
+
+def test_shapes_and_types_are_those_of_the_spec(make: Make) -> None:
+    environment = make(0)
+    assert environment.spec.num_envs == N
+    assert_observation(environment.reset(), environment)
+    result = environment.step(actions(0))
+    assert_observation(result.observation, environment)
+    for flag in (result.terminated, result.truncated, result.valid):
+        assert (flag.dtype, flag.shape) == (np.bool_, (N,))
+    for number in (result.success_probability, result.uncertainty):
+        assert (number.dtype, number.shape) == (np.float32, (N,))
+    assert (result.success_probability >= 0).all() and (result.success_probability <= 1).all()
+    assert (result.uncertainty >= 0).all()
+    assert result.ground_truth.dtype == np.float32
+    assert result.ground_truth.shape == (N, environment.spec.ground_truth_dim)
+    goals = environment.goals()
+    if goals is not None:
+        assert (goals[0].dtype, goals[0].shape) == (np.uint8, (N, SPEC.height, SPEC.width, 3))
+        assert (goals[1].dtype, goals[1].shape) == (np.bool_, (N,))
+
+
+def test_episode_ids_are_never_used_again_and_grow(make: Make) -> None:
+    environment = make(0)
+    first = environment.reset().episode_id
+    second = environment.reset().episode_id
+    third = environment.reset(mask=np.array([False, True])).episode_id
+    assert first.min() > 0 and first.max() < second.min() and len({*first, *second, third[1]}) == 2 * N + 1
+    assert third[0] == second[0] and third[1] > second.max()
+    np.testing.assert_array_equal(environment.step(actions(0)).observation.episode_id, third)
+
+
+def test_the_step_counter_is_0_after_a_reset_and_counts_the_steps_made(make: Make) -> None:
+    environment = make(0)
+    assert not environment.reset().episode_step.any()
+    assert [int(r.observation.episode_step[0]) for r in run_to_the_limit(environment)] == [1, 2, 3]
+
+
+def test_a_reset_by_mask_leaves_the_others_where_they_are(make: Make) -> None:
+    environment = make(0)
+    environment.reset(seeds=SEEDS)
+    before = environment.step(actions(0)).observation
+    after = environment.reset(mask=np.array([False, True]), seeds=SEEDS)
+    assert_equal(before, after, slice(0, 1))
+    assert after.episode_step.tolist() == [1, 0]
+    assert_equal(environment.reset(seeds=SEEDS), after, slice(1, 2))
+
+
+def test_an_ended_environment_stays_put_and_is_not_valid_until_its_reset(make: Make) -> None:
+    environment = make(0)
+    if not ends(environment):
+        pytest.skip("its episodes never end")
+    environment.reset(seeds=SEEDS)
+    results = run_to_the_limit(environment)
+    assert all(result.valid.all() and not result.truncated.any() for result in results[:-1])
+    assert (results[-1].terminated ^ results[-1].truncated).all()
+    late = environment.step(actions(9))
+    assert not (late.valid | late.terminated | late.truncated).any()
+    assert_equal(late.observation, results[-1].observation)
+    environment.reset(mask=np.array([True, False]))
+    assert environment.step(actions(0)).valid.tolist() == [True, False]
+
+
+def test_one_root_seed_gives_one_run_and_an_observation_is_not_written_later(make: Make) -> None:
+    first, second = make(5), make(5)
+    shown = first.reset()
+    assert_equal(shown, second.reset())
+    kept = replace(shown, **{name: value.copy() for name, value in vars(shown).items()})
+    for step in range(2):
+        mine, other = first.step(actions(step)), second.step(actions(step))
+        assert_equal(mine.observation, other.observation)
+        np.testing.assert_array_equal(mine.success_probability, other.success_probability)
+    assert_equal(shown, kept)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [
+        (np.zeros((N + 1, 3), np.float32), r"shape \(2, 3\).*\(3, 3\)"),
+        (np.zeros((N, 2), np.float32), r"shape \(2, 3\).*\(2, 2\)"),
+        (np.full((N, 3), np.nan, np.float32), "finite.*nan"),
+        (np.full((N, 3), 1.5, np.float32), r"\[-1, 1\].*1\.5"),
+    ],
+)
+def test_a_wrong_action_is_refused_by_value_and_changes_nothing(make: Make, wrong: FloatArray, text: str) -> None:
+    environment, untouched = make(0), make(0)
+    environment.reset(seeds=SEEDS)
+    untouched.reset(seeds=SEEDS)
+    with pytest.raises(ValueError, match=text):
+        environment.step(wrong)
+    assert_equal(environment.step(actions(0)).observation, untouched.step(actions(0)).observation)

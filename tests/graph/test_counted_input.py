@@ -1,0 +1,125 @@
+"""Bad input is refused, counted in diagnostics with one text that names value and remedy, and does not end training."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from graph.harness import Graph, Probe, wait_until
+from graph.test_environment import Client
+from graph.test_training import train
+
+from wm_msgs.action import Train
+from wm_msgs.msg import ErrorCode, RewardBatch, TransitionBatch
+from wm_msgs.srv import EvaluateReward, InferAction, LoadPolicy
+from wm_nodes.nodes.policy_holder import weights_uri
+from wm_nodes.ros import convert
+from wm_nodes.specs import EnvironmentSpec
+
+pytestmark = pytest.mark.graph
+
+LEARNER, EVALUATOR, POLICY = "/wm/learner", "/wm/reward_evaluator", "/wm/policy"
+
+
+def mosaic(spec: EnvironmentSpec, **changes: Any) -> Any:
+    """A black env/image of stamp 0, with some of its fields changed."""
+    message = convert.mosaic_msg(np.zeros((spec.num_envs, spec.height, spec.width, 3), np.uint8), 0, spec)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def wait_for_count(probe: Probe, node: str, counter: str, texts: tuple[str, ...], send: Callable[[], Any]) -> None:
+    """Send until the counter of a node is there, with the texts in its status message."""
+
+    def counted() -> bool:
+        send()
+        status = probe.diagnostics.get(node)
+        return int(probe.value(node, counter) or 0) > 0 and all(text in status.message for text in texts)  # type: ignore[union-attr]
+
+    wait_until(f"{counter} of {node} with {texts}", counted)
+
+
+@pytest.mark.parametrize(
+    ("name", "make", "nodes", "counter", "texts"),
+    [
+        ("env/image", lambda spec, session: mosaic(spec, encoding="bgr8"), (LEARNER, EVALUATOR), "refused_images",
+         ("encoding is 'bgr8', not 'rgb8'", "send 4 tiles of 16 x 16 px")),
+        ("env/image", lambda spec, session: mosaic(replace(spec, height=8)), (LEARNER, EVALUATOR), "refused_images",
+         ("height is 16, not 32", "send 4 tiles of 16 x 16 px")),
+        ("env/image", lambda spec, session: mosaic(spec, step=1), (LEARNER, EVALUATOR), "refused_images",
+         ("step is 1, not 96", "send 4 tiles of 16 x 16 px")),
+        ("env/transition", lambda spec, session: TransitionBatch(session=session, num_envs=3), (LEARNER, EVALUATOR),
+         "refused_transitions", ("transition of 3 environments", "env/spec says 4; send a row for each")),
+        ("reward", lambda spec, session: RewardBatch(transition_session=session, num_envs=4), (LEARNER,),
+         "refused_rewards", ("total has 0 values, expected (4,)", "compare with env/spec")),
+    ],
+    ids=["encoding", "size", "step", "transition", "reward"],
+)  # fmt: skip
+def test_a_bad_message_is_counted_by_every_reader_and_training_goes_on(
+    graph: Graph, probe: Probe, name: str, make: Callable[[EnvironmentSpec, int], Any], nodes: tuple[str, ...],
+    counter: str, texts: tuple[str, ...],
+) -> None:  # fmt: skip
+    graph.start_training_nodes()
+    client = Client(probe)
+    publisher, message = probe.publisher(name), make(client.spec, client.session)
+    wait_until("matching", lambda: publisher.get_subscription_count() >= len(nodes), 30)
+    updates: list[Any] = []
+    running = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
+    for node in nodes:
+        wait_for_count(probe, node, counter, texts, lambda: publisher.publish(message))
+    count = len(updates)
+    wait_until("another update", lambda: len(updates) > count, 30)
+    probe.run(running.cancel_goal_async, 5, "cancel")
+    assert probe.finish(running).termination_reason == Train.Result.CANCELED
+    assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
+
+
+def infer(client: Client, bad: bool) -> tuple[Any, str, Any]:
+    observation = mosaic(client.spec, **({"step": 1} if bad else {}))
+    request = InferAction.Request(observation=observation, tile=convert.tile_msg(client.spec), deterministic=True)
+    request.state = convert.to_field(np.zeros((4, 3), np.float32))
+    return InferAction, "policy/infer", request
+
+
+def load(client: Client, bad: bool) -> tuple[Any, str, Any]:
+    return LoadPolicy, "policy/load", LoadPolicy.Request(uri="nowhere.safetensors" if bad else weights_uri(1))
+
+
+def evaluate(client: Client, bad: bool) -> tuple[Any, str, Any]:
+    image = mosaic(client.spec)
+    transitions = client.probe.messages["env/transition"]
+    step = wait_until("a step", lambda: [step for step in transitions if step.header.stamp != step.next_stamp])[0]
+    goal = mosaic(client.spec, encoding="mono8") if bad else mosaic(client.spec)
+    request = EvaluateReward.Request(observation=image, next_observation=image, goal=goal, transition=step)
+    return EvaluateReward, "reward/evaluate", request
+
+
+@pytest.mark.parametrize(
+    ("call", "node", "counter", "code", "texts"),
+    [
+        (infer, POLICY, "refused_infer", ErrorCode.BAD_SHAPE,
+         ("step is 1, not 96", "send 4 tiles of 16 x 16 px")),
+        (load, POLICY, "refused_loads", ErrorCode.IO_ERROR, ("cannot read weights", "nowhere.safetensors")),
+        (evaluate, EVALUATOR, "refused_evaluations", ErrorCode.BAD_SHAPE,
+         ("encoding is 'mono8', not 'rgb8'", "send 4 tiles of 16 x 16 px")),
+    ],
+)  # fmt: skip
+def test_a_bad_request_is_answered_and_counted_a_good_one_served_and_training_goes_on(
+    graph: Graph, probe: Probe, call: Callable[[Client, bool], tuple[Any, str, Any]], node: str, counter: str,
+    code: int, texts: tuple[str, ...],
+) -> None:  # fmt: skip
+    probe.listen("env/transition")
+    graph.start_training_nodes()
+    assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
+    client = Client(probe)
+    served = probe.call(*call(client, False))
+    assert (served.error_code, served.message) == (ErrorCode.OK, "")
+    assert probe.value(node, counter) is None
+    refused = probe.call(*call(client, True))
+    assert refused.error_code == code
+    assert all(text in refused.message for text in texts), refused.message
+    wait_for_count(probe, node, counter, texts, lambda: None)
+    assert probe.value(node, counter) == "1"
+    assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
