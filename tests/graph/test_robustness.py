@@ -4,6 +4,7 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -115,10 +116,17 @@ def test_transitions_without_images_are_declared_invalid_although_the_simulated_
     graph.start_environment()
     client = Client(probe)
     wait_until("the evaluator", lambda: probe.value("/wm/reward_evaluator", "state") == "active")
-    wait_until("matching", lambda: probe.node.count_subscribers("/wm/env/transition") >= 1)
-    start = client.reset()
-    client.step(client.command(start.step_id + 1))
-    wait_until("a reward", lambda: rewards)
+    last = client.reset().step_id
+
+    def rewarded() -> bool:
+        """Steps until the environment has matched the evaluator; the pause is longer than image_wait_s."""
+        nonlocal last
+        last += 1
+        client.step(client.command(last))
+        time.sleep(0.5)
+        return bool(rewards)
+
+    wait_until("a reward", rewarded)
     wait_until("a summary", lambda: summaries)
 
 

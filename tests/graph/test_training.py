@@ -11,7 +11,7 @@ import pytest
 from graph import toy
 from graph.harness import Graph, Probe, own_domain, wait_until
 
-from wm_msgs.action import Train
+from wm_msgs.action import Replay, Train
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import GetWeights, InferAction, SaveCheckpoint, StopRecording
 from wm_nodes.ros import convert
@@ -146,9 +146,15 @@ def test_a_replay_that_starts_with_the_learner_trains_and_a_short_one_says_so(gr
         try:
             short.start("player", play_at_start=False)
             short.start_learner(replay_rate=1e6)
+            waiting = other.send(other.action(Train, "train"), Train.Goal(updates=1, from_replay=True))
+            played = Replay.Goal(bag_uri=str(bag), rate=1e6)
+            assert other.finish(other.send(other.action(Replay, "replay"), played)).termination_reason == 0
+            result = other.finish(waiting)
+            assert (result.termination_reason, result.updates) == (Train.Result.FINISHED, 1)
             result = train(other, updates=3, from_replay=True, bag_uris=[str(bag)])
             assert (result.termination_reason, result.updates) == (Train.Result.EXHAUSTED, 2)
-            assert "2 rollouts" in result.message
+            assert "1 rollouts" in result.message
+            assert weights_in(short.folder) == live
             missing = train(other, updates=1, from_replay=True, bag_uris=["no_such_bag"])
             assert missing.termination_reason == Train.Result.FAILED
             assert "no_such_bag" in missing.message

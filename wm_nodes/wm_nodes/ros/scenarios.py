@@ -8,6 +8,7 @@ import dataclasses
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from wm_nodes.ros.graph import Graph, GraphError, NodeSpec, ParameterValue
 
@@ -104,24 +105,19 @@ def build_graph(scenario: str, arguments: Mapping[str, str]) -> Graph:
     return dataclasses.replace(graph, environment=environment)
 
 
-def _number(arguments: Mapping[str, str], name: str, low: float, high: float) -> float:
+def _number(arguments: Mapping[str, str], name: str, low: float, high: float, kind: type = float) -> Any:
     try:
-        value = float(arguments[name])
+        value = kind(arguments[name])
     except ValueError:
-        raise GraphError(f"{name} must be a number, got {arguments[name]!r}") from None
+        what = "a whole number" if kind is int else "a number"
+        raise GraphError(f"{name} must be {what}, got {arguments[name]!r}") from None
     if not low <= value <= high:
-        raise GraphError(f"{name} must lie in {low:g}..{high:g}, got {arguments[name]}")
+        raise GraphError(f"{name} must be {low} to {high}, got {arguments[name]}")
     return value
 
 
 def _integer(arguments: Mapping[str, str], name: str, low: int, high: int = 2**31) -> int:
-    try:
-        value = int(arguments[name])
-    except ValueError:
-        raise GraphError(f"{name} must be a whole number, got {arguments[name]!r}") from None
-    if not low <= value <= high:
-        raise GraphError(f"{name} must be {low} to {high}, got {value}")
-    return value
+    return int(_number(arguments, name, low, high, int))
 
 
 def _node(
