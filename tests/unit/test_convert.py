@@ -127,7 +127,8 @@ def test_transitions_steps_and_resets_survive_the_wire() -> None:
     assert calls.reset_command(calls.reset_request(ResetCommand()), spec()) == ResetCommand()
 
 
-def test_a_reply_survives_the_wire() -> None:
+@pytest.mark.parametrize("shown_stamp_ns", [None, 2, 3])
+def test_a_reply_survives_the_wire_and_takes_a_shown_mosaic_of_its_own_stamp_only(shown_stamp_ns: int | None) -> None:
     from wm_msgs.srv import StepBatch
 
     t = transition()
@@ -136,7 +137,13 @@ def test_a_reply_survives_the_wire() -> None:
         truncated=t.truncated, episode_ids=t.episode_ids, success_probability=t.values, uncertainty=t.values,
         step_s=0.5,
     )  # fmt: skip
-    found = calls.step_reply(calls.fill_step_response(StepBatch.Response(), reply, spec()), spec(), 1)
+    shown = None
+    if shown_stamp_ns is not None:
+        images = reply.images if shown_stamp_ns == reply.stamp_ns else np.zeros_like(reply.images)
+        shown = convert.mosaic_msg(images, shown_stamp_ns, spec())
+    response = calls.fill_step_response(StepBatch.Response(), reply, spec(), shown)
+    assert (response.observation is shown) == (shown_stamp_ns == reply.stamp_ns)
+    found = calls.step_reply(response, spec(), 1)
     for name, value in vars(reply).items():
         np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
 

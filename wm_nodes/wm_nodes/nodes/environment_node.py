@@ -82,6 +82,7 @@ class EnvironmentNode(ManagedNode):
         self.served = LockstepEnvironment(environment, self.session, self, seed=int(self.param("seed")))
         self.served.before_step = self._require_credit
         self._spec = environment.spec
+        self._shown: Image | None = None
         row = topic("env/image")
         self._images = self.create_publisher(Image, row.name, row.qos)
         self.own(self.destroy_publisher, self._images)
@@ -141,6 +142,7 @@ class EnvironmentNode(ManagedNode):
         if self._clock_publisher is not None:
             self._clock_publisher.publish(Clock(clock=message.header.stamp))
         self._images.publish(message)
+        self._shown = message
         self._views.show(images, message)
 
     def goals(self, goals: Goals) -> None:
@@ -166,7 +168,7 @@ class EnvironmentNode(ManagedNode):
         except WireError as error:
             return self._refusal(response, error, "step")
         self.diagnostics.latency("step", reply.step_s)
-        return calls.fill_step_response(response, reply, self._spec)
+        return calls.fill_step_response(response, reply, self._spec, self._shown)
 
     def _on_reset(self, request: ResetBatch.Request, response: ResetBatch.Response) -> ResetBatch.Response:
         try:
@@ -175,7 +177,7 @@ class EnvironmentNode(ManagedNode):
             reply = served.reset(command) if self._asynchronous is None else self._asynchronous.reset(command)
         except WireError as error:
             return self._refusal(response, error, "reset")
-        return calls.fill_reset_response(response, reply, self._spec)
+        return calls.fill_reset_response(response, reply, self._spec, self._shown)
 
     def _on_get_spec(self, request: GetEnvSpec.Request, response: GetEnvSpec.Response) -> GetEnvSpec.Response:
         if not self.active:

@@ -33,9 +33,10 @@ class Tiles:
         num_images, height, width, channels = images.shape
         if (height, width) != (self.tile_height, self.tile_width) or num_images > self.rows * self.cols:
             raise ValueError(f"cannot lay {images.shape} images into {self}")
-        full = np.zeros((self.rows * self.cols, height, width, channels), np.uint8)
-        full[:num_images] = images
-        grid = full.reshape(self.rows, self.cols, height, width, channels)
+        missing = self.rows * self.cols - num_images
+        if missing:
+            images = np.concatenate([images, np.zeros((missing, *images.shape[1:]), np.uint8)])
+        grid = images.reshape(self.rows, self.cols, height, width, channels)
         return np.ascontiguousarray(grid.transpose(0, 2, 1, 3, 4)).reshape(*self.mosaic_shape, channels)
 
     def untile(self, mosaic: UInt8Array, num_images: int) -> UInt8Array:

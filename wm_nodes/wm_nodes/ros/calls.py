@@ -4,6 +4,7 @@ environments, A action, S state, H W 3 image."""
 from typing import Any
 
 import numpy as np
+from sensor_msgs.msg import Image
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import ResetBatch, StepBatch
@@ -68,27 +69,34 @@ def reset_command(request: ResetBatch.Request, spec: EnvironmentSpec) -> ResetCo
     )
 
 
-def fill_step_response(response: StepBatch.Response, reply: Reply, spec: EnvironmentSpec) -> StepBatch.Response:
+def fill_step_response(
+    response: StepBatch.Response, reply: Reply, spec: EnvironmentSpec, shown: Image | None = None
+) -> StepBatch.Response:
+    """shown: the newest published mosaic; sent again where it is the reply's."""
     response.step_id = reply.step_id
     response.step_ms = reply.step_s * 1e3
     response.terminated, response.truncated = to_field(reply.terminated), to_field(reply.truncated)
     response.success_probability = to_field(reply.success_probability)
     response.model_uncertainty = to_field(reply.uncertainty)
-    return _fill_common(response, reply, spec)
+    return _fill_common(response, reply, spec, shown)
 
 
-def fill_reset_response(response: ResetBatch.Response, reply: Reply, spec: EnvironmentSpec) -> ResetBatch.Response:
+def fill_reset_response(
+    response: ResetBatch.Response, reply: Reply, spec: EnvironmentSpec, shown: Image | None = None
+) -> ResetBatch.Response:
+    """shown: as in fill_step_response."""
     response.session, response.next_step_id = reply.session, reply.step_id + 1
-    return _fill_common(response, reply, spec)
+    return _fill_common(response, reply, spec, shown)
 
 
-def _fill_common(response: Any, reply: Reply, spec: EnvironmentSpec) -> Any:
+def _fill_common(response: Any, reply: Reply, spec: EnvironmentSpec, shown: Image | None) -> Any:
     response.error_code = ErrorCode.OK
     response.stamp = time_msg(reply.stamp_ns)
     response.state = to_field(reply.states)
     response.episode_id = to_field(reply.episode_ids)
     if reply.images is not None:
-        response.observation = mosaic_msg(reply.images, reply.stamp_ns, spec)
+        known = shown is not None and time_ns(shown.header.stamp) == reply.stamp_ns
+        response.observation = shown if known else mosaic_msg(reply.images, reply.stamp_ns, spec)
     return response
 
 
