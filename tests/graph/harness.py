@@ -27,6 +27,8 @@ TOY_FOLDER = Path(__file__).parent
 START_S = 60.0
 MATCH_S = 0.5
 """A server that has not matched a new client's reader yet loses its answer (rmw_fastrtps 556)."""
+RESEND_S = 8.0
+"""A request without an answer is sent once more after this time, for the same reason."""
 
 
 @contextlib.contextmanager
@@ -89,7 +91,16 @@ class Probe:
             time.sleep(MATCH_S)
         client = self._clients[name]
         wait_until(f"service {name}", client.service_is_ready, START_S)
-        return self.result(client.call_async(request), timeout_s, name)
+        if timeout_s <= RESEND_S:
+            return self.result(client.call_async(request), timeout_s, name)
+        sent = [client.call_async(request)]
+        answered = threading.Event()
+        sent[0].add_done_callback(lambda _: answered.set())
+        if not answered.wait(RESEND_S):
+            sent.append(client.call_async(request))
+            sent[1].add_done_callback(lambda _: answered.set())
+            assert answered.wait(timeout_s - RESEND_S), f"{name}: no answer within {timeout_s:g} s"
+        return next(future for future in sent if future.done()).result()
 
     def action(self, kind: type[Any], name: str) -> ActionClient:
         if name not in self._clients:

@@ -143,10 +143,15 @@ def test_a_full_disk_stops_recording_with_one_error_nothing_flushed_is_lost_and_
     process = graph.start("recorder", bag_uri="bags/full")
     wait_until("recording", lambda: "recording to" in graph.log("/wm/recorder"))
     partial = graph.folder / "bags" / "full.partial"
-    size = _size(partial)
-    start = client.reset()
-    client.step(client.command(start.step_id + 1))
-    wait_until("both transitions on the disk", lambda: _size(partial) > size and _count(partial, "env/transition") == 2)
+
+    def recorded() -> bool:
+        """Steps until the environment has matched the recorder, which flushes four times a second."""
+        start = client.reset()
+        client.step(client.command(start.step_id + 1))
+        time.sleep(0.5)
+        return _count(partial, "env/transition") >= 2
+
+    wait_until("transitions on the disk", recorded)
     full_disk(process, max(_size(partial), 10_000))
 
     def failed() -> bool:

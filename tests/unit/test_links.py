@@ -53,7 +53,7 @@ def test_data_may_flow_only_when_both_ends_of_every_shared_topic_are_known(world
     assert len(book.missing()) == 2
     world.discover()
     world.talk()
-    assert book.missing() == []
+    assert book.missing(["/wm/recorder"]) == []
 
 
 def test_an_awaited_node_must_be_heard_and_active(world: World) -> None:
@@ -69,16 +69,20 @@ def test_an_awaited_node_must_be_heard_and_active(world: World) -> None:
     assert book.missing(["/wm/recorder"]) == []
 
 
-def test_a_node_that_left_is_not_waited_for_and_a_restarted_one_is_matched_anew(world: World) -> None:
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_node_that_left_is_not_waited_for_a_lost_one_is_and_a_restarted_one_is_matched_anew(
+    world: World, lost: bool
+) -> None:
     book = world.books["/wm/environment"]
     world.discover()
     world.talk()
-    book.forget("/wm/recorder")
-    assert book.missing(["/wm/recorder"]) == []
+    book.forget("/wm/recorder", lost=lost)
+    assert book.missing(["/wm/recorder"]) == (["/wm/recorder is lost"] if lost else [])
+    assert book.missing() == []
     world.readers["image"] = set()
     world.books["/wm/recorder"] = LinkBook("/wm/recorder", session=999)
     world.talk()
     assert "/wm/environment has not matched /wm/recorder" in book.missing()
     world.discover()
     world.talk()
-    assert book.missing() == []
+    assert book.missing(["/wm/recorder"]) == []

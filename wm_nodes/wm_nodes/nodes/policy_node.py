@@ -213,10 +213,11 @@ class PolicyNode(ManagedNode):
             work.sleep(0.01)
 
     def _await_links(self, work: Work) -> None:
-        """Wait until no node of the graph can miss the rollout's first messages (see ros.links)."""
+        """Wait until no node of the graph can miss the rollout's first messages (see ros.links); once for each lack."""
         namespace = self.get_namespace().rstrip("/")
         awaited = [f"{namespace}/{name}" for name in self.param("await_nodes") if name]
         deadline = time.monotonic() + float(self.param("match_timeout_s"))
+        self._given_up &= set(self.links.book.missing(awaited))
         while lacking := set(self.links.book.missing(awaited)) - self._given_up:
             if time.monotonic() >= deadline:
                 text = f"data flow although {'; '.join(sorted(lacking))}: first messages may be missed"

@@ -296,7 +296,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             text = f"{name} is lost: silent for more than {self.peers.timeout_s:g} s; restart it"
             self.get_logger().error(text)
             self.diagnostics.set_condition(f"peer {name}", diagnostics.ERROR, text)
-            self.links.book.forget(name)
+            self.links.book.forget(name, lost=True)
             self.on_peer_lost(name)
 
     def _after_set(self, changes: Sequence[Parameter]) -> None:

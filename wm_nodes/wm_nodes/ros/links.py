@@ -44,6 +44,7 @@ class LinkBook:
         self._lock = threading.Lock()
         self._peers: dict[str, _Peer] = {}
         self._ever: set[str] = set()
+        self._lost: set[str] = set()
         self._own = _Peer(session, False, frozenset(), frozenset(), frozenset())
 
     def note(self, message: NodeLinks) -> None:
@@ -53,14 +54,17 @@ class LinkBook:
         linked = frozenset(zip(message.linked, message.linked_sessions, strict=True))
         with self._lock:
             self._ever.add(message.node)
+            self._lost.discard(message.node)
             self._peers[message.node] = _Peer(
                 message.session, message.active, frozenset(message.publishes), frozenset(message.subscribes), linked
             )
 
-    def forget(self, name: str) -> None:
-        """A node stopped or is lost: not waited for until it speaks again."""
+    def forget(self, name: str, *, lost: bool = False) -> None:
+        """A node stopped, and is not waited for until it speaks again; or it is lost, and may come back."""
         with self._lock:
             self._peers.pop(name, None)
+            if lost:
+                self._lost.add(name)
 
     def refresh(
         self, publishes: Collection[str], subscribes: Collection[str], active: bool, readers: Ends, writers: Ends
@@ -104,12 +108,13 @@ class LinkBook:
         """Return what still lacks until all active nodes know each other; empty: data may flow.
 
         Args:
-            awaited: fully qualified names of nodes that must be there; one that was there and left is not waited for.
+            awaited: fully qualified names of nodes that must be there; one that was there and stopped need not.
         """
         with self._lock:
             nodes = {self._own_name: self._own, **self._peers}
-            ever = set(self._ever)
+            ever, lost = set(self._ever), set(self._lost)
         lacking = [f"{name} has not been heard" for name in awaited if name not in nodes and name not in ever]
+        lacking += [f"{name} is lost" for name in awaited if name in lost]
         lacking += [f"{name} is not active" for name in awaited if name in nodes and not nodes[name].active]
         group = {name: node for name, node in nodes.items() if node.active}
         for name, node in group.items():
