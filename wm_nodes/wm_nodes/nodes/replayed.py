@@ -79,7 +79,7 @@ class ReplayJoiner:
         with self._changed:
             self._clear()
             self._num_steps = 0
-        self._withhold(False)
+            self._withhold(False)
 
     def enter_session(self, session: int) -> None:
         """The recorded environment was restarted: its stamps and step ids start again."""
@@ -116,9 +116,9 @@ class ReplayJoiner:
             self._current.joiner.put_transition(transition)
             self._current.steps.add(transition.step_id)
             self._current.envs = len(transition.valid)
+            if len(self._done) >= MAX_WAITING:
+                self._withhold(True)
             self._changed.notify_all()
-        if len(self._done) >= MAX_WAITING:
-            self._withhold(True)
 
     def put_rewards(self, rewards: Rewards) -> None:
         with self._changed:
@@ -153,8 +153,8 @@ class ReplayJoiner:
                 return None
             self._done.popleft()
             lost, self._overrun = self._overrun, 0
-        if len(self._done) < MAX_WAITING:
-            self._withhold(False)
+            if len(self._done) < MAX_WAITING:
+                self._withhold(False)
         if not whole:
             return group.version, None, Dropped(gap=lost + len(group.steps) * group.envs)
         _, first, last = group.span
