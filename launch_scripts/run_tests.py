@@ -16,11 +16,14 @@ import wm_setup
 ROOT = Path(__file__).resolve().parents[1]
 
 
+WITHOUT_GRAPH = ("tests/unit", "tests/contracts")
+"""These run two at a time; tests of the graph measure deadlines and share the cores between their own processes."""
+
+
 def main(argv):
-    """Run the checks, then pytest, whose closing line comes last. Return 0 if all passed."""
-    arguments = [text for text in argv if text != "--fast"]
-    if "--fast" in argv:
-        arguments = ["-m", "not slow", *arguments]
+    """Run the checks, then pytest, whose closing lines come last. Return 0 if all passed."""
+    marked = ["-m", "not slow"] if "--fast" in argv else []
+    named = [text for text in argv if text != "--fast"]
     scripts = Path(sys.prefix) / "bin"
     checks = {
         "ruff": [str(scripts / "ruff"), "check", "."],
@@ -30,9 +33,15 @@ def main(argv):
     failed = [name for name, command in checks.items() if not _passes(name, command)]
     if failed:
         print(f"failed before the tests: {', '.join(failed)}", flush=True)
-    command = [sys.executable, "-m", "pytest", *arguments]
-    code = subprocess.run(command, cwd=ROOT, check=False, env=_environment()).returncode
-    return code or int(bool(failed))
+    runs = [named] if named else [["-n", "2", "--dist", "loadfile", *WITHOUT_GRAPH], ["tests/parity", "tests/graph"]]
+    codes = [_pytest([*marked, *arguments]) for arguments in runs]
+    return max(codes) or int(bool(failed))
+
+
+def _pytest(arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "pytest", *arguments], cwd=ROOT, check=False, env=_environment()
+    ).returncode
 
 
 def _passes(name, command):
