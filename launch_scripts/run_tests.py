@@ -16,8 +16,9 @@ import wm_setup
 ROOT = Path(__file__).resolve().parents[1]
 
 
-WITHOUT_GRAPH = ("tests/unit", "tests/contracts")
-"""These run two at a time; tests of the graph measure deadlines and share the cores between their own processes."""
+MAIN_JOB = "tests/graph/test_main_job.py"
+TWO_AT_A_TIME = (MAIN_JOB, "tests/unit", "tests/contracts")
+"""The other tests of the graph measure deadlines, and share the cores between their own processes."""
 
 
 def main(argv):
@@ -33,7 +34,8 @@ def main(argv):
     failed = [name for name, command in checks.items() if not _passes(name, command)]
     if failed:
         print(f"failed before the tests: {', '.join(failed)}", flush=True)
-    runs = [named] if named else [["-n", "2", "--dist", "loadfile", *WITHOUT_GRAPH], ["tests/parity", "tests/graph"]]
+    two_at_a_time = ["-n", "2", "--dist", "loadfile", *TWO_AT_A_TIME]
+    runs = [named] if named else [two_at_a_time, ["tests/parity", "tests/graph", f"--ignore={MAIN_JOB}"]]
     codes = [_pytest([*marked, *arguments]) for arguments in runs]
     return max(codes) or int(bool(failed))
 

@@ -31,46 +31,44 @@ def mosaic(spec: EnvironmentSpec, **changes: Any) -> Any:
 
 
 def wait_for_count(probe: Probe, node: str, counter: str, texts: tuple[str, ...], send: Callable[[], Any]) -> None:
-    """Send until the counter of a node is there, with the texts in its status message."""
+    """Send until the counter of a node has grown, with the texts in its status message."""
+    before = int(probe.value(node, counter) or 0)
 
     def counted() -> bool:
         send()
         status = probe.diagnostics.get(node)
-        return int(probe.value(node, counter) or 0) > 0 and all(text in status.message for text in texts)  # type: ignore[union-attr]
+        return int(probe.value(node, counter) or 0) > before and all(text in status.message for text in texts)  # type: ignore[union-attr]
 
     wait_until(f"{counter} of {node} with {texts}", counted)
 
 
-@pytest.mark.parametrize(
-    ("name", "make", "nodes", "counter", "texts"),
-    [
-        ("env/image", lambda spec, session: mosaic(spec, encoding="bgr8"), (LEARNER, EVALUATOR), "refused_images",
-         ("encoding is 'bgr8', not 'rgb8'", "send 4 tiles of 16 x 16 px")),
-        ("env/image", lambda spec, session: mosaic(replace(spec, height=8)), (LEARNER, EVALUATOR), "refused_images",
-         ("height is 16, not 32", "send 4 tiles of 16 x 16 px")),
-        ("env/image", lambda spec, session: mosaic(spec, step=1), (LEARNER, EVALUATOR), "refused_images",
-         ("step is 1, not 96", "send 4 tiles of 16 x 16 px")),
-        ("env/transition", lambda spec, session: TransitionBatch(session=session, num_envs=3), (LEARNER, EVALUATOR),
-         "refused_transitions", ("transition of 3 environments", "env/spec says 4; send a row for each")),
-        ("reward", lambda spec, session: RewardBatch(transition_session=session, num_envs=4), (LEARNER,),
-         "refused_rewards", ("total has 0 values, expected (4,)", "compare with env/spec")),
-    ],
-    ids=["encoding", "size", "step", "transition", "reward"],
-)  # fmt: skip
-def test_a_bad_message_is_counted_by_every_reader_and_training_goes_on(
-    graph: Graph, probe: Probe, name: str, make: Callable[[EnvironmentSpec, int], Any], nodes: tuple[str, ...],
-    counter: str, texts: tuple[str, ...],
-) -> None:  # fmt: skip
+BAD_MESSAGES: list[tuple[str, Callable[[EnvironmentSpec, int], Any], tuple[str, ...], str, tuple[str, ...]]] = [
+    ("env/image", lambda spec, session: mosaic(spec, encoding="bgr8"), (LEARNER, EVALUATOR), "refused_images",
+     ("encoding is 'bgr8', not 'rgb8'", "send 4 tiles of 16 x 16 px")),
+    ("env/image", lambda spec, session: mosaic(replace(spec, height=8)), (LEARNER, EVALUATOR), "refused_images",
+     ("height is 16, not 32", "send 4 tiles of 16 x 16 px")),
+    ("env/image", lambda spec, session: mosaic(spec, step=1), (LEARNER, EVALUATOR), "refused_images",
+     ("step is 1, not 96", "send 4 tiles of 16 x 16 px")),
+    ("env/transition", lambda spec, session: TransitionBatch(session=session, num_envs=3), (LEARNER, EVALUATOR),
+     "refused_transitions", ("transition of 3 environments", "env/spec says 4; send a row for each")),
+    ("reward", lambda spec, session: RewardBatch(transition_session=session, num_envs=4), (LEARNER,),
+     "refused_rewards", ("total has 0 values, expected (4,)", "compare with env/spec")),
+]  # fmt: skip
+"""Topic, message, who reads it, their counter, and what their status says."""
+
+
+def test_a_bad_message_is_counted_by_every_reader_and_training_goes_on(graph: Graph, probe: Probe) -> None:
     graph.start_training_nodes()
     client = Client(probe)
-    publisher, message = probe.publisher(name), make(client.spec, client.session)
-    wait_until("matching", lambda: publisher.get_subscription_count() >= len(nodes), 30)
     updates: list[Any] = []
     running = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
-    for node in nodes:
-        wait_for_count(probe, node, counter, texts, lambda: publisher.publish(message))
-    count = len(updates)
-    wait_until("another update", lambda: len(updates) > count, 30)
+    for name, make, nodes, counter, texts in BAD_MESSAGES:
+        publisher, message = probe.publisher(name), make(client.spec, client.session)
+        wait_until("matching", lambda: publisher.get_subscription_count() >= len(nodes), 30)  # noqa: B023
+        for node in nodes:
+            wait_for_count(probe, node, counter, texts, lambda: publisher.publish(message))  # noqa: B023
+        count = len(updates)
+        wait_until("another update", lambda: len(updates) > count, 30)  # noqa: B023
     probe.run(running.cancel_goal_async, 5, "cancel")
     assert probe.finish(running).termination_reason == Train.Result.CANCELED
     assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
@@ -96,30 +94,29 @@ def evaluate(client: Client, bad: bool) -> tuple[Any, str, Any]:
     return EvaluateReward, "reward/evaluate", request
 
 
-@pytest.mark.parametrize(
-    ("call", "node", "counter", "code", "texts"),
-    [
-        (infer, POLICY, "refused_infer", ErrorCode.BAD_SHAPE,
-         ("step is 1, not 96", "send 4 tiles of 16 x 16 px")),
-        (load, POLICY, "refused_loads", ErrorCode.IO_ERROR, ("cannot read weights", "nowhere.safetensors")),
-        (evaluate, EVALUATOR, "refused_evaluations", ErrorCode.BAD_SHAPE,
-         ("encoding is 'mono8', not 'rgb8'", "send 4 tiles of 16 x 16 px")),
-    ],
-)  # fmt: skip
+BAD_REQUESTS: list[tuple[Callable[[Client, bool], tuple[Any, str, Any]], str, str, int, tuple[str, ...]]] = [
+    (infer, POLICY, "refused_infer", ErrorCode.BAD_SHAPE, ("step is 1, not 96", "send 4 tiles of 16 x 16 px")),
+    (load, POLICY, "refused_loads", ErrorCode.IO_ERROR, ("cannot read weights", "nowhere.safetensors")),
+    (evaluate, EVALUATOR, "refused_evaluations", ErrorCode.BAD_SHAPE,
+     ("encoding is 'mono8', not 'rgb8'", "send 4 tiles of 16 x 16 px")),
+]  # fmt: skip
+
+
 def test_a_bad_request_is_answered_and_counted_a_good_one_served_and_training_goes_on(
-    graph: Graph, probe: Probe, call: Callable[[Client, bool], tuple[Any, str, Any]], node: str, counter: str,
-    code: int, texts: tuple[str, ...],
-) -> None:  # fmt: skip
+    graph: Graph, probe: Probe
+) -> None:
     probe.listen("env/transition")
     graph.start_training_nodes()
     assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
     client = Client(probe)
-    served = probe.call(*call(client, False))
-    assert (served.error_code, served.message) == (ErrorCode.OK, "")
-    assert probe.value(node, counter) is None
-    refused = probe.call(*call(client, True))
-    assert refused.error_code == code
-    assert all(text in refused.message for text in texts), refused.message
-    wait_for_count(probe, node, counter, texts, lambda: None)
-    assert probe.value(node, counter) == "1"
-    assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
+    for call, node, counter, code, texts in BAD_REQUESTS:
+        served = probe.call(*call(client, False))
+        assert (served.error_code, served.message) == (ErrorCode.OK, "")
+        assert probe.value(node, counter) is None
+        refused = probe.call(*call(client, True))
+        assert refused.error_code == code
+        assert all(text in refused.message for text in texts), refused.message
+        wait_until("the count", lambda: probe.value(node, counter) == "1")  # noqa: B023
+        status = probe.diagnostics[node]
+        assert all(text in status.message for text in texts), status.message
+        assert train(probe, updates=1).termination_reason == Train.Result.FINISHED

@@ -4,30 +4,26 @@ import sys
 import time
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.signals import SignalHandlerOptions
+
+from wm_nodes.ros.spin import stop_on_signals
 
 
 def main() -> int:
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("tiny")
     die_after_s = node.declare_parameter("die_after_s", 0.0).value
     text = node.declare_parameter("text", "").value
     stubborn = node.declare_parameter("stubborn", False).value
-    print(f"tiny says {text!r} on domain {node.context.get_domain_id()}", flush=True)
     end = time.monotonic() + die_after_s if die_after_s else float("inf")
-    while True:
-        try:
-            while rclpy.ok() and time.monotonic() < end:
-                rclpy.spin_once(node, timeout_sec=0.1)
-        except (KeyboardInterrupt, ExternalShutdownException):
-            pass
-        if not stubborn:
-            break
-        time.sleep(0.05)
+    with stop_on_signals() as stopped:
+        print(f"tiny says {text!r} on domain {node.context.get_domain_id()}", flush=True)
+        while time.monotonic() < end and (stubborn or not stopped()):
+            rclpy.spin_once(node, timeout_sec=0.1)
+    rclpy.try_shutdown()
     if time.monotonic() >= end:
         print("tiny gives up", flush=True)
         return 7
-    rclpy.try_shutdown()
     return 0
 
 

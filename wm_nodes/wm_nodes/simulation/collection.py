@@ -71,9 +71,14 @@ def collect(
     missing = [shard for shard in shards if not shard[0].exists()]
     done = plan.num_episodes - sum(stop - start for _, start, stop in missing)
     with tqdm(total=plan.num_episodes, initial=done, unit="episode", desc="collect", disable=not progress) as bar:
-        if missing:
-            workers = min(num_workers, len(missing))
-            with ProcessPoolExecutor(workers, mp_context=mp.get_context("spawn")) as pool:
+        workers = min(num_workers, len(missing))
+        if workers == 1:  # a process of its own would only cost the seconds of its start
+            for shard in missing:
+                bar.update(_collect_shard(*shard, plan, write_shard))
+        elif missing:
+            with ProcessPoolExecutor(
+                workers, mp_context=mp.get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
+            ) as pool:
                 futures = {pool.submit(_collect_shard, *shard, plan, write_shard): shard for shard in missing}
                 for future in as_completed(futures):
                     bar.update(future.result())
@@ -88,7 +93,6 @@ def behaviour_of(seed: int, shares: dict[str, float]) -> str:
 
 
 def _collect_shard(path: Path, start: int, stop: int, plan: CollectionPlan, write_shard: WriteShard) -> int:
-    torch.set_num_threads(1)
     env = _worker_environment(plan.task, plan.simulation.model_dump_json(), plan.end_on_success)
     act_episode = _policy_episodes(env, plan) if plan.make_policy else _behaviour_episodes(env, plan)
     write_shard(path, plan, [act_episode(plan.first_seed + i, i) for i in range(start, stop)])
