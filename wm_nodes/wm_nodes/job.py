@@ -10,6 +10,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -94,16 +95,16 @@ class Trained:
         return folder / "policies" / f"policy_{self.version:06d}.safetensors"
 
 
-def train_round(job: Job, start: Start, judge: Callable[[BoolArray], None] | None = None) -> Trained:
-    """Train start.policy in start.model_dir and measure it in the simulator ; finished parts are kept.
+@dataclass(frozen=True)
+class WaitingGraph:
+    """A training's processes, started and not yet configured: they come up while what they will load is still made."""
 
-    Args:
-        judge: called with the starting policy's real success before any update; may raise to refuse the training.
-    """
-    marker = start.folder / TRAINED
-    if marker.is_file():
-        job.stage(f"{start.label or 'training'} is done already ({marker})")
-        return Trained(**json.loads(marker.read_text()))
+    runner: Runner
+    bag: Path
+
+
+def start_graph(job: Job, start: Start) -> WaitingGraph:
+    """Start the processes of one training; the caller stops the runner."""
     start.folder.mkdir(parents=True, exist_ok=True)
     (start.folder / "config.yaml").write_text(dump_config(start.config))
     name = "_".join(["training", *start.label.split(), time.strftime("%H%M%S")])
@@ -112,11 +113,34 @@ def train_round(job: Job, start: Start, judge: Callable[[BoolArray], None] | Non
         "config_file": str(start.folder / "config.yaml"), "run_dir": str(start.folder),
         "model_dir": str(start.model_dir), "starts_file": str(job.starts), "initial_policy": str(start.policy),
         "seed": str(start.config.seed), "bag_uri": str(bag), "domain_id": job.domain_id,
-        "compose": "true" if job.compose else "false",
+        "compose": "true" if job.compose else "false", "autostart": "false",
     })  # fmt: skip
     job.stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
-    with Runner(graph, log_dir=start.folder / "logs", log=sys.stdout if job.verbose else None) as runner:
-        runner.wait_ready(READY_S)
+    runner = Runner(graph, log_dir=start.folder / "logs", log=sys.stdout if job.verbose else None)
+    runner.start()
+    return WaitingGraph(runner, bag)
+
+
+def is_trained(start: Start) -> bool:
+    return (start.folder / TRAINED).is_file()
+
+
+def train_round(
+    job: Job, start: Start, judge: Callable[[BoolArray], None] | None = None, waiting: WaitingGraph | None = None
+) -> Trained:
+    """Train start.policy in start.model_dir and measure it in the simulator; finished parts are kept.
+
+    Args:
+        judge: called with the starting policy's real success before any update; may raise to refuse the training.
+        waiting: this training's processes, where they run already; stopped at the end.
+    """
+    marker = start.folder / TRAINED
+    if is_trained(start):
+        job.stage(f"{start.label or 'training'} is done already ({marker})")
+        return Trained(**json.loads(marker.read_text()))
+    waiting = waiting or start_graph(job, start)
+    with closing(waiting.runner) as runner:
+        runner.activate(READY_S)
         os.environ.update(runner.environment)
         with Operator(alive=runner.check) as operator:
             if judge is not None:
@@ -129,7 +153,7 @@ def train_round(job: Job, start: Start, judge: Callable[[BoolArray], None] | Non
             after, seconds = _progress(start.folder), time.monotonic() - began
             samples = int(after["samples"]) - int(before["samples"])
             trained = Trained(
-                int(after["version"]), int(after["updates"]), int(after["samples"]), samples / seconds, str(bag)
+                int(after["version"]), int(after["updates"]), int(after["samples"]), samples / seconds, str(waiting.bag)
             )
             _real(operator, job, start, "after", trained.policy(start.folder))
     write_atomic(marker, json.dumps(asdict(trained), indent=1).encode())

@@ -9,6 +9,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -19,12 +20,12 @@ import torch
 from wm_nodes.config.load import ConfigError, dump_config, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.job import Job, Stages, console, rate
+from wm_nodes.job import Job, Stages, console, is_trained, rate, start_graph
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, collect_plan, gate_plan
 from wm_nodes.learning.gate import judge_model
 from wm_nodes.learning.pictures import write_pictures
 from wm_nodes.learning.policies import load_policy
-from wm_nodes.learning.preparation import prepare_start
+from wm_nodes.learning.preparation import prepare_start, start_files
 from wm_nodes.learning.pretraining import load_arrays, make_model
 from wm_nodes.learning.statistics import paired_difference
 from wm_nodes.reports import Summary, machine_facts, results_table, rounds_table, write_report, write_summary
@@ -33,7 +34,7 @@ from wm_nodes.ros.graph import GraphError
 from wm_nodes.ros.operator import GoalFailed, PeerLost
 from wm_nodes.ros.readiness import NotReadyError
 from wm_nodes.ros.runner import NodeDiedError
-from wm_nodes.rounds import run_rounds
+from wm_nodes.rounds import round_start, run_rounds
 from wm_nodes.types import BoolArray
 from wm_nodes.world_model import load_model_folder
 
@@ -71,10 +72,17 @@ def run(arguments: argparse.Namespace) -> Summary:
     config, run_dir = _open_run(arguments)
     stage(f"run folder {run_dir}")
     model_dir = _model(arguments, config, run_dir, stage)
-    stage(f"{config.sft.num_demonstrations} MPLib demonstrations, first frames, and the weak policy cloned from them")
-    starts, weak = prepare_start(config, run_dir, model_dir)
+    starts, weak = start_files(run_dir)
     job = Job(config, run_dir, starts, stage, arguments.domain_id, arguments.compose, arguments.verbose)
-    found = run_rounds(job, model_dir, weak, partial(_judge, job, model_dir, arguments.force))
+    with ExitStack() as stack:
+        first, waiting = round_start(job, 1, model_dir, weak), None
+        if not is_trained(first):
+            waiting = start_graph(job, first)
+            stack.callback(waiting.runner.stop)
+        demos = config.sft.num_demonstrations
+        stage(f"{demos} MPLib demonstrations, first frames, and the weak policy cloned from them")
+        prepare_start(config, run_dir, model_dir)
+        found = run_rounds(job, model_dir, weak, partial(_judge, job, model_dir, arguments.force), waiting)
     summary = Summary(
         task=config.task, preset=arguments.preset, seed=config.seed,
         real_before=rate(found.real_before), real_after=rate(found.real_after),

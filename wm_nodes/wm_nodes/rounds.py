@@ -17,7 +17,17 @@ from typing import Any
 from rich.table import Table
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.job import Job, Start, Trained, console, imagined_success, rate, read_success, train_round
+from wm_nodes.job import (
+    Job,
+    Start,
+    Trained,
+    WaitingGraph,
+    console,
+    imagined_success,
+    rate,
+    read_success,
+    train_round,
+)
 from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.metrics import join_metrics
 from wm_nodes.learning.model_rounds import (
@@ -74,20 +84,34 @@ def split_updates(updates: int, rounds: int) -> list[int]:
     return [share + (number < remainder) for number in range(rounds)]
 
 
-def run_rounds(job: Job, model_dir: Path, policy: Path, judge: Judge) -> Rounds:
-    """Train `policy` for config.rounds.num_rounds rounds, beginning in the world model `model_dir`; judge it first."""
+def round_start(job: Job, number: int, model_dir: Path, policy: Path) -> Start:
+    """What round `number`, counted from 1, begins with."""
+    shares = split_updates(job.config.ppo.updates, job.config.rounds.num_rounds)
+    start = Start(_folder(job, number), model_dir, policy, job.config)
+    if len(shares) == 1:
+        return start
+    return replace(start, config=round_config(job.config, number, shares[number - 1]), label=f"round {number}")
+
+
+def run_rounds(
+    job: Job, model_dir: Path, policy: Path, judge: Judge, waiting: WaitingGraph | None = None
+) -> Rounds:
+    """Train `policy` for config.rounds.num_rounds rounds, beginning in the world model `model_dir`; judge it first.
+
+    waiting: the processes of round 1, where they run already.
+    """
     config = job.config
     shares = split_updates(config.ppo.updates, config.rounds.num_rounds)
     if len(shares) > 1:
         check_refreshable(model_dir)
     starts, trainings, table = list[Start](), list[Trained](), list[dict[str, Any]]()
     for number, updates in enumerate(shares, 1):
-        start = Start(_folder(job, number), model_dir, policy, config)
+        start = round_start(job, number, model_dir, policy)
         if len(shares) > 1:
-            start = replace(start, config=round_config(config, number, updates), label=f"round {number}")
             job.stage(f"round {number} of {len(shares)}: {updates} updates in {model_dir}")
         imagined = imagined_success(job, start.folder, "before", model_dir, policy)
-        trained = train_round(job, start, partial(judge, imagined) if number == 1 else None)
+        is_first = number == 1
+        trained = train_round(job, start, partial(judge, imagined) if is_first else None, waiting if is_first else None)
         policy = trained.policy(start.folder)
         imagined_success(job, start.folder, "after", model_dir, policy)
         starts.append(start)

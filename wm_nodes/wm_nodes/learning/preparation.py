@@ -52,6 +52,11 @@ def train_weak_policy(config: RunConfig, model_dir: Path, demo_bags: Iterable[Pa
     return policy
 
 
+def start_files(run_dir: Path) -> tuple[Path, Path]:
+    """Where prepare_start puts a run's first frames and its weak policy."""
+    return run_dir / "starts.safetensors", run_dir / "policies" / "weak.safetensors"
+
+
 def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Path, Path]:
     """Demonstrations, first frames and the weak policy of a run: (starts.safetensors, policies/weak.safetensors).
 
@@ -62,11 +67,10 @@ def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Pa
         config, config.sft.num_demonstrations + spare, DEMONSTRATION_SEEDS + SEEDS_PER_RUN * config.seed
     )
     demos = collect_plan(plan, config, run_dir / "bags" / "demos")
-    starts = run_dir / "starts.safetensors"
+    starts, weak = start_files(run_dir)
     if not starts.exists():
         first_frames = first_frames_plan(config, NUM_STARTS, START_SEEDS)
         write_starts(collect_plan(first_frames, config, run_dir / "bags" / "starts"), starts)
-    weak = run_dir / "policies" / "weak.safetensors"
     if not weak.exists():
         train_weak_policy(config, model_dir, demos, weak)
     return starts, weak

@@ -172,6 +172,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     def start(self) -> bool:
         """Configure and activate when `autostart` is set; return False (and set failed) when that fails."""
         if not self.param("autostart"):
+            self.get_logger().info("unconfigured; a lifecycle manager configures and activates this node")
             return True
         done = TransitionCallbackReturn.SUCCESS
         if self.trigger_configure() != done or self.trigger_activate() != done:

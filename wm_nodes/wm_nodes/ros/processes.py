@@ -93,8 +93,12 @@ class NodeProcess:
         self.close()
         code = self.wait(0.0)
         how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+        return f"required node {self.spec.label} {how}: {self.last_words()}"
+
+    def last_words(self) -> str:
+        """The last line written, and where the rest is."""
         last = next((line.strip() for line in reversed(self._lines) if line.strip()), "no output")
-        return f"required node {self.spec.label} {how}: {last}" + (f" (log: {self._file})" if self._file else "")
+        return last + (f" (log: {self._file})" if self._file else "")
 
     def _read(self, process: "subprocess.Popen[str]") -> None:
         if process.stdout is None:

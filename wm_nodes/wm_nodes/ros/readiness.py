@@ -16,6 +16,14 @@ class NotReadyError(TimeoutError):
     """Nodes are missing or inactive after the deadline; the text names them and their states."""
 
 
+class TransitionRefused(NotReadyError):
+    """A node could not configure or activate; its log says why. node: full name."""
+
+    def __init__(self, node: str, transition: str) -> None:
+        super().__init__(f"{node} refused to {transition}")
+        self.node = node
+
+
 def wait_ready(
     nodes: Sequence[NodeSpec], *, domain: int, timeout_s: float, check: Callable[[], None] = lambda: None
 ) -> None:
@@ -44,6 +52,43 @@ def wait_ready(
                 found = ", ".join(f"{name} ({states[name]})" for name in waiting)
                 raise NotReadyError(f"not ready after {timeout_s:g} s: {found}; their logs say why")
             spin_once(POLL_S)
+
+
+def activate(
+    nodes: Sequence[NodeSpec], *, domain: int, timeout_s: float, check: Callable[[], None] = lambda: None
+) -> None:
+    """Be the lifecycle manager of nodes that were started with autostart false: configure all, then activate all.
+
+    Raises:
+        TransitionRefused: a node could not configure or activate.
+        NotReadyError: a node did not answer within timeout_s.
+        Whatever `check` raises.
+    """
+    from lifecycle_msgs.msg import Transition
+    from lifecycle_msgs.srv import ChangeState
+
+    managed = [node.full_name for process in nodes for node in process.carried() if node.lifecycle]
+    deadline = time.monotonic() + timeout_s
+    with _observer(domain) as (observer, spin_once):
+        clients = {name: observer.create_client(ChangeState, f"{name}/change_state") for name in managed}
+        for transition, number in (
+            ("configure", Transition.TRANSITION_CONFIGURE),
+            ("activate", Transition.TRANSITION_ACTIVATE),
+        ):
+            request = ChangeState.Request(transition=Transition(id=number))
+            asked: dict[str, Any] = {}
+            while len(asked) < len(managed) or not all(future.done() for future in asked.values()):
+                check()
+                for name, client in clients.items():
+                    if name not in asked and client.service_is_ready():
+                        asked[name] = client.call_async(request)
+                silent = [name for name in managed if name not in asked or not asked[name].done()]
+                if silent and time.monotonic() > deadline:
+                    raise NotReadyError(f"no answer to {transition} within {timeout_s:g} s: {', '.join(silent)}")
+                spin_once(POLL_S)
+            for name, future in asked.items():
+                if not future.result().success:
+                    raise TransitionRefused(name, transition)
 
 
 def _wanted(node: NodeSpec) -> tuple[str, ...]:

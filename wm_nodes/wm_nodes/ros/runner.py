@@ -21,10 +21,12 @@ from wm_nodes.ros.domain import DomainInUseError, DomainLock
 from wm_nodes.ros.environment import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES, graph_environment, interpreter
 from wm_nodes.ros.graph import Graph, GraphError
 from wm_nodes.ros.processes import NodeProcess
-from wm_nodes.ros.readiness import NotReadyError, wait_ready
+from wm_nodes.ros.readiness import NotReadyError, TransitionRefused, activate, wait_ready
 from wm_nodes.ros.scenarios import describe_arguments
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+LAST_WORDS_S = 0.2
+"""Until what a node wrote before its answer has come through its pipe."""
 GRACE_S = 5.0
 """Time for an orderly end after SIGINT, and again after SIGTERM."""
 
@@ -98,6 +100,23 @@ class Runner:
             NotReadyError: after timeout_s; names the nodes and their states.
         """
         wait_ready(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
+
+    def activate(self, timeout_s: float = 60.0) -> None:
+        """Configure and activate the nodes of a graph that was started with autostart false.
+
+        Raises:
+            NodeDiedError: a required node ended meanwhile.
+            NotReadyError: a node refused (with its last words), or did not answer within timeout_s.
+        """
+        try:
+            activate(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
+        except TransitionRefused as refusal:
+            time.sleep(LAST_WORDS_S)
+            process = next(
+                process for process in self._processes.values()
+                if refusal.node in [node.full_name for node in process.spec.carried()]
+            )  # fmt: skip
+            raise NotReadyError(f"{refusal}: {process.last_words()}") from None
 
     def check(self) -> None:
         """Raise NodeDiedError if a required node has ended without having been told to."""
@@ -174,6 +193,8 @@ class Runner:
             clean_shared_memory(self.environment)
         if self._lock is not None:
             self._lock.release()
+
+    close = stop
 
     def __enter__(self) -> "Runner":
         self.start()
