@@ -1,0 +1,139 @@
+"""What the tests of the video model share: small latents and models, a sampled buffer, a learner rank to spawn."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from wm_nodes.learning.distributed import Ranks
+from wm_nodes.learning.video_grpo import GrpoLearner, GrpoSettings
+from wm_nodes.video_model import (
+    Condition,
+    NetworkSettings,
+    RolloutBuffer,
+    RolloutSettings,
+    SamplerSettings,
+    VideoNetwork,
+    config_hash,
+    initial_noise,
+    sample_videos,
+)
+
+ACTION_DIM = 2
+SHAPE = (3, 4, 5, 7)
+"""C, F, H, W of a toy video; odd where it may be odd."""
+
+
+def randn(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def times(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def toy_condition(
+    count: int, shape: tuple[int, int, int, int] = SHAPE, given: int = 1, *, seed: int = 0, text_dim: int = 0
+) -> Condition:
+    C, frames, H, W = shape
+    return Condition(
+        randn(count, C, given, H, W, seed=seed + 1),
+        randn(count, max(0, frames - 1), ACTION_DIM, seed=seed + 2),
+        randn(count, 3, text_dim, seed=seed + 3),
+    )
+
+
+class Analytic(nn.Module):
+    """A velocity model from a formula (x, t of rank 5) -> v. It has one parameter, which is added to the velocity."""
+
+    def __init__(self, velocity: Callable[[Tensor, Tensor], Tensor]) -> None:
+        super().__init__()
+        self.velocity = velocity
+        self.offset = nn.Parameter(torch.zeros(()))
+
+    def forward(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None = None) -> Tensor:
+        rows = t.to(device=x.device, dtype=x.dtype).view(-1, 1, 1, 1, 1)
+        return self.velocity(x, rows) + self.offset
+
+
+def swirl(x: Tensor, t: Tensor) -> Tensor:
+    """Some smooth velocity that mixes frames and cells, so that every element matters to its neighbours."""
+    return torch.sin(x + x.roll(1, 3)) - 0.5 * x.roll(1, 2) + t * x
+
+
+def towards(clean: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
+    """The exact velocity where all data is `clean`."""
+    return lambda x, t: (x - clean) / t
+
+
+def tiny_network(channels: int = SHAPE[0], *, text_dim: int = 0, seed: int = 0) -> VideoNetwork:
+    """A network whose every layer speaks: the zeros it starts with are replaced, and no norm has a single channel."""
+    torch.manual_seed(seed)
+    network = VideoNetwork(NetworkSettings(channels, ACTION_DIM, text_dim, width=16, depth=1))
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=generator))
+    return network
+
+
+def toy_rollout_settings(**changes: Any) -> RolloutSettings:
+    """Six steps of shift 3; names that SamplerSettings has go there."""
+    sampler = {name: changes.pop(name) for name in tuple(changes) if name in SamplerSettings.__dataclass_fields__}
+    return RolloutSettings(**{"num_steps": 6, "shift": 3.0, "sampler": SamplerSettings(**sampler), **changes})
+
+
+def toy_buffer(
+    model: nn.Module,
+    settings: RolloutSettings,
+    *,
+    groups: int = 2,
+    size: int = 4,
+    shape: tuple[int, int, int, int] = SHAPE,
+    given: int = 1,
+    version: int = 0,
+    iteration: int = 0,
+    text_dim: int = 0,
+) -> RolloutBuffer:
+    """Groups of videos sampled by `model`; the reward is the mean of the first channel."""
+    condition = toy_condition(groups, shape, given, seed=100 * iteration, text_dim=text_dim).repeat_interleave(size)
+    seeds = torch.arange(groups * size) + 1000 * iteration
+    rollout = sample_videos(model, condition, initial_noise(shape, seeds), seeds, settings)
+    buffer = RolloutBuffer(
+        rollout=rollout,
+        condition=condition,
+        group_ids=torch.arange(groups).repeat_interleave(size),
+        sample_ids=torch.arange(size).repeat(groups),
+        rewards={},
+        valid=torch.zeros(groups * size, dtype=torch.bool),
+        policy_version=version,
+        iteration=iteration,
+        config_hash=config_hash(settings),
+    )
+    return buffer.with_rewards({"brightness": rollout.latents[:, 0].mean((1, 2, 3))})
+
+
+def train_rounds(learner: GrpoLearner, rounds: range) -> None:
+    """Sample with the learner's weights and train, once per iteration."""
+    for iteration in rounds:
+        learner.train(toy_buffer(learner.model, learner.rollout, version=learner.version, iteration=iteration))
+
+
+def weights(model: nn.Module) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in model.state_dict().items()}
+
+
+def video_learner_rank(rank: int, size: int, folder: str, settings: GrpoSettings) -> None:
+    """One process of a learner; every rank samples the same buffer and saves its weights and its report."""
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=size)
+    learner = GrpoLearner(tiny_network(), settings, toy_rollout_settings(), seed=5, ranks=Ranks(rank, size))
+    buffer = toy_buffer(learner.model, learner.rollout)
+    report = learner.train(replace(buffer))
+    numbers = [[u.objective, u.kl, u.ratio_mean, u.clip_low_share, u.clip_high_share] for u in report.updates]
+    torch.save({"weights": weights(learner.model), "numbers": torch.tensor(numbers)}, Path(folder) / f"rank{rank}.pt")
+    dist.destroy_process_group()

@@ -1,0 +1,42 @@
+"""A flow-matching video model, its stochastic samplers, and what GRPO stores of them. Equations (3) to (12)."""
+
+from wm_nodes.video_model.buffer import RolloutBuffer, RolloutBufferError, concatenate_buffers, config_hash
+from wm_nodes.video_model.conditions import Condition, concatenate
+from wm_nodes.video_model.kernels import SamplerSettings, Step, StepContext, estimates, step
+from wm_nodes.video_model.mask import MaskSettings, dynamic_mask
+from wm_nodes.video_model.network import NetworkSettings, VelocityModel, VideoNetwork, guided_velocity
+from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout, initial_noise, sample_videos, step_noise
+from wm_nodes.video_model.schedule import flow_times
+from wm_nodes.video_model.step_window import WindowSettings, select_steps, stochastic_steps
+from wm_nodes.video_model.transitions import Transition, transition
+
+__all__ = [
+    "Condition",
+    "MaskSettings",
+    "NetworkSettings",
+    "RolloutBuffer",
+    "RolloutBufferError",
+    "RolloutSettings",
+    "SamplerSettings",
+    "Step",
+    "StepContext",
+    "Transition",
+    "VelocityModel",
+    "VideoNetwork",
+    "VideoRollout",
+    "WindowSettings",
+    "concatenate",
+    "concatenate_buffers",
+    "config_hash",
+    "dynamic_mask",
+    "estimates",
+    "flow_times",
+    "guided_velocity",
+    "initial_noise",
+    "sample_videos",
+    "select_steps",
+    "step",
+    "step_noise",
+    "stochastic_steps",
+    "transition",
+]

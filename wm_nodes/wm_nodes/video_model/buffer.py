@@ -1,0 +1,165 @@
+"""The rollout buffer of GRPO: sampled groups, their rewards, and everything a training step needs. Section 1.8.
+
+Shapes: N videos, S stochastic steps. The file is one safetensors; nothing in it is executed on load.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor
+
+from wm_nodes.video_model.conditions import Condition, concatenate
+from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout, concatenate_rollouts
+
+_METADATA_KEY = "rollout_buffer"
+_ROLLOUT_TENSORS = ("latents", "states", "mask", "sigma_base", "zeta", "seeds", "noise_share")
+
+
+class RolloutBufferError(ValueError):
+    """A buffer that is damaged, stale, or was made with other sampler settings."""
+
+
+def config_hash(settings: RolloutSettings) -> str:
+    """Return the sha256 of everything that decides the Gaussian of a transition; storage and batching do not."""
+    knobs = asdict(settings)
+    knobs.pop("micro_batch"), knobs.pop("noise_store")
+    return hashlib.sha256(json.dumps(knobs, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class RolloutBuffer:
+    """N videos in groups of one context each.
+
+    condition: of every video (rows repeat within a group). group_ids, sample_ids: int64 (N,). rewards: raw values by
+    name, float64 (N,), NaN where missing. valid: bool (N,), False where any reward is missing or was refused.
+    policy_version: optimizer steps of the weights that sampled. iteration: of the training run.
+    """
+
+    rollout: VideoRollout
+    condition: Condition
+    group_ids: Tensor
+    sample_ids: Tensor
+    rewards: Mapping[str, Tensor]
+    valid: Tensor
+    policy_version: int
+    iteration: int
+    config_hash: str
+
+    def __len__(self) -> int:
+        return len(self.group_ids)
+
+    @property
+    def num_bytes(self) -> int:
+        return sum(tensor.nbytes for tensor in self._tensors().values())
+
+    def with_rewards(self, rewards: Mapping[str, Tensor]) -> "RolloutBuffer":
+        """The same videos with rewards; a video is valid while all of its rewards are finite.
+
+        Raises:
+            RolloutBufferError: a reward is not one number per video.
+        """
+        values = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in rewards.items()}
+        for name, value in values.items():
+            if value.shape != (len(self),):
+                raise RolloutBufferError(f"reward {name} has shape {tuple(value.shape)}, the buffer {len(self)} videos")
+        valid = torch.ones(len(self), dtype=torch.bool)
+        for value in values.values():
+            valid &= torch.isfinite(value)
+        return replace(self, rewards=values, valid=valid)
+
+    def check(self, settings: RolloutSettings, policy_version: int, max_staleness: int) -> None:
+        """Raise RolloutBufferError if the buffer was sampled with other settings, or by weights that are too old."""
+        wanted = config_hash(settings)
+        if self.config_hash != wanted:
+            raise RolloutBufferError(
+                f"the buffer was sampled with sampler settings {self.config_hash[:12]}, the learner has {wanted[:12]}: "
+                f"its ratios would be wrong; sample again, or load the settings of that run"
+            )
+        staleness = policy_version - self.policy_version
+        if not 0 <= staleness <= max_staleness:
+            raise RolloutBufferError(
+                f"the buffer comes from version {self.policy_version}, the learner is at {policy_version}: staleness "
+                f"{staleness} is outside 0 to {max_staleness}; sample again, or raise train.max_staleness"
+            )
+
+    def to_bytes(self) -> bytes:
+        """One safetensors file; from_bytes gives an equal buffer."""
+        header = {
+            "steps": self.rollout.steps,
+            "state_steps": self.rollout.state_steps,
+            "policy_version": self.policy_version,
+            "iteration": self.iteration,
+            "config_hash": self.config_hash,
+        }
+        tensors, seen = self._tensors(), set[int]()
+        for name, tensor in tensors.items():  # safetensors refuses memory under two names, e.g. a total of one reward
+            if tensor.data_ptr() in seen:
+                tensors[name] = tensor.clone()
+            seen.add(tensor.data_ptr())
+        data: bytes = save(tensors, {_METADATA_KEY: json.dumps(header)})
+        return data
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> "RolloutBuffer":
+        """Raises RolloutBufferError where the bytes are no rollout buffer, or a truncated one."""
+        try:
+            tensors: dict[str, Any] = load(data)
+            header = json.loads(
+                json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"][_METADATA_KEY]
+            )
+            tensors.setdefault("rollout.zeta", None)  # absent where only seeds are kept
+            rollout = {name: tensors[f"rollout.{name}"] for name in _ROLLOUT_TENSORS}
+            rewards = sorted(name for name in tensors if name.startswith("reward."))
+            return cls(
+                rollout=VideoRollout(**rollout, steps=tuple(header["steps"]), state_steps=tuple(header["state_steps"])),
+                condition=Condition(
+                    tensors["condition.frames"], tensors["condition.actions"], tensors["condition.text"]
+                ),
+                group_ids=tensors["group_ids"],
+                sample_ids=tensors["sample_ids"],
+                rewards={name.removeprefix("reward."): tensors[name] for name in rewards},
+                valid=tensors["valid"],
+                policy_version=header["policy_version"],
+                iteration=header["iteration"],
+                config_hash=header["config_hash"],
+            )
+        except (SafetensorError, KeyError, TypeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise RolloutBufferError(
+                f"these {len(data)} bytes are no complete rollout buffer ({error}); sample again"
+            ) from error
+
+    def _tensors(self) -> dict[str, Tensor]:
+        tensors = {f"rollout.{name}": getattr(self.rollout, name) for name in _ROLLOUT_TENSORS}
+        tensors |= {f"condition.{name}": getattr(self.condition, name) for name in ("frames", "actions", "text")}
+        tensors |= {f"reward.{name}": value for name, value in self.rewards.items()}
+        tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids, "valid": self.valid}
+        return {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
+
+
+def concatenate_buffers(parts: list[RolloutBuffer]) -> RolloutBuffer:
+    """One buffer of the groups of all parts, which must agree on settings, version, iteration and steps."""
+    first = parts[0]
+    for part in parts[1:]:
+        if (part.config_hash, part.policy_version, part.iteration, part.rollout.steps) != (
+            first.config_hash, first.policy_version, first.iteration, first.rollout.steps
+        ):  # fmt: skip
+            raise RolloutBufferError(
+                f"buffers of versions {first.policy_version} and {part.policy_version}, iterations {first.iteration} "
+                f"and {part.iteration}, settings {first.config_hash[:12]} and {part.config_hash[:12]} do not belong "
+                f"together"
+            )
+    return replace(
+        first,
+        rollout=concatenate_rollouts([part.rollout for part in parts]),
+        condition=concatenate([part.condition for part in parts]),
+        group_ids=torch.cat([part.group_ids for part in parts]),
+        sample_ids=torch.cat([part.sample_ids for part in parts]),
+        rewards={name: torch.cat([part.rewards[name] for part in parts]) for name in first.rewards},
+        valid=torch.cat([part.valid for part in parts]),
+    )

@@ -1,0 +1,148 @@
+"""The velocity network of the embedded flow-matching video model.
+
+Shapes: B batch, C channels, F latent frames, H W latent grid.
+
+Fully convolutional in space and time (factorised 1x3x3 and 3x1x1), so that resolution and length are choices of the
+sampler. Each frame is told its own time (0 where it is given clean), the actions up to it, and the instruction.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from wm_nodes.video_model.conditions import Condition
+
+TIME_FEATURES = 32
+
+
+class VelocityModel(Protocol):
+    """(x_t, t, condition, drop) -> v = dx/dt of x_t = (1 - t) x_0 + t eps, shape of x_t.
+
+    t: float64 (B,). drop: bool (B,), rows that see neither actions nor instruction (the unconditional branch of
+    classifier-free guidance); None: no row. What is returned on conditioning frames is never used.
+    """
+
+    def __call__(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None = None) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Latent channels, action values, text embedding values (0: none); width; residual blocks; patch side."""
+
+    channels: int
+    action_dim: int
+    text_dim: int = 0
+    width: int = 64
+    depth: int = 5
+    patch: int = 2
+
+    def as_metadata(self) -> dict[str, int]:
+        return asdict(self)
+
+
+class VideoNetwork(nn.Module):
+    """Residual blocks of factorised convolutions with a per-frame scale and shift (FiLM) from the condition."""
+
+    def __init__(self, settings: NetworkSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        width, patch = settings.width, settings.patch
+        self.embed = nn.Conv3d(settings.channels + 3, width, (1, patch, patch), (1, patch, patch))
+        self.action = nn.Linear(2 * settings.action_dim + 1, width)
+        self.text = nn.Linear(max(1, settings.text_dim), width)
+        self.time = nn.Sequential(nn.Linear(TIME_FEATURES, width), nn.SiLU(), nn.Linear(width, width))
+        self.blocks = nn.ModuleList(Block(width) for _ in range(settings.depth))
+        self.norm = nn.GroupNorm(min(8, width), width)
+        self.head = nn.ConvTranspose3d(width, settings.channels, (1, patch, patch), (1, patch, patch))
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None = None) -> Tensor:
+        """See VelocityModel.
+
+        Raises:
+            ValueError: latents, actions or text of another size than the network was built for.
+        """
+        self._check(x, condition)
+        H, W = x.shape[3:]
+        pad_h, pad_w = -H % self.settings.patch, -W % self.settings.patch
+        inputs = F.pad(torch.cat([x, _places(x, condition.num_conditioning)], 1), (0, pad_w, 0, pad_h))
+        hidden = self.embed(inputs)
+        film_BFD = self._film(x, t, condition, drop)
+        for block in self.blocks:
+            hidden = block(hidden, film_BFD)
+        out: Tensor = self.head(F.silu(self.norm(hidden)))
+        return out[..., :H, :W].contiguous()
+
+    def _film(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None) -> Tensor:
+        B, frames, K = x.shape[0], x.shape[2], condition.num_conditioning
+        times_BF = t.to(device=x.device, dtype=x.dtype).view(B, 1).expand(B, frames).clone()
+        times_BF[:, :K] = 0
+        kept = x.new_ones(B, 1) if drop is None else (~drop).to(x.dtype).view(B, 1)
+        actions = F.pad(condition.actions.to(x.dtype), (0, 0, 1, 0))  # the first frame follows no action
+        steered = torch.cat([actions, actions.cumsum(1) / 4, torch.ones_like(actions[..., :1])], 2) * kept.unsqueeze(2)
+        film: Tensor = self.time(time_features(times_BF)) + self.action(steered)
+        if self.settings.text_dim:
+            text = condition.text.to(x.dtype).sum(1) / max(1, condition.text.shape[1])  # no token: zeros
+            film = film + (self.text(text) * kept).unsqueeze(1)
+        return film
+
+    def _check(self, x: Tensor, condition: Condition) -> None:
+        found = (x.shape[1], condition.actions.shape[2], condition.actions.shape[1] + 1)
+        wanted = (self.settings.channels, self.settings.action_dim, x.shape[2])
+        if found != wanted:
+            raise ValueError(
+                f"this video model takes {wanted[0]} latent channels and {wanted[1]} action values for every frame but "
+                f"the first ({wanted[2] - 1} actions for {wanted[2]} frames); got {found[0]} channels, {found[1]} "
+                f"values, {found[2] - 1} actions"
+            )
+        if self.settings.text_dim and condition.text.shape[1:][-1] != self.settings.text_dim:
+            raise ValueError(f"text must have {self.settings.text_dim} values, got {condition.text.shape[-1]}")
+
+
+class Block(nn.Module):
+    """norm, scale and shift, spatial convolution, temporal convolution, residual."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(min(8, width), width)
+        self.film = nn.Linear(width, 2 * width)
+        self.space = nn.Conv3d(width, width, (1, 3, 3), padding=(0, 1, 1))
+        self.time = nn.Conv3d(width, width, (3, 1, 1), padding=(1, 0, 0))
+        nn.init.zeros_(self.time.weight)
+        nn.init.zeros_(self.time.bias)  # type: ignore[arg-type]
+
+    def forward(self, hidden: Tensor, film_BFD: Tensor) -> Tensor:
+        scale, shift = self.film(F.silu(film_BFD)).transpose(1, 2)[..., None, None].chunk(2, 1)
+        inner = F.silu(self.norm(hidden) * (1 + scale) + shift)
+        out: Tensor = hidden + self.time(F.silu(self.space(inner)))
+        return out
+
+
+def time_features(times: Tensor) -> Tensor:
+    """Sines and cosines of times in [0, 1], (..., TIME_FEATURES)."""
+    frequencies = torch.exp(torch.linspace(0.0, 4.0, TIME_FEATURES // 2, dtype=times.dtype, device=times.device))
+    angles = times.unsqueeze(-1) * frequencies
+    return torch.cat([angles.sin(), angles.cos()], -1)
+
+
+def _places(x: Tensor, num_conditioning: int) -> Tensor:
+    """Channels that say where a cell is and whether its frame is given, (B, 3, F, H, W)."""
+    B, _, frames, H, W = x.shape
+    places = x.new_zeros(B, 3, frames, H, W)
+    places[:, 0] = torch.linspace(-1, 1, H, dtype=x.dtype, device=x.device).view(1, 1, H, 1)
+    places[:, 1] = torch.linspace(-1, 1, W, dtype=x.dtype, device=x.device).view(1, 1, 1, W)
+    places[:, 2, :num_conditioning] = 1
+    return places
+
+
+def guided_velocity(model: VelocityModel, x: Tensor, t: Tensor, condition: Condition, cfg: float) -> Tensor:
+    """Return v_u + g (v_c - v_u), g = cfg; 1 is off and costs one call instead of two."""
+    if cfg == 1:
+        return model(x, t, condition)
+    conditional = model(x, t, condition)
+    unconditional = model(x, t, condition, torch.ones(len(x), dtype=torch.bool, device=x.device))
+    return unconditional + cfg * (conditional - unconditional)

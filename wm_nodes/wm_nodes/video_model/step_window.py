@@ -1,0 +1,102 @@
+"""Which sampler steps are stochastic, and which of them train. Mix-GRPO's windows, Flow-GRPO-Fast, step fractions.
+
+Steps are numbered 0 to T - 1; the last one (s = 0) is never stochastic, so T - 1 steps can be.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from wm_nodes.seeding import numpy_stream, torch_stream
+
+DECAY_FROM = 13
+DECAY_RATE = 0.1
+
+
+@dataclass(frozen=True)
+class WindowSettings:
+    """strategy: all steps stochastic; a window of `size` steps that moves on by one every `period` iterations
+    (progressive), is drawn anew each iteration (random), moves on after exponentially fewer iterations from step 13 on
+    (decay), or is drawn in the first half (fast, Flow-GRPO-Fast).
+    """
+
+    strategy: Literal["all", "progressive", "random", "decay", "fast"] = "all"
+    size: int = 4
+    period: int = 25
+
+    def __post_init__(self) -> None:
+        if self.size < 1 or self.period < 1:
+            raise ValueError(f"window size and period must be >= 1, got {self.size} and {self.period}")
+
+
+def stochastic_steps(num_steps: int, settings: WindowSettings, iteration: int, seed: int) -> list[int]:
+    """Return the stochastic steps of one iteration; never empty unless T = 1, where no step can be.
+
+    The window's start is kept at or below T - 1 - size, so it never shrinks or runs empty near the end; a window of
+    T - 1 steps or more is all of them.
+    """
+    last_start = num_steps - 1 - settings.size
+    if settings.strategy == "all" or last_start <= 0:
+        return list(range(num_steps - 1))
+    if settings.strategy in ("random", "fast"):
+        high = last_start if settings.strategy == "random" else min(last_start, max(0, num_steps // 2 - settings.size))
+        start = int(numpy_stream(seed, "sde_window", iteration).integers(high + 1))
+    elif settings.strategy == "progressive":
+        start = (iteration // settings.period) % (last_start + 1)
+    else:
+        start = _decayed_start(iteration, settings.period, last_start)
+    return list(range(start, start + settings.size))
+
+
+def select_steps(
+    times: Tensor,
+    stochastic: list[int],
+    num_samples: int,
+    *,
+    fraction: float,
+    select: Literal["random", "first", "tmin"],
+    min_s: float,
+    seed: int,
+    iteration: int,
+) -> Tensor:
+    """Return which of the stochastic steps train, bool (N, S).
+
+    random: floor(fraction S) steps per sample without replacement; first: the first of them; tmin: those with
+    t >= fraction. At least one step stays. Steps that end below min_s never train.
+    """
+    usable = torch.tensor([float(times[k + 1]) >= min_s for k in stochastic], dtype=torch.bool)
+    if not stochastic or not bool(usable.any()):
+        raise ValueError(
+            f"no step can train: {len(stochastic)} stochastic steps, none of which ends at or above s = {min_s}; "
+            f"take more sampler steps, or lower train.min_s"
+        )
+    S, candidates = len(stochastic), torch.nonzero(usable).flatten()
+    chosen = torch.zeros(num_samples, S, dtype=torch.bool)
+    if select == "tmin":
+        late = [i for i in candidates.tolist() if float(times[stochastic[i]]) >= fraction]
+        chosen[:, late or candidates[:1].tolist()] = True
+        return chosen
+    count = min(len(candidates), max(1, int(fraction * S)))
+    for sample in range(num_samples):
+        generator = torch_stream(seed, "step_selection", iteration, sample)
+        order = (
+            torch.randperm(len(candidates), generator=generator)
+            if select == "random"
+            else torch.arange(len(candidates))
+        )
+        chosen[sample, candidates[order[:count]]] = True
+    return chosen
+
+
+def _decayed_start(iteration: int, period: int, last_start: int) -> int:
+    decays = (math.exp(-DECAY_RATE * max(0, start - DECAY_FROM)) for start in range(last_start + 1))
+    stays = [max(1, round(period * decay)) for decay in decays]
+    left = iteration % sum(stays)
+    for start, stay in enumerate(stays):
+        if left < stay:
+            return start
+        left -= stay
+    raise AssertionError("unreachable: left < sum(stays)")

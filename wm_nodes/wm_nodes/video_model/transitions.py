@@ -1,0 +1,61 @@
+"""Algorithm 1, training half: what the current weights say about stored transitions. Section 1.5.
+
+Shapes: M transitions, C channels, F latent frames, H W grid, K given frames, U = C (F - K) H W generated elements.
+"""
+
+from typing import Literal, NamedTuple
+
+from torch import Tensor
+
+from wm_nodes.video_model.conditions import Condition
+from wm_nodes.video_model.kernels import StepContext, step, with_conditioning
+from wm_nodes.video_model.network import VelocityModel, guided_velocity
+from wm_nodes.video_model.sampling import RolloutSettings, normalised_noise
+
+MaskSource = Literal["cached", "recompute"]
+
+
+class Transition(NamedTuple):
+    """zeta: (x_s - mean) / std under the weights given, (M, U), carries the gradient. std, slope (d mean / d v) and
+    mask: (M, U), constants. sigma_base: (M,).
+    """
+
+    zeta: Tensor
+    std: Tensor
+    slope: Tensor
+    mask: Tensor
+    sigma_base: Tensor
+
+
+def transition(
+    model: VelocityModel,
+    condition: Condition,
+    x_t: Tensor,
+    x_s: Tensor,
+    t: Tensor,
+    s: Tensor,
+    mask: Tensor | None,
+    settings: RolloutSettings,
+    *,
+    cfg: float,
+) -> Transition:
+    """Return the normalised noise that leads from x_t to x_s under `model`.
+
+    Args:
+        x_t, x_s: stored states (M, C, F, H, W). t, s: float64 (M,), s > 0. cfg: guidance of this pass.
+        mask: the one used at rollout (M, 1, F, H, W); None: recomputed from this pass (an ablation: a few cells that
+            flip throw the ratio out of its clip range).
+    """
+    K = condition.num_conditioning
+    context = StepContext(condition.frames.float(), float(settings.times[1]), mask)
+    x = with_conditioning(x_t.float(), context.conditioning)
+    v = guided_velocity(model, x, t, condition, cfg).float()
+    law = step(x, v, t, s, context, settings.sampler)
+    zeta = normalised_noise(x_s.float(), law, K)
+    std, slope, mask_used = (_elements(value, zeta, K) for value in (law.std, law.slope, law.mask))
+    return Transition(zeta.flatten(1), std, slope, mask_used, law.sigma_base)
+
+
+def _elements(value: Tensor, like: Tensor, num_conditioning: int) -> Tensor:
+    generated = value[:, :, num_conditioning:] if value.shape[2] > 1 else value
+    return generated.detach().expand_as(like).flatten(1)
