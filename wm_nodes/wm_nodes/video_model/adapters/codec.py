@@ -1,0 +1,95 @@
+"""Camera frames to latents and back, through the VAE of a public model.
+
+Shapes: B batch, N camera frames, H W camera pixels, C latent channels, h w latent grid, F = 1 + (N - 1) / 4 latent
+frames.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class VideoCodec:
+    """AutoencoderKLWan, with latents normalised to mean 0 and deviation 1 per channel, as the models take them.
+
+    Args:
+        device: where it computes. offload: it rests on the CPU and visits the device for each call.
+    """
+
+    def __init__(self, vae: Any, *, device: str | torch.device = "cpu", offload: bool = False) -> None:
+        self.vae = vae.requires_grad_(False).eval()
+        self.device, self.offload = torch.device(device), offload
+        self.frames_per_latent = int(vae.config.scale_factor_temporal)
+        self.pixels_per_cell = int(vae.config.scale_factor_spatial)
+        self.channels = int(vae.config.z_dim)
+        self._mean, self._std = (
+            torch.tensor(values, device=self.device, dtype=torch.float32).view(1, -1, 1, 1, 1)
+            for values in (vae.config.latents_mean, vae.config.latents_std)
+        )
+        if not offload:
+            vae.to(self.device)
+
+    @torch.no_grad()
+    def encode(self, frames: Tensor) -> Tensor:
+        """Return the latents (mode of the posterior) of uint8 (B, N, H, W, 3), float32 (B, C, F, h, w).
+
+        Raises:
+            ValueError: another dtype or layout, or a size that the VAE does not divide.
+        """
+        self._check(frames)
+        pixels = frames.to(self.device).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
+        return self._encode(pixels)
+
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> Tensor:
+        """Return uint8 camera frames (B, N, H, W, 3)."""
+        pixels = ((self._decode(latents) + 1) * 127.5).round().clamp(0, 255)
+        return pixels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous()
+
+    @torch.no_grad()
+    def continuation(self, latents: Tensor, num_frames: int) -> Tensor:
+        """Return the latents of given frames followed by grey ones: the image condition of Wan's I2V.
+
+        Their first frames are exactly those given; the rest is encoded from the frames as the VAE decodes them.
+        """
+        pixels = self._decode(latents)
+        N = 1 + (num_frames - 1) * self.frames_per_latent
+        grey = pixels.new_zeros((*pixels.shape[:2], N - pixels.shape[2], *pixels.shape[3:]))
+        rest = self._encode(torch.cat([pixels, grey], 2))
+        return torch.cat([latents.to(rest), rest[:, :, latents.shape[2] :]], 2)
+
+    def _encode(self, pixels: Tensor) -> Tensor:
+        with self._present():
+            latents: Tensor = self.vae.encode(pixels.to(self.vae.dtype)).latent_dist.mode().float()
+        return (latents - self._mean) / self._std
+
+    def _decode(self, latents: Tensor) -> Tensor:
+        raw = latents.to(self.device, torch.float32) * self._std + self._mean
+        with self._present():
+            pixels: Tensor = self.vae.decode(raw.to(self.vae.dtype), return_dict=False)[0].float()
+        return pixels
+
+    @contextmanager
+    def _present(self) -> Iterator[None]:
+        if self.offload:
+            self.vae.to(self.device)
+        try:
+            yield
+        finally:
+            if self.offload:
+                self.vae.to("cpu")
+
+    def _check(self, frames: Tensor) -> None:
+        if frames.dtype != torch.uint8 or frames.ndim != 5 or frames.shape[-1] != 3:
+            raise ValueError(
+                f"frames must be uint8 (batch, frames, height, width, 3), got {frames.dtype} {tuple(frames.shape)}"
+            )
+        _, N, H, W, _ = frames.shape
+        if (N - 1) % self.frames_per_latent or H % self.pixels_per_cell or W % self.pixels_per_cell:
+            raise ValueError(
+                f"this VAE takes 1 + {self.frames_per_latent} n frames of sides that are multiples of "
+                f"{self.pixels_per_cell}, got {N} frames of {H}x{W}"
+            )

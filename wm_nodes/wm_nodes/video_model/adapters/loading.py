@@ -1,0 +1,147 @@
+"""From a folder to everything that GRPO needs of a public model."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from wm_nodes.video_model.adapters.codec import VideoCodec
+from wm_nodes.video_model.adapters.cosmos import CosmosVelocity, CosmosVersion
+from wm_nodes.video_model.adapters.folder import ModelFolder, ModelFolderError
+from wm_nodes.video_model.adapters.packages import package
+from wm_nodes.video_model.adapters.text import MAX_TOKENS, TextEncoder, TextStyle
+from wm_nodes.video_model.adapters.velocity import PublicVelocity
+from wm_nodes.video_model.adapters.wan import GivenFrames, WanVelocity
+
+Precision = Literal["float32", "bfloat16", "float16"]
+WAN = ("WanPipeline", "WanImageToVideoPipeline")
+COSMOS: dict[str, CosmosVersion] = {
+    "Cosmos2VideoToWorldPipeline": "2",
+    "Cosmos2_5_PredictBasePipeline": "2.5",
+}
+COSMOS2_FPS = 16
+
+
+@dataclass(frozen=True)
+class LoadSettings:
+    """dtype: of the weights. autocast: of the network's arithmetic (see PublicVelocity); None: that of the weights.
+    device: where the network lives. offload: VAE and text encoder rest on the CPU and visit the device. tiling: the VAE
+    works through large pictures in tiles. gradient_checkpointing: see PublicVelocity. text: load the text encoder;
+    without it, Conditions bring text embedded elsewhere and guidance needs null_text. negative_prompt: what the
+    unconditional branch is told. action_dim: see PublicVelocity.
+    """
+
+    dtype: Precision = "float32"
+    autocast: Precision | None = None
+    device: str = "cpu"
+    offload: bool = False
+    tiling: bool = False
+    gradient_checkpointing: bool = False
+    text: bool = True
+    max_tokens: int = MAX_TOKENS
+    negative_prompt: str = ""
+    action_dim: int = 0
+
+
+@dataclass(frozen=True)
+class PublicVideoModel:
+    """velocity: the network, trainable. shift: RolloutSettings.shift of the model's own scheduler."""
+
+    velocity: PublicVelocity
+    codec: VideoCodec
+    text: TextEncoder | None
+    shift: float
+
+
+def load_public_model(
+    folder: Path | str, settings: LoadSettings | None = None, *, null_text: Tensor | None = None
+) -> PublicVideoModel:
+    """Load a Wan or Cosmos-Predict folder; nothing is fetched and nothing in it is executed.
+
+    Args:
+        null_text: embedded negative prompt (L, E), in place of settings.negative_prompt.
+
+    Raises:
+        ModelFolderError: the folder is missing, incomplete or of another kind; names the path and the remedy.
+        MissingPackageError: a package of requirements/video.txt is not installed.
+    """
+    settings = settings or LoadSettings()
+    package("diffusers"), package("transformers")
+    files = ModelFolder(folder)
+    if files.pipeline not in (*WAN, *COSMOS):
+        raise ModelFolderError(f"{files.folder} holds a {files.pipeline}; supported are {', '.join((*WAN, *COSMOS))}")
+    dtype = getattr(torch, settings.dtype)
+    vae = files.model("vae", "AutoencoderKLWan", dtype)
+    if settings.tiling:
+        vae.enable_tiling()
+    codec = VideoCodec(vae, device=settings.device, offload=settings.offload)
+    text = _text(files, settings, dtype)
+    if null_text is None and text is not None:
+        null_text = text.encode([settings.negative_prompt])[0]
+    scheduler = files.scheduler()
+    try:
+        if files.pipeline in WAN:
+            velocity: PublicVelocity = _wan(files, settings, codec, null_text, scheduler)
+        else:
+            velocity = _cosmos(files, settings, null_text)
+    except ModelFolderError:
+        raise
+    except ValueError as error:
+        raise ModelFolderError(f"{files.folder / 'transformer'}: {error}") from error
+    velocity.to(settings.device)
+    if settings.gradient_checkpointing:
+        velocity.enable_gradient_checkpointing()
+    return PublicVideoModel(velocity, codec, text, _shift(scheduler))
+
+
+def _text(files: ModelFolder, settings: LoadSettings, dtype: torch.dtype) -> TextEncoder | None:
+    if not settings.text:
+        return None
+    version = COSMOS.get(files.pipeline)
+    style: TextStyle = "wan" if version is None else "cosmos2" if version == "2" else "cosmos2.5"
+    return TextEncoder(
+        files.text_encoder(dtype), files.tokenizer(), style, device=settings.device, offload=settings.offload,
+        max_tokens=settings.max_tokens,
+    )  # fmt: skip
+
+
+def _wan(
+    files: ModelFolder, settings: LoadSettings, codec: VideoCodec, null_text: Tensor | None, scheduler: dict[str, Any]
+) -> WanVelocity:
+    dtype, name = getattr(torch, settings.dtype), "WanTransformer3DModel"
+    transformer = files.model("transformer", name, dtype)
+    frames: GivenFrames = "none"
+    if transformer.config.in_channels > transformer.config.out_channels:
+        frames = "channels"
+    elif files.index.get("expand_timesteps"):
+        frames = "fused"
+    boundary = files.index.get("boundary_ratio")
+    low_noise = files.model("transformer_2", name, dtype) if boundary is not None else None
+    return WanVelocity(
+        transformer, null_text, frames=frames, continuation=codec.continuation, low_noise=low_noise,
+        boundary=float(boundary or 0.0), time_scale=float(scheduler.get("num_train_timesteps", 1000)),
+        action_dim=settings.action_dim, autocast=_autocast(settings),
+    )  # fmt: skip
+
+
+def _cosmos(files: ModelFolder, settings: LoadSettings, null_text: Tensor | None) -> CosmosVelocity:
+    version = COSMOS[files.pipeline]
+    return CosmosVelocity(
+        files.model("transformer", "CosmosTransformer3DModel", getattr(torch, settings.dtype)), null_text,
+        version=version, fps=COSMOS2_FPS if version == "2" else None, action_dim=settings.action_dim,
+        autocast=_autocast(settings),
+    )  # fmt: skip
+
+
+def _autocast(settings: LoadSettings) -> torch.dtype | None:
+    return None if settings.autocast is None else getattr(torch, settings.autocast)
+
+
+def _shift(scheduler: dict[str, Any]) -> float:
+    """Wan's schedulers state it; Cosmos's sigmas are Karras's, for which the specification takes 5."""
+    if scheduler.get("use_karras_sigmas"):
+        return 5.0
+    shift: float = scheduler.get("flow_shift", scheduler.get("shift", 1.0))
+    return float(shift)

@@ -1,0 +1,73 @@
+"""Low-rank adapters on a public model's attention, through peft. Adapter off is the base model: kl.anchor lora_off."""
+
+from pathlib import Path
+
+import torch
+
+from wm_nodes.video_model.adapters.packages import package
+from wm_nodes.video_model.adapters.velocity import PublicVelocity, tuner_layers
+
+TARGETS = ("to_q", "to_k", "to_v", "to_out.0")
+"""Attention projections of Wan's and Cosmos's blocks."""
+
+
+def add_lora(
+    model: PublicVelocity, rank: int, alpha: float | None = None, *, targets: tuple[str, ...] = TARGETS, seed: int = 0
+) -> None:
+    """Add an adapter in place, which starts as no change; it alone trains afterwards, in float32.
+
+    Args:
+        alpha: the adapter is scaled by alpha / rank; None: 1.
+        seed: of its first weights.
+    """
+    if rank < 1:
+        raise ValueError(f"lora.rank must be >= 1, got {rank}")
+    if tuner_layers(model):
+        raise ValueError("this model has a LoRA adapter already")
+    config = package("peft").LoraConfig(
+        r=rank, lora_alpha=rank if alpha is None else alpha, target_modules=list(targets), lora_dropout=0.0
+    )
+    model.requires_grad_(False)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        for transformer in model.transformers():
+            transformer.add_adapter(config)
+    _train_adapter_alone(model)
+
+
+def save_lora(model: PublicVelocity, folder: Path) -> None:
+    """Write the adapter as safetensors that diffusers' pipelines load too (load_lora_adapter)."""
+    if not tuner_layers(model):
+        raise ValueError("this model has no LoRA adapter to save")
+    for name, transformer in zip(_names(model), model.transformers()):
+        transformer.save_lora_adapter(folder / name, safe_serialization=True)
+
+
+def load_lora(model: PublicVelocity, folder: Path) -> None:
+    """Add the adapter that save_lora wrote to a model without one.
+
+    Raises:
+        ValueError: the folder holds none, or the model has one.
+    """
+    if tuner_layers(model):
+        raise ValueError("this model has a LoRA adapter already")
+    missing = [name for name in _names(model) if not list((folder / name).glob("*.safetensors"))]
+    if missing:
+        raise ValueError(f"{folder / missing[0]} holds no LoRA adapter (*.safetensors); name a folder of save_lora")
+    model.requires_grad_(False)
+    for name, transformer in zip(_names(model), model.transformers()):
+        transformer.load_lora_adapter(
+            str(folder / name), prefix=None, adapter_name="default", use_safetensors=True, local_files_only=True
+        )
+    _train_adapter_alone(model)
+
+
+def _names(model: PublicVelocity) -> list[str]:
+    return [f"lora_{index}" for index in range(len(model.transformers()))]
+
+
+def _train_adapter_alone(model: PublicVelocity) -> None:
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_("lora_" in name)
+        if "lora_" in name:
+            parameter.data = parameter.data.float()
