@@ -3,8 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from wm_nodes.seeding import numpy_stream
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""
@@ -60,6 +64,17 @@ def proportions_agree(
     """Return whether 0 lies in the Newcombe interval of the difference: two independent rates may be one."""
     low, high = newcombe_difference(successes, episodes, other_successes, other_episodes, z=z)
     return low <= 0.0 <= high
+
+
+def bootstrap_mean(
+    values: Sequence[float] | NDArray[Any], *, seed: int, draws: int = 10_000
+) -> tuple[float, float, float]:
+    """Return (mean, low, high): the mean of values and its 95 % percentile bootstrap interval over them."""
+    array = np.asarray(values, np.float64)
+    generator = numpy_stream(seed, "bootstrap", len(array))
+    means = array[generator.integers(len(array), size=(draws, len(array)))].mean(1)
+    low, high = np.quantile(means, (0.025, 0.975))
+    return float(array.mean()), float(low), float(high)
 
 
 def paired_difference(before: Sequence[bool], after: Sequence[bool], *, z: float = Z_95) -> PairedDifference:

@@ -1,0 +1,57 @@
+"""The competing samplers of the DynDiff benchmark, by name; everything else of a run is shared by all arms."""
+
+from dataclasses import dataclass, replace
+
+from wm_nodes.learning.video_grpo import GrpoSettings, KlSettings
+from wm_nodes.video_model import MaskSettings, RolloutSettings, SamplerSettings
+
+NUM_STEPS, SHIFT = 10, 3.0
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One sampler with the learner settings that belong to it. shared_noise: one initial noise for a whole group."""
+
+    name: str
+    rollout: RolloutSettings
+    grpo: GrpoSettings
+    shared_noise: bool = False
+
+
+def sampler_arm(name: str, sampler: SamplerSettings, grpo: GrpoSettings | None = None) -> Arm:
+    return Arm(name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or GrpoSettings())
+
+
+def dyndiff(eta: float, combine: str = "gated", budget: str = "literal", **knobs: object) -> SamplerSettings:
+    mask = MaskSettings(combine=combine, budget=budget, **knobs)  # type: ignore[arg-type]
+    return SamplerSettings("dyndiff", eta, mask=mask)
+
+
+def diversity_arms() -> list[Arm]:
+    """Claim A: ODE, CPS at several noise levels, DynDiff as written, sparse, and at CPS's noise budget."""
+    arms = [sampler_arm("ODE", SamplerSettings("ode", 0.0))]
+    arms += [sampler_arm(f"CPS {eta:g}", SamplerSettings("cps", eta)) for eta in (0.2, 0.4, 0.6)]
+    arms += [sampler_arm(f"DynDiff {eta:g} gated", dyndiff(eta)) for eta in (0.6, 1.0)]
+    arms += [sampler_arm("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"))]
+    for eta in (0.2, 0.4, 0.6):
+        arms += [sampler_arm(f"DynDiff {eta:g} {kind}, rms", dyndiff(eta, kind, "rms")) for kind in ("gated", "sparse")]
+    return arms
+
+
+def learning_arms(learner: GrpoSettings) -> list[Arm]:
+    """Claim B: every arm on one learner; `learner` holds what they share."""
+    cps, frozen = replace(learner, logprob_weight="cps"), KlSettings(beta=learner.kl.beta, anchor="frozen")
+    arms = [
+        sampler_arm("CPS 0.6", SamplerSettings("cps", 0.6), cps),
+        sampler_arm("CPS 0.6, full", SamplerSettings("cps", 0.6), learner),
+        sampler_arm("Flow-GRPO 0.7", SamplerSettings("flow", 0.7), learner),
+        sampler_arm("DanceGRPO 0.3", SamplerSettings("dance", 0.3), learner),
+        sampler_arm("SAGE 0.5", SamplerSettings("sage", 0.5), learner),
+        sampler_arm("DynDiff 0.6 gated", dyndiff(0.6), learner),
+        sampler_arm("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"), learner),
+        sampler_arm("DynDiff 0.4 sparse, rms", dyndiff(0.4, "sparse", "rms"), learner),
+        sampler_arm("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps),
+        sampler_arm("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps),
+    ]
+    arms += [replace(arm, name=f"{arm.name}, frozen", grpo=replace(arm.grpo, kl=frozen)) for arm in (arms[0], arms[8])]
+    return arms
