@@ -26,7 +26,8 @@ def given(tmp_path: Path) -> dict[str, str]:
     (tmp_path / "bag").mkdir()
     return {
         "run_dir": str(tmp_path / "run"), "model_dir": str(tmp_path / "model"), "bag_uri": str(tmp_path / "bag"),
-        "preset": "smoke", "domain_id": "7",
+        "preset": "smoke", "domain_id": "7", "video_preset": "smoke", "video_model_dir": str(tmp_path / "model"),
+        "context_bags": f"{tmp_path / 'bag'},{tmp_path / 'bag'}",
     }  # fmt: skip
 
 
@@ -49,6 +50,7 @@ def test_each_scenario_has_the_nodes_that_its_summary_promises(given: dict[str, 
     assert labels("rollout_record", given) == training[:4]
     assert labels("replay_offline", given) == ["wm/player", "wm/learner"]
     assert labels("evaluate", given) == [*simulator, "wm/recorder"]
+    assert labels("world_model_rl", given) == ["wm/video_model", "wm/reward_evaluator", "wm/learner", "wm/recorder"]
     assert labels("composed", given) == ["wm/composed", "wm/sim/environment"]
     assert labels("evaluate", given, namespace="/lab/two", compose="false")[0] == "lab/two/sim/environment"
 
@@ -63,7 +65,9 @@ def test_every_node_module_and_its_ros2_run_name_exist(scenario: str, given: dic
         assert node.name in (*names, "composed")
 
 
-@pytest.mark.parametrize("scenario", ["online_training", "rollout_record", "replay_offline", "evaluate"])
+@pytest.mark.parametrize(
+    "scenario", ["online_training", "rollout_record", "replay_offline", "evaluate", "world_model_rl"]
+)
 def test_nodes_get_only_parameters_that_they_declare(scenario: str, given: dict[str, str]) -> None:
     """Nodes refuse unknown parameters; the declared names are read from the node's source."""
     graph, _ = launch_arguments.prepare(scenario, of(scenario, given))

@@ -31,7 +31,7 @@ FLUSH_S = 0.25
 QUIET_S = 0.3
 """After a stop, the bag is completed when no message has come for this long."""
 MIB = 2**20
-SEQUENCED = {topic.name for topic in topics.ALL_TOPICS if topic.sequenced}
+SEQUENCED = {topic.name for topic in (*topics.ALL_TOPICS, *topics.VIDEO_TOPICS) if topic.sequenced}
 DEFAULT_TOPICS = [topic.name for topic in topics.ALL_TOPICS]
 
 PARAMS = (

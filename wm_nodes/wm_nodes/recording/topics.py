@@ -81,6 +81,14 @@ ALL_TOPICS = (
     SPEC, IMAGES, TRANSITION, GOAL, REWARD, EPISODE, ACTION, POLICY_VERSION, REWARD_SUMMARY, LEARNER_METRICS, RUN_STATE,
 )  # fmt: skip
 
+CLIPS = Topic("clips", "wm_msgs/msg/ClipBatch", METRICS)
+CLIP_IMAGES = Topic("clips/image", "sensor_msgs/msg/Image", METRICS, sequenced=False)
+CLIP_SCORES = Topic("clips/scores", "wm_msgs/msg/ClipScores", METRICS)
+VIDEO_VERSION = Topic("video/version", "wm_msgs/msg/PolicyVersion", LATCHED)
+
+VIDEO_TOPICS = (CLIPS, CLIP_IMAGES, CLIP_SCORES, VIDEO_VERSION, RUN_STATE)
+"""Loop 2: clips come every few seconds, asked for one buffer at a time, so a depth of ten holds every unread one."""
+
 DEFAULT_NAMESPACE = "/wm"
 
 

@@ -27,6 +27,8 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     run_dir = Path(values["run_dir"] or f"runs/{time}-{scenario}").expanduser().absolute()
     values["run_dir"] = str(run_dir)
     given_config = values["config_file"]
+    if "video_preset" in values:
+        return _resolve_video(values, run_dir)
     if given_config:
         values["config_file"] = str(Path(given_config).expanduser().absolute())
         config = load_config(values["config_file"])
@@ -52,11 +54,24 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     return values
 
 
+def _resolve_video(values: dict[str, str], run_dir: Path) -> dict[str, str]:
+    """Loop 2 has settings of its own (learning/video_config.py); the world model gives the judge's position probe."""
+    from wm_nodes.learning.video_config import dump_video_config, load_video_config
+
+    config = load_video_config(values["config_file"] or values["video_preset"])
+    values["model_dir"] = _model_dir(values["model_dir"], config.task)
+    values["bag_uri"] = _bag_uri(values["bag_uri"], "world_model_rl", run_dir)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    values["config_file"] = str(run_dir / "video_config.yaml")
+    Path(values["config_file"]).write_text(dump_video_config(config))
+    return values
+
+
 def prepare(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
     """Return the graph to start and its resolved arguments; graph.json in the run folder keeps a copy for people."""
     values = resolve(scenario, given)
     graph = build_graph(scenario, values)
-    if values["compose"] == "true" or scenario == "composed":
+    if values.get("compose") == "true" or scenario == "composed":
         graph = compose(graph, str(Path(values["run_dir"]) / "composed.params.yaml"))
         for node in graph.nodes:
             if node.inside:

@@ -12,7 +12,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from wm_msgs.action import Evaluate, Train
+from wm_msgs.action import Evaluate, Train, TrainVideo
 from wm_nodes.ros.clients import run_goal
 from wm_nodes.ros.spin import make_executor, spin
 from wm_nodes.ros.wire import PeerLost
@@ -46,7 +46,7 @@ class Training:
 
 
 class Operator:
-    """Client of one graph's `train` and `evaluate` actions; use as a context manager.
+    """Client of one graph's `train`, `evaluate` and `video/train` actions; use as a context manager.
 
     Args:
         namespace: of the graph, e.g. "wm".
@@ -60,6 +60,7 @@ class Operator:
         self._node = Node("operator", namespace=namespace)
         self._train = ActionClient(self._node, Train, "train")
         self._evaluate = ActionClient(self._node, Evaluate, "evaluate")
+        self._train_video = ActionClient(self._node, TrainVideo, "video/train")
         self._executor = make_executor("events")
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=spin, args=(self._executor, self._stop.is_set), daemon=True)
@@ -95,6 +96,16 @@ class Operator:
         return Training(
             result.policy_version, result.updates, result.samples, result.success_rate, result.checkpoint_uri
         )
+
+    def train_video(self, iterations: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> int:
+        """Post-train the video model on so many buffers; on_progress gets TrainVideo.Feedback. Return the new version.
+
+        Raises:
+            GoalFailed: the training ended early. PeerLost: no learner.
+        """
+        goal = TrainVideo.Goal(iterations=iterations)
+        result = self._run(self._train_video, goal, lambda message: on_progress(message.feedback))
+        return int(result.policy_version)
 
     def close(self) -> None:
         self._stop.set()

@@ -15,6 +15,8 @@ from std_msgs.msg import Bool
 
 from wm_msgs.msg import (
     ActionBatch,
+    ClipBatch,
+    ClipScores,
     Credit,
     EnvSpec,
     EpisodeEvent,
@@ -102,6 +104,10 @@ TOPICS: dict[str, Topic] = {
         _recorded(recorded.POLICY_VERSION, PolicyVersion),
         _recorded(recorded.LEARNER_METRICS, LearnerMetrics),
         _recorded(recorded.RUN_STATE, RunState),
+        _recorded(recorded.CLIPS, ClipBatch),
+        _recorded(recorded.CLIP_IMAGES, Image),
+        _recorded(recorded.CLIP_SCORES, ClipScores),
+        _recorded(recorded.VIDEO_VERSION, PolicyVersion),
         Topic("env/image/compressed", CompressedImage, COMPRESSED),
         Topic("flow/credit", Credit, CREDIT),
         Topic("run/links", NodeLinks, LATCHED),

@@ -18,6 +18,7 @@ GRAPH_TOPICS = (
     *ENVIRONMENT_TOPICS, "reward", "action", "policy/version", "reward/summary", "learner/metrics", "run/state",
 )  # fmt: skip
 """What the recorder records of its own namespace: the recorder's default."""
+VIDEO_TOPICS = ("clips", "clips/image", "clips/scores", "video/version", "run/state")
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,9 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("run_dir", "", "Folder for weights, bags and logs; empty: runs/<time>-<scenario>"),
     LaunchArgument("namespace", "wm", "ROS namespace of the graph; several graphs on one host need several domains"),
     LaunchArgument("model_dir", "", "World-model folder; empty: the one shipped for the task"),
+    LaunchArgument("video_model_dir", "", "Folder of the trained video model"),
+    LaunchArgument("context_bags", "", "Bags of contexts for the clips, separated by commas"),
+    LaunchArgument("video_preset", "recommended", "Settings of loop 2: a name, or a .yaml file"),
     LaunchArgument("starts_file", "", "First frames to imagine from; empty: starts.safetensors in model_dir"),
     LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
     LaunchArgument("backend", "world_model", "What the environment node steps",
@@ -127,7 +131,9 @@ def _node(
     *,
     below: str = "",
     ranks: int = 1,
+    module: str = "",
 ) -> NodeSpec:
+    """module: of wm_nodes.nodes; empty: the one of the node's name."""
     namespace = "/" + "/".join(part for part in (arguments["namespace"].strip("/"), below) if part)
     common: dict[str, ParameterValue] = {
         "config_file": arguments["config_file"],
@@ -136,10 +142,10 @@ def _node(
         "executor": arguments["executor"],
         "use_sim_time": arguments["use_sim_time"] == "true",
     }
-    module, values = f"wm_nodes.nodes.{name}_node", {**common, **parameters}
+    values = {**common, **parameters}
     return NodeSpec(
-        module, name, namespace, values, ranks=ranks, log_level=arguments["log_level"],
-        extra_parameters=arguments["params_file"],
+        f"wm_nodes.nodes.{module or f'{name}_node'}", name, namespace, values, ranks=ranks,
+        log_level=arguments["log_level"], extra_parameters=arguments["params_file"],
     )  # fmt: skip
 
 
@@ -225,6 +231,25 @@ def _evaluate(arguments: Mapping[str, str]) -> Graph:
     return Graph("evaluate", (*_simulator_and_evaluation(arguments), *_recorder(arguments, simulator=True)))
 
 
+def _world_model_rl(arguments: Mapping[str, str]) -> Graph:
+    model: dict[str, ParameterValue] = {"video_model_dir": arguments["video_model_dir"]}
+    contexts: list[str] = [text for text in arguments["context_bags"].split(",") if text]
+    if not contexts or not arguments["video_model_dir"]:
+        raise GraphError("world_model_rl needs video_model_dir:=<folder> and context_bags:=<bag>[,<bag> ...]")
+    clips: dict[str, ParameterValue] = {**model, "context_bags": contexts}
+    nodes = [
+        _node(arguments, "video_model", clips),
+        _node(
+            arguments, "reward_evaluator", {**clips, "model_dir": arguments["model_dir"]},
+            module="clip_evaluator_node",
+        ),
+        _node(arguments, "learner", model, module="video_learner_node"),
+    ]
+    if arguments["record"] == "true":
+        nodes.append(_node(arguments, "recorder", {"bag_uri": arguments["bag_uri"], "topics": list(VIDEO_TOPICS)}))
+    return Graph("world_model_rl", tuple(nodes))
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A named graph; arguments: names in ARGUMENTS, in the order in which --show-args lists them."""
@@ -257,6 +282,9 @@ SCENARIOS: dict[str, Scenario] = {
                  (*_COMMON, "model_dir", "initial_policy", "policy_factory", "bag_uri", "rate",
                   "train"), _replay_offline),
         Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
+        Scenario("world_model_rl", "Post-train the video model by GRPO on clips that it samples",
+                 (*(name for name in _COMMON if name not in ("preset", "task", "compose")), "model_dir",
+                  "video_model_dir", "context_bags", "video_preset", "record", "bag_uri"), _world_model_rl),
         Scenario("composed", "online_training with all nodes in one process", _TRAINING, _online_training),
     )
 }  # fmt: skip

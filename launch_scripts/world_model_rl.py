@@ -1,0 +1,14 @@
+"""Loop 2: post-train the video world model by DynDiff-GRPO on clips that it samples, as a ROS 2 graph.
+
+python3 launch_scripts/world_model_rl.py [--preset P] ...     # --help lists everything
+"""
+
+import sys
+
+import wm_setup
+
+if __name__ == "__main__":
+    wm_setup.ensure()
+    from wm_nodes.world_model_job import main
+
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,151 @@
+"""video_model: samples groups of clips of recorded contexts, keeps them as rollout buffers, and shows them."""
+
+import hashlib
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from wm_msgs.action import GenerateClips
+from wm_msgs.msg import ClipBatch, PolicyVersion
+from wm_nodes.learning.clip_generation import ClipGenerator
+from wm_nodes.learning.files import write_atomic
+from wm_nodes.learning.video_config import load_video_config
+from wm_nodes.learning.video_data import load_clips
+from wm_nodes.learning.video_folder import load_video_folder
+from wm_nodes.learning.weights import WeightsError, load_weights
+from wm_nodes.nodes.policy_holder import read_weights
+from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.params import Param
+from wm_nodes.ros.qos import topic
+from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.wire import WireError
+from wm_nodes.types import UInt8Array
+
+PARAMS = (
+    Param("video_model_dir", "", "Folder of the trained video model", read_only=True),
+    Param("context_bags", [""], "Bags whose episodes give first frames, actions and instruction", read_only=True),
+    Param("keep_buffers", 4, "Rollout buffers kept in run_dir/buffers", minimum=1, maximum=100000),
+    Param("version_timeout_s", 20.0, "How long the asked version may take to be announced", "s",
+          minimum=0.1, maximum=600.0),
+)  # fmt: skip
+
+
+class VideoModelNode(ManagedNode):
+    """Action video/generate; follows video/version; publishes clips, clips/image."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("video_model", PARAMS, **node_arguments)
+
+    def configure(self) -> None:
+        torch.set_num_threads(max(1, torch.get_num_threads()))
+        config = load_video_config(str(self.param("config_file")))
+        folder = load_video_folder(Path(str(self.param("video_model_dir"))))
+        bags = [Path(text) for text in self.param("context_bags") if text]
+        self._generator = ClipGenerator(folder, load_clips(bags, folder.clip["stride"]), config)
+        self._version = 0
+        self._newest: PolicyVersion | None = None
+        self._clips = self.publish_on("clips")
+        row = topic("clips/image")
+        self._images = self.create_publisher(row.type, row.name, row.qos)
+        self.own(self.destroy_publisher, self._images)
+        self.listen("video/version", self._on_version, while_inactive=True)
+        self._action = WorkerAction(self, GenerateClips, "video/generate", self._generate, self._describe)
+        self.own(self._action.destroy)
+
+    def deactivate(self, reason: str) -> None:
+        self._action.stop(reason)
+
+    def update_diagnostics(self) -> None:
+        if hasattr(self, "_version"):
+            self.diagnostics.gauge("version", self._version)
+
+    def _on_version(self, message: PolicyVersion) -> None:
+        self._newest = message
+
+    # Sampling, in a worker thread.
+
+    def _generate(self, work: Work) -> GenerateClips.Result:
+        goal: GenerateClips.Goal = work.request
+        result = GenerateClips.Result(termination_reason=GenerateClips.Result.FINISHED)
+        try:
+            self._follow(work, int(goal.policy_version))
+            began = time.perf_counter()
+            request = self._generator.request(int(goal.iteration), int(goal.policy_version))
+
+            def report(done: int, total: int) -> None:
+                work.check()
+                work.feedback(GenerateClips.Feedback(clips_done=done, progress=done / total))
+
+            buffer = self._generator.sample(request, on_progress=report)
+            data = buffer.to_bytes()
+            result.buffer_uri = f"buffers/buffer_{goal.iteration:06d}.safetensors"
+            result.sha256, result.num_clips = hashlib.sha256(data).hexdigest(), len(buffer)
+            write_atomic(self.run_dir / result.buffer_uri, data)
+            self._forget_old()
+            share = buffer.rollout.noise_share
+            message = ClipBatch(
+                iteration=goal.iteration, policy_version=goal.policy_version, contexts=list(request.contexts),
+                group_size=request.group_size, num_frames=buffer.rollout.latents.shape[2],
+                buffer_uri=result.buffer_uri, sha256=result.sha256, sample_s=time.perf_counter() - began,
+                noise_share=float(share.square().mean().sqrt()) if len(share) else 0.0,
+            )  # fmt: skip
+            self._publish(message, film_strip(self._generator.folder.codec.decode(buffer.rollout.latents)))
+            self.diagnostics.latency("sample", message.sample_s)
+        except (WireError, WeightsError, ValueError, OSError) as error:
+            result.termination_reason, result.message = GenerateClips.Result.FAILED, str(error)
+            self.get_logger().error(f"clips of iteration {goal.iteration} failed: {error}")
+            self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=str(error))
+        return result
+
+    def _follow(self, work: Work, version: int) -> None:
+        """Have the weights of `version`; version 0 is the model's own folder.
+
+        Raises:
+            WireError: its file cannot be read. WeightsError: the file is not the announced one.
+            ValueError: another version is announced after version_timeout_s.
+        """
+        deadline = time.monotonic() + float(self.param("version_timeout_s"))
+        while (self._newest.version if self._newest is not None else 0) != version:
+            if time.monotonic() > deadline:
+                newest = "none" if self._newest is None else self._newest.version
+                raise ValueError(f"asked for version {version}, video/version announces {newest}; is a learner there?")
+            work.sleep(0.02)
+        newest = self._newest
+        if newest is not None and version != self._version:
+            load_weights(self._generator.folder.network, read_weights(newest.uri, self.run_dir), sha256=newest.sha256)
+            self._version = version
+
+    def _publish(self, message: ClipBatch, strip: UInt8Array) -> None:
+        stamp = self.get_clock().now().nanoseconds
+        message.header = convert.header(stamp, "")
+        self._images.publish(convert.image_msg(strip, stamp))
+        self._clips.publish(message)
+
+    def _forget_old(self) -> None:
+        kept = sorted((self.run_dir / "buffers").glob("buffer_*.safetensors"))
+        for path in kept[: -int(self.param("keep_buffers"))]:
+            path.unlink(missing_ok=True)
+
+    @staticmethod
+    def _describe(reason: int, text: str) -> GenerateClips.Result:
+        return GenerateClips.Result(termination_reason=reason, message=text)
+
+
+def film_strip(frames: torch.Tensor) -> UInt8Array:
+    """One picture of uint8 clips (N, F, H, W, 3): a row per clip, a column per frame, (N H, F W, 3)."""
+    N, F, H, W, _ = frames.shape
+    strip: UInt8Array = frames.permute(0, 2, 1, 3, 4).reshape(N * H, F * W, 3).numpy()
+    return strip
+
+
+def main() -> int:
+    return run_node(VideoModelNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
