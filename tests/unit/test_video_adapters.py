@@ -21,6 +21,7 @@ diffusers = pytest.importorskip("diffusers")
 transformers = pytest.importorskip("transformers")
 pytest.importorskip("peft")
 
+from wm_nodes.doctor import main as doctor  # noqa: E402
 from wm_nodes.learning.video_grpo import AdvantageSettings, GrpoLearner, GrpoSettings, KlSettings  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
     Condition,
@@ -601,6 +602,15 @@ class TestFolder:
         for cfg in (1.0, 4.0):
             args = (NOISE, torch.tensor([0.5]), given(frames, text), cfg)
             assert torch.equal(guided_velocity(loaded.velocity, *args), guided_velocity(model, *args))
+
+    def test_the_doctor_passes_it_with_and_without_an_adapter_and_refuses_a_folder_that_is_none(
+        self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        small = ["--size", "32x32", "--frames", "5", "--set", "rollout.num_steps=3", "--set", "grpo.kl.anchor=buffer"]
+        for more in ([], ["--lora-rank", "2"]):
+            assert doctor(["--public", str(folder), *small, *more]) == 0, capsys.readouterr().out
+        assert doctor(["--public", str(tmp_path), *small]) == 2
+        assert str(tmp_path) in capsys.readouterr().out.replace("\n", "")
 
     def test_bfloat16_checkpointing_and_no_text_encoder(self, folder: Path) -> None:
         both = load_public_model(folder, LoadSettings(dtype="bfloat16", max_tokens=12))

@@ -53,5 +53,7 @@ def learning_arms(learner: GrpoSettings) -> list[Arm]:
         sampler_arm("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps),
         sampler_arm("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps),
     ]
-    arms += [replace(arm, name=f"{arm.name}, frozen", grpo=replace(arm.grpo, kl=frozen)) for arm in (arms[0], arms[8])]
-    return arms
+    gated = sampler_arm("DynDiff 0.6 gated, rms, cps", dyndiff(0.6, "gated", "rms"), cps)
+    more = [replace(arm, name=f"{arm.name}, frozen", grpo=replace(arm.grpo, kl=frozen)) for arm in (arms[0], arms[8])]
+    more += [replace(arm, name=f"{arm.name}, shared", shared_noise=True) for arm in (arms[0], arms[8], arms[9], gated)]
+    return [*arms, gated, *more]

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from wm_nodes.benchmark.moving_disc import CHANNELS, NUM_ACTIONS, training_batch
 from wm_nodes.benchmark.video_arms import Arm, diversity_arms, learning_arms
+from wm_nodes.benchmark.video_cost import measure_anchors, measure_rollout
 from wm_nodes.benchmark.video_diversity import DiversityPlan, compare, measure_arm
 from wm_nodes.benchmark.video_learning import LearningPlan, train_arm
 from wm_nodes.learning.files import write_atomic
@@ -39,7 +40,7 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(argv)
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     try:
-        {"base": _base, "diversity": _diversity, "learning": _learning}[arguments.claim](arguments)
+        {"base": _base, "diversity": _diversity, "learning": _learning, "cost": _cost}[arguments.claim](arguments)
     except KeyboardInterrupt:
         return 130
     except (ValueError, OSError) as error:
@@ -105,6 +106,20 @@ def _learning(arguments: argparse.Namespace) -> None:
     _show_learning(rows)
 
 
+def _cost(arguments: argparse.Namespace) -> None:
+    model = load_base(arguments.base)
+    rollout = measure_rollout(model, arguments.repeats, arguments.seed)
+    rows = measure_anchors(model, LEARNER, arguments.repeats, arguments.seed)
+    _write(arguments, {"rollout": rollout, "rows": rows})
+    table = Table(title=f"KL anchors, median of {arguments.repeats} turns on one buffer")
+    for name in ("anchor", "training, s", "of which KL, s", "kept beside the weights, MiB"):
+        table.add_column(name, justify="left" if name == "anchor" else "right")
+    for row in rows:
+        table.add_row(row["anchor"], f"{row['train_s']:.3f}", f"{row['kl_s']:.3f}", f"{row['bytes'] / 2**20:.2f}")
+    console.print(table)
+    console.print(f"sampling with the mask / without: {rollout['dyndiff_over_cps']:.3f}", highlight=False)
+
+
 def _named(arms: list[Arm], names: list[str] | None) -> list[Arm]:
     known = {arm.name: arm for arm in arms}
     unknown = [name for name in names or [] if name not in known]
@@ -145,7 +160,8 @@ def _show_diversity(rows: list[dict[str, Any]], seed: int) -> None:
 
 def _show_learning(rows: list[dict[str, Any]]) -> None:
     table = Table(title="held-out scenes, ODE, before and after")
-    for name in ("arm", "seed", "reward", "obeyed", "bg", "mass", "noise rms/s", "clipped low/high @2", "seconds"):
+    shown = ("arm", "seed", "reward", "obeyed", "bg", "mass", "noise", "clipped low/high @2", "falling", "seconds")
+    for name in shown:
         table.add_column(name, justify="left" if name == "arm" else "right")
     for row in sorted(rows, key=lambda row: (row["arm"], row["seed"])):
         first, last = row["evaluations"][0], row["evaluations"][-1]
@@ -153,7 +169,8 @@ def _show_learning(rows: list[dict[str, Any]]) -> None:
         table.add_row(
             row["arm"], str(row["seed"]), *(f"{first[name]:.3f} -> {last[name]:.3f}" for name in ("reward", "obeyed")),
             f"{last['background']:.4f}", f"{last['mass']:.3f}", f"{row['buffers'][-1]['noise_share']:.3f}",
-            f"{update['clip_low_share']:.2f}/{update['clip_high_share']:.2f}", f"{sum(row['seconds'].values()):.0f}",
+            f"{update['clip_low_share']:.2f}/{update['clip_high_share']:.2f}", ", ".join(row["hacked"]),
+            f"{sum(row['seconds'].values()):.0f}",
         )  # fmt: skip
     console.print(table)
 
@@ -172,10 +189,13 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_argument("--iterations", type=int, default=20)
     learning.add_argument("--scenes", type=int, default=6, help="contexts per iteration, 8 videos each")
     learning.add_argument("--hackable", action="store_true", help="reward the task alone, to see the detector fire")
-    for claim in (base, diversity, learning):
+    cost = claims.add_parser("cost", help="claim C: seconds and bytes of the KL anchors, and of the mask")
+    cost.add_argument("--repeats", type=int, default=7)
+    for claim in (base, diversity, learning, cost):
         claim.add_argument("--seed", type=int, default=0)
     for claim in (diversity, learning):
         claim.add_argument("--arms", nargs="+", metavar="NAME")
+    for claim in (diversity, learning, cost):
         claim.add_argument("--base", type=Path, help="weights of another base model than the shipped one")
         claim.add_argument("--json", type=Path, help="write every row here; `learning` goes on where the file stops")
     return parser

@@ -14,6 +14,7 @@ from torch import Tensor
 from wm_nodes.benchmark.moving_disc import CHANNELS, FRAMES, SIDE, Scenes, Scores, draw_scenes, score
 from wm_nodes.benchmark.video_arms import NUM_STEPS, SHIFT, Arm
 from wm_nodes.learning.video_grpo import BufferReport, GrpoLearner
+from wm_nodes.rl.hacking import hacked_metrics
 from wm_nodes.seeding import stream_seed
 from wm_nodes.video_model import (
     RolloutBuffer,
@@ -27,6 +28,7 @@ from wm_nodes.video_model import (
 
 SHAPE = (CHANNELS, FRAMES, SIDE, SIDE)
 MAX_SEED = 2**62
+MIN_EVALUATIONS = 4
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,20 @@ def train_arm(
         if (iteration + 1) % plan.eval_every == 0 or iteration + 1 == plan.iterations:
             evaluations.append({"iteration": iteration + 1, **evaluate(model, plan.eval_scenes, seed)})
         on_iteration()
-    return {"arm": arm.name, "seed": seed, "evaluations": evaluations, "buffers": buffers, "seconds": seconds}
+    return {
+        "arm": arm.name, "seed": seed, "evaluations": evaluations, "buffers": buffers, "seconds": seconds,
+        "hacked": hacked(evaluations, "task" if plan.hackable else "reward"),
+    }  # fmt: skip
+
+
+def hacked(evaluations: list[dict[str, float]], proxy: str) -> list[str]:
+    """Held-out truths that fell while the training reward rose, equation (2), over all evaluations."""
+    if len(evaluations) < MIN_EVALUATIONS:
+        return []
+    truths = {name: [row[name] for row in evaluations] for name in ("obeyed", "mass")}
+    truths["background"] = [-row["background"] for row in evaluations]
+    found = hacked_metrics([row[proxy] for row in evaluations], truths, window=len(evaluations))
+    return [alarm.metric for alarm in found]
 
 
 def sample_groups(

@@ -46,10 +46,9 @@ class GroupSettings:
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """Held-out contexts, sampled by ODE. every: iterations between evaluations. num_steps: sampler steps."""
+    """Held-out contexts, sampled by ODE before and after. num_steps: sampler steps."""
 
     contexts: int = 48
-    every: int = 5
     num_steps: int = 10
 
 

@@ -1,0 +1,14 @@
+"""Checks a video model before GRPO trains it: ratio, KL, ODE step, mask, buffer, memory.
+
+python3 launch_scripts/doctor.py [--video-model FOLDER --context-bags BAG ... | --public FOLDER]
+"""
+
+import sys
+
+import wm_setup
+
+if __name__ == "__main__":
+    wm_setup.ensure()
+    from wm_nodes.doctor import main
+
+    raise SystemExit(main(sys.argv[1:]))

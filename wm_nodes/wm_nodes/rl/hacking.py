@@ -1,0 +1,56 @@
+"""Reward hacking made visible, equation (2): the training reward goes up while what it stands for does not."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class HackedMetric:
+    """One held-out metric that did not follow the training reward. Slopes are per evaluation, over the window."""
+
+    metric: str
+    proxy_slope: float
+    true_slope: float
+
+
+def hacked_metrics(
+    proxy: Sequence[float], held_out: Mapping[str, Sequence[float]], *, window: int, noise: float = 2.0
+) -> list[HackedMetric]:
+    """Return the metrics whose least-squares slope is <= 0 over the last `window` evaluations while the proxy's is > 0.
+
+    A slope counts as rising only where it exceeds `noise` standard errors, and a metric as falling only where it lies
+    as far below zero, so that two flat, noisy curves raise no alarm.
+
+    Args:
+        proxy: the training reward at each evaluation. held_out: true metrics at the same ones, more is better.
+
+    Raises:
+        ValueError: fewer than three evaluations in the window, or curves of different lengths.
+    """
+    if window < 3:
+        raise ValueError(f"window must be >= 3 evaluations, got {window}")
+    for name, values in held_out.items():
+        if len(values) != len(proxy):
+            raise ValueError(f"{name} has {len(values)} evaluations, the training reward {len(proxy)}")
+    if len(proxy) < window:
+        return []
+    rise, rise_error = slope(proxy[-window:])
+    if rise <= noise * rise_error:
+        return []
+    found = []
+    for name, values in held_out.items():
+        trend, error = slope(values[-window:])
+        if trend < -noise * error:
+            found.append(HackedMetric(name, rise, trend))
+    return found
+
+
+def slope(values: Sequence[float]) -> tuple[float, float]:
+    """Return the least-squares slope per step and its standard error."""
+    y = np.asarray(values, np.float64)
+    x = np.arange(len(y)) - (len(y) - 1) / 2
+    trend = float((x * y).sum() / (x * x).sum())
+    residual = y - y.mean() - trend * x
+    return trend, float(np.sqrt((residual**2).sum() / max(1, len(y) - 2) / (x * x).sum()))
