@@ -288,7 +288,7 @@ def test_the_player_publishes_the_same_bytes_in_order_with_the_clock(domain: int
     assert listener.ticks == sorted(listener.ticks)
     with Bag(path) as bag:
         assert listener.ticks[0] >= bag.start_ns
-        assert listener.ticks[-1] == bag.end_ns
+        player.wait(lambda: listener.ticks[-1] == bag.end_ns, "last tick")
     assert len(feedback) > 1
     assert [f.position for f in feedback] == sorted(f.position for f in feedback)
     assert player.end() == 0

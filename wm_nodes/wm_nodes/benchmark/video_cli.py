@@ -30,7 +30,7 @@ from wm_nodes.video_model import NetworkSettings, VideoNetwork
 
 BASE_ITERATIONS, BASE_BATCH = 4000, 16
 NETWORK = NetworkSettings(channels=CHANNELS, action_dim=NUM_ACTIONS, width=32, depth=5)
-LEARNER = GrpoSettings(learning_rate=2e-4, micro_batch=64)
+LEARNER = GrpoSettings(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
 console = Console()
 
@@ -186,7 +186,7 @@ def _parser() -> argparse.ArgumentParser:
     diversity.add_argument("--group-size", type=int, default=8)
     learning = claims.add_parser("learning", help="claim B: reward against model calls, every arm on one learner")
     learning.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    learning.add_argument("--iterations", type=int, default=20)
+    learning.add_argument("--iterations", type=int, default=40)
     learning.add_argument("--scenes", type=int, default=6, help="contexts per iteration, 8 videos each")
     learning.add_argument("--hackable", action="store_true", help="reward the task alone, to see the detector fire")
     cost = claims.add_parser("cost", help="claim C: seconds and bytes of the KL anchors, and of the mask")

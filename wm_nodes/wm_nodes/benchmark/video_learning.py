@@ -37,7 +37,7 @@ class LearningPlan:
     task alone, which the detector of (2) should catch.
     """
 
-    iterations: int = 20
+    iterations: int = 40
     scenes: int = 6
     group_size: int = 8
     eval_scenes: int = 100

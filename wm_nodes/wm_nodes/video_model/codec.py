@@ -3,7 +3,9 @@
 Shapes: B clips, F frames, H W 3 image, p patch side, C components, h = H / p, w = W / p.
 
 Linear, orthogonal and local: no training beyond one eigen-decomposition, any resolution that p divides, and an error
-that can be named (what the left-out components carried). Each component has unit variance over the data of its fit.
+that can be named (what the left-out components carried). Components are whitened half way: over the data of the fit
+their standard deviations are the square roots of the pixels' (mean 1), so that fine texture, which is mostly noise,
+does not weigh as much in a flow-matching loss as the shapes that the coarse components carry.
 """
 
 import torch
@@ -43,7 +45,8 @@ class PatchCodec(nn.Module):
         deviations = variances[order].clamp_min(0).sqrt()
         self.mean.copy_(mean)
         self.basis.copy_(vectors[:, order].T)
-        self.scale.copy_(deviations.clamp_min(MIN_SHARE * float(deviations[0])))
+        deviations = deviations.clamp_min(MIN_SHARE * float(deviations[0]))
+        self.scale.copy_((deviations * deviations.mean()).sqrt())
         return float(variances[order].sum() / variances.sum())
 
     @torch.no_grad()

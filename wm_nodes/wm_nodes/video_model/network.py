@@ -3,7 +3,8 @@
 Shapes: B batch, C channels, F latent frames, H W latent grid.
 
 Fully convolutional in space and time (factorised 1x3x3 and 3x1x1), so that resolution and length are choices of the
-sampler. Each frame is told its own time (0 where it is given clean), the actions up to it, and the instruction.
+sampler. Each frame is told its own time (0 where it is given clean), the actions up to it, the instruction, and the
+last given frame.
 """
 
 from dataclasses import asdict, dataclass
@@ -50,7 +51,7 @@ class VideoNetwork(nn.Module):
         super().__init__()
         self.settings = settings
         width, patch = settings.width, settings.patch
-        self.embed = nn.Conv3d(settings.channels + 3, width, (1, patch, patch), (1, patch, patch))
+        self.embed = nn.Conv3d(2 * settings.channels + 3, width, (1, patch, patch), (1, patch, patch))
         self.action = nn.Linear(2 * settings.action_dim + 1, width)
         self.text = nn.Linear(max(1, settings.text_dim), width)
         self.time = nn.Sequential(nn.Linear(TIME_FEATURES, width), nn.SiLU(), nn.Linear(width, width))
@@ -69,7 +70,8 @@ class VideoNetwork(nn.Module):
         self._check(x, condition)
         H, W = x.shape[3:]
         pad_h, pad_w = -H % self.settings.patch, -W % self.settings.patch
-        inputs = F.pad(torch.cat([x, _places(x, condition.num_conditioning)], 1), (0, pad_w, 0, pad_h))
+        seen = torch.cat([x, _last_given(x, condition), _places(x, condition.num_conditioning)], 1)
+        inputs = F.pad(seen, (0, pad_w, 0, pad_h))
         hidden = self.embed(inputs)
         film_BFD = self._film(x, t, condition, drop)
         for block in self.blocks:
@@ -127,6 +129,13 @@ def time_features(times: Tensor) -> Tensor:
     frequencies = torch.exp(torch.linspace(0.0, 4.0, TIME_FEATURES // 2, dtype=times.dtype, device=times.device))
     angles = times.unsqueeze(-1) * frequencies
     return torch.cat([angles.sin(), angles.cos()], -1)
+
+
+def _last_given(x: Tensor, condition: Condition) -> Tensor:
+    """The newest given frame beside every frame, whatever the reach of the temporal convolutions; zeros without one."""
+    if condition.num_conditioning == 0:
+        return torch.zeros_like(x)
+    return condition.frames[:, :, -1:].to(x.dtype).expand_as(x)
 
 
 def _places(x: Tensor, num_conditioning: int) -> Tensor:
