@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor, nn
+from torch import nn
 
 from wm_nodes.benchmark.moving_disc import CHANNELS, FRAMES, SIDE, draw_scenes
 from wm_nodes.benchmark.video_cli import load_base
@@ -86,7 +86,7 @@ def _public(
     model: Any = public.velocity
     if arguments.lora_rank:
         add_lora(model, arguments.lora_rank, 2 * arguments.lora_rank)
-    return model, _on(condition, arguments.device), (C, F, H, W), replace(
+    return model, condition.to(arguments.device), (C, F, H, W), replace(
         config, rollout=replace(config.rollout, shift=public.shift)
     )  # fmt: skip
 
@@ -103,11 +103,6 @@ def _picture(arguments: argparse.Namespace) -> "np.ndarray[Any, np.dtype[np.uint
         raise ValueError(f"{arguments.picture} is no picture that OpenCV reads")
     resized: np.ndarray[Any, np.dtype[np.uint8]] = cv2.cvtColor(cv2.resize(found, (width, height)), cv2.COLOR_BGR2RGB)
     return resized
-
-
-def _on(condition: Condition, device: str) -> Condition:
-    parts: list[Tensor] = [condition.frames, condition.actions, condition.text]
-    return Condition(*(part.to(device) for part in parts))
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 from tqdm import tqdm
 
-from wm_nodes.config.load import dump_config
+from wm_nodes.config.load import ConfigError, dump_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning.evaluation import evaluate
 from wm_nodes.learning.files import write_atomic
@@ -36,6 +36,21 @@ READY_S = 120.0
 TRAINED = "trained.json"
 
 console = Console()
+
+
+def open_run_dir(given: Path | None, name: str, config_text: str) -> Path:
+    """Make the run folder (default: runs/<time>-<name>) and keep its configuration there.
+
+    Raises:
+        ConfigError: the folder was begun with another configuration.
+    """
+    run_dir = (given or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}").expanduser().absolute()
+    run_dir.mkdir(parents=True, exist_ok=True)
+    saved = run_dir / "config.yaml"
+    if saved.exists() and saved.read_text() != config_text:
+        raise ConfigError(f"{run_dir} was begun with another configuration ({saved}); use its settings or a new folder")
+    saved.write_text(config_text)
+    return run_dir
 
 
 class Stages:

@@ -7,7 +7,6 @@ import argparse
 import json
 import os
 import sys
-import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -20,7 +19,7 @@ import torch
 from wm_nodes.config.load import ConfigError, dump_config, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.job import Job, Stages, console, is_trained, rate, start_graph
+from wm_nodes.job import Job, Stages, console, is_trained, open_run_dir, rate, start_graph
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, collect_plan, gate_plan
 from wm_nodes.learning.gate import judge_model
 from wm_nodes.learning.pictures import write_pictures
@@ -144,14 +143,7 @@ def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
     if arguments.rounds is not None:
         overrides["rounds.num_rounds"] = arguments.rounds
     config = load_config(arguments.preset, overrides)
-    name = f"{time.strftime('%Y%m%d-%H%M%S')}-{config.task}"
-    run_dir = (arguments.run_dir or Path("runs") / name).expanduser().absolute()
-    run_dir.mkdir(parents=True, exist_ok=True)
-    saved = run_dir / "config.yaml"
-    if saved.exists() and saved.read_text() != dump_config(config):
-        raise ConfigError(f"{run_dir} was begun with another configuration ({saved}); use its settings or a new folder")
-    saved.write_text(dump_config(config))
-    return config, run_dir
+    return config, open_run_dir(arguments.run_dir, config.task, dump_config(config))
 
 
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: Stages) -> Path:

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from wm_nodes.config.load import ConfigError, load_config, parse_override
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.job import READY_S, Stages, console
+from wm_nodes.job import READY_S, Stages, console, open_run_dir
 from wm_nodes.learning.clip_generation import ClipGenerator
 from wm_nodes.learning.clip_scores import score_clips
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
@@ -208,14 +208,7 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
     if arguments.seed is not None:
         overrides["seed"] = arguments.seed
     config = load_video_config(arguments.preset, overrides)
-    name = f"{time.strftime('%Y%m%d-%H%M%S')}-world_model_rl"
-    run_dir = (arguments.run_dir or Path("runs") / name).expanduser().absolute()
-    run_dir.mkdir(parents=True, exist_ok=True)
-    saved = run_dir / "config.yaml"
-    if saved.exists() and saved.read_text() != dump_video_config(config):
-        raise ConfigError(f"{run_dir} was begun with other settings ({saved}); use those, or a new folder")
-    saved.write_text(dump_video_config(config))
-    return config, run_dir
+    return config, open_run_dir(arguments.run_dir, "world_model_rl", dump_video_config(config))
 
 
 def _command() -> str:

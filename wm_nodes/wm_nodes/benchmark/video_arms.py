@@ -41,8 +41,12 @@ def diversity_arms() -> list[Arm]:
 def learning_arms(learner: GrpoSettings) -> list[Arm]:
     """Claim B: every arm on one learner; `learner` holds what they share."""
     cps, frozen = replace(learner, logprob_weight="cps"), KlSettings(beta=learner.kl.beta, anchor="frozen")
-    arms = [
-        sampler_arm("CPS 0.6", SamplerSettings("cps", 0.6), cps),
+    plain = sampler_arm("CPS 0.6", SamplerSettings("cps", 0.6), cps)
+    matched = sampler_arm("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps)
+    sparse = sampler_arm("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps)
+    gated = sampler_arm("DynDiff 0.6 gated, rms, cps", dyndiff(0.6, "gated", "rms"), cps)
+    return [
+        plain,
         sampler_arm("CPS 0.6, full", SamplerSettings("cps", 0.6), learner),
         sampler_arm("Flow-GRPO 0.7", SamplerSettings("flow", 0.7), learner),
         sampler_arm("DanceGRPO 0.3", SamplerSettings("dance", 0.3), learner),
@@ -50,10 +54,9 @@ def learning_arms(learner: GrpoSettings) -> list[Arm]:
         sampler_arm("DynDiff 0.6 gated", dyndiff(0.6), learner),
         sampler_arm("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"), learner),
         sampler_arm("DynDiff 0.4 sparse, rms", dyndiff(0.4, "sparse", "rms"), learner),
-        sampler_arm("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps),
-        sampler_arm("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps),
+        matched,
+        sparse,
+        gated,
+        *(replace(arm, name=f"{arm.name}, frozen", grpo=replace(arm.grpo, kl=frozen)) for arm in (plain, matched)),
+        *(replace(arm, name=f"{arm.name}, shared", shared_noise=True) for arm in (plain, matched, sparse, gated)),
     ]
-    gated = sampler_arm("DynDiff 0.6 gated, rms, cps", dyndiff(0.6, "gated", "rms"), cps)
-    more = [replace(arm, name=f"{arm.name}, frozen", grpo=replace(arm.grpo, kl=frozen)) for arm in (arms[0], arms[8])]
-    more += [replace(arm, name=f"{arm.name}, shared", shared_noise=True) for arm in (arms[0], arms[8], arms[9], gated)]
-    return [*arms, gated, *more]

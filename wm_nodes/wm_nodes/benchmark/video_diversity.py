@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from wm_nodes.benchmark.moving_disc import COLOUR, draw_scenes, opacity_at
+from wm_nodes.benchmark.moving_disc import draw_scenes, opacity_at
 from wm_nodes.benchmark.video_arms import Arm
 from wm_nodes.benchmark.video_learning import sample_groups
 from wm_nodes.learning.statistics import bootstrap_mean
@@ -17,6 +17,8 @@ from wm_nodes.rl.diversity import rollout_diversity
 from wm_nodes.video_model import VideoNetwork
 
 FEATURES = "centred pixels (each frame less its mean), no learned backbone"
+REACH = 5.0
+"""Cells that a disc can come to in the time of a video."""
 QUALITY_BACKGROUND, QUALITY_MASS = 0.10, 0.02
 """Equal quality: background error within 10 % of the other arm's, mass within 0.02."""
 
@@ -36,7 +38,6 @@ def measure_arm(model: VideoNetwork, arm: Arm, plan: DiversityPlan, seed: int) -
     groups = buffer.rollout.latents.view(plan.contexts, plan.group_size, *buffer.rollout.latents.shape[1:])
     moving = _moving(scenes.path(scenes.action)[:, :1].expand(-1, groups.shape[3], -1))
     rewards = scores.reward.view(plan.contexts, plan.group_size)
-    share = buffer.rollout.noise_share
     return {
         "arm": arm.name,
         "shared_noise": arm.shared_noise,
@@ -49,7 +50,7 @@ def measure_arm(model: VideoNetwork, arm: Arm, plan: DiversityPlan, seed: int) -
         "background": scores.background.view(plan.contexts, -1).mean(1).tolist(),
         "mass": scores.mass.view(plan.contexts, -1).mean(1).tolist(),
         "obeyed": scores.obeyed.view(plan.contexts, -1).mean(1).tolist(),
-        "noise_share": float(share.square().mean().sqrt()) if len(share) else 0.0,
+        "noise_share": buffer.rollout.spent_noise,
     }
 
 
@@ -75,5 +76,5 @@ def centred_pixels(videos: Tensor) -> Tensor:
 
 def _moving(start: Tensor) -> Tensor:
     """1 where a disc that begins at `start` (B, F, 2) can come to in the time, (B, 1, F, H, W)."""
-    reach = opacity_at(start, 2.5 * len(COLOUR))
+    reach = opacity_at(start, REACH)
     return (reach > 0.3).float()[:, None]

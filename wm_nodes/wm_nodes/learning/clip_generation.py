@@ -67,12 +67,13 @@ class ClipGenerator:
         noises = torch.zeros_like(sample) if request.shared_noise else sample
         drawn = _seeds(seed, "clip_noise", request.iteration, group, noises)
         steps = stochastic_steps(settings.num_steps, self.config.window, request.iteration, seed)
+        condition = self._condition(rows)
         rollout = sample_videos(
-            self.folder.network, self._condition(rows), initial_noise(self._shape(), drawn), seeds, settings, steps,
+            self.folder.network, condition, initial_noise(self._shape(), drawn), seeds, settings, steps,
             on_progress,
         )  # fmt: skip
         return RolloutBuffer(
-            rollout, self._condition(rows), group, sample, {}, torch.ones(len(group), dtype=torch.bool),
+            rollout, condition, group, sample, {}, torch.ones(len(group), dtype=torch.bool),
             request.policy_version, request.iteration, config_hash(settings),
         )  # fmt: skip
 

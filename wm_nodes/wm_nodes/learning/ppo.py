@@ -5,13 +5,10 @@ loss = E10b clipped policy + value_weight * E10c value - entropy_weight * entrop
        + kl_reference_weight * KL(policy || SFT policy), summed over valid samples and divided by their number.
 """
 
-import json
 import math
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +17,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.schema import PpoConfig
+from wm_nodes.learning.checkpoint_tensors import metadata_of, optimizer_tensors, restore_optimizer, section
 from wm_nodes.learning.distributed import Ranks
 from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.rollouts import Canceled
@@ -101,22 +99,19 @@ class PpoLearner:
             ValueError: no valid sample, or samples whose log_prob or value is unknown (NaN).
         """
         before = {name: tensor.clone() for name, tensor in self.policy.state_dict().items()}
-        optimizer_before = json.dumps(None) if not self._optimizer.state else self._optimizer_tensors(clone=True)
+        optimizer_before = {name: t.clone() for name, t in optimizer_tensors(self._optimizer).items()}
         try:
             metrics = self._update(rollout, should_stop)
         except (Canceled, FloatingPointError):
             self.policy.load_state_dict(before)
-            if isinstance(optimizer_before, dict):
-                self._restore_optimizer(optimizer_before)
-            else:
-                self._optimizer.state.clear()
+            restore_optimizer(self._optimizer, optimizer_before)
             raise
         self.updates += 1
         return metrics
 
     def save(self, path: Path) -> None:
         """Write optimiser, reference policy and counters, atomically."""
-        tensors = {f"optimizer.{name}": tensor for name, tensor in self._optimizer_tensors().items()}
+        tensors = {f"optimizer.{name}": tensor for name, tensor in optimizer_tensors(self._optimizer).items()}
         tensors |= {f"reference.{name}": tensor for name, tensor in self.reference.state_dict().items()}
         tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
         write_atomic(path, save(tensors, {"updates": str(self.updates), "seed": str(self.seed)}))
@@ -128,18 +123,16 @@ class PpoLearner:
             ValueError: the file is of another architecture or seed.
         """
         data = path.read_bytes()
-        (header_size,) = struct.unpack("<Q", data[:8])
-        metadata = json.loads(data[8 : 8 + header_size])["__metadata__"]
+        metadata = metadata_of(data)
         if int(metadata["seed"]) != self.seed:
             raise ValueError(
                 f"{path} was made with seed {metadata['seed']}, this run has {self.seed}; use a new run folder"
             )
         tensors = load(data)
-        reference = {n.removeprefix("reference."): t for n, t in tensors.items() if n.startswith("reference.")}
+        reference = section(tensors, "reference.")
         check_same_layout(self.reference.state_dict(), reference, what=str(path))
         self.reference.load_state_dict(reference)
-        optimizer = {n.removeprefix("optimizer."): t for n, t in tensors.items() if n.startswith("optimizer.")}
-        self._restore_optimizer(optimizer)
+        restore_optimizer(self._optimizer, section(tensors, "optimizer."))
         self.updates = int(metadata["updates"])
 
     def _update(self, rollout: Rollout, should_stop: Callable[[], bool] | None) -> PpoMetrics:
@@ -270,22 +263,6 @@ class PpoLearner:
             states = torch.from_numpy(rollout.next_states_TN[needed])
             values[torch.from_numpy(needed)] = self.policy.value(features, states)
         return values
-
-    def _optimizer_tensors(self, *, clone: bool = False) -> dict[str, Tensor]:
-        state = self._optimizer.state_dict()["state"]
-        return {
-            f"{index}.{name}": value.clone() if clone else value
-            for index, entries in state.items()
-            for name, value in entries.items()
-        }
-
-    def _restore_optimizer(self, tensors: dict[str, Tensor]) -> None:
-        state: dict[int, dict[str, Any]] = {}
-        for key, tensor in tensors.items():
-            index, name = key.split(".", 1)
-            state.setdefault(int(index), {})[name] = tensor.clone()
-        groups = self._optimizer.state_dict()["param_groups"]
-        self._optimizer.load_state_dict({"state": state, "param_groups": groups})
 
 
 METRIC_NAMES = tuple(field.name for field in fields(PpoMetrics))

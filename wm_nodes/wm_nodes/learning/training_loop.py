@@ -16,6 +16,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from wm_nodes.learning.checkpoint_tensors import metadata_of, optimizer_tensors, restore_optimizer, section
 from wm_nodes.learning.files import write_atomic
 
 CHECKPOINT_PERIOD_S = 240.0
@@ -120,31 +121,23 @@ class TrainingLoop:
             return
         tensors = {f"model.{key}": value for key, value in self.model.state_dict().items()}
         tensors |= {f"averaged.{key}": value for key, value in self.averaged.items()}
-        for index, state in self.optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{index}.{key}": value for key, value in state.items()}
+        tensors |= {f"optimizer.{key}": value for key, value in optimizer_tensors(self.optimizer).items()}
         tensors = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
         write_atomic(self.checkpoint_path, save(tensors, {"iteration": str(self.iteration)}))
 
     def _resume(self, path: Path) -> None:
         data = path.read_bytes()
         tensors = load(data)
-        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
         try:
-            self.model.load_state_dict(_section(tensors, "model."))
+            self.model.load_state_dict(section(tensors, "model."))
         except RuntimeError as error:
             raise ValueError(
                 f"{path} belongs to another architecture or configuration; give a fresh run folder, or delete the file "
                 f"to start over ({error})"
             ) from None
-        self.averaged = {key: value.clone() for key, value in _section(tensors, "averaged.").items()}
-        states: dict[int, dict[str, Tensor]] = {}
-        for key, value in _section(tensors, "optimizer.").items():
-            index, name = key.split(".", 1)
-            states.setdefault(int(index), {})[name] = value
-        self.optimizer.load_state_dict(
-            {"state": states, "param_groups": self.optimizer.state_dict()["param_groups"]}
-        )
-        self.iteration = int(header["__metadata__"]["iteration"])
+        self.averaged = {key: value.clone() for key, value in section(tensors, "averaged.").items()}
+        restore_optimizer(self.optimizer, section(tensors, "optimizer."))
+        self.iteration = int(metadata_of(data)["iteration"])
 
     def _logged(self) -> dict[str, float]:
         """The last metrics of a run that is resumed; empty at its start."""
@@ -161,7 +154,3 @@ class TrainingLoop:
         line = {"iteration": self.iteration, "seconds": round(seconds, 2), **metrics}
         with open(self.run_dir / f"metrics_{self.name}.jsonl", "a") as file:
             file.write(json.dumps(line) + "\n")
-
-
-def _section(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

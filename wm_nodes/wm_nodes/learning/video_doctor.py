@@ -3,7 +3,6 @@
 Shapes: N videos (a few), C channels, F latent frames, H W latent grid.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -54,34 +53,13 @@ def examine(
     model.eval()
     sampled = sample_videos(model, condition, noise, seeds, rollout)
     buffer = _buffer(sampled, condition, rollout)
-    checks: tuple[Callable[[], Finding], ...] = (
-        lambda: _ratio(model, buffer, rollout, grpo, seed),
-        lambda: _kl(model, buffer, rollout, grpo, seed),
-        lambda: _ode(model, condition, noise, seeds, rollout),
-        lambda: _mask(sampled, condition.num_conditioning, rollout),
-        lambda: _round_trip(buffer),
-        lambda: _memory(model, sampled, grpo),
-    )
-    return [check() for check in checks]
-
-
-def _ratio(
-    model: nn.Module, buffer: RolloutBuffer, rollout: RolloutSettings, grpo: GrpoSettings, seed: int
-) -> Finding:
-    report = _first_update(model, buffer, rollout, grpo, seed)
-    off = abs(report[0] - 1)
-    return Finding(
-        "ratio is 1 on the first update", off < RATIO_LIMIT, f"mean ratio differs from 1 by {off:.1e}",
-        "make rollout and training pass alike: dtype, micro_batch, cfg, dropout off, attention kernels",
-    )  # fmt: skip
-
-
-def _kl(model: nn.Module, buffer: RolloutBuffer, rollout: RolloutSettings, grpo: GrpoSettings, seed: int) -> Finding:
-    kl = _first_update(model, buffer, rollout, grpo, seed)[1]
-    return Finding(
-        "KL is 0 at the anchor", kl < KL_LIMIT, f"{kl:.1e}",
-        "as for the ratio; noise kept in bfloat16 alone gives 1e-6 (rollout.storage_dtype, noise_store)",
-    )  # fmt: skip
+    return [
+        *_first_update(model, buffer, rollout, grpo, seed),
+        _ode(model, condition, noise, seeds, rollout),
+        _mask(sampled, condition.num_conditioning, rollout),
+        _round_trip(buffer),
+        _memory(model, sampled, grpo),
+    ]
 
 
 def _ode(
@@ -135,18 +113,25 @@ def _memory(model: nn.Module, sampled: VideoRollout, grpo: GrpoSettings) -> Find
 
 def _first_update(
     model: nn.Module, buffer: RolloutBuffer, rollout: RolloutSettings, grpo: GrpoSettings, seed: int
-) -> tuple[float, float]:
-    """Mean ratio and KL of one update whose step is undone; the anchor is the buffer's."""
+) -> tuple[Finding, Finding]:
+    """Ratio and KL of one update that moves nothing; the anchor is the buffer's."""
     settings = replace(
         grpo, updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0,
         kl=replace(grpo.kl, mode="mean", anchor="buffer", beta=1.0), ratio_norm=False,
         advantage=replace(grpo.advantage, best_of_n=0),
     )  # fmt: skip
     learner = GrpoLearner(model, settings, rollout, seed=seed)
-    report = learner.train(buffer.with_rewards({"total": torch.arange(len(buffer), dtype=torch.float64)}))
+    (update,) = learner.train(buffer.with_rewards({"total": torch.arange(len(buffer), dtype=torch.float64)})).updates
     model.zero_grad(set_to_none=True)
     model.eval()
-    return report.updates[0].ratio_mean, report.updates[0].kl
+    off = abs(update.ratio_mean - 1)
+    return Finding(
+        "ratio is 1 on the first update", off < RATIO_LIMIT, f"mean ratio differs from 1 by {off:.1e}",
+        "make rollout and training pass alike: dtype, micro_batch, cfg, dropout off, attention kernels",
+    ), Finding(
+        "KL is 0 at the anchor", update.kl < KL_LIMIT, f"{update.kl:.1e}",
+        "as for the ratio; noise kept in bfloat16 alone gives 1e-6 (rollout.storage_dtype, noise_store)",
+    )  # fmt: skip
 
 
 def _buffer(sampled: VideoRollout, condition: Condition, rollout: RolloutSettings) -> RolloutBuffer:

@@ -20,6 +20,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
+from wm_nodes.learning.checkpoint_tensors import metadata_of, optimizer_tensors, restore_optimizer, section
 from wm_nodes.learning.distributed import Ranks
 from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.weights import check_same_layout
@@ -206,7 +207,6 @@ class GrpoLearner:
         except BaseException:
             self._restore(before)
             raise
-        share = buffer.rollout.noise_share
         return BufferReport(
             updates=updates,
             reward_mean=float(rewards[buffer.valid].mean()),
@@ -215,7 +215,7 @@ class GrpoLearner:
             invalid=advantages.num_invalid,
             kept=int(kept.sum()),
             group_size=len(buffer) / advantages.num_groups,
-            noise_share=float(share.square().mean().sqrt()) if len(share) else 0.0,
+            noise_share=buffer.rollout.spent_noise,
         )
 
     def gradients(self, buffer: RolloutBuffer, rows: "_Row", advantages: GroupAdvantages) -> dict[str, float]:
@@ -314,10 +314,7 @@ class GrpoLearner:
         device = next(self.model.parameters()).device
         steps = torch.tensor(buffer.rollout.steps)[positions]
         where = torch.tensor([buffer.rollout.state_steps.index(k) for k in buffer.rollout.steps])[positions]
-        condition = buffer.condition.rows(videos)
-        condition = type(condition)(
-            *(tensor.to(device) for tensor in (condition.frames, condition.actions, condition.text))
-        )
+        condition = buffer.condition.rows(videos).to(device)
         times = self.rollout.times
         return transition(
             model, condition, buffer.rollout.states[videos, where].to(device),
@@ -443,8 +440,7 @@ class GrpoLearner:
         tensors |= {f"averaged.{name}": value for name, value in self.averaged.items()}
         if self._anchor is not None:
             tensors |= {f"anchor.{name}": value for name, value in self._anchor.state_dict().items()}
-        for index, state in self._optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{index}.{key}": value for key, value in state.items()}
+        tensors |= {f"optimizer.{key}": value for key, value in optimizer_tensors(self._optimizer).items()}
         header = {"version": self.version, "seed": self.seed, "iteration": iteration}
         header |= {f.name: getattr(self._running, f.name) for f in fields(self._running)}
         tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
@@ -458,23 +454,19 @@ class GrpoLearner:
         """
         data = path.read_bytes()
         tensors = load(data)
-        header = json.loads(json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]["grpo"])
+        header = json.loads(metadata_of(data)["grpo"])
         if header["seed"] != self.seed:
             raise ValueError(
                 f"{path} was made with seed {header['seed']}, this run has {self.seed}; use a new run folder"
             )
-        weights = _section(tensors, "model.")
+        weights = section(tensors, "model.")
         check_same_layout(dict(_trained(self.model)), weights, what=str(path))
         _set_trained(self.model, weights)
         device = next(self.model.parameters()).device
-        self.averaged = {name: value.to(device) for name, value in _section(tensors, "averaged.").items()}
+        self.averaged = {name: value.to(device) for name, value in section(tensors, "averaged.").items()}
         if self._anchor is not None:
-            self._anchor.load_state_dict(_section(tensors, "anchor."))
-        states: dict[int, dict[str, Tensor]] = {}
-        for name, value in _section(tensors, "optimizer.").items():
-            index, key = name.split(".", 1)
-            states.setdefault(int(index), {})[key] = value
-        self._optimizer.load_state_dict({"state": states, "param_groups": self._optimizer.state_dict()["param_groups"]})
+            self._anchor.load_state_dict(section(tensors, "anchor."))
+        restore_optimizer(self._optimizer, section(tensors, "optimizer."))
         self._running = RunningStd(header["sum_of_squares"], header["count"])
         self.version = header["version"]
         return int(header["iteration"])
@@ -511,7 +503,3 @@ def _trained(model: nn.Module) -> Iterator[tuple[str, Tensor]]:
 def _set_trained(model: nn.Module, values: dict[str, Tensor]) -> None:
     for name, parameter in _trained(model):
         parameter.copy_(values[name])
-
-
-def _section(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}

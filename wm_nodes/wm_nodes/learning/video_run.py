@@ -13,7 +13,7 @@ from wm_nodes.learning.distributed import Ranks
 from wm_nodes.learning.metrics import MetricsWriter
 from wm_nodes.learning.video_config import VideoRlConfig
 from wm_nodes.learning.video_grpo import BufferReport, GrpoLearner
-from wm_nodes.learning.weights import PackedWeights, pack_weights, save_weights
+from wm_nodes.learning.weights import PackedWeights, save_weights
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 
 CHECKPOINT = "checkpoints/video_learner.safetensors"
@@ -43,6 +43,9 @@ class VideoRun:
             self.iterations = self.learner.load(run_dir / CHECKPOINT)
         self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if not ranks or ranks.rank == 0 else None
 
+        self.packed: PackedWeights | None = None
+        """What train() or save() wrote last."""
+
     @property
     def version(self) -> int:
         return self.learner.version
@@ -58,14 +61,12 @@ class VideoRun:
 
     def save(self) -> PackedWeights:
         """Write the version and the checkpoint, the checkpoint last; return the version's weights."""
-        packed = save_weights(self.network, self.run_dir / version_uri(self.version), {"version": str(self.version)})
+        path = self.run_dir / version_uri(self.version)
+        self.packed = save_weights(self.network, path, {"version": str(self.version)})
         self.learner.save(self.run_dir / CHECKPOINT, iteration=self.iterations)
         for old in sorted((self.run_dir / "video_policies").glob("video_*.safetensors"))[: -self._keep]:
             old.unlink(missing_ok=True)
-        return packed
-
-    def packed(self) -> PackedWeights:
-        return pack_weights(self.network, {"version": str(self.version)})
+        return self.packed
 
     def close(self) -> None:
         if self._metrics is not None:

@@ -57,7 +57,6 @@ class VideoLearnerNode(ManagedNode):
         self.own(self._action.destroy)
 
     def activate(self) -> None:
-        self._run.save()
         self._announce()
 
     def deactivate(self, reason: str) -> None:
@@ -130,7 +129,7 @@ class VideoLearnerNode(ManagedNode):
         )  # fmt: skip
 
     def _announce(self) -> None:
-        packed, version = self._run.packed(), self._run.version
+        packed, version = self._run.packed or self._run.save(), self._run.version
         message = PolicyVersion(
             version=version, train_step=self._run.iterations, uri=version_uri(version), sha256=packed.sha256,
             size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,

@@ -17,6 +17,7 @@ from wm_nodes.learning.video_data import load_clips
 from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.learning.weights import WeightsError, load_weights
 from wm_nodes.nodes.policy_holder import read_weights
+from wm_nodes.recording.layout import Tiles
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -42,7 +43,6 @@ class VideoModelNode(ManagedNode):
         super().__init__("video_model", PARAMS, **node_arguments)
 
     def configure(self) -> None:
-        torch.set_num_threads(max(1, torch.get_num_threads()))
         config = load_video_config(str(self.param("config_file")))
         folder = load_video_folder(Path(str(self.param("video_model_dir"))))
         bags = [Path(text) for text in self.param("context_bags") if text]
@@ -87,12 +87,11 @@ class VideoModelNode(ManagedNode):
             result.sha256, result.num_clips = hashlib.sha256(data).hexdigest(), len(buffer)
             write_atomic(self.run_dir / result.buffer_uri, data)
             self._forget_old()
-            share = buffer.rollout.noise_share
             message = ClipBatch(
                 iteration=goal.iteration, policy_version=goal.policy_version, contexts=list(request.contexts),
                 group_size=request.group_size, num_frames=buffer.rollout.latents.shape[2],
                 buffer_uri=result.buffer_uri, sha256=result.sha256, sample_s=time.perf_counter() - began,
-                noise_share=float(share.square().mean().sqrt()) if len(share) else 0.0,
+                noise_share=buffer.rollout.spent_noise,
             )  # fmt: skip
             self._publish(message, film_strip(self._generator.folder.codec.decode(buffer.rollout.latents)))
             self.diagnostics.latency("sample", message.sample_s)
@@ -139,8 +138,7 @@ class VideoModelNode(ManagedNode):
 def film_strip(frames: torch.Tensor) -> UInt8Array:
     """One picture of uint8 clips (N, F, H, W, 3): a row per clip, a column per frame, (N H, F W, 3)."""
     N, F, H, W, _ = frames.shape
-    strip: UInt8Array = frames.permute(0, 2, 1, 3, 4).reshape(N * H, F * W, 3).numpy()
-    return strip
+    return Tiles(N, F, H, W).tile(frames.flatten(0, 1).numpy())
 
 
 def main() -> int:

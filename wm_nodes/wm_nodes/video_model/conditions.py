@@ -29,6 +29,9 @@ class Condition:
     def rows(self, index: Tensor | slice) -> "Condition":
         return Condition(self.frames[index], self.actions[index], self.text[index])
 
+    def to(self, device: torch.device | str) -> "Condition":
+        return Condition(self.frames.to(device), self.actions.to(device), self.text.to(device))
+
     def repeat_interleave(self, times: int) -> "Condition":
         """Each row `times` times, in groups."""
         return Condition(*(tensor.repeat_interleave(times, 0) for tensor in (self.frames, self.actions, self.text)))

@@ -71,6 +71,11 @@ class VideoRollout:
     seeds: Tensor
     noise_share: Tensor
 
+    @property
+    def spent_noise(self) -> float:
+        """Root mean square of noise_share over the stochastic steps; 0 by ODE."""
+        return float(self.noise_share.square().mean().sqrt()) if len(self.noise_share) else 0.0
+
     def state(self, k: int) -> Tensor:
         """x before step k, (N, C, F, H, W), storage dtype."""
         return self.states[:, self.state_steps.index(k)]
