@@ -16,14 +16,13 @@ import wm_setup
 ROOT = Path(__file__).resolve().parents[1]
 
 
-MAIN_JOB = "tests/graph/test_main_job.py"
-TWO_AT_A_TIME = (MAIN_JOB, "tests/unit", "tests/contracts")
-"""The other tests of the graph measure deadlines, and share the cores between their own processes."""
+LONG_FIRST = ("tests/graph", "tests/parity", "tests/unit", "tests/contracts")
+TWO_AT_A_TIME = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", *LONG_FIRST)
 
 
 def main(argv):
     """Run the checks, then pytest, whose closing lines come last. Return 0 if all passed."""
-    marked = ["-m", "not slow"] if "--fast" in argv else []
+    fast = ["not slow"] if "--fast" in argv else []
     named = [text for text in argv if text != "--fast"]
     scripts = Path(sys.prefix) / "bin"
     checks = {
@@ -34,9 +33,8 @@ def main(argv):
     failed = [name for name, command in checks.items() if not _passes(name, command)]
     if failed:
         print(f"failed before the tests: {', '.join(failed)}", flush=True)
-    two_at_a_time = ["-n", "2", "--dist", "loadfile", *TWO_AT_A_TIME]
-    runs = [named] if named else [two_at_a_time, ["tests/parity", "tests/graph", f"--ignore={MAIN_JOB}"]]
-    codes = [_pytest([*marked, *arguments]) for arguments in runs]
+    runs = [([], named)] if named else [(["not alone"], TWO_AT_A_TIME), (["alone"], LONG_FIRST)]
+    codes = [_pytest(["-m", " and ".join(marks + fast), *arguments]) for marks, arguments in runs]
     return max(codes) or int(bool(failed))
 
 

@@ -13,7 +13,7 @@ from wm_msgs.action import Train
 from wm_msgs.msg import Credit, TransitionBatch
 from wm_nodes.ros.wire import WireError
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 
 @pytest.mark.kills

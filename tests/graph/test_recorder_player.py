@@ -29,7 +29,7 @@ from wm_nodes.recording import Bag, read_episodes, read_rollouts, recover, topic
 from wm_nodes.recording import messages as m
 from wm_nodes.ros import qos as table
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 TOPICS = [topics.SPEC, topics.IMAGES, topics.TRANSITION, topics.REWARD, topics.EPISODE]
 Streams = dict[str, list[bytes]]

@@ -25,7 +25,7 @@ from wm_nodes.recording import BagError, recover
 from wm_nodes.ros import calls
 from wm_nodes.ros.wire import ResetCommand, WireError
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 CYCLE = (
     Transition.TRANSITION_DEACTIVATE,

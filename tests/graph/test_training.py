@@ -190,6 +190,7 @@ def test_two_ranks_under_torchrun_give_the_update_of_one(graph: Graph, probe: Pr
     toy.assert_trained_in_one_process(file, updates=2, tolerance=1e-5)
 
 
+@pytest.mark.alone
 def test_cancel_ends_training_within_a_second_and_the_next_goal_works(graph: Graph, probe: Probe) -> None:
     graph.start_training_nodes()
     client = probe.action(Train, "train")
