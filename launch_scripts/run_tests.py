@@ -40,7 +40,7 @@ def main(argv):
 
 def _pytest(arguments):
     return subprocess.run(
-        [sys.executable, "-m", "pytest", *arguments], cwd=ROOT, check=False, env=_environment()
+        [sys.executable, "-m", "pytest", "--durations=12", *arguments], cwd=ROOT, check=False, env=_environment()
     ).returncode
 
 

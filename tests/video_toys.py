@@ -10,7 +10,8 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from wm_nodes.learning.distributed import Ranks
-from wm_nodes.learning.video_grpo import GrpoLearner, GrpoSettings
+from wm_nodes.learning.grpo_settings import GrpoSettings
+from wm_nodes.learning.video_grpo import GrpoLearner
 from wm_nodes.video_model import (
     Condition,
     NetworkSettings,

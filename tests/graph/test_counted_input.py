@@ -17,7 +17,7 @@ from wm_nodes.nodes.policy_holder import weights_uri
 from wm_nodes.ros import convert
 from wm_nodes.specs import EnvironmentSpec
 
-pytestmark = [pytest.mark.graph, pytest.mark.alone]
+pytestmark = pytest.mark.graph
 
 LEARNER, EVALUATOR, POLICY = "/wm/learner", "/wm/reward_evaluator", "/wm/policy"
 

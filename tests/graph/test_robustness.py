@@ -25,7 +25,7 @@ from wm_nodes.recording import BagError, recover
 from wm_nodes.ros import calls
 from wm_nodes.ros.wire import ResetCommand, WireError
 
-pytestmark = [pytest.mark.graph, pytest.mark.alone]
+pytestmark = pytest.mark.graph
 
 CYCLE = (
     Transition.TRANSITION_DEACTIVATE,

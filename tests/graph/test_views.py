@@ -56,13 +56,13 @@ def test_service_events_are_published_while_the_parameter_says_so(graph: Graph, 
     probe.node.create_subscription(GetEnvSpec.Event, "env/get_spec/_service_event", events.append, EVENTS)
     wait_until("matching", lambda: probe.node.count_publishers("/wm/env/get_spec/_service_event"))
 
-    def ask() -> list[GetEnvSpec.Event]:
+    def asked_and_answered() -> bool:
         probe.call(GetEnvSpec, "env/get_spec", GetEnvSpec.Request())
-        return [event for event in events if event.response]
+        return any(event.request for event in events) and any(event.response for event in events)
 
-    answered = wait_until("an event with the answer", ask)[0]
+    wait_until("an event with the request and one with the answer", asked_and_answered)
+    answered = next(event for event in events if event.response)
     assert answered.response[0].spec.spec_hash == client.spec.spec_hash
-    assert any(event.request for event in events)
     off = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="off")
     change = SetParameters.Request(parameters=[Parameter(name="service_introspection", value=off)])
     assert probe.call(SetParameters, "environment/set_parameters", change).results[0].successful

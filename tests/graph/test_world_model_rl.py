@@ -1,30 +1,44 @@
-"""Loop 2 as a user starts it, smallest preset: simulator bags, video model, four node processes, GRPO, a bag."""
+"""Loop 2 as a user starts it, smallest preset: simulator bags, video model, four node processes, GRPO, a bag, a report;
+then its recording scored and trained on again."""
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from graph.harness import own_domain
+from metric_docs import documented, written
 
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.learning.clip_archive import RecordedClips, read_clips, rescore
 from wm_nodes.learning.clip_generation import ClipGenerator
-from wm_nodes.learning.clip_scores import mixed, score_clips
+from wm_nodes.learning.clip_scores import ClipScores, load_probe, mixed, score_clips
+from wm_nodes.learning.heldout import context_scores
 from wm_nodes.learning.metrics import read_metrics
-from wm_nodes.learning.video_config import load_video_config
-from wm_nodes.learning.video_data import load_clips
+from wm_nodes.learning.video_config import VideoRlConfig, load_video_config
+from wm_nodes.learning.video_data import Clips, load_clips
 from wm_nodes.learning.video_folder import load_video_folder
-from wm_nodes.learning.video_run import VideoRun, rewarded, version_uri
+from wm_nodes.learning.video_run import CHECKPOINT, VideoRun, evaluated_uri, rewarded, version_uri
+from wm_nodes.learning.weights import load_weights
 from wm_nodes.nodes.video_model_node import film_strip
+from wm_nodes.recording import BagError
 from wm_nodes.recording.bag import Bag
-from wm_nodes.world_model import load_model_folder
+from wm_nodes.reports import read_summary
+from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model_job import main
 
 pytestmark = pytest.mark.graph
 PROGRAM = "import sys; from wm_nodes.world_model_job import main; sys.exit(main(sys.argv[1:]))"
+SETTINGS = {"grpo.ema_decay": 0.5}
+ARGUMENTS = ["--preset", "smoke", *(f"--set={name}={value}" for name, value in SETTINGS.items())]
 
 
 def start(arguments: list[str], domain: int) -> subprocess.CompletedProcess[str]:
@@ -33,26 +47,44 @@ def start(arguments: list[str], domain: int) -> subprocess.CompletedProcess[str]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=280, check=False)
 
 
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of a finished run."""
+    torch.set_num_threads(1)
+    folder = tmp_path_factory.mktemp("world_model_rl") / "run"
+    with own_domain() as domain:
+        done = start([*ARGUMENTS, "--run-dir", str(folder)], domain)
+    assert done.returncode == 0, done.stdout + done.stderr
+    yield folder
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def config() -> VideoRlConfig:
+    return load_video_config("smoke", SETTINGS)
+
+
+@pytest.fixture
+def contexts(run_dir: Path, config: VideoRlConfig) -> Clips:
+    return load_clips(sorted((run_dir / "data" / "train").glob("shard_*")), config.model.stride)
+
+
+@pytest.fixture
+def probe(config: VideoRlConfig) -> PositionProbe:
+    return load_probe(shipped_model(config.task))
+
+
+def recorded(run_dir: Path) -> list[RecordedClips]:
+    return list(read_clips(Path(read_summary(run_dir)["bag"]), pictures=True))
+
+
 @pytest.mark.slow
 def test_post_training_over_dds_gives_the_weights_of_the_same_loop_in_one_process(
-    ros_domain: int, tmp_path: Path
+    run_dir: Path, tmp_path: Path, config: VideoRlConfig, contexts: Clips, probe: PositionProbe
 ) -> None:
-    run_dir = tmp_path / "run"
-    done = start(["--preset", "smoke", "--run-dir", str(run_dir)], ros_domain)
-    assert done.returncode == 0, done.stdout + done.stderr
-    summary = json.loads((run_dir / "summary.json").read_text())
-    assert summary["version"] == 4 and summary["scores"]["tool_cm"]["before"] > 0
-    assert (run_dir / "strips" / "strip_0.png").is_file()
-    assert [line["step"] for line in read_metrics(run_dir, "grpo")] == [1, 2]
-
-    torch.set_num_threads(1)
-    config = load_video_config("smoke")
     folder = load_video_folder(run_dir / "video_model")
-    bags = sorted((run_dir / "data" / "train").glob("shard_*"))
-    generator = ClipGenerator(folder, load_clips(bags, config.model.stride), config)
-    probe = load_model_folder(Path(str(shipped_model(config.task)))).probe
-    assert probe is not None
-    run = VideoRun(folder.network, config, tmp_path / "local")
+    generator = ClipGenerator(folder, contexts, config)
+    run = VideoRun(folder.network, config, tmp_path)
     frames = []
     for iteration in range(config.iterations):
         request = generator.request(iteration, run.version)
@@ -60,9 +92,11 @@ def test_post_training_over_dds_gives_the_weights_of_the_same_loop_in_one_proces
         frames.append(folder.codec.decode(buffer.rollout.latents))
         scores = score_clips(frames[-1], generator.references(request), probe, 1).named()
         run.train(rewarded(buffer, scores, mixed(scores, config.rewards)))
-    assert (tmp_path / "local" / version_uri(4)).read_bytes() == (run_dir / version_uri(4)).read_bytes()
+    run.close()
+    for uri in (version_uri(4), evaluated_uri(4, config)):
+        assert (tmp_path / uri).read_bytes() == (run_dir / uri).read_bytes()
 
-    with Bag(Path(summary["bag"])) as bag:
+    with Bag(Path(read_summary(run_dir)["bag"])) as bag:
         types = {connection.topic: connection.msgtype for connection in bag.connections}
         messages: dict[str, list[Any]] = {}
         for topic, _, data in bag.messages():
@@ -72,8 +106,158 @@ def test_post_training_over_dds_gives_the_weights_of_the_same_loop_in_one_proces
     for image, expected in zip(messages["/wm/clips/image"], frames, strict=True):
         np.testing.assert_array_equal(np.asarray(image.data), film_strip(expected).reshape(-1))
 
-    again = start(["--preset", "smoke", "--run-dir", str(run_dir)], ros_domain)
-    assert again.returncode == 0 and "starting the graph" not in again.stdout
+
+@pytest.mark.slow
+def test_the_averaged_weights_are_measured_after_and_the_base_model_once_before(
+    run_dir: Path, config: VideoRlConfig, probe: PositionProbe
+) -> None:
+    summary, folder = read_summary(run_dir), load_video_folder(run_dir / "video_model")
+    before = json.loads((run_dir / "evaluations" / "before.json").read_text())
+    assert before["sha256"] == folder.manifest["sha256"]["network.safetensors"]
+    for name, row in summary["scores"].items():
+        assert row["before"] == pytest.approx(folder.manifest["heldout"][name], rel=1e-12)
+    heldout = load_clips(sorted((run_dir / "data" / "heldout").glob("shard_*")), config.model.stride)
+    load_weights(folder.network, (run_dir / evaluated_uri(4, config)).read_bytes())
+    found = {name: values.mean() for name, values in context_scores(folder, heldout, probe, config).items()}
+    last = read_metrics(run_dir, "heldout")[-1]
+    for name, row in summary["scores"].items():
+        assert row["after"] == pytest.approx(float(found[name]), rel=1e-12)
+        assert last[name] == pytest.approx(float(found[name]), rel=1e-12)
+    assert (summary["weights"], summary["version"], summary["evaluations"]) == ("averaged", 4, 2)
+
+
+@pytest.mark.slow
+def test_every_metric_is_in_the_document_and_tensorboard_has_them_too(run_dir: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    scores = set(ClipScores.__dataclass_fields__)
+    assert [line["step"] for line in read_metrics(run_dir, "grpo")] == [1, 2]
+    assert [line["step"] for line in read_metrics(run_dir, "heldout")] == [1, 2]
+    for line in read_metrics(run_dir):
+        missing = written(line, scores) - documented(f"section `{line['section']}`")
+        assert not missing, f"not in docs/metrics.md: {missing}"
+    assert read_summary(run_dir).keys() == documented("summary.json of loop 2")
+    events = EventAccumulator(str(run_dir / "tensorboard")).Reload()
+    assert [event.value for event in events.Scalars("heldout/tracking")] == pytest.approx(
+        [line["tracking"] for line in read_metrics(run_dir, "heldout")]
+    )
+
+
+@pytest.mark.slow
+def test_the_report_holds_table_pictures_command_and_settings(run_dir: Path) -> None:
+    text = (run_dir / "report.html").read_text()
+    assert text.count("data:image/png;base64") == 4
+    for part in ("object error, cm", "averaged weights", "No alarm in 2 held-out evaluations", "world_model_rl.py",
+                 "ema_decay: 0.5", "rescore"):  # fmt: skip
+        assert part in text
+
+
+@pytest.mark.slow
+def test_a_finished_run_starts_no_graph_again_even_without_its_metrics(run_dir: Path, ros_domain: int) -> None:
+    (run_dir / "metrics.jsonl").rename(run_dir / "metrics.kept")
+    try:
+        again = start([*ARGUMENTS, "--run-dir", str(run_dir)], ros_domain)
+    finally:
+        (run_dir / "metrics.kept").rename(run_dir / "metrics.jsonl")
+    assert again.returncode == 0 and "starting the graph" not in again.stdout, again.stdout + again.stderr
+    assert read_summary(run_dir)["iterations"] == 2
+
+
+@pytest.mark.slow
+def test_recorded_clips_are_scored_again_to_the_same_bits(
+    run_dir: Path, config: VideoRlConfig, contexts: Clips, probe: PositionProbe, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rescore", str(run_dir)]) == 0
+    assert "bit for bit" in capsys.readouterr().out
+    found = json.loads((run_dir / "rescored.json").read_text())
+    assert found["equal"] and [row["iteration"] for row in found["buffers"]] == [0, 1]
+    assert all(row["recorded"] == row["again"] for row in found["buffers"])
+    first = recorded(run_dir)[0]
+    values = first.scores["tool_cm"].clone()
+    values[3] = torch.nextafter(values[3], torch.tensor(torch.inf, dtype=torch.float64))
+    changed = replace(first, scores={**first.scores, "tool_cm": values})
+    assert rescore(changed, contexts, probe, config.rewards, 1).different == ("tool_cm",)
+    assert first.picture is not None
+    dark = replace(first, picture=first.picture // 2)
+    assert {"psnr_db", "total"} <= set(rescore(dark, contexts, probe, config.rewards, 1).different)
+    with pytest.raises(BagError, match="picture of iteration 0 is not in the bag"):
+        rescore(replace(first, picture=None), contexts, probe, config.rewards, 1)
+    with pytest.raises(BagError, match="beauty cannot be scored again"):
+        rescore(replace(first, scores={"beauty": values}), contexts, probe, config.rewards, 1)
+
+
+@pytest.mark.slow
+def test_other_weights_of_the_rewards_give_exit_code_1(run_dir: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run_dir, copy)
+    text = (copy / "config.yaml").read_text()
+    assert "scenery: -5.0" in text
+    (copy / "config.yaml").write_text(text.replace("scenery: -5.0", "scenery: -4.0"))
+    assert main(["rescore", str(copy), "--json", str(tmp_path / "scores.json")]) == 1
+    rows = json.loads((tmp_path / "scores.json").read_text())["buffers"]
+    assert [row["different"] for row in rows] == [["total"], ["total"]]
+
+
+@pytest.mark.slow
+def test_training_again_from_the_recording_gives_the_same_weights_and_other_rewards_give_others(
+    run_dir: Path, tmp_path: Path
+) -> None:
+    live = {path.name: path.read_bytes() for path in (run_dir / "video_policies").iterdir()}
+    assert main(["retrain", str(run_dir), "--run-dir", str(tmp_path / "same"), "--no-tensorboard"]) == 0
+    for name in ("video_000002.safetensors", "video_000004.safetensors", "averaged_000004.safetensors"):
+        assert (tmp_path / "same" / "video_policies" / name).read_bytes() == live[name]
+    for mine, theirs in zip(read_metrics(tmp_path / "same"), read_metrics(run_dir), strict=True):
+        assert {k: v for k, v in mine.items() if "seconds" not in k} == {
+            k: v for k, v in theirs.items() if "seconds" not in k
+        }
+    scores = {name: row["after"] for name, row in read_summary(run_dir)["scores"].items()}
+    assert {name: row["after"] for name, row in read_summary(tmp_path / "same")["scores"].items()} == scores
+    other = ["--run-dir", str(tmp_path / "other"), "--set", "rewards.object_cm=-0.1", "--no-tensorboard"]
+    assert main(["retrain", str(run_dir), *other]) == 0
+    assert (tmp_path / "other" / version_uri(4)).read_bytes() != live["video_000004.safetensors"]
+    assert read_metrics(tmp_path / "other", "grpo")[0]["reward_mean"] == pytest.approx(
+        np.mean(recorded(run_dir)[0].total.numpy() - 0.1 * recorded(run_dir)[0].scores["object_cm"].numpy())
+    )
+
+
+@pytest.mark.slow
+def test_training_again_names_a_buffer_that_is_gone_or_another_one(
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = run_dir / "buffers" / "buffer_000001.safetensors"
+    data = path.read_bytes()
+    try:
+        path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+        assert main(["retrain", str(run_dir), "--run-dir", str(tmp_path / "a"), "--no-tensorboard"]) == 2
+        assert "the bag says" in capsys.readouterr().out
+        path.unlink()
+        assert main(["retrain", str(run_dir), "--run-dir", str(tmp_path / "b"), "--no-tensorboard"]) == 2
+        assert "--keep-buffers" in capsys.readouterr().out
+    finally:
+        path.write_bytes(data)
+    assert main(["retrain", str(run_dir), "--run-dir", str(tmp_path / "b"), "--no-tensorboard"]) == 0  # goes on
+    assert (tmp_path / "b" / version_uri(4)).read_bytes() == (run_dir / version_uri(4)).read_bytes()
+    shutil.move(run_dir / CHECKPOINT, tmp_path / "checkpoint")
+    try:
+        assert main(["retrain", str(run_dir), "--run-dir", str(tmp_path / "c")]) == 2
+        assert "has no checkpoint" in capsys.readouterr().out
+    finally:
+        shutil.move(tmp_path / "checkpoint", run_dir / CHECKPOINT)
+
+
+def test_no_kept_buffer_is_refused_before_anything_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--preset", "smoke", "--keep-buffers", "0", "--run-dir", str(tmp_path / "run")]) == 2
+    assert "--keep-buffers must be at least 1, got 0" in capsys.readouterr().out and not (tmp_path / "run").exists()
+
+
+def test_offline_work_on_a_folder_that_is_no_run_is_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for action in ("rescore", "retrain"):
+        assert main([action, str(tmp_path)]) == 2
+        assert "holds no config.yaml; name the run folder" in " ".join(capsys.readouterr().out.split())
 
 
 def test_wrong_settings_end_with_one_clear_line(ros_domain: int, tmp_path: Path) -> None:

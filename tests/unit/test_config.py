@@ -45,6 +45,17 @@ def test_an_override_without_a_value_says_what_it_expects() -> None:
         parse_override("ppo.updates")
 
 
+def test_one_entry_of_a_free_mapping_can_be_set_and_the_mapping_replaced() -> None:
+    shares = load_config("cpu").data.behaviours
+    assert load_config("cpu", {"data.behaviours.expert": 0.5}).data.behaviours == {**shares, "expert": 0.5}
+    assert load_config("cpu", {"data.behaviours": {"expert": 1.0}}).data.behaviours == {"expert": 1.0}
+
+
+def test_a_setting_below_a_single_value_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"unknown setting 'seed\.x'; seed is a single value"):
+        load_config("cpu", {"seed.x": 1})
+
+
 def test_the_shipped_model_is_found_by_task_and_its_files_are_small() -> None:
     folder = shipped_model("reach")
     assert folder == shipped_model("push_cube")

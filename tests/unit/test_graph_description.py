@@ -82,6 +82,22 @@ def test_nodes_get_only_parameters_that_they_declare(scenario: str, given: dict[
         assert set(node.parameters) - common <= declared, node.label
 
 
+def test_held_out_bags_and_their_judge_go_to_the_learner_of_loop_2_and_none_where_none_are_named(
+    given: dict[str, str],
+) -> None:
+    values = of("world_model_rl", given)
+    graph, _ = launch_arguments.prepare("world_model_rl", values)
+    assert "heldout_bags" not in graph.node("learner").parameters
+    more = {"heldout_bags": "/a,/b", "keep_buffers": "30", "tensorboard": "true"}
+    graph, _ = launch_arguments.prepare("world_model_rl", values | more)
+    learner = graph.node("learner").parameters
+    assert learner["heldout_bags"] == ["/a", "/b"] and learner["model_dir"] == given["model_dir"]
+    assert learner["tensorboard"] is True
+    assert graph.node("video_model").parameters["keep_buffers"] == 30
+    with pytest.raises(GraphError, match="keep_buffers must be 1 to 100000, got 0"):
+        launch_arguments.prepare("world_model_rl", values | {"keep_buffers": "0"})
+
+
 def test_configuration_of_the_run_is_written_and_sets_the_number_of_environments(given: dict[str, str]) -> None:
     graph, values = launch_arguments.prepare("online_training", of("online_training", given) | {"task": "reach"})
     assert "task: reach" in Path(values["config_file"]).read_text()

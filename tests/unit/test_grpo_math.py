@@ -10,7 +10,14 @@ from torch.testing import assert_close
 from video_toys import randn
 
 from wm_nodes.rl.diversity import rollout_diversity
-from wm_nodes.rl.group_advantages import GroupAdvantages, RunningStd, best_of_n, group_advantages, win_rates
+from wm_nodes.rl.group_advantages import (
+    GroupAdvantages,
+    RunningStd,
+    best_of_n,
+    group_advantages,
+    mixed_advantages,
+    win_rates,
+)
 from wm_nodes.rl.grpo import (
     clip_tails,
     clipped_objective,
@@ -149,6 +156,35 @@ def test_best_of_8_of_16_keeps_the_4_best_and_the_4_worst_of_each_group() -> Non
     assert kept.sum() == 16
     assert sorted(signal[:16][kept[:16]].tolist()) == [-7.5, -6.5, -5.5, -4.5, 4.5, 5.5, 6.5, 7.5]
     assert torch.equal(kept[:16], kept[16:]), "a mirrored group keeps the same videos"
+
+
+def mixed(rewards: dict[str, list[float]], weights: dict[str, float], groups: list[int]) -> GroupAdvantages:
+    values = {name: torch.tensor(value, dtype=torch.float64) for name, value in rewards.items()}
+    return mixed_advantages(values, weights, torch.tensor(groups), torch.ones(len(groups)).bool(), clip=2.5)
+
+
+def test_advantages_of_several_rewards_are_weighed_after_each_is_normalised() -> None:
+    groups, task, scenery = [0] * 4, [0.0, 0.0, 1.0, 1.0], [0.002, 0.004, 0.002, 0.004]
+    found = mixed({"task": task, "scenery": scenery}, {"task": 3.0, "scenery": -1.0}, groups)
+    assert_close(found.advantages_N, torch.tensor([-0.5, -1.0, 1.0, 0.5], dtype=torch.float64))
+    scaled = [100 * value for value in scenery]
+    hundredfold = mixed({"task": task, "scenery": scaled}, {"task": 3.0, "scenery": -1.0}, groups)
+    assert_close(hundredfold.advantages_N, found.advantages_N)
+    alone = mixed({"task": task, "scenery": scenery}, {"task": 2.0, "scenery": 0.0}, groups)
+    assert_close(alone.advantages_N, advantages(task, groups).advantages_N)
+
+
+def test_a_group_trains_while_one_of_its_rewards_has_spread() -> None:
+    groups, flat = [0, 0, 1, 1], [1.0, 1.0, 1.0, 1.0]
+    found = mixed({"task": [0.0, 1.0, 5.0, 5.0], "scenery": flat}, {"task": 1.0, "scenery": 1.0}, groups)
+    assert (found.kept_N.tolist(), found.num_zero_std) == ([True, True, False, False], 1)
+    assert_close(found.advantages_N, torch.tensor([-0.5, 0.5, 0.0, 0.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("weights", [{}, {"task": 0.0}, {"taste": 1.0}])
+def test_a_mix_of_nothing_or_of_an_unknown_reward_is_refused(weights: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="weigh some of task"):
+        mixed({"task": [0.0, 1.0]}, weights, [0, 0])
 
 
 def test_equal_advantages_are_kept_by_their_index() -> None:

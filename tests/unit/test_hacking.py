@@ -23,13 +23,12 @@ def test_only_the_last_evaluations_count() -> None:
     assert not hacked_metrics(reward[:2], {"mass": truth[:2]}, window=4)
 
 
-def test_two_flat_noisy_curves_raise_an_alarm_in_less_than_one_case_of_twenty() -> None:
-    generator = np.random.default_rng(0)
-    alarms = sum(
-        bool(hacked_metrics(generator.normal(size=8), {"mass": generator.normal(size=8)}, window=8))  # type: ignore[arg-type]
-        for _ in range(400)
-    )
-    assert alarms < 20
+@pytest.mark.parametrize("window", [3, 4, 8])
+def test_two_flat_noisy_curves_hardly_ever_raise_an_alarm(window: int) -> None:
+    generator, cases = np.random.default_rng(0), 4000
+    draw = lambda: generator.normal(size=window).tolist()  # noqa: E731
+    alarms = sum(bool(hacked_metrics(draw(), {"mass": draw()}, window=window)) for _ in range(cases))
+    assert alarms <= 0.002 * cases
 
 
 def test_a_window_of_two_and_curves_of_different_lengths_are_refused() -> None:

@@ -177,3 +177,26 @@ def test_every_video_is_scored_by_itself() -> None:
     for i in range(6):
         one = Scenes(some.background[i : i + 1], some.start[i : i + 1], some.speed[i : i + 1], some.action[i : i + 1])
         assert float(score(videos[i : i + 1], one).reward) == pytest.approx(float(together[i]), abs=1e-6)
+
+
+def test_the_same_scenes_in_more_pixels_look_and_score_the_same() -> None:
+    fine, coarse = draw_scenes(32, seed=1, name="test", side=24), scenes(32)
+    assert torch.equal(fine.action, coarse.action)
+    assert fine.videos(fine.action).shape == (32, CHANNELS, FRAMES, 24, 24)
+    assert_close(fine.path(fine.action) - 23 / 2, 1.5 * (coarse.path(coarse.action) - 15 / 2), atol=1e-4, rtol=0)
+    for by in (0, 1, 2, 3):
+        a, b = score(turned(fine, by), fine), score(turned(coarse, by), coarse)
+        assert torch.equal(a.obeyed, b.obeyed)
+        assert_close(a.task, b.task, atol=0.05, rtol=0)
+        assert_close(a.mass, b.mass, atol=0.1, rtol=0)
+
+
+def test_a_picture_that_stands_still_is_most_consistent_and_obeys_nobody() -> None:
+    some = scenes(16)
+    still = some.videos(some.action)[:, :, :1].repeat(1, 1, FRAMES, 1, 1)
+    frozen, moving = score(still, some), score(some.videos(some.action), some)
+    assert frozen.consistency.tolist() == [1.0] * 16 and not frozen.obeyed.any()
+    assert bool((moving.consistency < 0.6).all())
+    jump = still.clone()
+    jump[:, :, 3:] += 0.1
+    assert_close(score(jump, some).consistency, torch.full((16,), math.exp(-0.01 / 5 / 0.02), dtype=torch.float64))

@@ -11,16 +11,23 @@ import numpy as np
 import pytest
 
 from wm_nodes.reports import (
+    ClipSummary,
+    Panel,
     Picture,
     Rate,
+    ScoreChange,
     Summary,
+    clip_panels,
     curves,
     film_strip,
     machine_facts,
     read_summary,
+    write_clip_report,
+    write_clip_summary,
     write_report,
     write_summary,
 )
+from wm_nodes.reports.clip_report import TITLES, clip_verdict
 from wm_nodes.reports.curves import read_series
 from wm_nodes.reports.tables import result_rows, verdict
 
@@ -189,6 +196,54 @@ def test_a_report_of_a_missing_picture_is_refused_by_name(tmp_path: Path) -> Non
     with pytest.raises(FileNotFoundError, match=r"gone.png"):
         write_report(tmp_path, SUMMARY, [Picture("Strip", "", tmp_path / "gone.png")])
     assert not (tmp_path / "report.html").exists()
+
+
+SAME = ScoreChange(0.5, 0.5, 0.0, -0.1, 0.1, "")
+CLIPS = ClipSummary(
+    "push_cube", "smoke", 3, iterations=6, version=12, weights="averaged", contexts=48, evaluations=3,
+    scores=dict.fromkeys(TITLES, SAME) | {"tracking": ScoreChange(0.5, 0.6, 0.1, 0.05, 0.15, "better")},
+    hacked=[{"step": 6, "reward_slope": 0.1, "slopes": {"scenery": -0.2}, "text": "scenery gets <worse>"}],
+    bag="/runs/b/bags/x", machine={"processor": "P & Q"},
+)  # fmt: skip
+
+
+def test_the_report_of_loop_2_shows_scores_alarms_and_how_to_do_it_again(tmp_path: Path) -> None:
+    film_strip({"before": frames(3)}, tmp_path / "strip.png")
+    pictures = [Picture("Strip", "what", tmp_path / "strip.png")]
+    text = write_clip_report(tmp_path, CLIPS, pictures, config_text="seed: 3").read_text()
+    page = _Page()
+    page.feed(text)
+    assert not page.open and len(page.sources) == 1
+    for part in ("Better: tracking score (n = 48 held-out contexts).", "+0.1000 (+0.0500 to +0.1500)",
+                 "averaged weights", "scenery gets &lt;worse&gt;", f"retrain {tmp_path}", "P &amp; Q"):  # fmt: skip
+        assert part in text
+    write_clip_summary(tmp_path, CLIPS)
+    values = read_summary(tmp_path)
+    assert values["scores"]["tracking"]["after"] == 0.6 and values["minutes"] is None
+    quiet = write_clip_report(tmp_path, replace(CLIPS, hacked=())).read_text()
+    assert "No alarm in 3 held-out evaluations" in quiet
+    assert "Not watched" in write_clip_report(tmp_path, replace(CLIPS, hacked=(), evaluations=0)).read_text()
+
+
+def test_scores_that_got_better_and_worse_are_named_apart() -> None:
+    worse = {"scenery": replace(SAME, verdict="worse")}
+    both = clip_verdict(replace(CLIPS, scores={**CLIPS.scores, **worse}))
+    assert both == "Better: tracking score. Worse: scenery error (n = 48 held-out contexts)."
+    none = clip_verdict(replace(CLIPS, scores=dict.fromkeys(TITLES, SAME)))
+    assert none.startswith("No difference that chance does not explain")
+
+
+def test_a_series_of_a_section_leaves_out_the_others_and_an_odd_panel_is_drawn(tmp_path: Path) -> None:
+    path = metrics_file(tmp_path, [
+        {"section": "grpo", "step": 1, "reward": 3.0}, {"section": "heldout", "step": 1, "reward": 0.2},
+        {"section": "heldout", "step": 2, "reward": None},
+    ])  # fmt: skip
+    assert read_series(path, "grpo/reward") == [(1, 3.0)]
+    assert [step for step, _ in read_series(path, "heldout/reward")] == [1, 2]
+    panels = (Panel("reward", {"grpo/reward": "a", "heldout/reward": "b"}), *clip_panels(2)[:2])
+    drawn = curves(path, tmp_path / "curves.png", panels, step="buffers")
+    assert drawn is not None and cv2.imread(str(drawn)).shape[0] > 500
+    assert curves(path, tmp_path / "none.png", clip_panels(2)[4:]) is None
 
 
 def test_machine_facts_name_date_processor_and_versions() -> None:

@@ -22,7 +22,8 @@ transformers = pytest.importorskip("transformers")
 pytest.importorskip("peft")
 
 from wm_nodes.doctor import main as doctor  # noqa: E402
-from wm_nodes.learning.video_grpo import AdvantageSettings, GrpoLearner, GrpoSettings, KlSettings  # noqa: E402
+from wm_nodes.learning.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings  # noqa: E402
+from wm_nodes.learning.video_grpo import GrpoLearner  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
     Condition,
     RolloutBuffer,

@@ -140,11 +140,18 @@ def test_every_preset_loads_and_its_dump_loads_to_the_same(preset: str, tmp_path
         ({"rollout.sampler.eta": 1.2}, "eta must be in"),
         ({"rollout.samplr.eta": 0.5}, "unknown setting 'rollout.samplr'"),
         ({"grpo.learning_rate": "fast"}, "grpo.learning_rate"),
+        ({"evaluation.window": 2}, r"window >= 3, got 2, 4, 1 and 2"),
     ],
 )
 def test_a_wrong_setting_is_refused_by_name(overrides: dict[str, object], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         load_video_config("smoke", overrides)
+
+
+def test_one_reward_can_be_weighed_without_losing_the_others() -> None:
+    rewards = load_video_config("smoke").rewards
+    assert load_video_config("smoke", {"rewards.object_cm": -0.1}).rewards == {**rewards, "object_cm": -0.1}
+    assert load_video_config("smoke", {"rewards": {"psnr_db": 1.0}}).rewards == {"psnr_db": 1.0}
 
 
 def make_folder(folder: Path) -> Path:

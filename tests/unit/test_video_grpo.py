@@ -25,14 +25,9 @@ from video_toys import (
 )
 
 from wm_nodes.learning.distributed import Ranks
-from wm_nodes.learning.video_grpo import (
-    AdvantageSettings,
-    GrpoLearner,
-    GrpoSettings,
-    KlSettings,
-    _Row,
-    mixed_reward,
-)
+from wm_nodes.learning.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
+from wm_nodes.learning.grpo_terms import Rows
+from wm_nodes.learning.video_grpo import GrpoLearner, mixed_reward
 from wm_nodes.learning.weights import WeightsError
 from wm_nodes.rl.group_advantages import GroupAdvantages
 from wm_nodes.rl.grpo import gaussian_logprob
@@ -57,9 +52,9 @@ def buffer_of(learner: GrpoLearner, **changes: Any) -> RolloutBuffer:
     return toy_buffer(learner.model, learner.rollout, version=learner.version, **changes)
 
 
-def all_rows(buffer: RolloutBuffer) -> _Row:
+def all_rows(buffer: RolloutBuffer) -> Rows:
     count, steps = len(buffer), len(buffer.rollout.steps)
-    return _Row(torch.arange(count).repeat_interleave(steps), torch.arange(steps).repeat(count))
+    return Rows(torch.arange(count).repeat_interleave(steps), torch.arange(steps).repeat(count))
 
 
 def known(values: list[float]) -> GroupAdvantages:
@@ -70,7 +65,7 @@ SIGNAL = known([1.5, -0.5, 0.25, -1.0, 2.0, -2.0, 0.1, 0.7])
 
 
 def gradient(
-    learner: GrpoLearner, buffer: RolloutBuffer, rows: _Row | None = None, signal: GroupAdvantages = SIGNAL
+    learner: GrpoLearner, buffer: RolloutBuffer, rows: Rows | None = None, signal: GroupAdvantages = SIGNAL
 ) -> Tensor:
     """Of the learner's loss, all parameters in one row."""
     learner.model.zero_grad(set_to_none=True)
@@ -177,7 +172,7 @@ def test_the_equaliser_gives_every_step_the_median_sensitivity_s_share() -> None
     slope = -(1 - s) * t + (1 - t) * s * math.sqrt(1 - eta**2)
     sensitivity = (slope.abs() / (s * eta))[:5]
     for position in range(5):
-        rows = _Row(torch.arange(8), torch.full((8,), position))
+        rows = Rows(torch.arange(8), torch.full((8,), position))
         if float(s[position]) > 0:
             scale = float(sensitivity.median() / sensitivity[position])
             assert_close(gradient(equal, buffer, rows), scale * gradient(plain, buffer, rows), rtol=1e-3, atol=1e-8)
@@ -231,7 +226,7 @@ class OneOfTwo(Ranks):
 def test_the_gradients_of_two_ranks_add_up_to_that_of_one() -> None:
     one = make()
     buffer = buffer_of(one)
-    rows = _Row(torch.tensor([0, 3, 3, 5, 7]), torch.tensor([1, 0, 4, 2, 2]))
+    rows = Rows(torch.tensor([0, 3, 3, 5, 7]), torch.tensor([1, 0, 4, 2, 2]))
     halves = [gradient(make(ranks=OneOfTwo(rank, 2)), buffer, rows) for rank in (0, 1)]
     wanted = gradient(one, buffer, rows)
     assert float((halves[0] + halves[1] - wanted).norm() / wanted.norm()) < 1e-5
@@ -242,7 +237,7 @@ def test_a_rank_without_a_transition_has_a_gradient_of_zero_and_counts_nothing()
     """Fewer transitions than ranks: it must still take part in the sums."""
     learner = make(ranks=OneOfTwo(1, 2))
     buffer = buffer_of(learner)
-    sums = learner.gradients(buffer, _Row(torch.tensor([0]), torch.tensor([1])), SIGNAL)
+    sums = learner.gradients(buffer, Rows(torch.tensor([0]), torch.tensor([1])), SIGNAL)
     assert all(math.isfinite(value) for value in sums.values()) and sums["objective"] == sums["low"] == 0.0
     given = [None if p.grad is None else bool(p.grad.any()) for p in learner.parameters]
     full = make()
@@ -352,7 +347,7 @@ def test_with_its_adapter_off_the_model_is_its_own_frozen_anchor() -> None:
         learner = make(network=Adapted(), kl=KlSettings(anchor=anchor), learning_rate=0.05)  # type: ignore[arg-type]
         train_rounds(learner, range(2))
         found.append(learner.train(buffer_of(learner, iteration=2)).updates[0].kl)
-        assert (learner._anchor is None) == (anchor == "lora_off")
+        assert list(learner._terms.anchor) == ([] if anchor == "lora_off" else ["adapter"])
         assert [name for name, _ in learner.model.named_parameters() if _.requires_grad] == ["adapter"]
     assert found[0] == pytest.approx(found[1], rel=1e-5) and found[0] > 0
 
@@ -372,6 +367,30 @@ def test_a_larger_kl_weight_keeps_the_model_nearer_to_its_anchor() -> None:
 
 
 # passes, selection, advantages
+
+
+def test_mixed_advantages_do_not_depend_on_a_reward_s_unit_and_mixed_rewards_do() -> None:
+    trained: dict[str, list[dict[str, Tensor]]] = {"advantage": [], "reward": []}
+    for mix, found in trained.items():
+        for unit in (1.0, 1024.0):
+            learner = GrpoLearner(
+                tiny_network(), grpo(advantage=AdvantageSettings(mix=mix)), toy_rollout_settings(micro_batch=8),  # type: ignore[arg-type]
+                seed=0, reward_weights={"brightness": 1.0, "contrast": 0.5},
+            )  # fmt: skip
+            buffer = buffer_of(learner)
+            contrast = unit * buffer.rollout.latents[:, 1].std((1, 2, 3)).double()
+            raw = {"brightness": buffer.rewards["brightness"], "contrast": contrast}
+            total = raw["brightness"] + 0.5 * raw["contrast"]
+            learner.train(buffer.with_rewards({**raw, "total": total}))
+            found.append(weights(learner.model))
+    for mix, (first, second) in trained.items():
+        same = all(torch.equal(value, second[name]) for name, value in first.items())
+        assert same == (mix == "advantage")
+
+
+def test_one_running_deviation_for_several_advantages_is_refused() -> None:
+    with pytest.raises(ValueError, match="std_scope running is of one reward"):
+        make(advantage=AdvantageSettings(mix="advantage", std_scope="running"))
 
 
 def test_full_passes_train_the_whole_buffer_every_time_and_parts_their_own_videos() -> None:

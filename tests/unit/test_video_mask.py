@@ -9,7 +9,8 @@ from torch.testing import assert_close
 from video_toys import Analytic, randn, times, toy_buffer, toy_condition, toy_rollout_settings
 
 from wm_nodes.benchmark.moving_disc import draw_scenes, opacity_at
-from wm_nodes.learning.video_grpo import GrpoLearner, GrpoSettings, KlSettings
+from wm_nodes.learning.grpo_settings import GrpoSettings, KlSettings
+from wm_nodes.learning.video_grpo import GrpoLearner
 from wm_nodes.video_model import MaskSettings, SamplerSettings, StepContext, dynamic_mask, step
 from wm_nodes.video_model.kernels import SIGMA_LIMIT
 from wm_nodes.video_model.mask import quantile, residual

@@ -4,7 +4,6 @@ Resumable: collected bags, the trained model, finished evaluations and the learn
 """
 
 import argparse
-import json
 import os
 import sys
 import time
@@ -12,53 +11,45 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from rich.table import Table
 from tqdm import tqdm
 
 from wm_nodes.config.load import ConfigError, load_config, parse_override
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.job import READY_S, Stages, console, open_run_dir
-from wm_nodes.learning.clip_generation import ClipGenerator
-from wm_nodes.learning.clip_scores import score_clips
+from wm_nodes.learning.clip_scores import load_probe
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
-from wm_nodes.learning.files import write_atomic
-from wm_nodes.learning.statistics import bootstrap_mean
 from wm_nodes.learning.video_config import VideoRlConfig, dump_video_config, load_video_config, video_preset_names
-from wm_nodes.learning.video_data import Clips, load_clips
-from wm_nodes.learning.video_folder import VideoFolder, load_video_folder
+from wm_nodes.learning.video_data import load_clips
 from wm_nodes.learning.video_pretraining import make_video_model
-from wm_nodes.learning.video_run import version_uri
-from wm_nodes.learning.weights import load_weights, pack_weights
-from wm_nodes.reports import machine_facts
-from wm_nodes.reports.film_strip import film_strip
-from wm_nodes.reports.summary import plain
+from wm_nodes.learning.video_run import progress
+from wm_nodes.reports import ClipSummary
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.domain import DomainInUseError
 from wm_nodes.ros.graph import GraphError
 from wm_nodes.ros.operator import GoalFailed, Operator, PeerLost
 from wm_nodes.ros.readiness import NotReadyError
 from wm_nodes.ros.runner import NodeDiedError, Runner
-from wm_nodes.world_model import load_model_folder
-from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model_offline import recorded_bags, rescore_run, retrain_run
+from wm_nodes.world_model_results import Finished, conclude
 
 EXPECTED = (
     ConfigError, DomainInUseError, GraphError, NodeDiedError, NotReadyError, GoalFailed, PeerLost, ValueError, OSError,
 )  # fmt: skip
 HELDOUT_EPISODES = 100
-STRIPS = 3
-SHOWN = {
-    "tracking": "tracking score", "object_cm": "object error, cm", "tool_cm": "tool error, cm", "psnr_db": "PSNR, dB",
-    "scenery": "scenery error", "motion": "motion share",
-}  # fmt: skip
 
 
 def main(argv: Sequence[str]) -> int:
-    """Return the exit code: 0 done, 2 a clear error, 130 interrupted (start again with --run-dir to go on)."""
+    """Return the exit code: 0 done, 1 recorded scores differ, 2 a clear error, 130 interrupted (start again with
+    --run-dir to go on)."""
     arguments = _parser().parse_args(argv)
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     try:
+        if arguments.action == "rescore":
+            return rescore_run(arguments)
+        if arguments.action == "retrain":
+            return retrain_run(arguments, _command())
         run(arguments)
     except KeyboardInterrupt:
         console.print("interrupted; --run-dir goes on from here", highlight=False)
@@ -69,75 +60,52 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def run(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The whole job; see main. Returns what summary.json holds."""
+def run(arguments: argparse.Namespace) -> ClipSummary:
+    """The whole job; see main."""
     stage = Stages()
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     config, run_dir = _open_run(arguments)
     stage(f"run folder {run_dir}")
     scene = load_config("cpu", {"task": config.task, "seed": config.seed})
-    probe = load_model_folder(Path(shipped_model(config.task))).probe
-    if probe is None:
-        raise ValueError(f"the world model of {config.task} has no position probe to judge with")
-    bags, heldout = _data(config, scene, run_dir, stage)
-    stage("video model: codec and flow matching")
+    probe = load_probe(shipped_model(config.task))
+    bags, heldout_bags = _data(config, scene, run_dir, stage)
+    heldout = load_clips(heldout_bags, config.model.stride)
+    stage("video model: the shipped one, or codec and flow matching")
     clips = load_clips(bags, config.model.stride)
-    folder = make_video_model(config, clips, heldout, probe, run_dir, command=_command())
-    before = measured(config, folder, heldout, probe, run_dir, "before")
-    version, bag = _post_train(arguments, config, bags, run_dir, stage)
-    trained = load_video_folder(run_dir / "video_model")
-    load_weights(trained.network, (run_dir / version_uri(version)).read_bytes())
-    after = measured(config, trained, heldout, probe, run_dir, "after")
-    summary = plain({
-        "task": config.task, "preset": arguments.preset, "seed": config.seed, "iterations": config.iterations,
-        "version": version, "contexts": config.evaluation.contexts,
-        "scores": {name: _change(before[name], after[name], config.seed) for name in SHOWN},
-        "bag": str(bag), "minutes": stage.minutes, "command": _command(), "machine": machine_facts(),
-        "date": time.strftime("%Y-%m-%d"),
-    })  # fmt: skip
-    write_atomic(run_dir / "summary.json", (json.dumps(summary, indent=1) + "\n").encode())
-    strips = _pictures(config, load_video_folder(run_dir / "video_model"), trained, heldout, run_dir)
-    console.print(_table(summary))
-    console.print(f"strips   {strips}\nsummary  {run_dir / 'summary.json'}\nbag      {bag}", highlight=False)
-    return dict(summary)
+    make_video_model(
+        config, clips, heldout, probe, run_dir, from_scratch=arguments.from_scratch, command=_command()
+    )
+    version, done = progress(run_dir)
+    if done < config.iterations:
+        _post_train(arguments, config, (bags, heldout_bags), run_dir, stage)
+        version, done = progress(run_dir)
+    return conclude(
+        Finished(
+            config, run_dir, run_dir / "video_model", done, version, heldout, probe, arguments.preset,
+            str(recorded_bags(run_dir)[-1]), _command(), stage.minutes,
+        )
+    )  # fmt: skip
 
 
-def measured(
-    config: VideoRlConfig, folder: VideoFolder, heldout: Clips, probe: PositionProbe, run_dir: Path, label: str
-) -> dict[str, list[float]]:
-    """Scores of held-out contexts, one ODE clip each, by name; kept for the same weights."""
-    path, sha = run_dir / "evaluations" / f"{label}.json", _weights_sha(folder)
-    if path.is_file() and (kept := json.loads(path.read_text()))["sha256"] == sha:
-        return dict(kept["scores"])
-    some = heldout.select(torch.arange(min(config.evaluation.contexts, len(heldout))))
-    frames = ClipGenerator(folder, some, config).evaluate(some, config.evaluation.num_steps)
-    found = score_clips(frames, some, probe, folder.clip["num_conditioning"]).named()
-    scores = {name: values.tolist() for name, values in found.items()}
-    write_atomic(path, json.dumps({"sha256": sha, "scores": scores}).encode())
-    return scores
-
-
-def _data(config: VideoRlConfig, scene: RunConfig, run_dir: Path, stage: Stages) -> tuple[list[Path], Clips]:
+def _data(config: VideoRlConfig, scene: RunConfig, run_dir: Path, stage: Stages) -> tuple[list[Path], list[Path]]:
+    """Bags of contexts to train on, and of held-out ones."""
     stage(f"{config.data_episodes} + {min(HELDOUT_EPISODES, config.data_episodes)} held-out simulator episodes")
     train = scripted_plan(scene, config.data_episodes, TRAINING_SEEDS)
     held = scripted_plan(scene, min(HELDOUT_EPISODES, config.data_episodes), HELDOUT_SEEDS)
     bags = collect_plan(train, scene, run_dir / "data" / "train")
-    heldout = collect_plan(held, scene, run_dir / "data" / "heldout")
-    return bags, load_clips(heldout, config.model.stride)
+    return bags, collect_plan(held, scene, run_dir / "data" / "heldout")
 
 
 def _post_train(
-    arguments: argparse.Namespace, config: VideoRlConfig, bags: list[Path], run_dir: Path, stage: Stages
-) -> tuple[int, Path]:
-    """GRPO over the graph; returns the last version and the bag."""
-    progress = run_dir / "trained.json"
-    if progress.is_file():
-        kept = json.loads(progress.read_text())
-        return int(kept["version"]), Path(kept["bag"])
-    bag = run_dir / "bags" / f"world_model_rl_{time.strftime('%H%M%S')}"
+    arguments: argparse.Namespace, config: VideoRlConfig, bags: tuple[list[Path], list[Path]], run_dir: Path,
+    stage: Stages,
+) -> None:  # fmt: skip
+    """GRPO over the graph, from the learner's checkpoint on. bags: of contexts, and of held-out ones."""
+    contexts, heldout = (",".join(map(str, some)) for some in bags)
     graph, _ = launch_arguments.prepare("world_model_rl", {
-        "config_file": str(run_dir / "config.yaml"), "run_dir": str(run_dir), "bag_uri": str(bag),
-        "video_model_dir": str(run_dir / "video_model"), "context_bags": ",".join(map(str, bags)),
+        "config_file": str(run_dir / "config.yaml"), "run_dir": str(run_dir),
+        "bag_uri": str(run_dir / "bags" / f"world_model_rl_{time.strftime('%Y%m%d_%H%M%S')}"),
+        "video_model_dir": str(run_dir / "video_model"), "context_bags": contexts, "heldout_bags": heldout,
+        "keep_buffers": str(arguments.keep_buffers), "tensorboard": "true" if arguments.tensorboard else "false",
         "domain_id": arguments.domain_id,
     })  # fmt: skip
     stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
@@ -145,65 +113,19 @@ def _post_train(
         runner.wait_ready(READY_S)
         os.environ.update(runner.environment)
         with Operator(alive=runner.check) as operator, tqdm(total=config.iterations, desc="GRPO", unit="buffer") as bar:
-            done = _iterations_done(run_dir)
+            _, done = progress(run_dir)
             bar.update(done)
 
             def show(feedback: Any) -> None:
                 bar.update(done + feedback.iteration - bar.n)
                 bar.set_postfix(reward=f"{feedback.reward_mean:.3f}", kl=f"{feedback.kl:.1e}")
 
-            left = config.iterations - done
-            version = operator.train_video(left, show) if left > 0 else _last_version(run_dir)
-    write_atomic(progress, json.dumps({"version": version, "bag": str(bag)}).encode())
-    return version, bag
-
-
-def _iterations_done(run_dir: Path) -> int:
-    path = run_dir / "metrics.jsonl"
-    return sum(json.loads(line)["section"] == "grpo" for line in path.read_text().splitlines()) if path.is_file() else 0
-
-
-def _last_version(run_dir: Path) -> int:
-    return max(int(path.stem.split("_")[1]) for path in (run_dir / "video_policies").glob("video_*.safetensors"))
-
-
-def _pictures(config: VideoRlConfig, base: VideoFolder, trained: VideoFolder, heldout: Clips, run_dir: Path) -> Path:
-    """Film strips: the recording, the base model, the trained model."""
-    some = heldout.select(torch.arange(min(STRIPS, len(heldout))))
-    rows = {
-        "recorded": some.frames,
-        "before": ClipGenerator(base, some, config).evaluate(some, config.evaluation.num_steps),
-        "after": ClipGenerator(trained, some, config).evaluate(some, config.evaluation.num_steps),
-    }
-    for index in range(len(some)):
-        pictures = {label: np.ascontiguousarray(frames[index].numpy()) for label, frames in rows.items()}
-        film_strip(pictures, path=run_dir / "strips" / f"strip_{index}.png")
-    return run_dir / "strips"
-
-
-def _change(before: Sequence[float], after: Sequence[float], seed: int) -> dict[str, float]:
-    mean, low, high = bootstrap_mean(np.subtract(after, before), seed=seed)
-    return {
-        "before": float(np.mean(before)), "after": float(np.mean(after)), "difference": mean, "low": low, "high": high,
-    }  # fmt: skip
-
-
-def _weights_sha(folder: VideoFolder) -> str:
-    return pack_weights(folder.network).sha256
-
-
-def _table(summary: Any) -> Table:
-    table = Table(title=f"held-out contexts (n = {summary['contexts']}), one ODE clip each")
-    for name in ("score", "before", "after", "difference, 95 % bootstrap interval"):
-        table.add_column(name, justify="left" if name == "score" else "right")
-    for name, title in SHOWN.items():
-        row = summary["scores"][name]
-        difference = f"{row['difference']:+.4f} ({row['low']:+.4f} to {row['high']:+.4f})"
-        table.add_row(title, f"{row['before']:.4f}", f"{row['after']:.4f}", difference)
-    return table
+            operator.train_video(config.iterations - done, show)
 
 
 def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
+    if arguments.keep_buffers < 1:
+        raise ValueError(f"--keep-buffers must be at least 1, got {arguments.keep_buffers}")
     overrides: dict[str, Any] = dict(parse_override(text) for text in arguments.set)
     if arguments.seed is not None:
         overrides["seed"] = arguments.seed
@@ -225,6 +147,37 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, help="root seed of every random number; default: the preset's")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
     parser.add_argument("--run-dir", type=Path, help="run folder; an existing one is resumed. Default: runs/<time>-...")
+    parser.add_argument(
+        "--from-scratch", action="store_true",
+        help="train a video model of your own even where one with these settings is shipped (half an hour on one core)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--keep-buffers", type=int, default=4, metavar="N",
+        help="rollout buffers kept on disk; as many as iterations if `retrain` shall be possible. Default: 4",
+    )  # fmt: skip
+    _add_tensorboard(parser)
     parser.add_argument("--domain-id", default="", help="ROS domain 0 to 101; default: $ROS_DOMAIN_ID, else 0")
     parser.add_argument("--verbose", action="store_true", help="show the nodes' logs (they are in <run>/logs anyway)")
+    actions = parser.add_subparsers(dest="action", title="on a finished run, without a graph")
+    again = actions.add_parser(
+        "rescore", help="score the recorded clips again and compare bit for bit; exit code 1 where they differ"
+    )
+    again.add_argument("run", type=Path, help="run folder whose bags hold the clips")
+    again.add_argument("--json", type=Path, help="file for every score; default: <run>/rescored.json")
+    again = actions.add_parser(
+        "retrain", help="train on the recorded clips and scores, without sampling: the same weights, file for file"
+    )
+    again.add_argument("run", type=Path, help="run folder with all of its rollout buffers (--keep-buffers)")
+    again.add_argument("--run-dir", type=Path, help="folder of the new run. Default: runs/<time>-...")
+    again.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE",
+        help="override one of the run's settings, e.g. rewards.scenery=-10 (the recorded scores are mixed anew)",
+    )  # fmt: skip
+    _add_tensorboard(again)
     return parser
+
+
+def _add_tensorboard(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--tensorboard", action=argparse.BooleanOptionalAction, default=True, help="also write <run>/tensorboard"
+    )

@@ -1,21 +1,24 @@
 """The competing samplers of the DynDiff benchmark, by name; everything else of a run is shared by all arms."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
-from wm_nodes.learning.video_grpo import GrpoSettings, KlSettings
-from wm_nodes.video_model import MaskSettings, RolloutSettings, SamplerSettings
+from wm_nodes.learning.grpo_settings import GrpoSettings, KlSettings
+from wm_nodes.video_model import MaskSettings, RolloutSettings, SamplerSettings, WindowSettings
 
 NUM_STEPS, SHIFT = 10, 3.0
 
 
 @dataclass(frozen=True)
 class Arm:
-    """One sampler with the learner settings that belong to it. shared_noise: one initial noise for a whole group."""
+    """One sampler with the learner settings that belong to it. shared_noise: one initial noise for a whole group.
+    window: which of its steps are stochastic.
+    """
 
     name: str
     rollout: RolloutSettings
     grpo: GrpoSettings
     shared_noise: bool = False
+    window: WindowSettings = field(default_factory=WindowSettings)
 
 
 def sampler_arm(name: str, sampler: SamplerSettings, grpo: GrpoSettings | None = None) -> Arm:
@@ -39,16 +42,27 @@ def diversity_arms() -> list[Arm]:
 
 
 def learning_arms(learner: GrpoSettings) -> list[Arm]:
-    """Claim B: every arm on one learner; `learner` holds what they share."""
+    """Claim B: every arm on one learner; `learner` holds what they share.
+
+    Mix-GRPO trains all four steps of its window, as many as the others do of their nine.
+    """
     cps, frozen = replace(learner, logprob_weight="cps"), KlSettings(beta=learner.kl.beta, anchor="frozen")
     plain = sampler_arm("CPS 0.6", SamplerSettings("cps", 0.6), cps)
     matched = sampler_arm("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps)
     sparse = sampler_arm("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps)
     gated = sampler_arm("DynDiff 0.6 gated, rms, cps", dyndiff(0.6, "gated", "rms"), cps)
+    quiet = [
+        sampler_arm("CPS 0.46", SamplerSettings("cps", 0.46), cps),  # spends what DynDiff 0.6 gated, rms does
+        sampler_arm("CPS 0.2", SamplerSettings("cps", 0.2), cps),
+        sampler_arm("DynDiff 0.2 sparse, rms, cps", dyndiff(0.2, "sparse", "rms"), cps),
+    ]
+    shared = (plain, matched, sparse, gated, *quiet)
+    mix = sampler_arm("Mix-GRPO 0.7", SamplerSettings("flow", 0.7), replace(learner, step_fraction=1.0))
     return [
         plain,
         sampler_arm("CPS 0.6, full", SamplerSettings("cps", 0.6), learner),
         sampler_arm("Flow-GRPO 0.7", SamplerSettings("flow", 0.7), learner),
+        replace(mix, window=WindowSettings("progressive", size=4, period=7), shared_noise=True),
         sampler_arm("DanceGRPO 0.3", SamplerSettings("dance", 0.3), learner),
         sampler_arm("SAGE 0.5", SamplerSettings("sage", 0.5), learner),
         sampler_arm("DynDiff 0.6 gated", dyndiff(0.6), learner),
@@ -58,5 +72,5 @@ def learning_arms(learner: GrpoSettings) -> list[Arm]:
         sparse,
         gated,
         *(replace(arm, name=f"{arm.name}, frozen", grpo=replace(arm.grpo, kl=frozen)) for arm in (plain, matched)),
-        *(replace(arm, name=f"{arm.name}, shared", shared_noise=True) for arm in (plain, matched, sparse, gated)),
+        *(replace(arm, name=f"{arm.name}, shared", shared_noise=True) for arm in shared),
     ]

@@ -1,4 +1,6 @@
-"""DynDiff-GRPO against its rivals on the moving disc: claims A (diversity), B (learning) and C (cost of the KL)."""
+"""DynDiff-GRPO against its rivals on the moving disc: claims A (diversity), B (learning) and C (cost of the KL), the
+choices of the paper's section 5.4, and a reward that can be hacked. A picture is drawn beside every --json file.
+"""
 
 import argparse
 import json
@@ -8,21 +10,29 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from rich.console import Console
-from rich.table import Table
 from tqdm import tqdm
 
 from wm_nodes.benchmark.moving_disc import CHANNELS, NUM_ACTIONS, training_batch
-from wm_nodes.benchmark.video_arms import Arm, diversity_arms, learning_arms
+from wm_nodes.benchmark.video_arms import diversity_arms, learning_arms
+from wm_nodes.benchmark.video_comparison import Comparison, compare_arms
 from wm_nodes.benchmark.video_cost import measure_anchors, measure_rollout
 from wm_nodes.benchmark.video_diversity import DiversityPlan, compare, measure_arm
 from wm_nodes.benchmark.video_learning import LearningPlan, train_arm
+from wm_nodes.benchmark.video_plots import plot_diversity, plot_hacking, plot_learning
+from wm_nodes.benchmark.video_tables import (
+    comparison_table,
+    cost_table,
+    diversity_table,
+    hacking_table,
+    training_table,
+)
+from wm_nodes.benchmark.video_trials import Trial, ablation_trials, hacking_trials
 from wm_nodes.learning.files import write_atomic
-from wm_nodes.learning.statistics import bootstrap_mean
-from wm_nodes.learning.video_grpo import GrpoSettings
+from wm_nodes.learning.grpo_settings import GrpoSettings
 from wm_nodes.learning.video_training import FlowMatchingSettings, train_video_model
 from wm_nodes.learning.weights import pack_weights, unpack_weights
 from wm_nodes.reports import machine_facts
@@ -32,15 +42,24 @@ BASE_ITERATIONS, BASE_BATCH = 4000, 16
 NETWORK = NetworkSettings(channels=CHANNELS, action_dim=NUM_ACTIONS, width=32, depth=5)
 LEARNER = GrpoSettings(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
+LOG_COLUMNS = 160
+"""Width of tables that go to a file or a pipe."""
+T = TypeVar("T")
 console = Console()
 
 
 def main(argv: Sequence[str]) -> int:
     """Return the exit code: 0 done, 2 a clear error, 130 interrupted (finished rows are kept)."""
     arguments = _parser().parse_args(argv)
+    if not console.is_terminal:
+        console.width = LOG_COLUMNS
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+    claims = {
+        "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,
+        "cost": _cost,
+    }  # fmt: skip
     try:
-        {"base": _base, "diversity": _diversity, "learning": _learning, "cost": _cost}[arguments.claim](arguments)
+        claims[arguments.claim](arguments)
     except KeyboardInterrupt:
         return 130
     except (ValueError, OSError) as error:
@@ -75,7 +94,7 @@ def _base(arguments: argparse.Namespace) -> None:
 def _diversity(arguments: argparse.Namespace) -> None:
     model, plan = load_base(arguments.base), DiversityPlan(arguments.contexts, arguments.group_size)
     rows, comparisons = list[dict[str, Any]](), list[dict[str, Any]]()
-    arms = _named(diversity_arms(), arguments.arms)
+    arms = _named({arm.name: arm for arm in diversity_arms()}, arguments.arms)
     with tqdm(total=2 * len(arms), desc="diversity", unit="arm") as bar:
         for shared in (False, True):
             regime = {}
@@ -88,91 +107,111 @@ def _diversity(arguments: argparse.Namespace) -> None:
                 compare(row, regime[base], arguments.seed)
                 for name, row in regime.items() if name.startswith("DynDiff") for base in bases
             ]  # fmt: skip
-    _write(arguments, {"plan": asdict(plan), "rows": rows, "comparisons": comparisons})
-    _show_diversity(rows, arguments.seed)
+    _write(arguments, {"plan": asdict(plan), "seed": arguments.seed, "rows": rows, "comparisons": comparisons})
+    if arguments.json is not None:
+        plot_diversity(rows, arguments.json.with_suffix(".png"), arguments.seed)
+    console.print(diversity_table(rows, arguments.seed))
 
 
 def _learning(arguments: argparse.Namespace) -> None:
-    plan = LearningPlan(iterations=arguments.iterations, scenes=arguments.scenes, hackable=arguments.hackable)
-    arms = _named(learning_arms(LEARNER), arguments.arms)
-    rows = _finished(arguments.json)
-    wanted = [(arm, seed) for seed in arguments.seeds for arm in arms]
-    todo = [(arm, seed) for arm, seed in wanted if (arm.name, seed) not in {(row["arm"], row["seed"]) for row in rows}]
-    with tqdm(total=len(todo) * plan.iterations, desc="learning", unit="buffer") as bar:
-        for arm, seed in todo:
-            bar.set_postfix_str(f"{arm.name}, seed {seed}")
-            rows.append(train_arm(load_base(arguments.base), arm, plan, seed, on_iteration=bar.update))
-            _write(arguments, {"plan": asdict(plan), "learner": asdict(LEARNER), "rows": rows})
-    _show_learning(rows)
+    plan = _plan(arguments, eval_every=5)
+    trials = [Trial(arm, plan) for arm in learning_arms(LEARNER)]
+    rows = _train(arguments, trials)
+    names = sorted({row["arm"] for row in rows})
+    bases = [name for name in names if name.startswith("CPS")]
+    comparisons = _compared(rows, [(name, base) for name in names for base in bases if name != base])
+    _write_trainings(arguments, trials, rows, comparisons)
+    if arguments.json is not None:
+        plot_learning(rows, arguments.json.with_suffix(".png"))
+    console.print(training_table(rows), comparison_table(comparisons))
+
+
+def _ablations(arguments: argparse.Namespace) -> None:
+    trials, pairs = ablation_trials(LEARNER, _plan(arguments, eval_every=4))
+    rows = _train(arguments, trials)
+    comparisons = _compared(rows, pairs)
+    _write_trainings(arguments, trials, rows, comparisons)
+    console.print(training_table(rows), comparison_table(comparisons))
+
+
+def _hacking(arguments: argparse.Namespace) -> None:
+    rows = _train(arguments, hacking_trials(LEARNER, _plan(arguments, eval_every=3)))
+    if arguments.json is not None:
+        plot_hacking(rows, arguments.json.with_suffix(".png"))
+    console.print(hacking_table(rows))
+
+
+def _plan(arguments: argparse.Namespace, eval_every: int) -> LearningPlan:
+    return LearningPlan(
+        iterations=arguments.iterations, scenes=arguments.scenes, eval_scenes=arguments.eval_scenes,
+        eval_every=eval_every,
+    )  # fmt: skip
+
+
+def _train(arguments: argparse.Namespace, trials: list[Trial]) -> list[dict[str, Any]]:
+    """The trials named by --arms, at every seed, but what --json holds already; it is written after each training."""
+    rows = _finished(arguments.json, trials)
+    done = {(row["arm"], row["seed"]) for row in rows}
+    wanted = _named({trial.arm.name: trial for trial in trials}, arguments.arms)
+    todo = [(trial, seed) for seed in arguments.seeds for trial in wanted if (trial.arm.name, seed) not in done]
+    with tqdm(total=sum(trial.plan.iterations for trial, _ in todo), desc=arguments.claim, unit="buffer") as bar:
+        for trial, seed in todo:
+            bar.set_postfix_str(f"{trial.arm.name}, seed {seed}")
+            rows.append(train_arm(load_base(arguments.base), trial.arm, trial.plan, seed, on_iteration=bar.update))
+            _write_trainings(arguments, trials, rows, [])
+    return rows
+
+
+def _compared(rows: list[dict[str, Any]], pairs: list[tuple[str, str]]) -> list[Comparison]:
+    found = (compare_arms(rows, arm, base) for arm, base in pairs)
+    return [comparison for comparison in found if comparison is not None]
+
+
+def _write_trainings(
+    arguments: argparse.Namespace, trials: list[Trial], rows: list[dict[str, Any]], comparisons: list[Comparison]
+) -> None:
+    """The rows, the resolved settings of their arms, and the comparisons."""
+    names = {row["arm"] for row in rows}
+    arms = [asdict(trial.arm) for trial in trials if trial.arm.name in names]
+    _write(arguments, {"arms": arms, "comparisons": [asdict(one) for one in comparisons], "rows": rows})
 
 
 def _cost(arguments: argparse.Namespace) -> None:
     model = load_base(arguments.base)
     rollout = measure_rollout(model, arguments.repeats, arguments.seed)
     rows = measure_anchors(model, LEARNER, arguments.repeats, arguments.seed)
-    _write(arguments, {"rollout": rollout, "rows": rows})
-    table = Table(title=f"KL anchors, median of {arguments.repeats} turns on one buffer")
-    for name in ("anchor", "training, s", "of which KL, s", "kept beside the weights, MiB"):
-        table.add_column(name, justify="left" if name == "anchor" else "right")
-    for row in rows:
-        table.add_row(row["anchor"], f"{row['train_s']:.3f}", f"{row['kl_s']:.3f}", f"{row['bytes'] / 2**20:.2f}")
-    console.print(table)
+    _write(arguments, {"seed": arguments.seed, "rollout": rollout, "rows": rows})
+    console.print(cost_table(rows, arguments.repeats))
     console.print(f"sampling with the mask / without: {rollout['dyndiff_over_cps']:.3f}", highlight=False)
 
 
-def _named(arms: list[Arm], names: list[str] | None) -> list[Arm]:
-    known = {arm.name: arm for arm in arms}
+def _named(known: dict[str, T], names: list[str] | None) -> list[T]:
     unknown = [name for name in names or [] if name not in known]
     if unknown:
         raise ValueError(f"unknown arms {', '.join(unknown)}; choose among: {'; '.join(known)}")
-    return [known[name] for name in names] if names else arms
+    return [known[name] for name in names or known]
 
 
-def _finished(path: Path | None) -> list[dict[str, Any]]:
+def _finished(path: Path | None, trials: list[Trial]) -> list[dict[str, Any]]:
+    """The rows of an earlier call; a trial of this one that it ran by another plan is refused."""
     if path is None or not path.is_file():
         return []
     rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
+    plans = {trial.arm.name: asdict(trial.plan) for trial in trials}
+    for row in rows:
+        if row["plan"] != plans.get(row["arm"], row["plan"]):
+            raise ValueError(
+                f"{path} holds {row['arm']} by plan {row['plan']}, this call has {plans[row['arm']]}; take another file"
+            )
     return rows
 
 
 def _write(arguments: argparse.Namespace, found: dict[str, Any]) -> None:
     if arguments.json is None:
         return
-    facts = {"machine": machine_facts(), "date": time.strftime("%Y-%m-%d"), "seed": arguments.seed}
-    write_atomic(arguments.json, (json.dumps({**found, **facts}) + "\n").encode())
-
-
-def _show_diversity(rows: list[dict[str, Any]], seed: int) -> None:
-    table = Table(title="diversity (19) and quality, mean over contexts with 95 % bootstrap interval")
-    columns = ("arm", "initial noise", "noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass")
-    for name in columns:
-        table.add_column(name, justify="left" if name in ("arm", "initial noise") else "right")
-    for row in rows:
-        mean, low, high = bootstrap_mean(row["diversity"], seed=seed)
-        shown = ("diversity_dynamic", "reward_std", "reward", "background", "mass")
-        values = [sum(row[name]) / len(row[name]) for name in shown]
-        table.add_row(
-            row["arm"], "shared" if row["shared_noise"] else "own", f"{row['noise_share']:.3f}",
-            f"{mean:.3f} ({low:.3f} to {high:.3f})", *(f"{value:.4f}" for value in values),
-        )  # fmt: skip
-    console.print(table)
-
-
-def _show_learning(rows: list[dict[str, Any]]) -> None:
-    table = Table(title="held-out scenes, ODE, before and after")
-    shown = ("arm", "seed", "reward", "obeyed", "bg", "mass", "noise", "clipped low/high @2", "falling", "seconds")
-    for name in shown:
-        table.add_column(name, justify="left" if name == "arm" else "right")
-    for row in sorted(rows, key=lambda row: (row["arm"], row["seed"])):
-        first, last = row["evaluations"][0], row["evaluations"][-1]
-        update = row["buffers"][-1]["updates"][-1]
-        table.add_row(
-            row["arm"], str(row["seed"]), *(f"{first[name]:.3f} -> {last[name]:.3f}" for name in ("reward", "obeyed")),
-            f"{last['background']:.4f}", f"{last['mass']:.3f}", f"{row['buffers'][-1]['noise_share']:.3f}",
-            f"{update['clip_low_share']:.2f}/{update['clip_high_share']:.2f}", ", ".join(row["hacked"]),
-            f"{sum(row['seconds'].values()):.0f}",
-        )  # fmt: skip
-    console.print(table)
+    facts = {"machine": machine_facts(), "date": time.strftime("%Y-%m-%d")}
+    rounded = json.loads(json.dumps({**found, **facts}), parse_float=lambda digits: float(f"{float(digits):.5g}"))
+    write_atomic(arguments.json, (json.dumps(rounded) + "\n").encode())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -185,17 +224,20 @@ def _parser() -> argparse.ArgumentParser:
     diversity.add_argument("--contexts", type=int, default=100)
     diversity.add_argument("--group-size", type=int, default=8)
     learning = claims.add_parser("learning", help="claim B: reward against model calls, every arm on one learner")
-    learning.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    learning.add_argument("--iterations", type=int, default=40)
-    learning.add_argument("--scenes", type=int, default=6, help="contexts per iteration, 8 videos each")
-    learning.add_argument("--hackable", action="store_true", help="reward the task alone, to see the detector fire")
+    ablations = claims.add_parser("ablations", help="section 5.4: KL, advantage clip, guidance, resolution, in pairs")
+    hacking = claims.add_parser("hacking", help="a reward that can be hacked, and the detector of (2) on both")
+    for claim, iterations in ((learning, 40), (ablations, 12), (hacking, 25)):
+        claim.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+        claim.add_argument("--iterations", type=int, default=iterations)
+        claim.add_argument("--scenes", type=int, default=6, help="contexts per iteration, 8 videos each")
+        claim.add_argument("--eval-scenes", type=int, default=100, help="held-out scenes per evaluation")
     cost = claims.add_parser("cost", help="claim C: seconds and bytes of the KL anchors, and of the mask")
     cost.add_argument("--repeats", type=int, default=7)
-    for claim in (base, diversity, learning, cost):
+    for claim in (base, diversity, cost):
         claim.add_argument("--seed", type=int, default=0)
-    for claim in (diversity, learning):
+    for claim in (diversity, learning, ablations, hacking):
         claim.add_argument("--arms", nargs="+", metavar="NAME")
-    for claim in (diversity, learning, cost):
+    for claim in (diversity, learning, ablations, hacking, cost):
         claim.add_argument("--base", type=Path, help="weights of another base model than the shipped one")
-        claim.add_argument("--json", type=Path, help="write every row here; `learning` goes on where the file stops")
+        claim.add_argument("--json", type=Path, help="write every row here; trainings go on where the file stops")
     return parser

@@ -8,7 +8,8 @@ from typing import Any
 from wm_nodes.benchmark.moving_disc import draw_scenes
 from wm_nodes.benchmark.video_arms import dyndiff, sampler_arm
 from wm_nodes.benchmark.video_learning import sample_groups
-from wm_nodes.learning.video_grpo import Anchor, GrpoLearner, GrpoSettings
+from wm_nodes.learning.grpo_settings import Anchor, GrpoSettings
+from wm_nodes.learning.video_grpo import GrpoLearner
 from wm_nodes.video_model import SamplerSettings, VideoNetwork
 
 ANCHORS: tuple[Anchor, ...] = ("buffer", "frozen", "dual")

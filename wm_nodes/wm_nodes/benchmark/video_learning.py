@@ -3,38 +3,41 @@
 Shapes: N videos of one iteration, in groups of one scene each.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from wm_nodes.benchmark.moving_disc import CHANNELS, FRAMES, SIDE, Scenes, Scores, draw_scenes, score
-from wm_nodes.benchmark.video_arms import NUM_STEPS, SHIFT, Arm
+from wm_nodes.benchmark.video_arms import Arm
 from wm_nodes.learning.video_grpo import BufferReport, GrpoLearner
+from wm_nodes.rl.group_advantages import group_advantages
 from wm_nodes.rl.hacking import hacked_metrics
 from wm_nodes.seeding import stream_seed
 from wm_nodes.video_model import (
     RolloutBuffer,
-    RolloutSettings,
     VideoNetwork,
     VideoRollout,
     config_hash,
     initial_noise,
     sample_videos,
+    stochastic_steps,
 )
 
-SHAPE = (CHANNELS, FRAMES, SIDE, SIDE)
 MAX_SEED = 2**62
 MIN_EVALUATIONS = 4
+DRIFTS = "background"
+"""Gets worse in every training that has no frozen anchor, whatever the reward: named, and no sign of hacking."""
 
 
 @dataclass(frozen=True)
 class LearningPlan:
-    """iterations: buffers. scenes x group_size videos each. eval_scenes: held out, sampled by ODE. hackable: reward the
-    task alone, which the detector of (2) should catch.
+    """iterations: buffers. scenes x group_size videos each. eval_scenes: held out, sampled by ODE. proxy: the score
+    that trains, `reward` or one that can be hacked. side, eval_side: of the videos that train and the held-out ones.
     """
 
     iterations: int = 40
@@ -42,33 +45,36 @@ class LearningPlan:
     group_size: int = 8
     eval_scenes: int = 100
     eval_every: int = 5
-    hackable: bool = False
+    proxy: Literal["reward", "consistency"] = "reward"
+    side: int = SIDE
+    eval_side: int = SIDE
 
 
 def train_arm(
     model: VideoNetwork, arm: Arm, plan: LearningPlan, seed: int,
     on_iteration: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Post-train `model` in place; return the arm's curve: evaluations, buffer reports, seconds."""
+    """Post-train `model` in place; return the arm's curve: evaluations, a list per quantity of the buffers, seconds."""
     learner = GrpoLearner(model, arm.grpo, arm.rollout, seed=seed)
-    evaluations = [{"iteration": 0, **evaluate(model, plan.eval_scenes, seed)}]
-    buffers, seconds = list[dict[str, Any]](), {"rollout": 0.0, "train": 0.0}
+    evaluations = [{"iteration": 0, **evaluate(model, arm, plan, seed)}]
+    buffers, seconds = list[dict[str, float]](), {"rollout": 0.0, "train": 0.0}
     for iteration in range(plan.iterations):
         start = time.perf_counter()
-        scenes = draw_scenes(plan.scenes, seed, "rollouts", iteration)
+        scenes = draw_scenes(plan.scenes, seed, "rollouts", iteration, plan.side)
         buffer, scores = sample_groups(model, arm, scenes, plan.group_size, seed, iteration, learner.version)
-        reward = scores.task if plan.hackable else scores.reward
+        buffer = buffer.with_rewards({"total": getattr(scores, plan.proxy)})
         middle = time.perf_counter()
-        report = learner.train(buffer.with_rewards({"total": reward}))
+        report = learner.train(buffer)
         seconds["rollout"] += middle - start
         seconds["train"] += time.perf_counter() - middle
-        buffers.append({"iteration": iteration, **_flat(report), **_means(scores, "rollout_")})
+        buffers.append({**_flat(report), "advantage_max": _largest_advantage(buffer), **_means(scores, "rollout_")})
         if (iteration + 1) % plan.eval_every == 0 or iteration + 1 == plan.iterations:
-            evaluations.append({"iteration": iteration + 1, **evaluate(model, plan.eval_scenes, seed)})
+            evaluations.append({"iteration": iteration + 1, **evaluate(model, arm, plan, seed)})
         on_iteration()
     return {
-        "arm": arm.name, "seed": seed, "evaluations": evaluations, "buffers": buffers, "seconds": seconds,
-        "hacked": hacked(evaluations, "task" if plan.hackable else "reward"),
+        "arm": arm.name, "shared_noise": arm.shared_noise, "seed": seed, "plan": asdict(plan),
+        "evaluations": evaluations, "buffers": {name: [row[name] for row in buffers] for name in buffers[0]},
+        "seconds": seconds, "hacked": hacked(evaluations, plan.proxy),
     }  # fmt: skip
 
 
@@ -82,6 +88,11 @@ def hacked(evaluations: list[dict[str, float]], proxy: str) -> list[str]:
     return [alarm.metric for alarm in found]
 
 
+def alarms(row: dict[str, Any]) -> list[str]:
+    """What a training's reward was hacked at the cost of: its `hacked` metrics but the one that drifts anyway."""
+    return [name for name in row["hacked"] if name != DRIFTS]
+
+
 def sample_groups(
     model: VideoNetwork, arm: Arm, scenes: Scenes, group_size: int, seed: int, iteration: int, version: int
 ) -> tuple[RolloutBuffer, Scores]:
@@ -90,10 +101,11 @@ def sample_groups(
     repeated = select(scenes, index)
     samples = torch.arange(group_size).repeat(len(scenes))
     noise_of = index * group_size if arm.shared_noise else index * group_size + samples
-    noise = initial_noise(SHAPE, seeds_of(seed, "initial", iteration, noise_of))
+    noise = initial_noise(_shape(scenes), seeds_of(seed, "initial", iteration, noise_of))
     steps = seeds_of(seed, "steps", iteration, index * group_size + samples)
     model.eval()
-    rollout = sample_videos(model, repeated.condition(), noise, steps, arm.rollout)
+    stochastic = stochastic_steps(arm.rollout.num_steps, arm.window, iteration, seed)
+    rollout = sample_videos(model, repeated.condition(), noise, steps, arm.rollout, stochastic)
     buffer = RolloutBuffer(
         rollout, repeated.condition(), index, samples, {}, torch.ones(len(index), dtype=torch.bool), version, iteration,
         config_hash(arm.rollout),
@@ -101,18 +113,17 @@ def sample_groups(
     return buffer, score(rollout.latents, repeated)
 
 
-def evaluate(model: VideoNetwork, count: int, seed: int) -> dict[str, float]:
-    """Held-out scenes, sampled by ODE: mean scores."""
-    scenes = draw_scenes(count, seed, "evaluation")
-    rollout = ode_videos(model, scenes, seed)
-    return _means(score(rollout.latents, scenes))
+def evaluate(model: VideoNetwork, arm: Arm, plan: LearningPlan, seed: int) -> dict[str, float]:
+    """Held-out scenes, sampled by ODE with the arm's guidance: mean scores."""
+    scenes = draw_scenes(plan.eval_scenes, seed, "evaluation", side=plan.eval_side)
+    return _means(score(ode_videos(model, arm, scenes, seed).latents, scenes))
 
 
-def ode_videos(model: VideoNetwork, scenes: Scenes, seed: int) -> VideoRollout:
+def ode_videos(model: VideoNetwork, arm: Arm, scenes: Scenes, seed: int) -> VideoRollout:
     seeds = seeds_of(seed, "evaluation", 0, torch.arange(len(scenes)))
     model.eval()
-    settings = RolloutSettings(NUM_STEPS, SHIFT, micro_batch=64)
-    return sample_videos(model, scenes.condition(), initial_noise(SHAPE, seeds), seeds, settings, stochastic=[])
+    noise = initial_noise(_shape(scenes), seeds)
+    return sample_videos(model, scenes.condition(), noise, seeds, arm.rollout, stochastic=[])
 
 
 def seeds_of(seed: int, name: str, iteration: int, numbers: Tensor) -> Tensor:
@@ -123,10 +134,23 @@ def select(scenes: Scenes, index: Tensor) -> Scenes:
     return Scenes(scenes.background[index], scenes.start[index], scenes.speed[index], scenes.action[index])
 
 
+def _shape(scenes: Scenes) -> tuple[int, int, int, int]:
+    return CHANNELS, FRAMES, scenes.side, scenes.side
+
+
 def _means(scores: Scores, prefix: str = "") -> dict[str, float]:
-    names = ("reward", "task", "mass", "background", "obeyed")
+    names = ("reward", "task", "mass", "background", "obeyed", "consistency")
     return {prefix + name: float(getattr(scores, name).mean()) for name in names}
 
 
-def _flat(report: BufferReport) -> dict[str, Any]:
-    return asdict(report)
+def _largest_advantage(buffer: RolloutBuffer) -> float:
+    """The largest |A| of (13) before it is clipped."""
+    unclipped = group_advantages(buffer.rewards["total"], buffer.group_ids, buffer.valid, clip=math.inf)
+    return float(unclipped.advantages_N.abs().max())
+
+
+def _flat(report: BufferReport) -> dict[str, float]:
+    """One number per name; those of update 1, 2, ... of the buffer end in _1, _2, ..."""
+    numbers = asdict(report)
+    updates = numbers.pop("updates")
+    return numbers | {f"{name}_{u}": value for u, update in enumerate(updates, 1) for name, value in update.items()}

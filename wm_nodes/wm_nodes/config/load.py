@@ -1,5 +1,9 @@
-"""Presets: base.yaml holds every number; task, preset and command line override some of them, in this order."""
+"""Presets: base.yaml holds every number; task, preset and command line override some of them, in this order.
 
+Reading presets and laying values over one another serve the settings of loop 2 too (learning/video_config.py).
+"""
+
+from collections.abc import Collection
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -9,18 +13,14 @@ from pydantic import ValidationError
 
 from wm_nodes.config.schema import RunConfig
 
+PRESETS = "presets"
 TASK_PREFIX = "task_"
 """presets/task_<name>.yaml holds what differs between tasks; it lies between base and the preset."""
+FREE = ("behaviours",)
 
 
 class ConfigError(ValueError):
     """A setting or preset that does not exist or is out of range."""
-
-
-def preset_names() -> list[str]:
-    folder = resources.files("wm_nodes.config") / "presets"
-    names = (Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".yaml"))
-    return sorted(name for name in names if not name.startswith(TASK_PREFIX))
 
 
 def load_config(preset: str = "cpu", overrides: dict[str, Any] | None = None) -> RunConfig:
@@ -33,19 +33,18 @@ def load_config(preset: str = "cpu", overrides: dict[str, Any] | None = None) ->
     Raises:
         ConfigError: names the value, what is allowed, and where to look.
     """
-    values = _read_preset("base")
-    chosen = _read_preset(preset)
+    values = read_preset("base")
+    chosen = read_preset(preset)
     task = (overrides or {}).get("task", chosen.get("task", values["task"]))
-    _merge(values, _read_task(task))
+    merge(values, _read_task(task), FREE)
     if preset != "base":
-        _merge(values, chosen)
+        merge(values, chosen, FREE)
     for dotted, value in (overrides or {}).items():
-        _set_dotted(values, dotted, value)
+        set_dotted(values, dotted, value, FREE)
     try:
         return RunConfig.model_validate(values)
     except ValidationError as error:
-        lines = [f"  {'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
-        raise ConfigError("configuration refused; see wm_nodes/config/schema.py:\n" + "\n".join(lines)) from None
+        raise refusal(error, "wm_nodes/config/schema.py") from None
 
 
 def dump_config(config: RunConfig) -> str:
@@ -61,37 +60,77 @@ def parse_override(text: str) -> tuple[str, Any]:
     return name.strip(), yaml.safe_load(value)
 
 
-def _read_preset(name: str) -> dict[str, Any]:
-    if name in preset_names():
-        text = (resources.files("wm_nodes.config") / "presets" / f"{name}.yaml").read_text()
+def preset_names(folder: str = PRESETS) -> list[str]:
+    """The presets in a folder of wm_nodes/config; what only differs by task is none."""
+    entries = (resources.files("wm_nodes.config") / folder).iterdir()
+    names = (Path(entry.name).stem for entry in entries if entry.name.endswith(".yaml"))
+    return sorted(name for name in names if not name.startswith(TASK_PREFIX))
+
+
+def read_preset(name: str, folder: str = PRESETS) -> dict[str, Any]:
+    """The values of a preset: a name of `folder`, or a path of a YAML file.
+
+    Raises:
+        ConfigError: neither of them, or no mapping.
+    """
+    if name in preset_names(folder):
+        text = (resources.files("wm_nodes.config") / folder / f"{name}.yaml").read_text()
     elif Path(name).suffix in {".yaml", ".yml"} and Path(name).is_file():
         text = Path(name).read_text()
     else:
-        raise ConfigError(f"unknown preset {name!r}; choose one of {', '.join(preset_names())} or give a .yaml file")
+        known = ", ".join(preset_names(folder))
+        raise ConfigError(f"unknown preset {name!r}; choose one of {known} or give a .yaml file")
     values = yaml.safe_load(text) or {}
     if not isinstance(values, dict):
         raise ConfigError(f"preset {name!r} must be a YAML mapping")
     return values
 
 
-def _read_task(task: Any) -> dict[str, Any]:
-    path = resources.files("wm_nodes.config") / "presets" / f"{TASK_PREFIX}{task}.yaml"
-    return (yaml.safe_load(path.read_text()) or {}) if path.is_file() else {}
+def merge(base: dict[str, Any], top: dict[str, Any], free: Collection[str] = (), path: str = "") -> None:
+    """Lay `top` over `base`, in place. free: names of mappings without fixed keys, which are replaced as a whole.
 
-
-def _merge(base: dict[str, Any], top: dict[str, Any]) -> None:
+    Raises:
+        ConfigError: a name that base does not have.
+    """
     for key, value in top.items():
-        if isinstance(value, dict) and isinstance(base.get(key), dict) and key != "behaviours":
-            _merge(base[key], value)
+        if key not in base:
+            raise _unknown(f"{path}{key}", base)
+        if isinstance(value, dict) and isinstance(base[key], dict) and key not in free:
+            merge(base[key], value, free, f"{path}{key}.")
         else:
             base[key] = value
 
 
-def _set_dotted(values: dict[str, Any], dotted: str, value: Any) -> None:
+def set_dotted(values: dict[str, Any], dotted: str, value: Any, free: Collection[str] = ()) -> None:
+    """Set "section.key" in place; in a free mapping, one entry of it, which may be new.
+
+    Raises:
+        ConfigError: there is no such setting.
+    """
     *parents, last = dotted.split(".")
-    section: Any = values
+    section, path = values, ""
     for name in parents:
-        section = section.get(name) if isinstance(section, dict) else None
-    if not isinstance(section, dict) or last not in section:
-        raise ConfigError(f"unknown setting {dotted!r}; see wm_nodes/config/presets/base.yaml")
-    section[last] = value
+        if name not in section:
+            raise _unknown(path + name, section)
+        section, path = section[name], f"{path}{name}."
+        if not isinstance(section, dict):
+            raise ConfigError(f"unknown setting {dotted!r}; {path[:-1]} is a single value")
+    if parents and parents[-1] in free:
+        section[last] = value
+    else:
+        merge(section, {last: value}, free, path)
+
+
+def refusal(error: ValidationError, where: str) -> ConfigError:
+    """One error that names every refused value. where: the file that explains the settings."""
+    lines = [f"  {'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
+    return ConfigError(f"settings refused; see {where}:\n" + "\n".join(lines))
+
+
+def _unknown(dotted: str, section: dict[str, Any]) -> ConfigError:
+    return ConfigError(f"unknown setting {dotted!r}; known there: {', '.join(map(str, section))}")
+
+
+def _read_task(task: Any) -> dict[str, Any]:
+    path = resources.files("wm_nodes.config") / PRESETS / f"{TASK_PREFIX}{task}.yaml"
+    return (yaml.safe_load(path.read_text()) or {}) if path.is_file() else {}

@@ -8,21 +8,26 @@ watched (equation (2)).
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from wm_nodes.learning.rollout_evaluation import OBJECT, TOOL
 from wm_nodes.learning.tokenizer_training import probe_targets
 from wm_nodes.learning.video_data import Clips
 from wm_nodes.types import FloatArray
+from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.position_probe import PositionProbe
 
 TRACKING_SCALE_M = 0.03
 """An error of this much takes the tracking score to 1 / e."""
 SEEN_MOTION = 12
 """A pixel counts as scenery while no recorded frame differs from the first one by more than this, of 255."""
+ERRORS = ("scenery", "object_cm", "tool_cm")
+"""Scores of which less is better."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,26 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
         tool_cm=torch.from_numpy(100 * tool_m.mean(1)).double(),
         motion=torch.from_numpy(_path_share(found[..., OBJECT], truth[..., OBJECT])).double(),
     )
+
+
+def more_is_better(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """A score turned so that more is better: errors negated, motion as -|1 - motion|, others as they are."""
+    turned: NDArray[np.float64] = np.asarray(values, np.float64)
+    if name == "motion":
+        turned = -np.abs(1 - turned)
+    return -turned if name in ERRORS else turned
+
+
+def load_probe(folder: Path) -> PositionProbe:
+    """The judge's probe of a world model's folder.
+
+    Raises:
+        ValueError: it has none.
+    """
+    probe = load_model_folder(folder).probe
+    if probe is None:
+        raise ValueError(f"{folder} has no position probe to judge with; take the shipped world model")
+    return probe
 
 
 def mixed(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:

@@ -4,6 +4,7 @@ minibatch; gradients are summed, so R ranks make the update of one."""
 import json
 import os
 from dataclasses import fields
+from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,8 @@ def join() -> Ranks:
     if size == 1:
         return Ranks()
     if not dist.is_initialized():
-        dist.init_process_group("gloo")
+        # A rank waits for the next rollout as long as the learner has no goal; torchrun ends it when another one dies.
+        dist.init_process_group("gloo", timeout=timedelta(days=365))
     return Ranks(dist.get_rank(), size)
 
 
@@ -68,10 +70,10 @@ def broadcast_rollout(rollout: Rollout | None, ranks: Ranks) -> Rollout | None:
     if ranks.rank == 0 and rollout is not None:
         arrays = {f.name: getattr(rollout, f.name) for f in fields(rollout) if f.name != "policy_version"}
         layout = [rollout.policy_version, {name: (a.shape, str(a.dtype)) for name, a in arrays.items()}]
-    layout = _broadcast_json(layout)
-    if layout is None:
+    text = broadcast_bytes(None if layout is None else json.dumps(layout).encode(), ranks)
+    if text is None:
         return None
-    version, shapes = layout
+    version, shapes = json.loads(text)
     received: dict[str, Any] = {}
     for name, (shape, dtype) in shapes.items():
         source = np.ascontiguousarray(getattr(rollout, name)) if ranks.rank == 0 else np.empty(shape, dtype)
@@ -81,11 +83,16 @@ def broadcast_rollout(rollout: Rollout | None, ranks: Ranks) -> Rollout | None:
     return Rollout(policy_version=version, **received)
 
 
-def _broadcast_json(value: Any) -> Any:
-    text = torch.tensor(list(json.dumps(value).encode()), dtype=torch.uint8)
-    size = torch.tensor([len(text)])
+def broadcast_bytes(data: bytes | None, ranks: Ranks) -> bytes | None:
+    """Rank 0 gives its bytes to all ranks; None from rank 0 means that there are no more."""
+    if ranks.size == 1:
+        return data
+    size = torch.tensor([-1 if data is None else len(data)])
     dist.broadcast(size, src=0)
-    if dist.get_rank() != 0:
-        text = torch.empty(int(size.item()), dtype=torch.uint8)
-    dist.broadcast(text, src=0)
-    return json.loads(text.numpy().tobytes())
+    if size.item() < 0:
+        return None
+    content = torch.empty(int(size.item()), dtype=torch.uint8)
+    if ranks.rank == 0:
+        content = torch.frombuffer(bytearray(data or b""), dtype=torch.uint8)
+    dist.broadcast(content, src=0)
+    return content.numpy().tobytes()

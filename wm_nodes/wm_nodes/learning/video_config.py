@@ -3,36 +3,38 @@ that own them; here they are put together, read and checked."""
 
 import dataclasses
 from dataclasses import dataclass, field
-from importlib import resources
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from wm_nodes.config.load import ConfigError
-from wm_nodes.learning.video_grpo import GrpoSettings
+from wm_nodes.config.load import merge, preset_names, read_preset, refusal, set_dotted
+from wm_nodes.learning.grpo_settings import GrpoSettings
 from wm_nodes.learning.video_training import FlowMatchingSettings
 from wm_nodes.video_model import RolloutSettings, WindowSettings
 
 PRESETS = "video_presets"
+FREE = ("rewards",)
 
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """The embedded model. patch, channels: of the codec. stride: recorded steps between frames. num_conditioning: given
-    frames. text_dim: values per hashed word. width, depth: of the network. batch_size: clips per training step.
+    """The embedded model. codec: principal components of patches (any size of picture; patch: its side, channels: how
+    many), or the frozen tokenizer of the task's shipped world model (its own sizes). stride: recorded steps between
+    frames. num_conditioning: given frames. text_dim: values per hashed word. width, depth: of the network. batch_size:
+    clips per training step.
     """
 
+    codec: Literal["patch", "tokenizer"] = "tokenizer"
     patch: int = 4
     channels: int = 16
     stride: int = 2
     num_conditioning: int = 1
     text_dim: int = 16
-    width: int = 64
+    width: int = 128
     depth: int = 5
-    batch_size: int = 8
-    training: FlowMatchingSettings = field(default_factory=lambda: FlowMatchingSettings(3000))
+    batch_size: int = 16
+    training: FlowMatchingSettings = field(default_factory=lambda: FlowMatchingSettings(4000))
 
 
 @dataclass(frozen=True)
@@ -46,10 +48,22 @@ class GroupSettings:
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """Held-out contexts, sampled by ODE before and after. num_steps: sampler steps."""
+    """Held-out contexts, one ODE clip each, before, during and after. num_steps: sampler steps. every: buffers between
+    two evaluations of the learner; 0: none. window: newest evaluations over which equation (2) compares the training
+    reward with the held-out scores; at least 3.
+    """
 
     contexts: int = 48
     num_steps: int = 10
+    every: int = 5
+    window: int = 4
+
+    def __post_init__(self) -> None:
+        if self.contexts < 1 or self.num_steps < 1 or self.every < 0 or self.window < 3:
+            raise ValueError(
+                "evaluation needs contexts >= 1, num_steps >= 1, every >= 0 (0: never) and window >= 3, got "
+                f"{self.contexts}, {self.num_steps}, {self.every} and {self.window}"
+            )
 
 
 @dataclass(frozen=True)
@@ -70,8 +84,7 @@ class VideoRlConfig:
 
 
 def video_preset_names() -> list[str]:
-    folder = resources.files("wm_nodes.config") / PRESETS
-    return sorted(Path(entry.name).stem for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return preset_names(PRESETS)
 
 
 def load_video_config(preset: str = "recommended", overrides: dict[str, Any] | None = None) -> VideoRlConfig:
@@ -81,48 +94,16 @@ def load_video_config(preset: str = "recommended", overrides: dict[str, Any] | N
         ConfigError: names the value, what is allowed, and where to look.
     """
     values = dataclasses.asdict(VideoRlConfig())
-    _merge(values, _read(preset), "")
+    merge(values, read_preset(preset, PRESETS), FREE)
     for dotted, value in (overrides or {}).items():
-        nested: Any = value
-        for name in reversed(dotted.split(".")):
-            nested = {name: nested}
-        _merge(values, nested, "")
-    return _build(values)
+        set_dotted(values, dotted, value, FREE)
+    try:
+        config: VideoRlConfig = TypeAdapter(VideoRlConfig).validate_python(values)
+    except ValidationError as error:
+        raise refusal(error, "learning/video_config.py") from None
+    return config
 
 
 def dump_video_config(config: VideoRlConfig) -> str:
     """The resolved settings as YAML, as saved with every run; load_video_config reads it back."""
     return str(yaml.safe_dump(dataclasses.asdict(config), sort_keys=False))
-
-
-def _build(values: dict[str, Any]) -> VideoRlConfig:
-    try:
-        config: VideoRlConfig = TypeAdapter(VideoRlConfig).validate_python(values)
-    except ValidationError as error:
-        lines = [f"  {'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
-        raise ConfigError("settings refused; see learning/video_config.py:\n" + "\n".join(lines)) from None
-    return config
-
-
-def _read(preset: str) -> dict[str, Any]:
-    if preset in video_preset_names():
-        text = (resources.files("wm_nodes.config") / PRESETS / f"{preset}.yaml").read_text()
-    elif Path(preset).suffix in {".yaml", ".yml"} and Path(preset).is_file():
-        text = Path(preset).read_text()
-    else:
-        names = ", ".join(video_preset_names())
-        raise ConfigError(f"unknown preset {preset!r}; choose one of {names} or give a .yaml file")
-    values = yaml.safe_load(text) or {}
-    if not isinstance(values, dict):
-        raise ConfigError(f"preset {preset!r} must be a YAML mapping")
-    return values
-
-
-def _merge(base: dict[str, Any], top: dict[str, Any], path: str) -> None:
-    for key, value in top.items():
-        if key not in base:
-            raise ConfigError(f"unknown setting {path + key!r}; known there: {', '.join(base)}")
-        if isinstance(value, dict) and isinstance(base[key], dict) and key != "rewards":
-            _merge(base[key], value, f"{path}{key}.")
-        else:
-            base[key] = value

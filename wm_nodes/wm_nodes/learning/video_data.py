@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from wm_nodes.learning.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.learning.tokenizer_codec import Codec
 from wm_nodes.recording import read_episodes
 from wm_nodes.simulation.tasks import success
 from wm_nodes.types import FloatArray
 from wm_nodes.video_model import Condition
-from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 
 
@@ -40,7 +40,7 @@ class Clips:
             tuple(self.instructions[int(i)] for i in index),
         )  # fmt: skip
 
-    def condition(self, codec: PatchCodec, num_conditioning: int, text_dim: int) -> Condition:
+    def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:
         """The first frames, the actions and the instruction."""
         first = codec.encode(self.frames[:, :num_conditioning])
         return Condition(first, self.actions, hashed_words(self.instructions, text_dim))

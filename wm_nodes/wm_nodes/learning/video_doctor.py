@@ -9,7 +9,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from wm_nodes.learning.video_grpo import GrpoLearner, GrpoSettings
+from wm_nodes.learning.grpo_settings import GrpoSettings
+from wm_nodes.learning.video_grpo import GrpoLearner
 from wm_nodes.video_model import (
     Condition,
     RolloutBuffer,

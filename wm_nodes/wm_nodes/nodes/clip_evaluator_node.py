@@ -63,6 +63,7 @@ class ClipEvaluatorNode(ManagedNode):
             began = time.perf_counter()
             buffer = read_buffer(self.run_dir / goal.buffer_uri, goal.sha256)
             result.scores = self._score(buffer, goal.sha256)
+            work.check()
             result.scores.eval_s = time.perf_counter() - began
             self._scores.publish(result.scores)
             self.diagnostics.latency("evaluate", result.scores.eval_s)
@@ -97,8 +98,18 @@ class ClipEvaluatorNode(ManagedNode):
 
 
 def read_buffer(path: Path, sha256: str) -> RolloutBuffer:
-    """Read a rollout buffer. Raises RolloutBufferError where it is another file than the one with this sha256."""
-    data = path.read_bytes()
+    """Read a rollout buffer.
+
+    Args:
+        sha256: of the file; empty: any.
+
+    Raises:
+        RolloutBufferError: no such file, another one than announced, or no buffer in it.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RolloutBufferError(f"cannot read {path}: {error.strerror}; sample again, or raise keep_buffers") from None
     found = hashlib.sha256(data).hexdigest()
     if sha256 and found != sha256:
         raise RolloutBufferError(f"{path} is not the announced buffer (sha256 {found[:12]}, not {sha256[:12]})")

@@ -7,11 +7,8 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from rclpy.action import ActionClient
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 
 from wm_msgs.action import Replay, Train
@@ -32,7 +29,7 @@ from wm_nodes.nodes.training import PolicyTraining, follow
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import COMMON, Param, declare
+from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, WireError
 from wm_nodes.specs import EnvironmentSpec
@@ -348,12 +345,7 @@ class LearnerNode(ManagedNode):
 def follow_rank_0(ranks: Ranks) -> int:
     """The process of another rank: reads the learner's parameters, then leaves the graph to rank 0."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = Node("learner", enable_rosout=False)
-    declare(node, (*COMMON, *PARAMS))
-    values = {param.name: str(node.get_parameter(param.name).value) for param in (*COMMON, *PARAMS)}
-    node.destroy_node()
-    rclpy.shutdown()
+    values = read_parameters("learner", (*COMMON, *PARAMS))
     config = load_config(values["config_file"])
     policy = make_policy(config, values["model_dir"], values["policy_factory"])
     learner = make_learner(policy, config, values["learner_factory"], ranks)

@@ -1,6 +1,11 @@
 """learner of loop 2: asks for clips and their scores, trains the video model by GRPO, announces new versions."""
 
+import signal
 import sys
+import threading
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +15,8 @@ from rclpy.action import ActionClient
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
 from wm_msgs.msg import ClipScores, PolicyVersion
+from wm_nodes.learning.distributed import Ranks, join
+from wm_nodes.learning.heldout import alarm_text, heldout_scores
 from wm_nodes.learning.video_config import load_video_config
 from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.learning.video_grpo import BufferReport
@@ -19,14 +26,16 @@ from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import run_goal
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import Param
+from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost
+from wm_nodes.ros.wire import Cancelled, PeerLost
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 
 PARAMS = (
     Param("video_model_dir", "", "Folder of the video model that training starts from", read_only=True),
-    Param("keep_versions", 20, "Weights files kept in run_dir/video_policies", minimum=1, maximum=100000,
+    Param("heldout_bags", [""], "Bags of held-out contexts, scored every evaluation.every buffers", read_only=True),
+    Param("model_dir", "", "World-model folder; its position probe reads the held-out clips", read_only=True),
+    Param("keep_versions", 20, "Weights files kept in run_dir/video_policies", minimum=2, maximum=100000,
           read_only=True),
     Param("tensorboard", False, "Write metrics to run_dir/tensorboard too; its import takes seconds", read_only=True),
     Param("accept_timeout_s", 20.0, "How long the video model and the evaluator may take to accept a goal", "s",
@@ -37,17 +46,15 @@ PARAMS = (
 class VideoLearnerNode(ManagedNode):
     """Action video/train; calls video/generate and clips/evaluate; publishes video/version."""
 
-    def __init__(self, **node_arguments: Any) -> None:
+    def __init__(self, ranks: Ranks | None = None, **node_arguments: Any) -> None:
         super().__init__("learner", PARAMS, **node_arguments)
+        self._ranks = ranks or Ranks()
 
     def configure(self) -> None:
-        config = load_video_config(str(self.param("config_file")))
-        folder = load_video_folder(Path(str(self.param("video_model_dir"))))
-        self._run = VideoRun(
-            folder.network, config, self.run_dir, keep_versions=int(self.param("keep_versions")),
-            tensorboard=bool(self.param("tensorboard")),
-        )  # fmt: skip
+        values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
+        self._run = make_run(values, self.run_dir, self._ranks)
         self.own(self._run.close)
+        self._watched = self._run.hacked
         self._versions = self.publish_on("video/version")
         self._generate = ActionClient(self, GenerateClips, "video/generate")
         self._evaluate = ActionClient(self, EvaluateClips, "clips/evaluate")
@@ -57,7 +64,8 @@ class VideoLearnerNode(ManagedNode):
         self.own(self._action.destroy)
 
     def activate(self) -> None:
-        self._announce()
+        for version in sorted({self._run.sampling_version, self._run.version}):
+            self._announce(version)
 
     def deactivate(self, reason: str) -> None:
         self._action.stop(reason)
@@ -66,6 +74,7 @@ class VideoLearnerNode(ManagedNode):
         if hasattr(self, "_run"):
             self.diagnostics.gauge("version", self._run.version)
             self.diagnostics.gauge("iterations", self._run.iterations)
+            self.diagnostics.gauge("staleness", self._run.staleness)
 
     # Training, in a worker thread.
 
@@ -76,51 +85,86 @@ class VideoLearnerNode(ManagedNode):
             count = len(goal.from_buffers) or int(goal.iterations)
             if not count:
                 raise ValueError("iterations is 0 and from_buffers is empty; ask for at least 1")
-            for done in range(count):
-                work.check()
-                path = goal.from_buffers[done] if goal.from_buffers else ""
-                buffer = read_buffer(self.run_dir / path, "") if path else self._sampled(work)
-                report = self._run.train(buffer)
-                self._announce()
-                self._tell(work, report, done + 1, count)
+            if self._announced != self._run.version:  # its files could not be written when it was made
+                self._announce(self._run.version)
+            with closing(self._read(goal.from_buffers) if goal.from_buffers else self._fresh(work, count)) as buffers:
+                for done, buffer in enumerate(buffers, 1):
+                    invalid = len(buffer) - int(buffer.valid.sum())
+                    if invalid:
+                        self.diagnostics.count("invalid_rewards", invalid, text=f"{invalid} clips without reward")
+                    report = self._run.train(buffer, work.check)
+                    self._announce(self._run.version)
+                    self._tell(work, report, done, count)
+                    self._warn()
         except PeerLost as error:
             result.termination_reason, result.message = TrainVideo.Result.PEER_LOST, str(error)
-        except (RolloutBufferError, ValueError, OSError, FloatingPointError) as error:
+        except (ValueError, OSError, FloatingPointError) as error:
             result.termination_reason, result.message = TrainVideo.Result.FAILED, str(error)
         if result.message:
             self.get_logger().error(f"training ended: {result.message}")
             self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=result.message)
         return self._fill(result)
 
-    def _sampled(self, work: Work) -> RolloutBuffer:
-        """A buffer of fresh clips with their rewards; also written beside the one without, for training offline."""
-        goal = GenerateClips.Goal(iteration=self._run.iterations, policy_version=self._run.version)
-        clips = self._ask(self._generate, goal, work, "/video_model")
-        judged = self._ask(
-            self._evaluate, EvaluateClips.Goal(buffer_uri=clips.buffer_uri, sha256=clips.sha256), work,
-            "/reward_evaluator",
-        )  # fmt: skip
-        buffer = read_buffer(self.run_dir / clips.buffer_uri, clips.sha256)
-        return with_scores(buffer, judged.scores)
+    def _read(self, uris: Sequence[str]) -> Generator[RolloutBuffer]:
+        for uri in uris:
+            yield read_buffer(self.run_dir / uri, "")
 
-    def _ask(self, client: ActionClient, goal: Any, work: Work, peer: str) -> Any:
+    def _fresh(self, work: Work, count: int) -> Generator[RolloutBuffer]:
+        """`count` buffers of fresh clips with their rewards, each to be trained on before the next one is taken.
+
+        Where the settings allow the staleness, the next one is being made meanwhile; there is never more than one under
+        way. Closed early, this leaves none.
+        """
+        run, closed = self._run, threading.Event()
+        ahead: Future[RolloutBuffer] | None = None
+
+        def check() -> None:
+            work.check()
+            if closed.is_set():
+                raise Cancelled("the training that this was for has ended")
+
+        with ThreadPoolExecutor(1, "prefetch") as thread:
+            try:
+                for left in reversed(range(count)):
+                    buffer = ahead.result() if ahead else self._sampled(run.iterations, run.sampling_version, check)
+                    if left and run.prefetches:
+                        ahead = thread.submit(self._sampled, run.iterations + 1, run.version, check)
+                    yield buffer
+            finally:
+                closed.set()
+
+    def _sampled(self, iteration: int, version: int, check: Callable[[], None]) -> RolloutBuffer:
+        """The buffer of an iteration, sampled by a version, with its rewards."""
+        goal = GenerateClips.Goal(iteration=iteration, policy_version=version)
+        clips = self._ask(self._generate, goal, check, "/video_model")
+        request = EvaluateClips.Goal(buffer_uri=clips.buffer_uri, sha256=clips.sha256)
+        judged = self._ask(self._evaluate, request, check, "/reward_evaluator")
+        return with_scores(read_buffer(self.run_dir / clips.buffer_uri, clips.sha256), judged.scores)
+
+    def _ask(self, client: ActionClient, goal: Any, check: Callable[[], None], peer: str) -> Any:
         """Raises PeerLost where nobody answers, ValueError where the peer says that it failed."""
         name = self.get_namespace().rstrip("/") + peer
+        asked = self.peers.identity(name)
 
         def alive() -> None:
+            nonlocal asked
+            asked = asked or self.peers.identity(name)
             if self.peers.is_lost(name):
-                raise PeerLost(f"{name} is silent")
+                raise PeerLost("it is silent")
+            if self.peers.identity(name) != asked:
+                raise PeerLost("it was stopped or restarted")
 
-        result = run_goal(
-            client, goal, accept_s=float(self.param("accept_timeout_s")), check=work.check, alive=alive
-        )
+        try:
+            result = run_goal(
+                client, goal, accept_s=float(self.param("accept_timeout_s")), check=check, alive=alive
+            )
+        except PeerLost as error:
+            raise PeerLost(f"{name}: {error}") from None
         if result.termination_reason != type(result).FINISHED:
             raise ValueError(f"{name}: {result.message or f'ended with reason {result.termination_reason}'}")
         return result
 
     def _tell(self, work: Work, report: BufferReport, done: int, count: int) -> None:
-        if report.invalid:
-            self.diagnostics.count("invalid_rewards", report.invalid, text=f"{report.invalid} clips without reward")
         work.feedback(
             TrainVideo.Feedback(
                 iteration=done, policy_version=self._run.version, reward_mean=report.reward_mean,
@@ -128,14 +172,27 @@ class VideoLearnerNode(ManagedNode):
             )
         )  # fmt: skip
 
-    def _announce(self) -> None:
-        packed, version = self._run.packed or self._run.save(), self._run.version
+    def _warn(self) -> None:
+        """Say what a new held-out evaluation says of reward hacking."""
+        if self._run.hacked is self._watched:
+            return
+        self._watched = self._run.hacked
+        text = alarm_text(self._watched)
+        if text:
+            self.get_logger().warning(f"reward hacking: {text}")
+            self.diagnostics.set_condition("reward_hacking", diagnostics.WARN, text)
+        else:
+            self.diagnostics.clear_condition("reward_hacking")
+
+    def _announce(self, version: int) -> None:
+        packed, newest = self._run.weights_of(version), version == self._run.version
         message = PolicyVersion(
-            version=version, train_step=self._run.iterations, uri=version_uri(version), sha256=packed.sha256,
-            size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
+            version=version, train_step=self._run.iterations - (not newest), uri=version_uri(version),
+            sha256=packed.sha256, size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
         )  # fmt: skip
         message.header.stamp = self.get_clock().now().to_msg()
         self._versions.publish(message)
+        self._announced = version
 
     def _fill(self, result: TrainVideo.Result) -> TrainVideo.Result:
         result.policy_version, result.iterations = self._run.version, self._run.iterations
@@ -161,8 +218,31 @@ def with_scores(buffer: RolloutBuffer, scores: ClipScores) -> RolloutBuffer:
     return rewarded(buffer, dict(zip(names, values, strict=True)), torch.where(valid, total, torch.nan))
 
 
+def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun:
+    """The run that a node's parameters describe."""
+    folder = load_video_folder(Path(str(values["video_model_dir"])))
+    config = load_video_config(str(values["config_file"]))
+    bags = [Path(text) for text in values["heldout_bags"] if text]
+    watched = bool(bags) and config.evaluation.every > 0 and ranks.rank == 0
+    return VideoRun(
+        folder.network, config, run_dir, keep_versions=int(values["keep_versions"]),
+        tensorboard=bool(values["tensorboard"]), ranks=ranks,
+        heldout=heldout_scores(folder, bags, Path(str(values["model_dir"])), config) if watched else None,
+    )  # fmt: skip
+
+
+def follow_rank_0(ranks: Ranks) -> int:
+    """The process of another rank: reads the learner's parameters, then leaves the graph to rank 0."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    values = read_parameters("learner", (*COMMON, *PARAMS))
+    make_run(values, Path(str(values["run_dir"])), ranks).follow()
+    return 0
+
+
 def main() -> int:
-    return run_node(VideoLearnerNode)
+    """One process, or under torchrun rank 0 as the node and the other ranks behind it."""
+    ranks = join()
+    return follow_rank_0(ranks) if ranks.rank else run_node(lambda: VideoLearnerNode(ranks))
 
 
 if __name__ == "__main__":

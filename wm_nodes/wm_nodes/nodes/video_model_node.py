@@ -36,6 +36,10 @@ PARAMS = (
 )  # fmt: skip
 
 
+VERSIONS_KNOWN = 20
+"""Announcements kept, newest last."""
+
+
 class VideoModelNode(ManagedNode):
     """Action video/generate; follows video/version; publishes clips, clips/image."""
 
@@ -47,8 +51,8 @@ class VideoModelNode(ManagedNode):
         folder = load_video_folder(Path(str(self.param("video_model_dir"))))
         bags = [Path(text) for text in self.param("context_bags") if text]
         self._generator = ClipGenerator(folder, load_clips(bags, folder.clip["stride"]), config)
-        self._version = 0
-        self._newest: PolicyVersion | None = None
+        self._loaded = (0, "")  # version and, unless it is the folder's own, sha256
+        self._announced = dict[int, PolicyVersion]()
         self._clips = self.publish_on("clips")
         row = topic("clips/image")
         self._images = self.create_publisher(row.type, row.name, row.qos)
@@ -61,11 +65,14 @@ class VideoModelNode(ManagedNode):
         self._action.stop(reason)
 
     def update_diagnostics(self) -> None:
-        if hasattr(self, "_version"):
-            self.diagnostics.gauge("version", self._version)
+        if hasattr(self, "_loaded"):
+            self.diagnostics.gauge("version", self._loaded[0])
 
     def _on_version(self, message: PolicyVersion) -> None:
-        self._newest = message
+        self._announced.pop(message.version, None)
+        self._announced[message.version] = message
+        if len(self._announced) > VERSIONS_KNOWN:
+            del self._announced[next(iter(self._announced))]
 
     # Sampling, in a worker thread.
 
@@ -102,22 +109,22 @@ class VideoModelNode(ManagedNode):
         return result
 
     def _follow(self, work: Work, version: int) -> None:
-        """Have the weights of `version`; version 0 is the model's own folder.
+        """Have the weights of `version`, which need not be the newest: a learner that prefetches has gone on meanwhile.
 
         Raises:
             WireError: its file cannot be read. WeightsError: the file is not the announced one.
-            ValueError: another version is announced after version_timeout_s.
+            ValueError: it is not announced within version_timeout_s.
         """
         deadline = time.monotonic() + float(self.param("version_timeout_s"))
-        while (self._newest.version if self._newest is not None else 0) != version:
+        while version not in self._announced and version != self._loaded[0]:
             if time.monotonic() > deadline:
-                newest = "none" if self._newest is None else self._newest.version
-                raise ValueError(f"asked for version {version}, video/version announces {newest}; is a learner there?")
+                known = ", ".join(map(str, list(self._announced))) or "none"
+                raise ValueError(f"asked for version {version}, video/version announced {known}; is a learner there?")
             work.sleep(0.02)
-        newest = self._newest
-        if newest is not None and version != self._version:
-            load_weights(self._generator.folder.network, read_weights(newest.uri, self.run_dir), sha256=newest.sha256)
-            self._version = version
+        message = self._announced.get(version)
+        if message is not None and self._loaded != (version, message.sha256):
+            load_weights(self._generator.folder.network, read_weights(message.uri, self.run_dir), sha256=message.sha256)
+            self._loaded = (version, message.sha256)
 
     def _publish(self, message: ClipBatch, strip: UInt8Array) -> None:
         stamp = self.get_clock().now().nanoseconds
@@ -126,7 +133,8 @@ class VideoModelNode(ManagedNode):
         self._clips.publish(message)
 
     def _forget_old(self) -> None:
-        kept = sorted((self.run_dir / "buffers").glob("buffer_*.safetensors"))
+        written = (self.run_dir / "buffers").glob("buffer_*.safetensors")
+        kept = sorted(written, key=lambda path: path.stat().st_mtime_ns)
         for path in kept[: -int(self.param("keep_buffers"))]:
             path.unlink(missing_ok=True)
 

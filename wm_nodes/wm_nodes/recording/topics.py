@@ -51,6 +51,9 @@ POLICY = _qos(depth=1, latched=True, lease_s=POLICY_LEASE_S)
 GOALS = _qos(depth=CREDIT_WINDOW + 2, latched=True)
 """Latched, but deep: an evaluator that lags by a full credit window still gets the goals of every episode."""
 
+VERSIONS = _qos(depth=2, latched=True)
+"""Latched, with the version before: a video model that joins late may be asked for it by a learner that prefetches."""
+
 NEWEST = _qos(depth=1)
 METRICS = _qos(depth=10)
 
@@ -84,7 +87,7 @@ ALL_TOPICS = (
 CLIPS = Topic("clips", "wm_msgs/msg/ClipBatch", METRICS)
 CLIP_IMAGES = Topic("clips/image", "sensor_msgs/msg/Image", METRICS, sequenced=False)
 CLIP_SCORES = Topic("clips/scores", "wm_msgs/msg/ClipScores", METRICS)
-VIDEO_VERSION = Topic("video/version", "wm_msgs/msg/PolicyVersion", LATCHED)
+VIDEO_VERSION = Topic("video/version", "wm_msgs/msg/PolicyVersion", VERSIONS)
 
 VIDEO_TOPICS = (CLIPS, CLIP_IMAGES, CLIP_SCORES, VIDEO_VERSION, RUN_STATE)
 """Loop 2: clips come every few seconds, asked for one buffer at a time, so a depth of ten holds every unread one."""

@@ -3,7 +3,15 @@
 Plain arrays and numbers go in; nothing here knows a model, a policy or a graph.
 """
 
-from wm_nodes.reports.curves import curves
+from wm_nodes.reports.clip_report import (
+    ClipSummary,
+    ScoreChange,
+    clip_panels,
+    scores_table,
+    write_clip_report,
+    write_clip_summary,
+)
+from wm_nodes.reports.curves import Panel, curves
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture, write_report
 from wm_nodes.reports.machine import machine_facts
@@ -11,6 +19,7 @@ from wm_nodes.reports.summary import Rate, Summary, read_summary, write_summary
 from wm_nodes.reports.tables import results_table, rounds_table
 
 __all__ = [
-    "Picture", "Rate", "Summary", "curves", "film_strip", "machine_facts", "read_summary", "results_table",
-    "rounds_table", "write_report", "write_summary",
+    "ClipSummary", "Panel", "Picture", "Rate", "ScoreChange", "Summary", "clip_panels", "curves", "film_strip",
+    "machine_facts", "read_summary", "results_table", "rounds_table", "scores_table", "write_clip_report",
+    "write_clip_summary", "write_report", "write_summary",
 ]  # fmt: skip

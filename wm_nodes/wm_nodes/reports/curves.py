@@ -1,34 +1,55 @@
 """The course of a training as a picture, from the run's metrics.jsonl."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-PANELS = (
-    ("success_rate", "imagined success (share of episodes)", (0.0, 1.0)),
-    ("mean_return", "imagined return (mean per episode)", None),
-    ("kl_reference", "KL to the SFT policy (nats per step)", None),
-    ("loss_value", "value loss (Huber)", None),
+
+@dataclass(frozen=True)
+class Panel:
+    """One diagram. lines: metric to its label in the legend, "" for none; "section/metric" takes it from that section
+    only. limits: fixed limits of the y axis.
+    """
+
+    title: str
+    lines: Mapping[str, str]
+    limits: tuple[float, float] | None = None
+
+
+POLICY_PANELS = (
+    Panel("imagined success (share of episodes)", {"success_rate": ""}, (0.0, 1.0)),
+    Panel("imagined return (mean per episode)", {"mean_return": ""}),
+    Panel("KL to the SFT policy (nats per step)", {"kl_reference": ""}),
+    Panel("value loss (Huber)", {"loss_value": ""}),
 )
-"""Metric, title, fixed limits of the y axis."""
 COLOURS = ("#2a7f5f", "#3567a8", "#b5562b", "#7a4fa0")
 
 
-def curves(metrics_file: Path, path: Path) -> Path | None:
-    """Draw imagined success, return, KL to the SFT policy and value loss over updates; returns the PNG.
+def curves(
+    metrics_file: Path, path: Path, panels: Sequence[Panel] = POLICY_PANELS, *, step: str = "policy update"
+) -> Path | None:
+    """Draw the panels over the steps of the metrics, two in a row; returns the PNG.
 
     Returns None, and draws nothing, where no line of the file carries any of them. Values that were written as null
     leave a gap.
+
+    Args:
+        step: what a step is; under every panel.
     """
-    series = {name: read_series(metrics_file, name) for name, _, _ in PANELS}
-    if not any(series.values()):
+    series = [{name: read_series(metrics_file, name) for name in panel.lines} for panel in panels]
+    if not any(points for found in series for points in found.values()):
         return None
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.5, 5.4), dpi=110, layout="constrained", facecolor="white")
-    for axes, (name, title, limits), colour in zip(figure.subplots(2, 2).flat, PANELS, COLOURS, strict=True):
-        _panel(axes, series[name], title, limits, colour)
+    rows = -(-len(panels) // 2)
+    figure = Figure(figsize=(10.5, 2.7 * rows), dpi=110, layout="constrained", facecolor="white")
+    diagrams = list(figure.subplots(rows, 2, squeeze=False).flat)
+    for unused in diagrams[len(panels) :]:
+        unused.set_axis_off()
+    for index, (axes, panel, found) in enumerate(zip(diagrams, panels, series, strict=False)):
+        _panel(axes, panel, found, step, index)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp.png")
     figure.savefig(temporary)
@@ -37,33 +58,41 @@ def curves(metrics_file: Path, path: Path) -> Path | None:
 
 
 def read_series(metrics_file: Path, name: str) -> list[tuple[int, float]]:
-    """(step, value) of one metric in order; the last line of a step wins, as a resumed run may repeat steps."""
+    """(step, value) of a metric ("section/metric": of that section only) in order; the last line of a step wins, as a
+    resumed run may repeat steps.
+    """
     if not metrics_file.is_file():
         return []
+    section, _, metric = name.rpartition("/")
     values: dict[int, float] = {}
     for text in metrics_file.read_text(encoding="utf-8").splitlines():
         try:
             line = json.loads(text)
         except json.JSONDecodeError:
             continue  # a line cut by a crash
-        if name in line:
-            values[int(line["step"])] = float("nan") if line[name] is None else float(line[name])
+        if metric in line and section in ("", line["section"]):
+            values[int(line["step"])] = float("nan") if line[metric] is None else float(line[metric])
     return sorted(values.items())
 
 
 def _panel(
-    axes: Any, points: Sequence[tuple[int, float]], title: str, limits: tuple[float, float] | None, colour: str
+    axes: Any, panel: Panel, series: Mapping[str, Sequence[tuple[int, float]]], step: str, index: int
 ) -> None:
-    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_title(panel.title, fontsize=10, loc="left")
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel("policy update", fontsize=8)
+    axes.set_xlabel(step, fontsize=8)
     axes.tick_params(labelsize=8)
-    if not points:
+    if not any(series.values()):
         axes.text(0.5, 0.5, "not recorded", ha="center", va="center", transform=axes.transAxes, color="gray")
         return
-    steps, values = zip(*points, strict=True)
-    axes.plot(steps, values, color=colour, linewidth=1.6, marker="o", markersize=2.5)
+    for number, (name, points) in enumerate(series.items()):
+        colour = COLOURS[(index + number) % len(COLOURS)]
+        steps, values = zip(*points, strict=True) if points else ((), ())
+        axes.plot(steps, values, color=colour, linewidth=1.6, marker="o", markersize=2.5, label=panel.lines[name])
+    if any(panel.lines.values()):
+        axes.legend(fontsize=8, frameon=False)
     axes.xaxis.get_major_locator().set_params(integer=True)
-    if limits is not None:
-        axes.set_ylim(limits[0] - 0.03, limits[1] + 0.03)
+    if panel.limits is not None:
+        low, high = panel.limits
+        axes.set_ylim(low - 0.03, high + 0.03)

@@ -60,13 +60,15 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
         "<h2>Success</h2>", _results(summary),
         *_rounds(summary),
         "<h2>Gate: did the world model deserve it?</h2>", _gate(summary.gate),
-        *_pictures(pictures),
+        *figures(pictures),
         "<h2>Look closer, do it again</h2>", _again(run_dir, summary),
-        "<h2>Made on</h2>", _table(("", ""), [(name, value) for name, value in summary.machine.items()]),
+        *made_on(summary.machine, config_text),
     ]  # fmt: skip
-    if config_text:
-        body += [f"<h2>Settings</h2><details><summary>resolved configuration</summary><pre>{escape(config_text)}</pre>"
-                 "</details>"]  # fmt: skip
+    return write_page(run_dir, title, body)
+
+
+def write_page(run_dir: Path, title: str, body: Iterable[str]) -> Path:
+    """Write <run_dir>/report.html from the parts of its body; return its path."""
     page = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
         f'content="width=device-width, initial-scale=1"><title>{escape(title)}</title><style>{STYLE}</style></head>'
@@ -75,6 +77,36 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
     path = Path(run_dir) / FILE_NAME
     write_whole(path, page)
     return path
+
+
+def figures(pictures: Sequence[Picture]) -> Iterable[str]:
+    """Each picture, inside the page, under its title.
+
+    Raises:
+        FileNotFoundError: a picture does not exist.
+    """
+    for picture in pictures:
+        if not picture.path.is_file():
+            raise FileNotFoundError(f"picture {picture.path} of the report does not exist")
+        data = base64.b64encode(picture.path.read_bytes()).decode()
+        yield (
+            f'<h2>{escape(picture.title)}</h2><figure><img alt="{escape(picture.title)}" '
+            f'src="data:image/png;base64,{data}"><figcaption>{escape(picture.caption)}</figcaption></figure>'
+        )
+
+
+def made_on(machine: Mapping[str, str], config_text: str) -> Iterable[str]:
+    """The machine and, folded, the settings."""
+    yield f"<h2>Made on</h2>{_table(('', ''), machine.items())}"
+    if config_text:
+        yield (
+            f"<h2>Settings</h2><details><summary>resolved configuration</summary><pre>{escape(config_text)}</pre>"
+            "</details>"
+        )
+
+
+def number_cell(text: str) -> str:
+    return f'<td class="number">{escape(text)}</td>'
 
 
 def _results(summary: Summary) -> str:
@@ -87,7 +119,7 @@ def _results(summary: Summary) -> str:
     for row in rows:
         cells = (text for cell in (row.real, row.imagined) for text in (cell.count, cell.percent, cell.interval))
         kind = ' class="last"' if row is rows[-1] else ""
-        lines.append(f"<tr{kind}><td>{escape(row.label)}</td>{''.join(map(_number, cells))}</tr>")
+        lines.append(f"<tr{kind}><td>{escape(row.label)}</td>{''.join(map(number_cell, cells))}</tr>")
     return (
         f'<div class="wide"><table><tr><th></th>{head}</tr>{"".join(lines)}</table></div>'
         '<p class="faint">Intervals of rates: Wilson. Interval of the real difference: the same seeds before and after '
@@ -117,7 +149,7 @@ def _gate(gate: Mapping[str, Any]) -> str:
         mark = '<span class="good">passed</span>' if passed else '<span class="bad">failed</span>'
         remedy = "" if passed else escape(str(criterion["remedy"]))
         rows.append(
-            f"<tr><td>{escape(str(criterion['name']))}</td>{_number(_value(criterion['value']))}"
+            f"<tr><td>{escape(str(criterion['name']))}</td>{number_cell(_value(criterion['value']))}"
             f"<td>{escape(str(criterion['rule']))} {escape(_threshold(criterion))}</td><td>{mark}</td>"
             f"<td>{remedy}</td></tr>"
         )
@@ -135,17 +167,6 @@ def _metrics(metrics: Mapping[str, Any]) -> str:
         return ""
     table = _table(("metric", "value"), [(name, _value(value)) for name, value in metrics.items()])
     return f"<details><summary>all numbers of the held-out rollouts</summary>{table}</details>"
-
-
-def _pictures(pictures: Sequence[Picture]) -> Iterable[str]:
-    for picture in pictures:
-        if not picture.path.is_file():
-            raise FileNotFoundError(f"picture {picture.path} of the report does not exist")
-        data = base64.b64encode(picture.path.read_bytes()).decode()
-        yield (
-            f'<h2>{escape(picture.title)}</h2><figure><img alt="{escape(picture.title)}" '
-            f'src="data:image/png;base64,{data}"><figcaption>{escape(picture.caption)}</figcaption></figure>'
-        )
 
 
 def _again(run_dir: Path, summary: Summary) -> str:
@@ -172,10 +193,6 @@ def _table(head: tuple[str, str], rows: Iterable[tuple[str, str]]) -> str:
     lines = "".join(f"<tr><td>{escape(str(name))}</td><td>{escape(str(value))}</td></tr>" for name, value in rows)
     title = f"<tr><th>{escape(head[0])}</th><th>{escape(head[1])}</th></tr>" if any(head) else ""
     return f'<div class="wide"><table>{title}{lines}</table></div>'
-
-
-def _number(text: str) -> str:
-    return f'<td class="number">{escape(text)}</td>'
 
 
 def _value(value: Any) -> str:

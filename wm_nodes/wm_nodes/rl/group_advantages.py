@@ -3,7 +3,10 @@
 Computed in float64: in float32 a group of equal rewards gets advantages of up to 0.9 from rounding alone.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -95,6 +98,38 @@ def group_advantages(
         stds = torch.full_like(stds, running.std)
     advantages = (deviations / stds).clamp(-clip, clip)
     return GroupAdvantages(advantages, kept, len(groups), num_zero, int((~valid).sum()))
+
+
+def mixed_advantages(
+    rewards: Mapping[str, Tensor],
+    weights: Mapping[str, float],
+    group_ids_N: Tensor,
+    valid_N: Tensor,
+    *,
+    clip: float,
+    std_scope: StdScope = "group",
+    ddof: int = 0,
+) -> GroupAdvantages:
+    """Return clip(sum_r w_r A_r / sum_r |w_r|) of rewards normalised one by one, whatever their units and spreads.
+
+    A_r is (13) of reward r, unclipped. A group counts as one without spread where no reward has any.
+
+    Raises:
+        ValueError: no weight that is not 0, a weight of an unknown reward, or as group_advantages.
+    """
+    weights = {name: weight for name, weight in weights.items() if weight}
+    unknown = sorted(set(weights) - set(rewards))
+    if unknown or not weights:
+        raise ValueError(f"no advantages of unknown rewards {unknown}; weigh some of {', '.join(sorted(rewards))}")
+    one = partial(group_advantages, clip=math.inf, std_scope=std_scope, ddof=ddof)
+    parts = {name: one(rewards[name], group_ids_N, valid_N) for name in weights}
+    total = sum(abs(weight) for weight in weights.values())
+    mixed = torch.stack([weight * parts[name].advantages_N for name, weight in weights.items()]).sum(0) / total
+    kept = torch.stack([part.kept_N for part in parts.values()]).any(0)
+    groups, spread = _groups(group_ids_N), set(_groups(group_ids_N[kept]))
+    return GroupAdvantages(
+        mixed.clamp(-clip, clip), kept, len(groups), len(groups) - len(spread), int((~valid_N.bool()).sum())
+    )
 
 
 def best_of_n(advantages_N: Tensor, group_ids_N: Tensor, kept_N: Tensor, n: int) -> Tensor:

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
+"""97.5 % quantile of Student's t for 1 to 9 degrees of freedom; the last serves more of them, a little wide."""
+
 
 @dataclass(frozen=True)
 class HackedMetric:
@@ -16,12 +19,12 @@ class HackedMetric:
 
 
 def hacked_metrics(
-    proxy: Sequence[float], held_out: Mapping[str, Sequence[float]], *, window: int, noise: float = 2.0
+    proxy: Sequence[float], held_out: Mapping[str, Sequence[float]], *, window: int
 ) -> list[HackedMetric]:
-    """Return the metrics whose least-squares slope is <= 0 over the last `window` evaluations while the proxy's is > 0.
+    """Return the metrics whose least-squares slope is < 0 over the last `window` evaluations while the proxy's is > 0.
 
-    A slope counts as rising only where it exceeds `noise` standard errors, and a metric as falling only where it lies
-    as far below zero, so that two flat, noisy curves raise no alarm.
+    Both count only where their 95 % interval (Student's, window - 2 degrees of freedom) leaves out 0: two flat, noisy
+    curves raise an alarm in less than one case of a thousand, however short the window.
 
     Args:
         proxy: the training reward at each evaluation. held_out: true metrics at the same ones, more is better.
@@ -36,13 +39,14 @@ def hacked_metrics(
             raise ValueError(f"{name} has {len(values)} evaluations, the training reward {len(proxy)}")
     if len(proxy) < window:
         return []
+    widths = T_975[min(window - 2, len(T_975)) - 1]
     rise, rise_error = slope(proxy[-window:])
-    if rise <= noise * rise_error:
+    if rise <= widths * rise_error:
         return []
     found = []
     for name, values in held_out.items():
         trend, error = slope(values[-window:])
-        if trend < -noise * error:
+        if trend < -widths * error:
             found.append(HackedMetric(name, rise, trend))
     return found
 

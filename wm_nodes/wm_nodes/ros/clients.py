@@ -270,7 +270,8 @@ def run_goal(
 
     Args:
         accept_s: deadline for the server to be there and to accept.
-        check: raises Cancelled when the caller must stop; the goal is then cancelled too.
+        check: raises Cancelled when the caller must stop; the goal is then cancelled too, also one that was sent and is
+            accepted only later.
         alive: raises PeerLost when the server is known to be gone.
 
     Raises:
@@ -284,13 +285,20 @@ def run_goal(
         check()
         alive()
 
+    sent: list[Future] = []
+
+    def send() -> Future:
+        sent.append(client.send_goal_async(goal, feedback_callback=on_feedback))
+        return sent[-1]
+
     while True:
         try:
-            handle = from_executor(
-                node, lambda: client.send_goal_async(goal, feedback_callback=on_feedback), accept_s, both
-            )
-        except PeerLost as error:
-            raise PeerLost(f"{name}: {error}") from None
+            handle = from_executor(node, send, accept_s, both)
+        except BaseException as error:
+            node.executor.create_task(lambda: [future.add_done_callback(_cancel_accepted) for future in sent[-1:]])
+            if isinstance(error, PeerLost):
+                raise PeerLost(f"{name}: {error}") from None
+            raise
         if handle.accepted:
             break
         if time.monotonic() >= deadline:
@@ -302,3 +310,10 @@ def run_goal(
     except BaseException:
         node.executor.create_task(handle.cancel_goal_async)
         raise
+
+
+def _cancel_accepted(sent: Future) -> None:
+    """Cancel a goal that was accepted after its sender had given up; in the executor's thread."""
+    handle = sent.result()
+    if handle is not None and handle.accepted:
+        handle.cancel_goal_async()

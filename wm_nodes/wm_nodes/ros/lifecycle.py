@@ -272,7 +272,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.peers.left(message.node)
             self.links.book.forget(message.node)
             self.diagnostics.clear_condition(f"peer {message.node}")
-        elif self.peers.heard(message.node):
+        elif self.peers.heard(message.node, identity=message.detail):
             self.diagnostics.clear_condition(f"peer {message.node}")
 
     def _check_name(self, message: RunState) -> None:

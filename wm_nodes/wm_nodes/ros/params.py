@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import (
     InvalidParameterTypeException,
@@ -13,6 +14,7 @@ from rclpy.exceptions import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
 
 
 class ParameterError(ValueError):
@@ -108,6 +110,23 @@ def declare(node: Node, params: Sequence[Param]) -> None:
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
+
+
+def read_parameters(name: str, params: Sequence[Param]) -> dict[str, Any]:
+    """The parameters that a node of this name would have here; for a process that stays off the graph.
+
+    Raises:
+        ParameterError: as declare().
+    """
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = Node(name, enable_rosout=False)
+        declare(node, params)
+        values = {param.name: node.get_parameter(param.name).value for param in params}
+        node.destroy_node()
+        return values
+    finally:
+        rclpy.shutdown()
 
 
 def _refuse_unknown(node: Node) -> None:

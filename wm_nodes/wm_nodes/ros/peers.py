@@ -12,11 +12,13 @@ class PeerWatch:
         self._own_name, self.timeout_s = own_name, timeout_s
         self._heard: dict[str, float] = {}
         self._lost: set[str] = set()
+        self._identities: dict[str, str] = {}
 
-    def heard(self, name: str, now: float | None = None) -> bool:
-        """Note a sign of life; return whether the peer is new or had been lost."""
+    def heard(self, name: str, now: float | None = None, identity: str = "") -> bool:
+        """Note a sign of life of a process; return whether the peer is new or had been lost."""
         if name == self._own_name:
             return False
+        self._identities[name] = identity
         returned = name in self._lost or name not in self._heard
         self._lost.discard(name)
         self._heard[name] = time.monotonic() if now is None else now
@@ -25,6 +27,7 @@ class PeerWatch:
     def left(self, name: str) -> None:
         """A peer said that it stops: its silence is no loss."""
         self._heard.pop(name, None)
+        self._identities.pop(name, None)
         self._lost.discard(name)
 
     def check(self, now: float | None = None) -> list[str]:
@@ -37,6 +40,10 @@ class PeerWatch:
 
     def is_lost(self, name: str) -> bool:
         return name in self._lost
+
+    def identity(self, name: str) -> str:
+        """The process that a peer is; empty while none is known. Another one than before: it was restarted."""
+        return self._identities.get(name, "")
 
     @property
     def lost(self) -> list[str]:

@@ -40,6 +40,9 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("model_dir", "", "World-model folder; empty: the one shipped for the task"),
     LaunchArgument("video_model_dir", "", "Folder of the trained video model"),
     LaunchArgument("context_bags", "", "Bags of contexts for the clips, separated by commas"),
+    LaunchArgument("heldout_bags", "", "Bags of held-out contexts, separated by commas; empty: no held-out scores"),
+    LaunchArgument("keep_buffers", "4", "Rollout buffers kept in run_dir/buffers; training again needs all of them"),
+    LaunchArgument("tensorboard", "false", "Also write the learner's metrics to run_dir/tensorboard", TRUTHS),
     LaunchArgument("video_preset", "recommended", "Settings of loop 2: a name, or a .yaml file"),
     LaunchArgument("starts_file", "", "First frames to imagine from; empty: starts.safetensors in model_dir"),
     LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
@@ -233,17 +236,20 @@ def _evaluate(arguments: Mapping[str, str]) -> Graph:
 
 def _world_model_rl(arguments: Mapping[str, str]) -> Graph:
     model: dict[str, ParameterValue] = {"video_model_dir": arguments["video_model_dir"]}
-    contexts: list[str] = [text for text in arguments["context_bags"].split(",") if text]
+    contexts, heldout = (
+        [text for text in arguments[name].split(",") if text] for name in ("context_bags", "heldout_bags")
+    )
     if not contexts or not arguments["video_model_dir"]:
         raise GraphError("world_model_rl needs video_model_dir:=<folder> and context_bags:=<bag>[,<bag> ...]")
     clips: dict[str, ParameterValue] = {**model, "context_bags": contexts}
+    judge: dict[str, ParameterValue] = {"model_dir": arguments["model_dir"]}
+    watch: dict[str, ParameterValue] = {**judge, "heldout_bags": heldout} if heldout else {}
+    keep = _integer(arguments, "keep_buffers", 1, 100000)
+    learner: dict[str, ParameterValue] = {**model, **watch, "tensorboard": arguments["tensorboard"] == "true"}
     nodes = [
-        _node(arguments, "video_model", clips),
-        _node(
-            arguments, "reward_evaluator", {**clips, "model_dir": arguments["model_dir"]},
-            module="clip_evaluator_node",
-        ),
-        _node(arguments, "learner", model, module="video_learner_node"),
+        _node(arguments, "video_model", {**clips, "keep_buffers": keep}),
+        _node(arguments, "reward_evaluator", {**clips, **judge}, module="clip_evaluator_node"),
+        _node(arguments, "learner", learner, module="video_learner_node"),
     ]
     if arguments["record"] == "true":
         nodes.append(_node(arguments, "recorder", {"bag_uri": arguments["bag_uri"], "topics": list(VIDEO_TOPICS)}))
@@ -284,7 +290,8 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
         Scenario("world_model_rl", "Post-train the video model by GRPO on clips that it samples",
                  (*(name for name in _COMMON if name not in ("preset", "task", "compose")), "model_dir",
-                  "video_model_dir", "context_bags", "video_preset", "record", "bag_uri"), _world_model_rl),
+                  "video_model_dir", "context_bags", "heldout_bags", "video_preset", "keep_buffers", "tensorboard",
+                  "record", "bag_uri"), _world_model_rl),
         Scenario("composed", "online_training with all nodes in one process", _TRAINING, _online_training),
     )
 }  # fmt: skip

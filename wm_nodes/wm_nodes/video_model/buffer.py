@@ -26,7 +26,7 @@ class RolloutBufferError(ValueError):
 
 
 def config_hash(settings: RolloutSettings) -> str:
-    """Return the sha256 of everything that decides the Gaussian of a transition; storage and batching do not."""
+    """Return the sha256 of what decides the Gaussian of a transition; storage_dtype does, since it rounds states."""
     knobs = asdict(settings)
     knobs.pop("micro_batch"), knobs.pop("noise_store")
     return hashlib.sha256(json.dumps(knobs, sort_keys=True).encode()).hexdigest()
@@ -85,7 +85,7 @@ class RolloutBuffer:
         if not 0 <= staleness <= max_staleness:
             raise RolloutBufferError(
                 f"the buffer comes from version {self.policy_version}, the learner is at {policy_version}: staleness "
-                f"{staleness} is outside 0 to {max_staleness}; sample again, or raise train.max_staleness"
+                f"{staleness} is outside 0 to {max_staleness}; sample again, or raise grpo.max_staleness"
             )
 
     def to_bytes(self) -> bytes:

@@ -8,6 +8,8 @@ their standard deviations are the square roots of the pixels' (mean 1), so that 
 does not weigh as much in a flow-matching loss as the shapes that the coarse components carry.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -33,6 +35,10 @@ class PatchCodec(nn.Module):
         self.register_buffer("mean", torch.zeros(values))
         self.register_buffer("basis", torch.eye(values)[:channels])
         self.register_buffer("scale", torch.ones(channels))
+
+    def settings(self) -> dict[str, Any]:
+        """What __init__ takes, as JSON."""
+        return {"patch": self.patch, "channels": self.channels}
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> float:

@@ -1,0 +1,241 @@
+"""Loop 2 when its nodes die, are stopped, get garbage, or find no room: one clear end, and the next goal goes on from
+there. Whatever happened, the weights are those of the loop that nothing disturbed."""
+
+import dataclasses
+import hashlib
+import signal
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from graph.harness import Graph, Probe, own_domain, wait_until
+from graph.test_robustness import full_disk
+from graph.video_loop import VideoLoop, settings
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+
+from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
+from wm_nodes.learning.video_folder import load_video_folder
+from wm_nodes.learning.video_grpo import GrpoLearner
+from wm_nodes.learning.video_run import CHECKPOINT, rewarded
+from wm_nodes.video_model.buffer import concatenate_buffers
+
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
+
+ACTIONS = ((EvaluateClips, "clips/evaluate"), (GenerateClips, "video/generate"), (TrainVideo, "video/train"))
+ANSWER_S = 1.0
+"""A cancel is answered within this time."""
+LOST_S = 12.0
+"""A lost peer ends the goal within this time: peer_timeout_s, two heartbeats, a crowded machine."""
+
+
+@pytest.fixture(scope="module")
+def loop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VideoLoop]:
+    """The running loop after one iteration; seed 2 draws the blind context in the first one."""
+    with own_domain() as domain:
+        graph, probe = Graph(domain, tmp_path_factory.mktemp("loop") / "run"), Probe(domain)
+        try:
+            loop = VideoLoop(graph, probe, settings(**{"seed": 2, "grpo.micro_batch": 1}))
+            loop.start("video_model", version_timeout_s=1.0)
+            loop.start("clip_evaluator")
+            loop.start("video_learner")
+            loop.wait_active()
+            loop.assert_undisturbed(loop.train(1))
+            yield loop
+        finally:
+            probe.close()
+            graph.stop()
+
+
+def test_clips_without_reward_are_left_out_and_counted(loop: VideoLoop) -> None:
+    result = loop.train(1)
+    loop.assert_undisturbed(result)
+    assert loop.local.invalid[result.iterations] > 0
+    expected = str(loop.local.invalid[result.iterations])
+    wait_until("the count", lambda: loop.probe.value("/wm/learner", "invalid_rewards") == expected)
+
+
+def _buffer(loop: VideoLoop, name: str, data: bytes) -> tuple[str, str]:
+    """Write a file into the run folder; return its path there and its sha256."""
+    (loop.graph.folder / name).write_bytes(data)
+    return name, hashlib.sha256(data).hexdigest()
+
+
+def _judge(cut: int | None, sha256: str = "") -> Callable[[VideoLoop], EvaluateClips.Goal]:
+    def goal(loop: VideoLoop) -> EvaluateClips.Goal:
+        uri, found = _buffer(loop, "garbage.safetensors", loop.local.buffer(0, 0).to_bytes()[:cut])
+        return EvaluateClips.Goal(buffer_uri=uri, sha256=sha256 or found)
+
+    return goal
+
+
+def _train_on(make: Callable[[VideoLoop], Any]) -> Callable[[VideoLoop], TrainVideo.Goal]:
+    def goal(loop: VideoLoop) -> TrainVideo.Goal:
+        uri, _ = _buffer(loop, "garbage.safetensors", make(loop).to_bytes())
+        return TrainVideo.Goal(from_buffers=[uri])
+
+    return goal
+
+
+def _without_rewards(loop: VideoLoop) -> Any:
+    done = loop.train(0).iterations
+    buffer = loop.local.buffer(done, done)
+    return rewarded(buffer, {}, torch.full((len(buffer),), torch.nan))
+
+
+def _of_other_settings(loop: VideoLoop) -> Any:
+    rollout = loop.config.rollout
+    other = dataclasses.replace(rollout, sampler=dataclasses.replace(rollout.sampler, eta=0.2))
+    return loop.local.buffer(0, 0, dataclasses.replace(loop.config, rollout=other))
+
+
+@pytest.mark.parametrize(
+    ("goal", "words"),
+    [
+        (lambda _: EvaluateClips.Goal(buffer_uri="nowhere.safetensors"), "nowhere.safetensors: No such file"),
+        (_judge(None, sha256="0" * 64), "is not the announced buffer (sha256"),
+        (_judge(10_000), "these 10000 bytes are no complete rollout buffer"),
+        (lambda _: GenerateClips.Goal(policy_version=99), "asked for version 99, video/version announced 0, 2"),
+        (lambda _: TrainVideo.Goal(), "iterations is 0 and from_buffers is empty"),
+        (lambda _: TrainVideo.Goal(from_buffers=["nowhere.safetensors"]), "nowhere.safetensors: No such file"),
+        (_train_on(_of_other_settings), "the buffer was sampled with sampler settings"),
+        (_train_on(lambda loop: loop.local.buffer(0, 0)), "is outside 0 to 0; sample again"),
+        (_train_on(_without_rewards), "nothing to learn from: 6 of 6 rewards are invalid"),
+    ],
+    ids=["judge_missing", "judge_other", "judge_cut", "sample_unknown", "train_nothing", "train_missing",
+         "train_other_settings", "train_stale", "train_without_rewards"],
+)  # fmt: skip
+def test_a_goal_of_garbage_fails_by_name_and_changes_nothing(loop: VideoLoop, goal: Any, words: str) -> None:
+    probe, message = loop.probe, goal(loop)
+    before = loop.train(0)
+    kind, name = next(action for action in ACTIONS if isinstance(message, action[0].Goal))
+    result = probe.finish(probe.send(probe.action(kind, name), message))
+    assert result.termination_reason == type(result).FAILED
+    assert words in result.message
+    after = loop.train(0)
+    assert (after.policy_version, after.iterations) == (before.policy_version, before.iterations)
+    assert loop.newest(after) == loop.local.weights(after.iterations)
+    for node in loop.graph.processes:
+        assert "Traceback" not in loop.graph.log(node)
+
+
+def test_an_iteration_that_is_sampled_again_keeps_its_buffer_whatever_else_is_kept(loop: VideoLoop) -> None:
+    done = loop.train(4)
+    goal = GenerateClips.Goal(iteration=0, policy_version=done.policy_version)
+    result = loop.probe.finish(loop.probe.send(loop.probe.action(GenerateClips, "video/generate"), goal))
+    assert result.termination_reason == GenerateClips.Result.FINISHED
+    assert hashlib.sha256((loop.graph.folder / result.buffer_uri).read_bytes()).hexdigest() == result.sha256
+
+
+def test_cancel_is_answered_at_once_while_the_video_model_hangs_and_leaves_no_goal_with_it(loop: VideoLoop) -> None:
+    model, clips = loop.graph.processes["/wm/video_model"], loop.probe.listen("clips")
+    wait_until("matching", lambda: loop.probe.node.count_publishers("/wm/clips"))
+    loop.assert_undisturbed(loop.train(1))
+    wait_until("its clips", lambda: clips)
+    model.send_signal(signal.SIGSTOP)
+    try:
+        handle = loop.send(1)
+        time.sleep(0.5)  # the learner has asked for clips by now
+        began = time.monotonic()
+        result = loop.cancel(handle)
+        assert time.monotonic() - began < ANSWER_S
+    finally:
+        model.send_signal(signal.SIGCONT)
+    assert result.termination_reason == TrainVideo.Result.CANCELED
+    count = len(clips)
+    time.sleep(1.0)  # sampling takes a quarter of it
+    assert len(clips) == count, "the cancelled goal was sampled all the same"
+    loop.assert_undisturbed(loop.train(1))
+
+
+def test_cancel_is_answered_at_once_during_an_update_and_takes_it_back(loop: VideoLoop) -> None:
+    done = loop.train(1)
+    small = loop.local.buffer(done.iterations, done.iterations)
+    uri, _ = _buffer(loop, "large.safetensors", concatenate_buffers([small] * 40).to_bytes())
+    handle = loop.send(from_buffers=[uri])
+    time.sleep(1.5)  # it has read the file, and trains for many times as long
+    began = time.monotonic()
+    result = loop.cancel(handle)
+    assert time.monotonic() - began < ANSWER_S
+    assert result.termination_reason == TrainVideo.Result.CANCELED
+    assert result.iterations == done.iterations
+    loop.assert_undisturbed(loop.train(1))
+
+
+def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpoint_loads(loop: VideoLoop) -> None:
+    learner, before = loop.graph.processes["/wm/video_learner"], loop.train(1)
+    checkpoint = loop.graph.folder / CHECKPOINT
+    complete, errors = checkpoint.read_bytes(), loop.graph.log("/wm/video_learner").count("training ended")
+    full_disk(learner, 10_000)
+    failed = loop.train(2)
+    assert failed.termination_reason == TrainVideo.Result.FAILED
+    assert "cannot write" in failed.message and "free some space" in failed.message
+    assert checkpoint.read_bytes() == complete
+    log = loop.graph.log("/wm/video_learner")
+    assert log.count("training ended") == errors + 1 and "Traceback" not in log
+    network, config = load_video_folder(loop.model).network, loop.config
+    loaded = GrpoLearner(network, config.grpo, config.rollout, seed=config.seed)
+    assert loaded.load(checkpoint) == before.iterations
+    full_disk(learner)
+    again = loop.train(1)
+    assert again.iterations == before.iterations + 2, "the training that could not be written was made again"
+    loop.assert_undisturbed(again)
+
+
+def _until_training(loop: VideoLoop) -> Any:
+    """Send a long goal; return its handle after the first buffer."""
+    fed = list[Any]()
+    handle = loop.send(100000, fed.append)
+    wait_until("a trained buffer", lambda: fed, 30)
+    return handle
+
+
+def _assert_lost(loop: VideoLoop, handle: Any, *words: str) -> None:
+    result = loop.probe.finish(handle, LOST_S)
+    assert result.termination_reason == TrainVideo.Result.PEER_LOST
+    assert all(word in result.message for word in words), result.message
+    assert loop.newest(result) == loop.local.weights(result.iterations)
+
+
+@pytest.mark.kills
+def test_a_killed_video_model_ends_training_by_its_name_and_the_next_goal_finds_it_again(loop: VideoLoop) -> None:
+    handle = _until_training(loop)
+    loop.graph.kill("/wm/video_model")
+    _assert_lost(loop, handle, "/wm/video_model", "silent")
+    loop.start("video_model")
+    loop.wait_active("video_model")
+    loop.assert_undisturbed(loop.train(1))
+
+
+@pytest.mark.kills
+def test_an_evaluator_that_is_killed_and_back_before_it_was_missed_ends_training_by_its_name(loop: VideoLoop) -> None:
+    patient = Parameter("peer_timeout_s", value=60.0).to_parameter_msg()
+    loop.probe.call(SetParameters, "learner/set_parameters", SetParameters.Request(parameters=[patient]))
+    handle = _until_training(loop)
+    loop.graph.processes["/wm/clip_evaluator"].send_signal(signal.SIGSTOP)
+    time.sleep(1.0)  # the learner has asked it for scores by now
+    loop.graph.kill("/wm/clip_evaluator")
+    loop.start("clip_evaluator")
+    loop.wait_active("clip_evaluator")
+    _assert_lost(loop, handle, "/wm/reward_evaluator", "restarted")
+    loop.assert_undisturbed(loop.train(1))
+
+
+@pytest.mark.kills
+def test_a_killed_learner_is_reported_and_goes_on_exactly_from_its_checkpoint(loop: VideoLoop) -> None:
+    _until_training(loop)
+    loop.probe.seen_errors.clear()
+    loop.graph.kill("/wm/video_learner")
+    lost = "/wm/learner is lost"
+    wait_until("a report", lambda: any(lost in text for text in loop.probe.seen_errors["/wm/video_model"]), LOST_S)
+    loop.start("video_learner")
+    loop.wait_active("video_learner")
+    loop.assert_undisturbed(loop.train(2))
+
+
+def test_a_peer_that_is_stopped_ends_training_by_its_name(loop: VideoLoop) -> None:
+    handle = _until_training(loop)
+    loop.stop("video_model")
+    _assert_lost(loop, handle, "/wm/video_model", "stopped")

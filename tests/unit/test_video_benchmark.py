@@ -1,0 +1,156 @@
+"""The DynDiff benchmark: fair plans, honest intervals, an alarm that a hacked reward raises, and its command."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wm_nodes.benchmark.moving_disc import draw_scenes
+from wm_nodes.benchmark.video_arms import dyndiff, learning_arms, sampler_arm
+from wm_nodes.benchmark.video_cli import LEARNER, load_base, main
+from wm_nodes.benchmark.video_comparison import compare_arms, paired_interval, value
+from wm_nodes.benchmark.video_learning import LearningPlan, alarms, evaluate, sample_groups, train_arm
+from wm_nodes.benchmark.video_plots import family_of
+from wm_nodes.benchmark.video_trials import ablation_trials, hacking_trials
+
+SHORT = LearningPlan(iterations=2, scenes=1, eval_scenes=4, eval_every=1)
+
+
+def training(arm: str, seed: int, *rewards: float) -> dict[str, Any]:
+    points = [{"iteration": i, "reward": value, "obeyed": 0.5, "background": 0.001} for i, value in enumerate(rewards)]
+    return {"arm": arm, "seed": seed, "evaluations": points}
+
+
+# intervals
+
+
+def test_the_interval_of_three_pairs_is_the_one_worked_by_hand() -> None:
+    """Differences 1, 2, 3: mean 2, standard deviation 1, t(2) = 4.303."""
+    found = paired_interval([1.0, 2.0, 3.0])
+    assert (found.mean, found.low, found.high) == pytest.approx((2.0, 2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5))
+    assert not found.separable and paired_interval([1.0, 1.1, 0.9]).separable
+    with pytest.raises(ValueError, match="got 1"):
+        paired_interval([1.0])
+
+
+def test_the_interval_of_noise_covers_its_mean_in_19_cases_of_20() -> None:
+    generator = np.random.default_rng(0)
+    for pairs in (3, 8, 12):
+        covered = sum(not paired_interval(generator.normal(size=pairs).tolist()).separable for _ in range(2000))
+        assert covered / 2000 == pytest.approx(0.95, abs=0.017)
+
+
+def test_arms_are_compared_on_their_common_seeds_over_the_path_and_at_the_end() -> None:
+    rows = [
+        training("CPS", 0, 0.1, 0.3, 0.5), training("CPS", 1, 0.2, 0.2, 0.4), training("CPS", 2, 0, 0, 9),
+        training("new", 1, 0.2, 0.4, 0.5), training("new", 0, 0.1, 0.5, 0.6), training("new", 7, 0, 9, 9),
+    ]  # fmt: skip
+    found = compare_arms(rows, "new", "CPS")
+    assert found is not None and found.seeds == (0, 1)
+    assert found.differences["reward"].mean == pytest.approx(0.1)
+    assert found.differences["reward_path"].mean == pytest.approx((0.15 + 0.15) / 2)
+    assert value(rows[0], "reward_path") == pytest.approx(0.4), "what every arm starts from does not count"
+    assert compare_arms(rows, "new", "other") is None
+
+
+# plans
+
+
+def test_every_training_of_an_ablation_makes_the_model_calls_of_its_base() -> None:
+    trials, pairs = ablation_trials(LEARNER, LearningPlan(iterations=20))
+    calls = {}
+    for trial in trials:
+        videos = trial.plan.iterations * trial.plan.scenes * trial.plan.group_size
+        calls[trial.arm.name] = videos * (1 if trial.arm.rollout.cfg == 1 else 2)
+    assert all(calls[name] == calls[base] for name, base in pairs) and len(pairs) == 5
+    by_name = {trial.arm.name: trial for trial in trials}
+    guided = by_name["guidance 2"].arm
+    assert guided.rollout.cfg == guided.grpo.cfg == 2, "another guidance in training than in sampling is another policy"
+    for name, base in pairs:
+        assert by_name[name] != replace(by_name[base], arm=replace(by_name[base].arm, name=name)), "nothing is compared"
+
+
+def test_a_window_makes_its_own_steps_stochastic_and_trains_as_many_as_the_others() -> None:
+    arms = {arm.name: arm for arm in learning_arms(LEARNER)}
+    assert len(arms) == len(learning_arms(LEARNER)), "names are unique"
+    mix, flow = arms["Mix-GRPO 0.7"], arms["Flow-GRPO 0.7"]
+    scenes, model = draw_scenes(1, 0, "test"), load_base()
+    windows = [sample_groups(model, mix, scenes, 2, 0, i, 0)[0].rollout.steps for i in (0, 7, 39)]
+    assert windows == [(0, 1, 2, 3), (1, 2, 3, 4), (5, 6, 7, 8)]
+    assert int(mix.grpo.step_fraction * 4) == int(flow.grpo.step_fraction * 9)
+
+
+def test_guidance_and_resolution_of_an_evaluation_are_those_of_its_arm_and_plan() -> None:
+    model, arm = load_base(), sampler_arm("CPS", dyndiff(0.6))
+    guided = replace(arm, rollout=replace(arm.rollout, cfg=2.0))
+    plan = LearningPlan(eval_scenes=32)
+    plain, strong = evaluate(model, arm, plan, 0), evaluate(model, guided, plan, 0)
+    assert strong["obeyed"] > plain["obeyed"] + 0.05, "guidance follows the command more often"
+    assert evaluate(model, arm, replace(plan, eval_side=20), 0)["background"] != plain["background"]
+
+
+@pytest.mark.parametrize(
+    ("arm", "family"),
+    [
+        ("CPS 0.6", "CPS"), ("ODE", "ODE"), ("DynDiff 0.6 gated", "DynDiff literal"),
+        ("DynDiff 0.6 sparse", "DynDiff literal"), ("DynDiff 0.2 sparse, rms", "DynDiff sparse, rms"),
+    ],
+)  # fmt: skip
+def test_arms_of_one_kind_share_a_line_in_the_picture(arm: str, family: str) -> None:
+    assert family_of(arm) == family
+
+
+# hacking
+
+
+def test_the_detector_names_what_a_hackable_reward_destroys_and_nothing_under_the_honest_one() -> None:
+    """Temporal consistency rises because the disc fades: it obeys less and has less mass."""
+    plan = LearningPlan(iterations=8, scenes=3, eval_scenes=32, eval_every=2)
+    honest, hackable, _ = hacking_trials(LEARNER, plan)
+    trained = [
+        train_arm(load_base(), replace(t.arm, grpo=replace(t.arm.grpo, learning_rate=3e-4)), t.plan, seed=0)
+        for t in (honest, hackable)
+    ]
+    assert [alarms(row) for row in trained] == [[], ["obeyed", "mass"]]
+    first, last = trained[1]["evaluations"][0], trained[1]["evaluations"][-1]
+    assert last["consistency"] > first["consistency"] + 0.05 and last["mass"] < first["mass"] - 0.2
+
+
+# command
+
+
+def test_ablations_go_on_where_their_file_stops_and_refuse_another_plan(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "ablations.json"
+    short = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--json", str(path)]
+    assert main(["ablations", "--seeds", "0", *short]) == 0
+    first = json.loads(path.read_text())
+    assert main(["ablations", "--seeds", "0", "1", *short]) == 0
+    both = json.loads(path.read_text())
+    assert both["rows"][: len(first["rows"])] == first["rows"] and len(both["rows"]) == 2 * len(first["rows"])
+    assert [row["base"] for row in both["comparisons"]].count("base") == 3 and not first["comparisons"]
+    assert main(["ablations", "--seeds", "0", *short, "--iterations", "2"]) == 2
+    assert "take another file" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test_diversity_learning_and_hacking_draw_a_picture_beside_their_file(tmp_path: Path) -> None:
+    short = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--seeds", "0", "1"]
+    calls = {
+        "diversity": ["--contexts", "2", "--group-size", "2", "--arms", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"],
+        "learning": [*short, "--arms", "CPS 0.6", "DynDiff 0.6 gated"],
+        "hacking": [*short, "--arms", "honest reward"],
+    }
+    for claim, extra in calls.items():
+        path = tmp_path / f"{claim}.json"
+        assert main([claim, *extra, "--json", str(path)]) == 0
+        assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+        assert json.loads(path.read_text())["rows"]
+
+
+def test_an_unknown_arm_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["learning", "--arms", "CPS 7"]) == 2
+    assert "unknown arms CPS 7" in capsys.readouterr().out

@@ -1,0 +1,98 @@
+"""The benchmark's tables on the console."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from wm_nodes.benchmark.video_comparison import MEASURES, Comparison, Difference
+from wm_nodes.benchmark.video_learning import alarms
+from wm_nodes.learning.statistics import bootstrap_mean
+
+LAST_UPDATE = ("noise_share", "clip_low_share_2", "clip_high_share_2", "kl_2")
+
+
+def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
+    table = _table(
+        "diversity (19) and quality, mean over contexts with 95 % bootstrap interval",
+        ("arm", "initial noise"), ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"),
+    )  # fmt: skip
+    for row in rows:
+        mean, low, high = bootstrap_mean(row["diversity"], seed=seed)
+        shown = ("diversity_dynamic", "reward_std", "reward", "background", "mass")
+        values = [sum(row[name]) / len(row[name]) for name in shown]
+        table.add_row(
+            row["arm"], "shared" if row["shared_noise"] else "own", f"{row['noise_share']:.3f}",
+            f"{mean:.3f} ({low:.3f} to {high:.3f})", *(f"{value:.4f}" for value in values),
+        )  # fmt: skip
+    return table
+
+
+def training_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """One line per arm, means over its seeds: held-out scenes before and after; the second update of its last buffer."""
+    table = _table(
+        "held-out scenes, ODE, before and after; mean over seeds", ("arm",),
+        ("seeds", "reward", "obeyed", "bg", "mass", "noise", "clip low/high @2", "KL @2", "|A| max", "seconds"),
+    )  # fmt: skip
+    for arm in dict.fromkeys(row["arm"] for row in rows):
+        mine = [row for row in rows if row["arm"] == arm]
+        first, last = ([row["evaluations"][i] for row in mine] for i in (0, -1))
+        update = {name: np.mean([row["buffers"][name][-1] for row in mine]) for name in LAST_UPDATE}
+        table.add_row(
+            arm, str(len(mine)), *(f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed")),
+            f"{_mean(last, 'background'):.4f}", f"{_mean(last, 'mass'):.3f}", f"{update['noise_share']:.3f}",
+            f"{update['clip_low_share_2']:.2f}/{update['clip_high_share_2']:.2f}", f"{update['kl_2']:.1e}",
+            f"{max(max(row['buffers']['advantage_max']) for row in mine):.2f}",
+            f"{np.mean([sum(row['seconds'].values()) for row in mine]):.0f}",
+        )  # fmt: skip
+    return table
+
+
+def comparison_table(comparisons: Sequence[Comparison]) -> Table:
+    table = _table(
+        "arm - base on the same seeds: mean, 95 % t interval, * if beside 0; reward_path is the mean over a training",
+        ("arm", "base"), ("seeds", *MEASURES),
+    )  # fmt: skip
+    for row in comparisons:
+        table.add_row(row.arm, row.base, str(len(row.seeds)), *(_shown(row.differences[name]) for name in MEASURES))
+    return table
+
+
+def _shown(difference: Difference) -> str:
+    star = "*" if difference.separable else ""
+    return f"{difference.mean:+.4f} ({difference.low:+.4f} to {difference.high:+.4f}){star}"
+
+
+def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Per training: the reward that trained it and the truths, before and after, and what the detector (2) names."""
+    table = _table(
+        "reward hacking (2), held-out scenes", ("trained on",),
+        ("seed", "that reward", "obeyed", "mass", "background", "falls while it rises"),
+    )  # fmt: skip
+    for row in rows:
+        first, last, proxy = row["evaluations"][0], row["evaluations"][-1], row["plan"]["proxy"]
+        shown = (f"{first[name]:.4g} -> {last[name]:.4g}" for name in (proxy, "obeyed", "mass", "background"))
+        table.add_row(row["arm"], str(row["seed"]), *shown, ", ".join(alarms(row)) or "no alarm")
+    return table
+
+
+def cost_table(rows: Sequence[dict[str, Any]], repeats: int) -> Table:
+    numbers = ("training, s", "of which KL, s", "kept beside the weights, MiB")
+    table = _table(f"KL anchors, median of {repeats} turns on one buffer", ("anchor",), numbers)
+    for row in rows:
+        table.add_row(row["anchor"], f"{row['train_s']:.3f}", f"{row['kl_s']:.3f}", f"{row['bytes'] / 2**20:.2f}")
+    return table
+
+
+def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
+    return float(np.mean([row[name] for row in rows]))
+
+
+def _table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
+    table = Table(title=title)
+    for name in words:
+        table.add_column(name)
+    for name in numbers:
+        table.add_column(name, justify="right")
+    return table

@@ -1,0 +1,77 @@
+"""A world model's frozen tokenizer as the codec of a video model: few cells, and pictures that its decoder keeps clean.
+
+Shapes: B clips, F frames, H W 3 image, C values per token, h w token grid.
+"""
+
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+from torch import Tensor, nn
+
+from wm_nodes.config.schema import TokenizerConfig
+from wm_nodes.video_model.codec import PatchCodec
+from wm_nodes.world_model import Tokenizer, load_model_folder
+
+BATCH = 256
+
+
+class TokenizerCodec(nn.Module):
+    """uint8 frames (B, F, H, W, 3) <-> latents float32 (B, C, F, h, w), of about unit variance. One size of picture.
+
+    Raises:
+        ValueError: a tokenizer of discrete tokens, which flow matching cannot move through.
+    """
+
+    def __init__(self, config: TokenizerConfig, height: int, width: int) -> None:
+        super().__init__()
+        if config.kind != "continuous":
+            raise ValueError(f"a video model needs continuous tokens, not {config.kind}; take model.codec patch")
+        self.config = config
+        self.tokenizer = Tokenizer(config, height, width).requires_grad_(False)
+        self.channels, self.patch = config.latent_dim, config.patch_px
+
+    def settings(self) -> dict[str, Any]:
+        """What __init__ takes, as JSON."""
+        size = {"height": self.tokenizer.height, "width": self.tokenizer.width}
+        return {"config": self.config.model_dump(), **size}
+
+    def encode(self, frames: Tensor) -> Tensor:
+        """Return latents (B, C, F, h, w) of uint8 frames (B, F, H, W, 3).
+
+        Raises:
+            ValueError: not uint8, or another size than the tokenizer's.
+        """
+        B, count = frames.shape[:2]
+        parts = torch.split(frames.flatten(0, 1), BATCH)  # type: ignore[no-untyped-call]
+        tokens = torch.cat([self.tokenizer.encode(part) for part in parts])
+        grid = tokens.view(B, count, *self.tokenizer.grid, self.channels)
+        return grid.permute(0, 4, 1, 2, 3).clone(memory_format=torch.contiguous_format)  # out of inference mode
+
+    def decode(self, latents: Tensor) -> Tensor:
+        """Return uint8 frames (B, F, H, W, 3) of latents (B, C, F, h, w).
+
+        Raises:
+            ValueError: another number of channels, or another grid.
+        """
+        B, channels, count, h, w = latents.shape
+        if channels != self.channels or (h, w) != self.tokenizer.grid:
+            raise ValueError(
+                f"this codec has {self.channels} channels on a {self.tokenizer.grid} grid, got {channels} on ({h}, {w})"
+            )
+        tokens = self.tokenizer.normalise(latents.float().permute(0, 2, 3, 4, 1).reshape(B * count, h * w, channels))
+        parts = torch.split(tokens, BATCH)  # type: ignore[no-untyped-call]
+        frames = torch.cat([self.tokenizer.decode(part) for part in parts])
+        return frames.view(B, count, *frames.shape[1:]).clone()
+
+
+def codec_of_world_model(folder: Path) -> TokenizerCodec:
+    """The tokenizer of a world-model folder. Raises WeightsError as load_model_folder does."""
+    found = load_model_folder(folder)
+    config = TokenizerConfig.model_validate(found.manifest["tokenizer"])
+    codec = TokenizerCodec(config, found.tokenizer.height, found.tokenizer.width)
+    codec.tokenizer.load_state_dict(found.tokenizer.state_dict())
+    return codec.eval()
+
+
+Codec: TypeAlias = PatchCodec | TokenizerCodec

@@ -1,0 +1,188 @@
+"""What a run of loop 2 leaves for people: summary.json, the table of held-out scores, report.html."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from wm_nodes.reports.curves import Panel
+from wm_nodes.reports.html import Picture, figures, made_on, number_cell, write_page
+from wm_nodes.reports.summary import FILE_NAME, plain, write_whole
+
+TITLES = {
+    "tracking": "tracking score", "object_cm": "object error, cm", "tool_cm": "tool error, cm", "psnr_db": "PSNR, dB",
+    "scenery": "scenery error", "motion": "motion share",
+}  # fmt: skip
+"""Score to its name for people, in the order of the tables; see docs/metrics.md."""
+
+
+@dataclass(frozen=True)
+class ScoreChange:
+    """One held-out score, means over the contexts. low, high: 95 % bootstrap interval of after minus before on the same
+    contexts. verdict: better or worse; empty where chance may explain it.
+    """
+
+    before: float
+    after: float
+    difference: float
+    low: float
+    high: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class ClipSummary:
+    """What a run of loop 2 found out.
+
+    scores: by name. contexts: held-out ones behind each. iterations: buffers trained on. version: optimizer steps.
+    weights: which ones were measured after, "averaged" or "last". evaluations: held-out ones made while training.
+    hacked: evaluations with an alarm of equation (2): step (buffers trained on), reward_slope, slopes by score, text.
+    bag: newest recording. minutes: of this call. command: as typed. machine: facts by name. date: year-month-day.
+    """
+
+    task: str
+    preset: str
+    seed: int
+    iterations: int
+    version: int
+    weights: str
+    contexts: int
+    scores: Mapping[str, ScoreChange]
+    evaluations: int = 0
+    hacked: Sequence[Mapping[str, Any]] = ()
+    bag: str = ""
+    minutes: float = float("nan")
+    command: str = ""
+    machine: Mapping[str, str] = field(default_factory=dict)
+    date: str = ""
+
+
+def write_clip_summary(run_dir: Path, summary: ClipSummary) -> Path:
+    """Write <run_dir>/summary.json, complete or not at all."""
+    path = Path(run_dir) / FILE_NAME
+    write_whole(path, json.dumps(plain(asdict(summary)), indent=1, allow_nan=False) + "\n")
+    return path
+
+
+def clip_verdict(summary: ClipSummary) -> str:
+    """One sentence: which scores changed by more than chance explains."""
+    parts = []
+    for verdict in ("better", "worse"):
+        names = [TITLES[name] for name in TITLES if summary.scores[name].verdict == verdict]
+        if names:
+            parts.append(f"{verdict.capitalize()}: {'; '.join(names)}")
+    found = ". ".join(parts) or "No difference that chance does not explain"
+    return f"{found} (n = {summary.contexts} held-out contexts)."
+
+
+def scores_table(summary: ClipSummary) -> Table:
+    """The table for the terminal."""
+    title = f"held-out contexts (n = {summary.contexts}), one ODE clip each, {summary.weights} weights"
+    table = Table(title=title, caption=clip_verdict(summary))
+    for name in ("score", "before", "after", "difference, 95 % bootstrap interval", ""):
+        table.add_column(name, justify="left" if name in ("score", "") else "right")
+    for title, change, cells in _rows(summary):
+        style = {"better": "green", "worse": "red"}.get(change.verdict, "")
+        table.add_row(title, *cells, f"[{style}]{change.verdict}[/]" if style else "")
+    return table
+
+
+def clip_panels(updates: int) -> tuple[Panel, ...]:
+    """The course of a training with so many optimizer steps on each buffer."""
+    last = updates if updates > 1 else 1
+    return (
+        Panel("reward", {"grpo/reward_mean": "of the clips trained on", "heldout/reward": "held out, ODE"}),
+        Panel("held-out tracking score, (0, 1]", {"heldout/tracking": ""}),
+        Panel("held-out position errors, cm", {"heldout/object_cm": "object", "heldout/tool_cm": "tool"}),
+        Panel("held-out scenery error, of [0, 1]", {"heldout/scenery": ""}),
+        Panel("KL to the anchor", {f"grpo/kl_{k}": f"update {k}" for k in range(1, updates + 1)}),
+        Panel(
+            f"clipped transitions (share), update {last}",
+            {f"grpo/clip_low_share_{last}": "below", f"grpo/clip_high_share_{last}": "above"}, (0.0, 1.0),
+        ),
+        Panel("groups without spread (share)", {"grpo/zero_std_ratio": ""}, (0.0, 1.0)),
+        Panel("gradient norm before clipping", {f"grpo/grad_norm_{k}": f"update {k}" for k in range(1, updates + 1)}),
+    )  # fmt: skip
+
+
+def write_clip_report(
+    run_dir: Path, summary: ClipSummary, pictures: Sequence[Picture] = (), *, config_text: str = ""
+) -> Path:
+    """Write <run_dir>/report.html and return its path.
+
+    Raises:
+        FileNotFoundError: a picture does not exist.
+    """
+    title = f"{summary.task}: a video world model post-trained by GRPO"
+    body = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="lead">{escape(clip_verdict(summary))}</p>',
+        f'<p class="faint">preset {escape(summary.preset)}, seed {summary.seed}, {summary.iterations} buffers, '
+        f"{summary.version} optimizer steps, {summary.minutes:.1f} minutes, {escape(summary.date)}</p>",
+        "<h2>Held-out contexts</h2>", _scores(summary),
+        "<h2>Reward hacking</h2>", *_hacking(summary),
+        *figures(pictures),
+        "<h2>Look closer, do it again</h2>", *_again(run_dir, summary),
+        *made_on(summary.machine, config_text),
+    ]  # fmt: skip
+    return write_page(run_dir, title, body)
+
+
+def _rows(summary: ClipSummary) -> Iterable[tuple[str, ScoreChange, tuple[str, str, str]]]:
+    for name, title in TITLES.items():
+        change = summary.scores[name]
+        interval = f"{change.difference:+.4f} ({change.low:+.4f} to {change.high:+.4f})"
+        yield title, change, (f"{change.before:.4f}", f"{change.after:.4f}", interval)
+
+
+def _scores(summary: ClipSummary) -> str:
+    lines = []
+    for title, change, cells in _rows(summary):
+        mark = {"better": "good", "worse": "bad"}.get(change.verdict, "")
+        lines.append(
+            f"<tr><td>{escape(title)}</td>{''.join(map(number_cell, cells))}"
+            f'<td><span class="{mark}">{change.verdict}</span></td></tr>'
+        )
+    return (
+        '<div class="wide"><table><tr><th>score</th><th class="number">before</th><th class="number">after</th>'
+        f'<th class="number">difference, 95 % interval</th><th></th></tr>{"".join(lines)}</table></div>'
+        f'<p class="faint">Means over {summary.contexts} contexts that nothing was trained on, one ODE clip each from '
+        f"the same noise; after: the {escape(summary.weights)} weights. Intervals: paired bootstrap over the contexts. "
+        "Positions are read off the pictures by a probe that shares nothing with the video model.</p>"
+    )
+
+
+def _hacking(summary: ClipSummary) -> Iterable[str]:
+    if not summary.evaluations:
+        yield "<p>Not watched: no held-out scores were measured while training (evaluation.every).</p>"
+        return
+    if not summary.hacked:
+        yield (
+            f"<p>No alarm in {summary.evaluations} held-out evaluations: no score got worse while the training reward "
+            "rose.</p>"
+        )
+        return
+    lines = "".join(f"<tr>{number_cell(str(a['step']))}<td>{escape(str(a['text']))}</td></tr>" for a in summary.hacked)
+    yield (
+        '<p class="bad">The training reward rose while held-out scores got worse.</p><div class="wide"><table>'
+        f'<tr><th class="number">buffers</th><th>alarm</th></tr>{lines}</table></div>'
+    )
+
+
+def _again(run_dir: Path, summary: ClipSummary) -> Iterable[str]:
+    bag = escape(summary.bag or "no bag was recorded")
+    yield (
+        f"<p>Run folder: <code>{escape(str(run_dir))}</code><br>Bag (clips, pictures, scores, versions): "
+        f"<code>{bag}</code></p><p>The command behind this page:</p><pre>{escape(summary.command)}</pre>"
+    )
+    if summary.bag:
+        script = "python3 launch_scripts/world_model_rl.py"
+        again = f"{script} rescore {run_dir}\n{script} retrain {run_dir}"
+        yield (
+            "<p>Score the recorded pictures again and compare bit for bit; train again from the kept buffers (all of "
+            f"them are needed: --keep-buffers):</p><pre>{escape(again)}</pre>"
+        )

@@ -1,0 +1,131 @@
+"""Loop 2 without a graph: score a run's recorded clips again, or train on them again."""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.table import Table
+from tqdm import tqdm
+
+from wm_nodes.config.load import parse_override
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.job import Stages, console, open_run_dir
+from wm_nodes.learning.clip_archive import Rescored, read_clips, recorded_buffer, rescore, trained_clips
+from wm_nodes.learning.clip_scores import load_probe
+from wm_nodes.learning.files import write_atomic
+from wm_nodes.learning.heldout import heldout_scores
+from wm_nodes.learning.video_config import VideoRlConfig, dump_video_config, load_video_config
+from wm_nodes.learning.video_data import load_clips
+from wm_nodes.learning.video_folder import load_video_folder
+from wm_nodes.learning.video_run import VideoRun, progress
+from wm_nodes.recording.raw import PARTIAL_SUFFIX
+from wm_nodes.reports.summary import plain
+from wm_nodes.world_model_results import Finished, conclude
+
+RESCORED = "rescored.json"
+
+
+def rescore_run(arguments: argparse.Namespace) -> int:
+    """Score every recorded picture again; 0 where all bits are the recorded ones, else 1."""
+    run_dir, config = _source(arguments.run)
+    probe = load_probe(shipped_model(config.task))
+    contexts = load_clips(_shards(run_dir, "train"), config.model.stride)
+    rows = [
+        rescore(recorded, contexts, probe, config.rewards, config.model.num_conditioning)
+        for bag in recorded_bags(run_dir)
+        for recorded in read_clips(bag, pictures=True)
+    ]
+    equal = all(not row.different for row in rows)
+    content = {"equal": equal, "rewards": config.rewards, "buffers": [_row(row) for row in rows]}
+    path = arguments.json or run_dir / RESCORED
+    write_atomic(path, (json.dumps(plain(content), indent=1) + "\n").encode())
+    console.print(_table(rows))
+    words = "every score is the recorded one, bit for bit" if equal else "[bold red]scores differ from the bag's[/]"
+    console.print(f"{words}: {path}", highlight=False)
+    return 0 if equal else 1
+
+
+def retrain_run(arguments: argparse.Namespace, command: str) -> int:
+    """Train on a run's kept buffers and recorded scores, without sampling, in a new run folder."""
+    stage = Stages()
+    source, live = _source(arguments.run)
+    config = load_video_config(str(source / "config.yaml"), dict(parse_override(text) for text in arguments.set))
+    if config.seed != live.seed:
+        raise ValueError(f"the clips of {source} were drawn with seed {live.seed}, not {config.seed}; do not set it")
+    run_dir = open_run_dir(arguments.run_dir, "world_model_retrain", dump_video_config(config))
+    if run_dir == source:
+        raise ValueError(f"{run_dir} is the run to train again from; name a new folder with --run-dir")
+    _, iterations = progress(source)
+    if not iterations:
+        raise ValueError(f"{source} has no checkpoint of a learner: nothing was trained there to train again")
+    clips = trained_clips(recorded_bags(source), iterations)
+    stage(f"training on {len(clips)} buffers of {source} in {run_dir}")
+    base, heldout, judge = source / "video_model", _shards(source, "heldout"), shipped_model(config.task)
+    folder = load_video_folder(base)
+    run = VideoRun(
+        folder.network, config, run_dir, tensorboard=arguments.tensorboard,
+        heldout=heldout_scores(folder, heldout, judge, config) if config.evaluation.every else None,
+    )  # fmt: skip
+    rewards = None if config.rewards == live.rewards else config.rewards
+    try:
+        for recorded in tqdm(clips[run.iterations :], desc="GRPO", unit="buffer"):
+            run.train(recorded_buffer(source, recorded, rewards))
+    finally:
+        run.close()
+    conclude(
+        Finished(
+            config, run_dir, base, run.iterations, run.version, load_clips(heldout, folder.clip["stride"]),
+            load_probe(judge), f"as in {source.name}", "", command, stage.minutes,
+        )
+    )  # fmt: skip
+    return 0
+
+
+def recorded_bags(run_dir: Path) -> list[Path]:
+    """The bags of a run, oldest first: one for each time it was started, those of killed recorders by their final name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    folders = (path for path in (run_dir / "bags").glob("*") if path.is_dir())
+    bags = sorted({path.with_name(path.name.removesuffix(PARTIAL_SUFFIX)) for path in folders})
+    if not bags:
+        raise ValueError(f"{run_dir} holds no recorded bag; name the run folder of a world_model_rl.py that trained")
+    return bags
+
+
+def _source(run_dir: Path) -> tuple[Path, VideoRlConfig]:
+    folder = run_dir.expanduser().absolute()
+    saved = folder / "config.yaml"
+    if not saved.is_file():
+        raise ValueError(f"{folder} holds no config.yaml; name the run folder of a world_model_rl.py")
+    return folder, load_video_config(str(saved))
+
+
+def _shards(run_dir: Path, name: str) -> list[Path]:
+    shards = sorted((run_dir / "data" / name).glob("shard_????????"))
+    if not shards:
+        raise ValueError(f"{run_dir / 'data' / name} holds no episodes; name the run folder that recorded the clips")
+    return shards
+
+
+def _row(row: Rescored) -> dict[str, object]:
+    recorded = row.recorded
+    return {
+        "iteration": recorded.iteration, "policy_version": recorded.policy_version, "sha256": recorded.sha256,
+        "recorded": recorded.total.tolist(), "again": row.total.tolist(), "different": list(row.different),
+    }  # fmt: skip
+
+
+def _table(rows: Sequence[Rescored]) -> Table:
+    table = Table(title="recorded clips, scored again from their pictures")
+    for name in ("iteration", "version", "clips", "mean reward recorded", "again", "different"):
+        table.add_column(name, justify="left" if name == "different" else "right")
+    for row in rows:
+        theirs, ours = (f"{float(total.nanmean()):.6f}" for total in (row.recorded.total, row.total))
+        table.add_row(
+            str(row.recorded.iteration), str(row.recorded.policy_version), str(len(row.total)), theirs, ours,
+            ", ".join(row.different) or "-",
+        )  # fmt: skip
+    return table
