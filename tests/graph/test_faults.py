@@ -67,6 +67,21 @@ def test_training_ends_with_peer_lost_when_a_node_does_not_come_back(graph: Grap
     assert "/wm/policy" in result.message
 
 
+@pytest.mark.kills
+def test_a_policy_that_is_back_before_it_was_missed_gets_its_rollout_again(graph: Graph, probe: Probe) -> None:
+    graph.start_training_nodes(peer_timeout_s=60.0)
+    updates: list[Any] = []
+    handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
+    wait_until("an update", lambda: updates, 60)
+    graph.kill("/wm/policy")
+    count = len(updates)
+    graph.start_policy()
+    wait_until("an update by the new policy process", lambda: len(updates) > count + 1, 60)
+    assert not _reported(probe, "/wm/learner", "/wm/policy")
+    assert "/wm/policy was stopped or restarted" in graph.log("/wm/learner")
+    del handle
+
+
 def test_reported_gaps_equal_the_true_gaps_of_a_flood(graph: Graph, probe: Probe) -> None:
     graph.start_reward()
     credits = probe.listen("flow/credit")

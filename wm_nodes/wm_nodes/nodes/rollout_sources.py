@@ -17,7 +17,7 @@ from wm_nodes.nodes.replayed import ReplayJoiner
 from wm_nodes.nodes.training import Progress
 from wm_nodes.recording import BagReport, read_rollouts, topics
 from wm_nodes.ros.actions import Work
-from wm_nodes.ros.clients import run_goal
+from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.wire import PeerLost, WireError
 from wm_nodes.specs import EnvironmentSpec
@@ -87,10 +87,16 @@ class LiveRollouts:
         goal = RolloutAction.Goal(
             policy_version=version, steps=self._num_steps, seed=self._seed, reset=True, behaviour="policy"
         )
-        self._check_peers()
+        same_policy = same_process(node.peers, f"{node.get_namespace().rstrip('/')}/policy")
+
+        def alive() -> None:
+            self._check_peers()
+            same_policy()
+
+        alive()
         self._joiner.begin()
         found: RolloutAction.Result = run_goal(
-            self._client, goal, accept_s=5.0, check=self._work.check, alive=self._check_peers
+            self._client, goal, accept_s=5.0, check=self._work.check, alive=alive
         )
         if found.termination_reason == RolloutAction.Result.FAILED:
             raise WireError(ErrorCode.INTERNAL, f"the policy node failed: {found.message}")

@@ -24,7 +24,7 @@ from wm_nodes.learning.video_run import CHECKPOINT, VideoRun, rewarded, version_
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
-from wm_nodes.ros.clients import run_goal
+from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
@@ -144,22 +144,13 @@ class VideoLearnerNode(ManagedNode):
     def _ask(self, client: ActionClient, goal: Any, check: Callable[[], None], peer: str) -> Any:
         """Raises PeerLost where nobody answers, ValueError where the peer says that it failed."""
         name = self.get_namespace().rstrip("/") + peer
-        asked = self.peers.identity(name)
-
-        def alive() -> None:
-            nonlocal asked
-            asked = asked or self.peers.identity(name)
-            if self.peers.is_lost(name):
-                raise PeerLost("it is silent")
-            if self.peers.identity(name) != asked:
-                raise PeerLost("it was stopped or restarted")
-
+        alive = same_process(self.peers, name)
         try:
             result = run_goal(
                 client, goal, accept_s=float(self.param("accept_timeout_s")), check=check, alive=alive
             )
         except PeerLost as error:
-            raise PeerLost(f"{name}: {error}") from None
+            raise PeerLost(str(error) if name in str(error) else f"{name}: {error}") from None
         if result.termination_reason != type(result).FINISHED:
             raise ValueError(f"{name}: {result.message or f'ended with reason {result.termination_reason}'}")
         return result

@@ -12,6 +12,7 @@ from rclpy.task import Future
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
 from wm_nodes.ros import calls, convert
+from wm_nodes.ros.peers import PeerWatch
 from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
 from wm_nodes.specs import EnvironmentSpec
 
@@ -310,6 +311,21 @@ def run_goal(
     except BaseException:
         node.executor.create_task(handle.cancel_goal_async)
         raise
+
+
+def same_process(peers: PeerWatch, name: str) -> Callable[[], None]:
+    """Return a check that raises PeerLost once the peer is silent, stopped, or another process than it was here."""
+    asked = peers.identity(name)
+
+    def check() -> None:
+        nonlocal asked
+        asked = asked or peers.identity(name)
+        if peers.is_lost(name):
+            raise PeerLost(f"{name} is silent")
+        if peers.identity(name) != asked:
+            raise PeerLost(f"{name} was stopped or restarted")
+
+    return check
 
 
 def _cancel_accepted(sent: Future) -> None:
