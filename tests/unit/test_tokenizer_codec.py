@@ -10,7 +10,9 @@ from torch import Tensor
 
 from wm_nodes.config.load import load_config
 from wm_nodes.learning.tokenizer_codec import TokenizerCodec, codec_of_world_model
+from wm_nodes.learning.video_config import load_video_config
 from wm_nodes.learning.video_folder import load_video_folder, save_video_folder
+from wm_nodes.learning.video_pretraining import shipped_video_model
 from wm_nodes.learning.weights import WeightsError
 from wm_nodes.seeding import torch_stream
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
@@ -70,6 +72,14 @@ def test_beside_its_world_model_the_folder_needs_no_codec_of_its_own(world_model
     shutil.move(folder, tmp_path / "alone")
     with pytest.raises(WeightsError, match=r"codec\.safetensors is missing"):
         load_video_folder(tmp_path / "alone")
+
+
+def test_the_shipped_video_model_serves_the_recommended_settings_and_no_others() -> None:
+    shipped = shipped_video_model(load_video_config("recommended"))
+    assert shipped is not None and isinstance(shipped.codec, TokenizerCodec)
+    assert shipped.manifest["heldout"]["tool_cm"] < 0.2 * shipped.manifest["heldout"]["copy_tool_cm"]
+    assert shipped_video_model(load_video_config("recommended", {"model.width": 64})) is None
+    assert shipped_video_model(load_video_config("recommended", {"task": "pull_cube"})) is None
 
 
 def test_pictures_and_latents_of_another_size_and_discrete_tokens_are_refused(world_model: Path) -> None:

@@ -3,8 +3,9 @@
 Shapes: n videos of a context, F frames, H W 3 image. Equation (19), section 1.7.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from wm_nodes.learning.clip_generation import ClipGenerator, GroupRequest
 from wm_nodes.learning.clip_scores import SEEN_MOTION, mixed, score_clips
 from wm_nodes.learning.frame_features import FrameFeatures
 from wm_nodes.learning.rollout_evaluation import OBJECT
+from wm_nodes.learning.statistics import bootstrap_mean
 from wm_nodes.learning.video_config import VideoRlConfig
 from wm_nodes.learning.video_data import Clips
 from wm_nodes.learning.video_folder import VideoFolder
@@ -25,6 +27,7 @@ from wm_nodes.world_model.position_probe import PositionProbe
 
 MARGIN_PX = 4
 """The moving part of a picture reaches this far beyond the pixels that change in the recording."""
+SPREADS = ("diversity", "diversity_dynamic", "object_spread_cm", "reward_std")
 SCORES = ("tracking", "scenery", "object_cm", "motion")
 
 
@@ -72,3 +75,19 @@ def moving_part(frames: Tensor) -> Tensor:
     changed = (frames.int() - frames[:1].int()).abs().amax((0, 3)) > SEEN_MOTION
     grown = F.max_pool2d(changed.float()[None, None], 2 * MARGIN_PX + 1, stride=1, padding=MARGIN_PX)
     return grown[0, 0, :, :, None].to(torch.uint8)
+
+
+def clip_comparisons(rows: Sequence[Mapping[str, Any]], seed: int) -> list[dict[str, Any]]:
+    """Each DynDiff arm less each CPS arm of one regime, paired over contexts: mean, 95 % bootstrap interval."""
+    found = []
+    for row, base in product(rows, rows):
+        pair = row["arm"].startswith("DynDiff") and base["arm"].startswith("CPS")
+        if not pair or row["shared_noise"] != base["shared_noise"]:
+            continue
+        differences = {
+            name: bootstrap_mean(np.subtract(row[name], base[name]), seed=seed) for name in (*SPREADS, "tracking")
+        }
+        noise = [float(np.mean(one["noise_share"])) for one in (row, base)]
+        names = {"arm": row["arm"], "base": base["arm"], "shared_noise": row["shared_noise"], "noise_share": noise}
+        found.append({**names, **differences})
+    return found

@@ -16,6 +16,7 @@ import torch
 from rich.console import Console
 from tqdm import tqdm
 
+from wm_nodes.benchmark.clip_diversity import clip_comparisons, measure_clips
 from wm_nodes.benchmark.moving_disc import CHANNELS, NUM_ACTIONS, training_batch
 from wm_nodes.benchmark.video_arms import diversity_arms, learning_arms
 from wm_nodes.benchmark.video_comparison import Comparison, compare_arms
@@ -24,6 +25,8 @@ from wm_nodes.benchmark.video_diversity import DiversityPlan, compare, measure_a
 from wm_nodes.benchmark.video_learning import LearningPlan, train_arm
 from wm_nodes.benchmark.video_plots import plot_diversity, plot_hacking, plot_learning
 from wm_nodes.benchmark.video_tables import (
+    clip_comparison_table,
+    clip_table,
     comparison_table,
     cost_table,
     diversity_table,
@@ -31,18 +34,32 @@ from wm_nodes.benchmark.video_tables import (
     training_table,
 )
 from wm_nodes.benchmark.video_trials import Trial, ablation_trials, hacking_trials
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.learning.clip_scores import load_probe
 from wm_nodes.learning.files import write_atomic
+from wm_nodes.learning.frame_features import (
+    CentredPixels,
+    FrameFeatures,
+    RandomFeatures,
+    TokenizerFeatures,
+    load_backbone,
+)
 from wm_nodes.learning.grpo_settings import GrpoSettings
+from wm_nodes.learning.video_config import load_video_config
+from wm_nodes.learning.video_data import load_clips
+from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.learning.video_training import FlowMatchingSettings, train_video_model
 from wm_nodes.learning.weights import pack_weights, unpack_weights
 from wm_nodes.reports import machine_facts
+from wm_nodes.seeding import numpy_stream
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
+from wm_nodes.world_model import load_model_folder
 
 BASE_ITERATIONS, BASE_BATCH = 4000, 16
 NETWORK = NetworkSettings(channels=CHANNELS, action_dim=NUM_ACTIONS, width=32, depth=5)
 LEARNER = GrpoSettings(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
-LOG_COLUMNS = 160
+LOG_COLUMNS = 180
 """Width of tables that go to a file or a pipe."""
 T = TypeVar("T")
 console = Console()
@@ -56,7 +73,7 @@ def main(argv: Sequence[str]) -> int:
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     claims = {
         "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,
-        "cost": _cost,
+        "cost": _cost, "clips": _clips,
     }  # fmt: skip
     try:
         claims[arguments.claim](arguments)
@@ -111,6 +128,41 @@ def _diversity(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         plot_diversity(rows, arguments.json.with_suffix(".png"), arguments.seed)
     console.print(diversity_table(rows, arguments.seed))
+
+
+def _clips(arguments: argparse.Namespace) -> None:
+    config = load_video_config(arguments.preset)
+    folder, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(config.task))
+    clips = load_clips(arguments.context_bags, folder.clip["stride"])
+    drawn = numpy_stream(arguments.seed, "clip_diversity").permutation(len(clips))[: arguments.contexts]
+    contexts, features = clips.select(torch.from_numpy(drawn)), _features(arguments.features, config.task)
+    arms = _named({arm.name: arm for arm in diversity_arms()}, arguments.arms)
+    rows = []
+    with tqdm(total=2 * len(arms) * len(contexts), desc="clips", unit="context") as bar:
+        for shared in (False, True):
+            for arm in arms:
+                bar.set_postfix_str(arm.name)
+                named = replace(arm, shared_noise=shared)
+                rows.append(
+                    measure_clips(
+                        folder, contexts, named, features, probe, config, arguments.group_size, on_context=bar.update
+                    )
+                )
+    compared = clip_comparisons(rows, arguments.seed)
+    size = {"contexts": len(contexts), "group_size": arguments.group_size, "features": features.name}
+    _write(arguments, {**size, "seed": arguments.seed, "rows": rows, "comparisons": compared})
+    console.print(clip_table(rows, arguments.seed), clip_comparison_table(compared))
+
+
+def _features(name: str, task: str) -> FrameFeatures:
+    if name == "pixels":
+        return CentredPixels()
+    if name == "random":
+        return RandomFeatures()
+    if name == "tokenizer":
+        folder = shipped_model(task)
+        return TokenizerFeatures(load_model_folder(folder).tokenizer, folder.name)
+    return load_backbone(Path(name))
 
 
 def _learning(arguments: argparse.Namespace) -> None:
@@ -233,11 +285,22 @@ def _parser() -> argparse.ArgumentParser:
         claim.add_argument("--eval-scenes", type=int, default=100, help="held-out scenes per evaluation")
     cost = claims.add_parser("cost", help="claim C: seconds and bytes of the KL anchors, and of the mask")
     cost.add_argument("--repeats", type=int, default=7)
-    for claim in (base, diversity, cost):
+    clips = claims.add_parser("clips", help="claim A on a video model of recorded episodes")
+    clips.add_argument("--video-model", type=Path, default=shipped_model("push_cube") / "video_model")
+    clips.add_argument("--context-bags", type=Path, nargs="+", required=True, help="episodes to take contexts from")
+    clips.add_argument("--contexts", type=int, default=100)
+    clips.add_argument("--group-size", type=int, default=8)
+    clips.add_argument(
+        "--features", default="tokenizer",
+        help="tokenizer, pixels, random, or the folder of a vision backbone, e.g. DINOv3 (default: tokenizer)",
+    )  # fmt: skip
+    clips.add_argument("--preset", default="recommended", help="settings of loop 2, for the rewards")
+    for claim in (base, diversity, cost, clips):
         claim.add_argument("--seed", type=int, default=0)
-    for claim in (diversity, learning, ablations, hacking):
+    for claim in (diversity, learning, ablations, hacking, clips):
         claim.add_argument("--arms", nargs="+", metavar="NAME")
     for claim in (diversity, learning, ablations, hacking, cost):
         claim.add_argument("--base", type=Path, help="weights of another base model than the shipped one")
+    for claim in (diversity, learning, ablations, hacking, cost, clips):
         claim.add_argument("--json", type=Path, help="write every row here; trainings go on where the file stops")
     return parser

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.rl.hacking import T_975
+
 MEASURES = ("reward_path", "reward", "obeyed", "background")
 """reward_path: mean held-out reward over the evaluations of a training, its area per model call; the others: at its
 end."""
-T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
-"""97.5 % quantile of Student's t for 1 to 9 degrees of freedom; the last serves more of them, a little wide."""
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,7 @@ def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
             label = f"{name} (trains)" if name == proxy else name
             axes.plot(x, mean, color=colour, linewidth=2, linestyle="-" if name == proxy else "--", label=label)
         axes.set_ylim(bottom=0)
-        axes.legend(fontsize=8, frameon=False, loc="center left")
+        axes.legend(fontsize=8, frameon=False, loc="lower left")
     _save(figure, path)
 
 

@@ -23,27 +23,62 @@ def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
         shown = ("diversity_dynamic", "reward_std", "reward", "background", "mass")
         values = [sum(row[name]) / len(row[name]) for name in shown]
         table.add_row(
-            row["arm"], "shared" if row["shared_noise"] else "own", f"{row['noise_share']:.3f}",
+            row["arm"], _regime(row), f"{row['noise_share']:.3f}",
             f"{mean:.3f} ({low:.3f} to {high:.3f})", *(f"{value:.4f}" for value in values),
         )  # fmt: skip
     return table
 
 
+def clip_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
+    table = _table(
+        f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("arm", "initial noise"),
+        ("noise rms/s", "diversity (19)", "moving part", "object spread, cm", "reward std", "tracking", "scenery"),
+    )  # fmt: skip
+    for row in rows:
+        mean, low, high = bootstrap_mean(row["diversity"], seed=seed)
+        shown = ("diversity_dynamic", "object_spread_cm", "reward_std", "tracking", "scenery")
+        table.add_row(
+            row["arm"], _regime(row), f"{_average(row, 'noise_share'):.3f}", f"{mean:.4f} ({low:.4f} to {high:.4f})",
+            *(f"{_average(row, name):.4f}" for name in shown),
+        )  # fmt: skip
+    return table
+
+
+def clip_comparison_table(comparisons: Sequence[dict[str, Any]]) -> Table:
+    table = _table(
+        "DynDiff - CPS, paired over contexts, 95 % bootstrap interval", ("arm", "base", "initial noise"),
+        ("noise", "diversity (19)", "moving part", "object spread, cm", "tracking"),
+    )  # fmt: skip
+    for row in comparisons:
+        shown = ("diversity", "diversity_dynamic", "object_spread_cm", "tracking")
+        intervals = ("{:+.4f} ({:+.4f} to {:+.4f})".format(*row[name]) for name in shown)
+        table.add_row(row["arm"], row["base"], _regime(row), "{:.2f}, {:.2f}".format(*row["noise_share"]), *intervals)
+    return table
+
+
+def _regime(row: dict[str, Any]) -> str:
+    return "shared" if row["shared_noise"] else "own"
+
+
+def _average(row: dict[str, Any], name: str) -> float:
+    return float(sum(row[name]) / len(row[name]))
+
+
 def training_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per arm, means over its seeds: held-out scenes before and after; the second update of its last buffer."""
+    """One line per arm, means over its seeds: held-out scenes before and after; the last buffer's second update."""
     table = _table(
         "held-out scenes, ODE, before and after; mean over seeds", ("arm",),
-        ("seeds", "reward", "obeyed", "bg", "mass", "noise", "clip low/high @2", "KL @2", "|A| max", "seconds"),
+        ("seeds", "reward", "obeyed", "bg", "mass", "noise", "clip low/high @2", "KL @2", "seconds"),
     )  # fmt: skip
     for arm in dict.fromkeys(row["arm"] for row in rows):
         mine = [row for row in rows if row["arm"] == arm]
         first, last = ([row["evaluations"][i] for row in mine] for i in (0, -1))
         update = {name: np.mean([row["buffers"][name][-1] for row in mine]) for name in LAST_UPDATE}
+        course = (f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed"))
         table.add_row(
-            arm, str(len(mine)), *(f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed")),
+            arm, str(len(mine)), *course,
             f"{_mean(last, 'background'):.4f}", f"{_mean(last, 'mass'):.3f}", f"{update['noise_share']:.3f}",
             f"{update['clip_low_share_2']:.2f}/{update['clip_high_share_2']:.2f}", f"{update['kl_2']:.1e}",
-            f"{max(max(row['buffers']['advantage_max']) for row in mine):.2f}",
             f"{np.mean([sum(row['seconds'].values()) for row in mine]):.0f}",
         )  # fmt: skip
     return table
@@ -61,7 +96,7 @@ def comparison_table(comparisons: Sequence[Comparison]) -> Table:
 
 def _shown(difference: Difference) -> str:
     star = "*" if difference.separable else ""
-    return f"{difference.mean:+.4f} ({difference.low:+.4f} to {difference.high:+.4f}){star}"
+    return f"{difference.mean:+.4f} ({difference.low:+.4f}, {difference.high:+.4f}){star}"
 
 
 def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:

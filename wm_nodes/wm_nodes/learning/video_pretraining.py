@@ -1,6 +1,5 @@
 """From clips to a video model: codec, flow matching, held-out scores. Resumable; what is finished is kept."""
 
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import date
@@ -52,7 +51,7 @@ def make_video_model(
         made, losses = _trained(config, clips, run_dir, progress)
         story = {
             "command": command, "date": date.today().isoformat(), "seed": config.seed, "task": config.task,
-            "machine": platform.processor(), "episodes": len(clips), "training": losses,
+            "episodes": len(clips), "training": losses,
         }  # fmt: skip
     scores = kept_scores(run_dir / BEFORE, made, heldout, probe, config)
     story |= {"model": asdict(config.model), "heldout": {**_means(scores), **_baselines(made, heldout, probe, config)}}
