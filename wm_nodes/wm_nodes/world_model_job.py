@@ -22,7 +22,7 @@ from wm_nodes.learning.clip_scores import load_probe
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
 from wm_nodes.learning.video_config import VideoRlConfig, dump_video_config, load_video_config, video_preset_names
 from wm_nodes.learning.video_data import load_clips
-from wm_nodes.learning.video_pretraining import make_video_model
+from wm_nodes.learning.video_pretraining import make_video_model, shipped_video_model
 from wm_nodes.learning.video_run import progress
 from wm_nodes.reports import ClipSummary
 from wm_nodes.ros import arguments as launch_arguments
@@ -67,9 +67,10 @@ def run(arguments: argparse.Namespace) -> ClipSummary:
     stage(f"run folder {run_dir}")
     scene = load_config("cpu", {"task": config.task, "seed": config.seed})
     probe = load_probe(shipped_model(config.task))
-    bags, heldout_bags = _data(config, scene, run_dir, stage)
+    shipped = not arguments.from_scratch and shipped_video_model(config) is not None
+    bags, heldout_bags = _data(scene, config.context_episodes if shipped else config.data_episodes, run_dir, stage)
     heldout = load_clips(heldout_bags, config.model.stride)
-    stage("video model: the shipped one, or codec and flow matching")
+    stage("video model: " + ("the shipped one" if shipped else "flow matching"))
     clips = load_clips(bags, config.model.stride)
     make_video_model(
         config, clips, heldout, probe, run_dir, from_scratch=arguments.from_scratch, command=_command()
@@ -86,11 +87,11 @@ def run(arguments: argparse.Namespace) -> ClipSummary:
     )  # fmt: skip
 
 
-def _data(config: VideoRlConfig, scene: RunConfig, run_dir: Path, stage: Stages) -> tuple[list[Path], list[Path]]:
+def _data(scene: RunConfig, episodes: int, run_dir: Path, stage: Stages) -> tuple[list[Path], list[Path]]:
     """Bags of contexts to train on, and of held-out ones."""
-    stage(f"{config.data_episodes} + {min(HELDOUT_EPISODES, config.data_episodes)} held-out simulator episodes")
-    train = scripted_plan(scene, config.data_episodes, TRAINING_SEEDS)
-    held = scripted_plan(scene, min(HELDOUT_EPISODES, config.data_episodes), HELDOUT_SEEDS)
+    stage(f"{episodes} + {min(HELDOUT_EPISODES, episodes)} held-out simulator episodes")
+    train = scripted_plan(scene, episodes, TRAINING_SEEDS)
+    held = scripted_plan(scene, min(HELDOUT_EPISODES, episodes), HELDOUT_SEEDS)
     bags = collect_plan(train, scene, run_dir / "data" / "train")
     return bags, collect_plan(held, scene, run_dir / "data" / "heldout")
 

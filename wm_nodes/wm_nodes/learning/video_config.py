@@ -68,12 +68,16 @@ class EvaluationSettings:
 
 @dataclass(frozen=True)
 class VideoRlConfig:
-    """Everything of a run of loop 2. rewards: weight of each reward; see clip_scores and the evaluator's backends."""
+    """Everything of a run of loop 2. data_episodes: of the simulator, to train the video model on and to draw contexts
+    from; context_episodes: those of a run whose video model is the shipped one. rewards: weight of each reward; see
+    clip_scores and the evaluator's backends.
+    """
 
     seed: int = 0
     task: str = "push_cube"
     iterations: int = 30
     data_episodes: int = 1000
+    context_episodes: int = 200
     rewards: dict[str, float] = field(default_factory=lambda: {"tracking": 1.0, "scenery": -5.0})
     model: ModelSettings = field(default_factory=ModelSettings)
     groups: GroupSettings = field(default_factory=GroupSettings)
