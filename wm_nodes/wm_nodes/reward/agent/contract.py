@@ -1,0 +1,51 @@
+"""What a trainer may do with verdicts. Specification: sections 2.3 (trainer contract) and 2.6. Shapes: N clips."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wm_nodes.reward.agent.types import Verdict
+from wm_nodes.types import BoolArray
+
+ADVANTAGE_CLIP = 2.5
+"""Of group advantages; the paper lowered it from 5 because this reward varies more."""
+MAX_INVALID_SHARE = 0.1
+"""A round with more invalid clips pauses training."""
+
+
+def trainable(valid_N: BoolArray, group_ids_N: NDArray[np.int64]) -> BoolArray:
+    """Return which clips train, (N,): the valid ones of groups with n_valid >= max(2, G / 2)."""
+    if valid_N.shape != group_ids_N.shape:
+        raise ValueError(f"valid and group ids must have one shape, got {valid_N.shape} and {group_ids_N.shape}")
+    kept = np.zeros(valid_N.shape, bool)
+    for group in np.unique(group_ids_N):
+        members = group_ids_N == group
+        kept[members] = valid_N[members] & (valid_N[members].sum() >= max(2, members.sum() / 2))
+    return kept
+
+
+def pause_reason(verdicts: Sequence[Verdict]) -> str:
+    """Why training must pause after this round, with an example; "" where it may go on."""
+    invalid = [verdict for verdict in verdicts if not verdict.valid]
+    if len(invalid) <= MAX_INVALID_SHARE * len(verdicts):
+        return ""
+    first = invalid[0]
+    return (
+        f"{len(invalid)} of {len(verdicts)} verdicts are invalid, more than {MAX_INVALID_SHARE:.0%}; "
+        f"e.g. {first.clip_id}: {first.status} {first.reason}"
+    )
+
+
+def check_one_judge(verdicts: Sequence[Verdict], group_ids: Sequence[int]) -> None:
+    """Rewards of one group are compared, so one judge, model and rubric must have given them.
+
+    Raises:
+        ValueError: names the group and what was mixed.
+    """
+    seen: dict[int, tuple[str, ...]] = {}
+    for verdict, group in zip(verdicts, group_ids, strict=True):
+        p = verdict.provenance
+        identity = (p.judge_id, p.transport, p.model, p.server_version, p.rubric_version)
+        if seen.setdefault(group, identity) != identity:
+            raise ValueError(f"group {group} mixes judges {seen[group]} and {identity}; judge the whole group again")

@@ -1,0 +1,32 @@
+"""Judges: whoever reads clips for the reward agent. Here: any server that speaks chat completions, such as vLLM.
+
+    vllm serve MODEL --enable-prefix-caching --limit-mm-per-prompt '{"image": 40}'
+
+    transport = ChatTransport([Endpoint("http://127.0.0.1:8000/v1", "MODEL")])
+    agent = RewardAgent(OpenAIJudge(transport, rubric, cache=VerdictCache(folder)), rubric)
+
+A profile sends up to 32 images. Keys come from environment variables only (Endpoint.api_key_env). Label votes need a
+server with logprobs; `transformers serve` has none, so votes after the first are errors there.
+"""
+
+from wm_nodes.reward.judges.cache import VerdictCache
+from wm_nodes.reward.judges.calls import ChatOptions
+from wm_nodes.reward.judges.openai_client import OpenAIJudge
+from wm_nodes.reward.judges.transport import (
+    ChatTransport,
+    Endpoint,
+    MissingPackageError,
+    RetryPolicy,
+    TransportError,
+)
+
+__all__ = [
+    "ChatOptions",
+    "ChatTransport",
+    "Endpoint",
+    "MissingPackageError",
+    "OpenAIJudge",
+    "RetryPolicy",
+    "TransportError",
+    "VerdictCache",
+]

@@ -1,0 +1,99 @@
+"""How much an endpoint is asked for at once, and when it is left alone. Specification: section 2.6."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from enum import Enum
+
+
+class AdaptiveLimit:
+    """A semaphore whose size follows the server: halved when it is overloaded, one more after every 50 good answers.
+
+    Calls that were already under way at the last halving cannot halve again: 32 answers 429 to one burst are one sign
+    of overload, not 32.
+    """
+
+    def __init__(self, maximum: int = 32, *, raise_after: int = 50) -> None:
+        if maximum < 1 or raise_after < 1:
+            raise ValueError(f"maximum and raise_after must be >= 1, got {maximum} and {raise_after}")
+        self.limit = maximum
+        self.in_flight = 0
+        self._maximum, self._raise_after = maximum, raise_after
+        self._good = 0
+        self._halvings = 0
+        self._freed = asyncio.Condition()
+
+    async def acquire(self) -> int:
+        """Wait for a free place; return the ticket that `overloaded` wants."""
+        async with self._freed:
+            await self._freed.wait_for(lambda: self.in_flight < self.limit)
+            self.in_flight += 1
+            return self._halvings
+
+    async def release(self) -> None:
+        self.in_flight -= 1
+        async with self._freed:
+            self._freed.notify_all()
+
+    def overloaded(self, ticket: int) -> None:
+        """Halve the limit, unless it was halved since the call with this ticket began."""
+        if ticket == self._halvings:
+            self._halvings += 1
+            self._good = 0
+            self.limit = max(1, self.limit // 2)
+
+    def good(self) -> None:
+        self._good += 1
+        if self._good >= self._raise_after:
+            self._good = 0
+            self.limit = min(self._maximum, self.limit + 1)
+
+
+class Admission(Enum):
+    """What a circuit breaker answers to a call that wants to begin."""
+
+    YES = "yes"
+    PROBE = "probe"
+    NO = "no"
+
+
+class CircuitBreaker:
+    """Opens when more than half of the last `window` calls failed; then lets one probe through every `probe_s` seconds.
+
+    A probe that succeeds closes it and forgets the failures. A probe that is never reported (its caller was cancelled)
+    costs one `probe_s` and nothing more.
+
+    Args:
+        now: a monotonic clock, s.
+    """
+
+    def __init__(self, now: Callable[[], float], *, window: int = 20, probe_s: float = 10.0) -> None:
+        if window < 1 or not probe_s > 0:
+            raise ValueError(f"window must be >= 1 call and probe_s > 0, got {window} and {probe_s}")
+        self._now, self._probe_s = now, probe_s
+        self._failed: deque[bool] = deque(maxlen=window)
+        self._next_probe: float | None = None
+
+    @property
+    def is_open(self) -> bool:
+        return self._next_probe is not None
+
+    def admit(self) -> Admission:
+        """Whether a call may begin now; the answer belongs into `record`."""
+        if self._next_probe is None:
+            return Admission.YES
+        if self._now() < self._next_probe:
+            return Admission.NO
+        self._next_probe = self._now() + self._probe_s
+        return Admission.PROBE
+
+    def record(self, admission: Admission, *, failed: bool) -> None:
+        """Count one ended call. Calls that began before the breaker opened do not close it."""
+        if self.is_open:
+            if admission is Admission.PROBE and not failed:
+                self._next_probe = None
+                self._failed.clear()
+            return
+        self._failed.append(failed)
+        if len(self._failed) == self._failed.maxlen and 2 * sum(self._failed) > len(self._failed):
+            self._next_probe = self._now() + self._probe_s
