@@ -234,7 +234,8 @@ def _cost(arguments: argparse.Namespace) -> None:
     rows = measure_anchors(model, LEARNER, arguments.repeats, arguments.seed)
     _write(arguments, {"seed": arguments.seed, "rollout": rollout, "rows": rows})
     console.print(cost_table(rows, arguments.repeats))
-    console.print(f"sampling with the mask / without: {rollout['dyndiff_over_cps']:.3f}", highlight=False)
+    shares = f"with the mask / without: {rollout['dyndiff_over_cps']:.3f}, the masks alone {rollout['mask_s']:.4f} s"
+    console.print(f"sampling {rollout['cps_s']:.3f} s; {shares}", highlight=False)
 
 
 def _named(known: dict[str, T], names: list[str] | None) -> list[T]:

@@ -113,10 +113,11 @@ def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def cost_table(rows: Sequence[dict[str, Any]], repeats: int) -> Table:
-    numbers = ("training, s", "of which KL, s", "kept beside the weights, MiB")
+    numbers = ("forward, s", "KL, s", "backward, s", "kept beside the weights, MiB")
     table = _table(f"KL anchors, median of {repeats} turns on one buffer", ("anchor",), numbers)
     for row in rows:
-        table.add_row(row["anchor"], f"{row['train_s']:.3f}", f"{row['kl_s']:.3f}", f"{row['bytes'] / 2**20:.2f}")
+        seconds = (f"{row[name]:.3f}" for name in ("forward_s", "kl_s", "backward_s"))
+        table.add_row(row["anchor"], *seconds, f"{row['bytes'] / 2**20:.2f}")
     return table
 
 

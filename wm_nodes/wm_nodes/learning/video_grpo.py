@@ -37,7 +37,7 @@ from wm_nodes.video_model.step_window import select_steps
 class UpdateReport:
     """One optimizer step; see docs/metrics.md. clip_low_share, clip_high_share: of transitions, by tail.
 
-    *_seconds: forward with backward of the weights that train; the anchor's forward and the KL.
+    *_seconds: forward of the weights that train; the anchor's forward and the KL; backward of both.
     """
 
     objective: float
@@ -47,8 +47,9 @@ class UpdateReport:
     clip_high_share: float
     grad_norm: float
     transitions: int
-    train_seconds: float
+    forward_seconds: float
     kl_seconds: float
+    backward_seconds: float
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ class GrpoLearner:
     def gradients(self, buffer: RolloutBuffer, rows: "Rows", advantages: GroupAdvantages) -> dict[str, float]:
         """Accumulate the gradient of L = -J + beta KL over the rows into .grad; return the sums for a report."""
         device, total = next(self.model.parameters()).device, len(rows)
-        sums = dict.fromkeys(("objective", "kl", "ratio", "low", "high", "train_s", "kl_s"), 0.0)
+        sums = dict.fromkeys(("objective", "kl", "ratio", "low", "high", "forward_s", "kl_s", "backward_s"), 0.0)
         weights = self._terms.step_weights(buffer, rows.videos[:1]) if self.settings.equalise else None
         limits = {"clip_low": self.settings.clip_low, "clip_high": self.settings.clip_high}
         own = self.ranks.share(torch.arange(total))
@@ -155,19 +156,20 @@ class GrpoLearner:
             objective = clipped_objective(ratio, signal, **limits)
             if weights is not None:
                 objective = objective * weights[part.positions].to(device)
-            middle = time.perf_counter()
+            forward_end = time.perf_counter()
             kl = self._terms.kl(found, buffer, part, self.version)
-            kl_seconds = time.perf_counter() - middle
+            kl_end = time.perf_counter()
             loss = (self.settings.kl.beta * kl - objective).sum() / total
             loss.backward()  # type: ignore[no-untyped-call]
+            sums["forward_s"] += forward_end - start
+            sums["kl_s"] += kl_end - forward_end
+            sums["backward_s"] += time.perf_counter() - kl_end
             low, high = clip_tails(ratio.detach(), **limits)
             sums["objective"] += float(objective.detach().sum())
             sums["kl"] += float(kl.detach().sum())
             sums["ratio"] += float(ratio.detach().exp().sum())
             sums["low"] += low * len(index) if len(index) else 0.0  # a share of none is not a number
             sums["high"] += high * len(index) if len(index) else 0.0
-            sums["kl_s"] += kl_seconds
-            sums["train_s"] += time.perf_counter() - start - kl_seconds
         values = torch.tensor(list(sums.values()), dtype=torch.float64)
         self.ranks.sum_(values)
         return dict(zip(sums, values.tolist(), strict=True))
@@ -227,7 +229,8 @@ class GrpoLearner:
         return UpdateReport(
             objective=sums["objective"] / total, kl=sums["kl"] / total, ratio_mean=sums["ratio"] / total,
             clip_low_share=sums["low"] / total, clip_high_share=sums["high"] / total, grad_norm=float(norm),
-            transitions=total, train_seconds=sums["train_s"], kl_seconds=sums["kl_s"],
+            transitions=total, forward_seconds=sums["forward_s"],
+            kl_seconds=sums["kl_s"], backward_seconds=sums["backward_s"],
         )  # fmt: skip
 
     def _snapshot(self) -> dict[str, Any]:
