@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from graph.harness import MATCH_S
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -61,10 +62,17 @@ class Peer:
     def call(self, kind: Any, name: str, **fields: Any) -> Any:
         client = self.node.create_client(kind, name)
         self.wait(client.service_is_ready, name)
+        self.match()
         future = client.call_async(kind.Request(**fields))
         self.wait(future.done, f"answer of {name}")
         self.node.destroy_client(client)
         return future.result()
+
+    def match(self) -> None:
+        """Spin for as long as a server may take to match a new client's reader (harness.MATCH_S)."""
+        until = time.monotonic() + MATCH_S
+        while time.monotonic() < until:
+            self.executor.spin_once(timeout_sec=0.05)
 
     def end(self, how: int = signal.SIGTERM) -> int:
         self.process.send_signal(how)
@@ -264,6 +272,7 @@ class Listener:
 def replay(peer: Peer, feedback: list[Any], **goal: Any) -> tuple[Any, Any]:
     client = ActionClient(peer.node, Replay, "replay")
     peer.wait(client.server_is_ready, "replay server")
+    peer.match()
     accepted = client.send_goal_async(
         Replay.Goal(publish_clock=True, **goal), feedback_callback=lambda message: feedback.append(message.feedback)
     )

@@ -127,6 +127,7 @@ def test_training_from_the_bag_and_from_its_replay_gives_the_weights_of_the_live
                 offline.stop()
 
 
+@pytest.mark.alone
 def test_a_replay_that_starts_with_the_learner_trains_and_a_short_one_says_so(graph: Graph, probe: Probe) -> None:
     bag = recorded_training(graph, probe, updates=2)
     live = weights_in(graph.folder)

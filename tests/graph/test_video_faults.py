@@ -153,7 +153,7 @@ def test_cancel_is_answered_at_once_while_the_video_model_hangs_and_leaves_no_go
 def test_cancel_is_answered_at_once_during_an_update_and_takes_it_back(loop: VideoLoop) -> None:
     done = loop.train(1)
     small = loop.local.buffer(done.iterations, done.iterations)
-    uri, _ = _buffer(loop, "large.safetensors", concatenate_buffers([small] * 40).to_bytes())
+    uri, _ = _buffer(loop, "large.safetensors", concatenate_buffers([small] * 150).to_bytes())
     handle = loop.send(from_buffers=[uri])
     time.sleep(1.5)  # it has read the file, and trains for many times as long
     began = time.monotonic()

@@ -133,8 +133,14 @@ class VideoLoop:
         self.graph.start(node, **{**values, **params})
 
     def wait_active(self, *nodes: str) -> None:
+        """Wait until the nodes are active, and none of them is lost to the learner any more."""
         for node in nodes or NAMES:
             wait_until(f"active {node}", lambda n=node: self.probe.value(NAMES[n], "state") == "active", 60)
+            wait_until(f"a learner that hears {node}", lambda n=node: not self._lost(NAMES[n]))
+
+    def _lost(self, name: str) -> bool:
+        learner = self.probe.diagnostics.get("/wm/learner")
+        return learner is not None and f"{name} is lost" in learner.message
 
     def stop(self, node: str) -> None:
         """SIGINT, as a person would."""
