@@ -45,6 +45,7 @@ def test_a_reward_for_bad_pictures_is_named_in_log_diagnostics_and_metrics_until
                         and probe.diagnostics["/wm/learner"])  # fmt: skip
     assert "the training reward rises by 1 per evaluation" in status.message and f"{worse[0]} by" in status.message
     assert f"reward hacking: {status.message}" in graph.log("/wm/video_learner")
-    assert loop.train(from_buffers=write_buffers(loop, [-1, -2, -3, -4])).termination_reason == TrainVideo.Result.FINISHED
+    result = loop.train(from_buffers=write_buffers(loop, [-1, -2, -3, -4]))
+    assert result.termination_reason == TrainVideo.Result.FINISHED, result.message
     assert read_metrics(graph.folder, "heldout")[-1]["hacked"] == 0
     wait_until("no warning", lambda: probe.diagnostics["/wm/learner"].level == DiagnosticStatus.OK)
