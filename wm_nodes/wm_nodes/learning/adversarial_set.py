@@ -1,0 +1,259 @@
+"""Build a set of clips with known labels from the simulator: record, draw, edit, draw again, describe. Section 3.
+
+A folder holds manifest.jsonl and one compressed .npz per clip (frames, masks, fps), named by its hash. The manifest is
+written last: a folder without one is unfinished. Equal arguments give equal bytes.
+
+    python -m wm_nodes.learning.adversarial_set FOLDER --tasks push_cube --episodes 8
+"""
+
+import argparse
+import io
+import sys
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from wm_nodes.config.load import load_config
+from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.learning.files import write_atomic
+from wm_nodes.reward.adversarial import (
+    Division,
+    LabelledClip,
+    Manifest,
+    ManifestError,
+    Origin,
+    SceneStates,
+    SourceClip,
+    StateEdit,
+    children,
+    from_bytes,
+    manifest_of,
+    recorded,
+    rendered,
+    to_bytes,
+)
+from wm_nodes.reward.agent.types import media_sha
+from wm_nodes.seeding import numpy_stream
+from wm_nodes.simulation.clip_scenes import (
+    CAMERAS,
+    ClipStage,
+    EpisodeStates,
+    Look,
+    cube_half_sizes,
+    record_states,
+)
+from wm_nodes.simulation.environment import ManiSkillEnvironment
+from wm_nodes.simulation.tasks import TASKS, get_task
+from wm_nodes.types import UInt8Array
+
+MANIFEST = "manifest.jsonl"
+SIDE_PX = 96
+OBJECT_COLOURS = {
+    "blue": (0.05, 0.16, 0.63), "green": (0.05, 0.5, 0.12), "orange": (0.85, 0.4, 0.05), "purple": (0.45, 0.1, 0.6),
+}  # fmt: skip
+TABLES = {"sand": (0.78, 0.74, 0.66), "slate": (0.42, 0.46, 0.5), "moss": (0.5, 0.58, 0.42)}
+PUSHING = {"expert": 0.5, "short": 0.2, "near_miss": 0.15, "noisy": 0.1, "random": 0.05}
+BEHAVIOURS = {"push_cube": PUSHING, "pull_cube": PUSHING, "reach": {"hover": 0.6, "hover_noisy": 0.3, "near_miss": 0.1}}
+"""Shares by task."""
+HELD_OUT = Division(tasks=("pull_cube",), cameras=("near_high",), objects=("cube/purple",), scenes=("moss",))
+HELD_OUT_SHARE = 0.12
+"""Of the episodes, for each held-out camera, object and scene; two thirds of a trained task's are none of them."""
+
+
+@dataclass(frozen=True)
+class SetPlan:
+    """tasks: in turn. num_episodes: recorded ones, each seen by one camera. edits_per_clip: (recipe, severity) pairs
+    that are tried on each, None for all. seed: episode i is reset with seed + i; look and recipes follow from it.
+    """
+
+    tasks: tuple[str, ...] = ("push_cube",)
+    num_episodes: int = 8
+    edits_per_clip: int | None = None
+    seed: int = 0
+    division: Division = HELD_OUT
+
+    def __post_init__(self) -> None:
+        if self.num_episodes < 1 or (self.edits_per_clip is not None and self.edits_per_clip < 0):
+            raise ValueError(f"need at least 1 episode and 0 edits, got {self.num_episodes} and {self.edits_per_clip}")
+
+
+class ClipSource:
+    """Recorded clips and redrawn edits of one task. Building it starts the simulator: seconds.
+
+    Raises:
+        NoRendererError: Vulkan finds no device.
+    """
+
+    def __init__(self, task: str, config: SimulationConfig) -> None:
+        self._task = task
+        self._config = config
+        self._env = ManiSkillEnvironment(task, config.model_copy(update={"image_size": 16}), end_on_success=False)
+        self.stage = ClipStage(task, config.model_copy(update={"image_size": SIDE_PX}))
+
+    def origin(self, seed: int) -> Origin:
+        """Behaviour, camera and colours, drawn by `seed`."""
+        rng = numpy_stream(seed, f"adversarial_origin/{self._task}")
+        behaviours = BEHAVIOURS[self._task]
+        behaviour = str(rng.choice(list(behaviours), p=list(behaviours.values())))
+        things = [f"cube/{colour}" for colour in OBJECT_COLOURS]
+        camera, thing = _pick(rng, list(CAMERAS), HELD_OUT.cameras), _pick(rng, things, HELD_OUT.objects)
+        return Origin(self._task, camera, thing, _pick(rng, list(TABLES), HELD_OUT.scenes), seed, behaviour)
+
+    def clip(self, seed: int) -> LabelledClip:
+        """Record one episode and draw it."""
+        origin = self.origin(seed)
+        return recorded(self._drawn(scene_states(record_states(self._env, origin.behaviour, seed)), origin))
+
+    def redraw(self, parent: LabelledClip, edit: StateEdit) -> LabelledClip:
+        return rendered(parent, edit, self._drawn(edit.states, parent.clip.origin))
+
+    def close(self) -> None:
+        self._env.close()
+        self.stage.close()
+
+    def _drawn(self, states: SceneStates, origin: Origin) -> SourceClip:
+        colour = origin.object_id.split("/")[1]
+        look = Look(OBJECT_COLOURS[colour], TABLES[origin.scene], seed=origin.seed)
+        drawing = self.stage.draw(
+            states.robot_q, states.poses, states.half_sizes_m * states.scales, states.tool, states.goal, origin.camera,
+            look,
+        )  # fmt: skip
+        return SourceClip(
+            drawing.frames, drawing.masks, drawing.tracks, states, origin,
+            get_task(self._task).instruction.replace("blue", colour), self._config.control_hz,
+        )  # fmt: skip
+
+
+def _pick(rng: np.random.Generator, values: Sequence[str], rare: Sequence[str]) -> str:
+    """One of the values; each rare one with HELD_OUT_SHARE, the others evenly."""
+    common = (1 - HELD_OUT_SHARE * len(rare)) / (len(values) - len(rare))
+    return str(rng.choice(list(values), p=[HELD_OUT_SHARE if value in rare else common for value in values]))
+
+
+def scene_states(states: EpisodeStates) -> SceneStates:
+    """An episode of the cube in the benchmark's words."""
+    num_frames = len(states.poses)
+    return SceneStates(
+        states.robot_q, states.tool, states.gripper_m, states.poses, np.ones((num_frames, 1, 3), np.float32),
+        cube_half_sizes(1)[0], states.contact, states.goal,
+    )  # fmt: skip
+
+
+def build(
+    folder: Path, plan: SetPlan, config: SimulationConfig, *, progress: bool = True
+) -> tuple[Manifest, Counter[str]]:
+    """Make the set; returns its manifest, and how often which recipe did not apply and why.
+
+    Raises:
+        NoRendererError: Vulkan finds no device. OSError: a full disk.
+        FileExistsError: a finished set is there already.
+    """
+    if (folder / MANIFEST).exists():
+        raise FileExistsError(f"{folder / MANIFEST} is there already; take a new folder, or remove the old set")
+    skipped: Counter[str] = Counter()
+
+    def kept() -> Iterator[LabelledClip]:
+        for task in plan.tasks:
+            source = ClipSource(task, config)
+            try:
+                for seed in tqdm(range(plan.seed, plan.seed + plan.num_episodes), desc=task, disable=not progress):
+                    parent = source.clip(seed)
+                    made = children(parent, seed, source.redraw, count=plan.edits_per_clip, skipped=skipped)
+                    for clip in (parent, *made):
+                        write_atomic(clip_path(folder, clip.sha256), to_file(clip))
+                        yield clip
+            finally:
+                source.close()
+
+    manifest = manifest_of(kept(), plan.division)
+    write_atomic(folder / MANIFEST, to_bytes(manifest))
+    return manifest, skipped
+
+
+def clip_path(folder: Path, sha256: str) -> Path:
+    return folder / "clips" / f"{sha256}.npz"
+
+
+def to_file(clip: LabelledClip) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, frames=clip.clip.frames, masks=clip.clip.masks, fps=np.float64(clip.clip.fps))
+    return buffer.getvalue()
+
+
+def load_set(folder: Path) -> Manifest:
+    """Read and verify a set's manifest.
+
+    Raises:
+        ManifestError: see manifest.from_bytes. OSError: not there.
+    """
+    return from_bytes((folder / MANIFEST).read_bytes())
+
+
+def load_frames(folder: Path, sha256: str) -> UInt8Array:
+    """The frames of a clip, uint8 (T, H, W, 3).
+
+    Raises:
+        ManifestError: the file is missing or damaged, or holds another clip.
+    """
+    path = clip_path(folder, sha256)
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            frames, fps = arrays["frames"], float(arrays["fps"])
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ManifestError(f"{path} cannot be read: {error}; build the set again") from error
+    if media_sha(frames, fps) != sha256:
+        raise ManifestError(f"{path} holds another clip than its name says; build the set again")
+    checked: UInt8Array = frames
+    return checked
+
+
+def check_set(folder: Path) -> Manifest:
+    """Read the manifest and every clip of a set.
+
+    Raises:
+        ManifestError: what is wrong. OSError: no manifest.
+    """
+    manifest = load_set(folder)
+    for row in manifest.rows:
+        load_frames(folder, row.sha256)
+    return manifest
+
+
+def main(argv: Sequence[str]) -> int:
+    """Build a set and print its prevalence. Return the exit code: 0 done, 2 a clear error."""
+    parser = argparse.ArgumentParser(prog="adversarial_set", description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="new folder of the set")
+    parser.add_argument("--tasks", nargs="+", choices=sorted(TASKS), default=["push_cube"])
+    parser.add_argument("--episodes", type=int, default=8, help="recorded episodes per task")
+    parser.add_argument("--edits", type=int, help="edits tried on each; all by default")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--check", action="store_true", help="build nothing, verify the set that is there")
+    arguments = parser.parse_args(argv)
+    try:
+        if arguments.check:
+            manifest, skipped = check_set(arguments.folder), Counter[str]()
+        else:
+            plan = SetPlan(tuple(arguments.tasks), arguments.episodes, arguments.edits, arguments.seed)
+            manifest, skipped = build(arguments.folder, plan, load_config("cpu").simulation)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    splits = Counter(row.split for row in manifest.rows)
+    print(f"{len(manifest.rows)} clips in {arguments.folder}: " + ", ".join(f"{n} {s}" for s, n in splits.items()))
+    print(f"{'label':16} {'pass':>6} {'fail':>6} {'unknown':>8}  fails")
+    for name, found in manifest.prevalence["all"].items():
+        share = found["fail"] / max(1, found["pass"] + found["fail"])
+        print(f"{name:16} {found['pass']:6} {found['fail']:6} {found['unknown']:8}  {share:5.1%}")
+    for reason, count in skipped.most_common(10):
+        print(f"left out {count} times: {reason}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

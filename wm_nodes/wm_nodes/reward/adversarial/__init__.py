@@ -1,0 +1,84 @@
+"""Clips that are wrong in a known way: recipes on pixels, time and states, their labels, the manifest of a set.
+
+Section 3 of the specification. Pure functions of arrays: what renders edited states is elsewhere.
+"""
+
+from wm_nodes.reward.adversarial.clips import (
+    BACKGROUND,
+    COMPONENTS,
+    DISTRACTOR,
+    OBJECT,
+    PHYSICS,
+    ROBOT,
+    TC,
+    Edit,
+    LabelledClip,
+    Labels,
+    NotApplicableError,
+    Origin,
+    SceneStates,
+    SourceClip,
+)
+from wm_nodes.reward.adversarial.generator import Redraw, children, replay
+from wm_nodes.reward.adversarial.manifest import (
+    SPLITS,
+    Division,
+    Manifest,
+    ManifestError,
+    from_bytes,
+    manifest_of,
+    prevalence,
+    regenerate,
+    to_bytes,
+)
+from wm_nodes.reward.adversarial.recipes import (
+    RECIPES,
+    Recipe,
+    StateEdit,
+    apply,
+    edit_states,
+    recipes_sha,
+    rendered,
+)
+from wm_nodes.reward.adversarial.truth import TASK_RULES, TaskRule, failed_physics, recorded, tc_level
+
+__all__ = [
+    "BACKGROUND",
+    "COMPONENTS",
+    "DISTRACTOR",
+    "OBJECT",
+    "PHYSICS",
+    "RECIPES",
+    "ROBOT",
+    "SPLITS",
+    "TASK_RULES",
+    "TC",
+    "Division",
+    "Edit",
+    "LabelledClip",
+    "Labels",
+    "Manifest",
+    "ManifestError",
+    "NotApplicableError",
+    "Origin",
+    "Recipe",
+    "Redraw",
+    "SceneStates",
+    "SourceClip",
+    "StateEdit",
+    "TaskRule",
+    "apply",
+    "children",
+    "edit_states",
+    "failed_physics",
+    "from_bytes",
+    "manifest_of",
+    "prevalence",
+    "recipes_sha",
+    "recorded",
+    "regenerate",
+    "rendered",
+    "replay",
+    "tc_level",
+    "to_bytes",
+]
