@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 from chat_server import ChatServer, Fault
 
+from wm_nodes.optional import MissingPackageError
 from wm_nodes.reward.judges.limits import AdaptiveLimit, Admission, CircuitBreaker
 from wm_nodes.reward.judges.transport import (
     ChatTransport,
     Endpoint,
-    MissingPackageError,
     RetryPolicy,
     TransportError,
     retry_after_s,

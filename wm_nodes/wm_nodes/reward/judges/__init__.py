@@ -9,13 +9,13 @@ A profile sends up to 32 images. Keys come from environment variables only (Endp
 server with logprobs; `transformers serve` has none, so votes after the first are errors there.
 """
 
+from wm_nodes.optional import MissingPackageError
 from wm_nodes.reward.judges.cache import VerdictCache
 from wm_nodes.reward.judges.calls import ChatOptions
 from wm_nodes.reward.judges.openai_client import OpenAIJudge
 from wm_nodes.reward.judges.transport import (
     ChatTransport,
     Endpoint,
-    MissingPackageError,
     RetryPolicy,
     TransportError,
 )

@@ -6,7 +6,6 @@ waits and what counts against an endpoint are decided here. Specification: secti
 
 import asyncio
 import contextlib
-import importlib
 import os
 import random
 import time
@@ -19,18 +18,14 @@ from urllib.parse import urlsplit
 
 from pydantic import ValidationError
 
+from wm_nodes.optional import optional_package
 from wm_nodes.reward.judges.limits import AdaptiveLimit, Admission, CircuitBreaker
 from wm_nodes.reward.judges.protocol import Completion
 
-INSTALL = "pip install -c requirements/constraints.txt -r requirements/judge.txt"
 CONNECT_S = 5.0
 OVERLOAD = (429, 503)
 _RETRIED = (408, 409, 425, 429)
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
-
-
-class MissingPackageError(ImportError):
-    """The package of requirements/judge.txt is not installed."""
 
 
 class TransportError(RuntimeError):
@@ -325,10 +320,4 @@ def retry_after_s(headers: Mapping[str, str]) -> float:
 
 
 def _openai() -> Any:
-    try:
-        return importlib.import_module("openai")
-    except ModuleNotFoundError as error:
-        raise MissingPackageError(
-            f"the OpenAI-compatible judge needs the package {error.name or 'openai'}, which is not installed; "
-            f"run: {INSTALL}"
-        ) from error
+    return optional_package("openai", needed_by="the OpenAI-compatible judge needs", requirements="judge.txt")

@@ -9,12 +9,12 @@ in no diffusers folder. WanVelocity takes any module with the call of WanTransfo
 published network is all that is missing, beside its text encoder (last hidden states of Qwen2.5-VL).
 """
 
+from wm_nodes.optional import MissingPackageError
 from wm_nodes.video_model.adapters.codec import VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity
 from wm_nodes.video_model.adapters.folder import ModelFolder, ModelFolderError
 from wm_nodes.video_model.adapters.loading import LoadSettings, PublicVideoModel, load_public_model
 from wm_nodes.video_model.adapters.lora import add_lora, load_lora, save_lora
-from wm_nodes.video_model.adapters.packages import MissingPackageError
 from wm_nodes.video_model.adapters.text import TextEncoder
 from wm_nodes.video_model.adapters.velocity import PublicVelocity, normalised_cfg
 from wm_nodes.video_model.adapters.wan import WanVelocity
