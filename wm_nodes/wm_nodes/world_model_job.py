@@ -67,14 +67,12 @@ def run(arguments: argparse.Namespace) -> ClipSummary:
     stage(f"run folder {run_dir}")
     scene = load_config("cpu", {"task": config.task, "seed": config.seed})
     probe = load_probe(shipped_model(config.task))
-    shipped = not arguments.from_scratch and shipped_video_model(config) is not None
+    shipped = None if arguments.from_scratch else shipped_video_model(config)
     bags, heldout_bags = _data(scene, config.context_episodes if shipped else config.data_episodes, run_dir, stage)
     heldout = load_clips(heldout_bags, config.model.stride)
     stage("video model: " + ("the shipped one" if shipped else "flow matching"))
     clips = load_clips(bags, config.model.stride)
-    make_video_model(
-        config, clips, heldout, probe, run_dir, from_scratch=arguments.from_scratch, command=_command()
-    )
+    make_video_model(config, clips, heldout, probe, run_dir, shipped=shipped, command=_command())
     version, done = progress(run_dir)
     if done < config.iterations:
         _post_train(arguments, config, (bags, heldout_bags), run_dir, stage)

@@ -30,22 +30,22 @@ BEFORE = Path("evaluations") / "before.json"
 
 def make_video_model(
     config: VideoRlConfig, clips: Clips, heldout: Clips, probe: PositionProbe, run_dir: Path, *,
-    from_scratch: bool = False, progress: bool = True, command: str = "",
+    shipped: VideoFolder | None = None, progress: bool = True, command: str = "",
 ) -> VideoFolder:  # fmt: skip
-    """The shipped video model where it was made with these settings, else a trained one, with its held-out scores.
+    """The shipped video model, or without one a model trained on the clips, with its held-out scores.
 
     Kept in run_dir/video_model, and loaded from there; the scores of each held-out context are kept in
     run_dir/evaluations/before.json.
 
     Args:
-        from_scratch: train one in any case.
+        shipped: what shipped_video_model() gives; None: train one.
     """
     folder = run_dir / "video_model"
     if (folder / MANIFEST).is_file():
         return load_video_folder(folder)
-    made = None if from_scratch else shipped_video_model(config)
     story: dict[str, Any]
-    if made is not None:
+    if shipped is not None:
+        made = shipped
         story = {"shipped": {name: made.manifest[name] for name in ("command", "date", "seed", "episodes", "training")}}
     else:
         made, losses = _trained(config, clips, run_dir, progress)
