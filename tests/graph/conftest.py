@@ -1,7 +1,7 @@
 """Fixtures: a graph and a probe on an own domain; nothing is left over afterwards."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,8 @@ pytest.importorskip("rclpy", reason="the graph tests need rclpy")
 
 from graph.harness import Graph, Probe, own_domain
 
+LOG_LINES = 25
+
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """WM_TEST_RERUNS=1 repeats a failed graph test once, for crowded machines; .ci/run leaves it unset, so none is."""
@@ -19,6 +21,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if reruns and "graph" in item.path.parts:
             item.add_marker(pytest.mark.flaky(reruns=reruns))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show what the nodes of a failed test said last."""
+    report = yield
+    if report.failed:
+        for graph in Graph.started:
+            for log in sorted(graph.folder.glob("*.log")):
+                tail = log.read_text(errors="replace").splitlines()[-LOG_LINES:]
+                report.sections.append((f"{graph.folder.name}/{log.name}", "\n".join(tail)))
+    if call.when == "teardown":
+        Graph.started.clear()
+    return report
 
 
 @pytest.fixture

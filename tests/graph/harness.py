@@ -1,5 +1,6 @@
 """Real nodes in real processes on an own ROS domain, and a probe node that talks to them."""
 
+import atexit
 import contextlib
 import fcntl
 import os
@@ -11,10 +12,11 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, ClassVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from graph.forked import ForkedNode, Forks
 from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
@@ -155,31 +157,40 @@ class Probe:
 
 
 class Graph:
-    """Processes of one run folder on one domain."""
+    """Processes of one run folder on one domain. forks: see graph.forked; otherwise each node is an interpreter of its
+    own, with its own hash seed."""
 
-    def __init__(self, domain: int, folder: Path, config: RunConfig | None = None) -> None:
+    started: ClassVar[list["Graph"]] = []
+    """Of the running test; conftest prints the logs of a failed one."""
+
+    def __init__(self, domain: int, folder: Path, config: RunConfig | None = None, *, forks: bool = True) -> None:
         self.domain, self.folder = domain, folder
+        self._launcher: tuple[str, ...] | None = None if forks else ()
         folder.mkdir(parents=True, exist_ok=True)
         self.config = config or load_config("smoke")
         (folder / "config.yaml").write_text(dump_config(self.config))
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.processes: dict[str, subprocess.Popen[bytes] | ForkedNode] = {}
         self._logs: list[IO[bytes]] = []
+        Graph.started.append(self)
 
     def start(
-        self, node: str, namespace: str = "/wm", launcher: tuple[str, ...] = (), **params: Any
-    ) -> subprocess.Popen[bytes]:
-        """Start python [launcher] -m wm_nodes.nodes.<node>_node; a parameter is given by keyword."""
+        self, node: str, namespace: str = "/wm", launcher: tuple[str, ...] | None = None, **params: Any
+    ) -> subprocess.Popen[bytes] | ForkedNode:
+        """Fork wm_nodes.nodes.<node>_node, or start python LAUNCHER -m ...; a parameter is given by keyword."""
         values = {"config_file": self.folder / "config.yaml", "run_dir": self.folder, **params}
-        command = [sys.executable, *launcher, "-m", f"wm_nodes.nodes.{node}_node"]
-        command += ["--ros-args", "-r", f"__ns:={namespace}"]
+        module, args = f"wm_nodes.nodes.{node}_node", ["--ros-args", "-r", f"__ns:={namespace}"]
         for name, value in values.items():
-            command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
+            args += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
         name = f"{namespace}/{node}"
+        launcher = self._launcher if launcher is None else launcher
+        if launcher is None:
+            self.processes[name] = forks().start(module, args, self.environment(), self.log_path(name))
+            return self.processes[name]
         log = open(self.log_path(name), "ab")  # noqa: SIM115
         self._logs.append(log)
-        process = subprocess.Popen(command, env=self.environment(), stdout=log, stderr=subprocess.STDOUT)
-        self.processes[name] = process
-        return process
+        command = [sys.executable, *launcher, "-m", module, *args]
+        self.processes[name] = subprocess.Popen(command, env=self.environment(), stdout=log, stderr=subprocess.STDOUT)
+        return self.processes[name]
 
     def environment(self) -> dict[str, str]:
         path = os.pathsep.join([str(TOY_FOLDER), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -233,6 +244,18 @@ class Graph:
         for log in self._logs:
             log.close()
         return {name: process.returncode for name, process in self.processes.items()}
+
+
+_forks: Forks | None = None
+
+
+def forks() -> Forks:
+    """The fork server of this test process, started by the first node."""
+    global _forks
+    if _forks is None:
+        _forks = Forks()
+        atexit.register(_forks.close)
+    return _forks
 
 
 def shm_files() -> set[str]:

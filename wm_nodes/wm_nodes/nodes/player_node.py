@@ -3,6 +3,7 @@
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,10 @@ NOT_PLAYED = ("/run/state", "/flow/credit", "/clock", "/diagnostics")
 """Signs of life and of demand: left out unless named, since recorded ones would speak for absent nodes."""
 
 MATCH_S = 0.5
-"""Time for subscribers to find fresh publishers before the first message, s."""
+"""Time for subscribers outside the graph to find fresh publishers before the first message, s."""
+
+LINKS_S = 5.0
+"""How long the first message waits for nodes of the graph that miss one another (see ros.links), s."""
 
 PARAMS = (
     Param("bag_uri", "", "Bag to play when activated, and by a replay goal without one; relative to run_dir"),
@@ -139,9 +143,7 @@ class PlayerNode(ManagedNode):
         return playback
 
     def _play(self, playback: Playback, request: Replay.Goal, work: Work | None) -> None:
-        began, last_feedback = time.monotonic(), 0.0
-        while not playback.paused and time.monotonic() - began < MATCH_S:
-            time.sleep(0.02)
+        last_feedback = 0.0
 
         def check() -> None:
             nonlocal last_feedback
@@ -162,9 +164,19 @@ class PlayerNode(ManagedNode):
                 self._clock_publisher.publish(Clock(clock=time_msg(time_ns)))
 
         try:
+            self._await_readers(playback, check)
             playback.run(publish, tick, check)
         finally:
             self._playback = None
+
+    def _await_readers(self, playback: Playback, check: Callable[[], None]) -> None:
+        """Wait until the outlets' subscribers have found them; a paused player lets the user wait instead."""
+        began = time.monotonic()
+        while not playback.paused and (waited_s := time.monotonic() - began) < LINKS_S:
+            if waited_s > MATCH_S and not self.links.book.missing():
+                return
+            check()
+            time.sleep(0.02)
 
     def _play_alone(self, playback: Playback, request: Replay.Goal) -> None:
         try:
@@ -188,7 +200,7 @@ class PlayerNode(ManagedNode):
             termination_reason=Replay.Result.FINISHED, messages=playback.messages, duration=time.monotonic() - began
         )
 
-    def _wait_for_credit(self, playback: Playback, data: bytes, check: Any) -> None:
+    def _wait_for_credit(self, playback: Playback, data: bytes, check: Callable[[], None]) -> None:
         """Hold a transition back until every consumer has granted it, as the environment does."""
         session, seq = session_and_seq(data)
         ledger = self._ledgers.setdefault(session, CreditLedger(CREDITED, session))

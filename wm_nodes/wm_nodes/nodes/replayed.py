@@ -95,6 +95,7 @@ class ReplayJoiner:
         with self._changed:
             if not self.collecting:
                 return
+            self.heard_s = time.monotonic()
             self._images.put(stamp_ns, images)
             for group in self._open():
                 group.joiner.put_image(stamp_ns, images)
@@ -124,6 +125,7 @@ class ReplayJoiner:
         with self._changed:
             if not self.collecting:
                 return
+            self.heard_s = time.monotonic()
             self._rewards.append(rewards)
             for group in self._open():
                 group.joiner.put_rewards(rewards)

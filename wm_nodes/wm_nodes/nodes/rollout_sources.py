@@ -27,8 +27,9 @@ RETRY_S = 0.5
 MAX_GAP_RETRIES = 2
 TRAINING_PEERS = ("environment", "policy", "reward_evaluator")
 REPLAYED = tuple(topic.name for topic in (topics.SPEC, topics.IMAGES, topics.TRANSITION, topics.REWARD))
-ARRIVAL_S = 0.5
-"""After the player's end: how long its last messages may stay away before the stream counts as over."""
+ARRIVAL_S = 2.0
+"""After the player's end: how long nothing may arrive before the stream counts as over. An update in the worker thread
+can keep the callbacks waiting."""
 
 
 class RolloutSource(Protocol):
