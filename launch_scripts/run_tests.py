@@ -1,4 +1,5 @@
-"""Every check of the repository: ruff, mypy, import contracts, then the tests. Sets up what is missing first.
+"""Every check of the repository: ruff, mypy, import contracts, then the tests. Sets up what is missing first, on Debian
+with a browser, which only the tests of pages need.
 
 python3 launch_scripts/run_tests.py            # everything
 python3 launch_scripts/run_tests.py --fast     # without the tests marked slow
@@ -12,6 +13,7 @@ import time
 from pathlib import Path
 
 import wm_setup
+from setup_steps import system
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -31,6 +33,7 @@ def main(argv):
         "import contracts": [str(scripts / "lint-imports"), "--no-cache"],
     }
     failed = [name for name, command in checks.items() if not _passes(name, command)]
+    system.install(system.browser_plan(system.find_browser(), system.read_os_release()), ROOT / ".venv_setup.log")
     if failed:
         print(f"failed before the tests: {', '.join(failed)}", flush=True)
     runs = [([], named)] if named else [(["not alone"], TWO_AT_A_TIME), (["alone"], LONG_FIRST)]

@@ -14,7 +14,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["wm_nodes", "wm_nodes.*"]),
-    package_data={"": ["py.typed", "**/*.xml", "**/*.yaml", "**/*.json", "**/*.safetensors"]},
+    package_data={"": ["py.typed", "**/*.xml", "**/*.yaml", "**/*.json", "**/*.css", "**/*.js", "**/*.safetensors"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/wm_nodes"]),
         ("share/wm_nodes", ["package.xml"]),

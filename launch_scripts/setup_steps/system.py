@@ -17,6 +17,8 @@ MIN_MESA = (24, 3)
 """The first Mesa whose software renderer (lavapipe) has VK_KHR_external_memory_fd, which SAPIEN needs."""
 BACKPORTS_FILE = "/etc/apt/sources.list.d/wm-backports.sources"
 RENDERER = ("mesa-vulkan-drivers", "libvulkan1")
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "chrome")
+"""Programs that open a page in tests."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,21 @@ def current_plan(gpu_renderer: bool) -> AptPlan:
         os_release=read_os_release(),
         sources=read_sources(),
     )
+
+
+def find_browser() -> str | None:
+    """Path of an installed Chromium; a snap's wrapper, which does not see temporary folders, does not count."""
+    paths = (shutil.which(name) for name in BROWSERS)
+    return next((path for path in paths if path and "/snap/" not in os.path.realpath(path)), None)
+
+
+def browser_plan(browser: str | None, os_release: dict[str, str]) -> AptPlan:
+    """What the tests of pages need, and nothing else does: a browser. Ubuntu's package is a snap: none there."""
+    plan = AptPlan()
+    if browser is None and os_release.get("ID") == "debian":
+        plan.packages.append("chromium-headless-shell")
+        plan.reasons.append("chromium-headless-shell: opens pages in the tests (64 MB)")
+    return plan
 
 
 def install(plan: AptPlan, log: Path) -> bool:

@@ -35,7 +35,7 @@ def pytest_runtest_makereport(
                 tail = log.read_text(errors="replace").splitlines()[-LOG_LINES:]
                 report.sections.append((f"{graph.folder.name}/{log.name}", "\n".join(tail)))
     if call.when == "teardown":
-        Graph.started.clear()
+        Graph.started[:] = [graph for graph in Graph.started if graph.running]
     return report
 
 

@@ -161,7 +161,7 @@ class Graph:
     own, with its own hash seed."""
 
     started: ClassVar[list["Graph"]] = []
-    """Of the running test; conftest prints the logs of a failed one."""
+    """Of the running test, or running still; conftest prints the logs of a failed one."""
 
     def __init__(self, domain: int, folder: Path, config: RunConfig | None = None, *, forks: bool = True) -> None:
         self.domain, self.folder = domain, folder
@@ -218,6 +218,10 @@ class Graph:
         self.start_policy(await_nodes=["environment", "reward_evaluator", "learner", *recorder])
         self.start_reward()
         self.start_learner(**learner)
+
+    @property
+    def running(self) -> bool:
+        return any(process.poll() is None for process in self.processes.values())
 
     def log_path(self, name: str) -> Path:
         return self.folder / f"{name.strip('/').replace('/', '_')}.log"

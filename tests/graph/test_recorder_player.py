@@ -69,7 +69,7 @@ class Peer:
         return future.result()
 
     def match(self) -> None:
-        """Spin for as long as a server may take to match a new client's reader (harness.MATCH_S)."""
+        """Spin for as long as the node may take to match what is new here (harness.MATCH_S)."""
         until = time.monotonic() + MATCH_S
         while time.monotonic() < until:
             self.executor.spin_once(timeout_sec=0.05)
@@ -132,6 +132,7 @@ def publish(peer: Peer, graph: Graph, *, pause_s: float = 0.0, stop: Callable[[]
     )
     for name, publisher in publishers.items():
         peer.wait(publisher.get_subscription_count, f"subscription of {name}")
+    peer.match()  # the recorder's side of it
     sent: Streams = {topic.name: [] for topic in TOPICS}
     for topic, message, _ in graph.published:
         if topic is topics.TRANSITION:

@@ -17,9 +17,12 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
+from wm_nodes.learning.clip_archive import read_clips
 from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.learning.video_grpo import GrpoLearner
 from wm_nodes.learning.video_run import CHECKPOINT, rewarded
+from wm_nodes.recording import recover
+from wm_nodes.ros.scenarios import VIDEO_TOPICS
 from wm_nodes.video_model.buffer import concatenate_buffers
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
@@ -233,6 +236,23 @@ def test_a_killed_learner_is_reported_and_goes_on_exactly_from_its_checkpoint(lo
     loop.start("video_learner")
     loop.wait_active("video_learner")
     loop.assert_undisturbed(loop.train(2))
+
+
+@pytest.mark.kills
+def test_a_killed_recorder_disturbs_no_training_and_records_again_beside_what_it_left(loop: VideoLoop) -> None:
+    topics = "[" + ",".join(VIDEO_TOPICS) + "]"
+    bags = loop.graph.folder / "bags"
+    awaited = Parameter("await_nodes", value=["recorder"]).to_parameter_msg()
+    loop.probe.call(SetParameters, "learner/set_parameters", SetParameters.Request(parameters=[awaited]))
+    for _ in range(2):
+        loop.probe.diagnostics.pop("/wm/recorder", None)
+        loop.graph.start("recorder", bag_uri="bags/run", topics=topics, min_free_mib=16)
+        wait_until("a recorder", lambda: loop.probe.value("/wm/recorder", "state") == "active", 60)
+        loop.assert_undisturbed(loop.train(1))
+        time.sleep(2.0)  # a kill may cost the recorder's last second
+        loop.graph.kill("/wm/recorder")
+    first, second = (list(read_clips(recover(bags / name).bag)) for name in ("run.partial", "run_1.partial"))
+    assert [clips.iteration + 1 for clips in first] == [clips.iteration for clips in second]
 
 
 def test_a_peer_that_is_stopped_ends_training_by_its_name(loop: VideoLoop) -> None:

@@ -7,7 +7,7 @@ from rl_toys import toy_policy
 
 from wm_nodes.learning.evaluation import EvaluationResult, evaluate
 from wm_nodes.learning.rollouts import Canceled
-from wm_nodes.learning.statistics import wilson_interval
+from wm_nodes.statistics import wilson_interval
 
 FIRST_SEED = 1_000_000
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wm_nodes.config.load import load_config
-from wm_nodes.job import kept
+from wm_nodes.config.load import ConfigError, dump_config, load_config
+from wm_nodes.job import kept, open_run_dir
 from wm_nodes.learning.metrics import MetricsWriter, join_metrics, read_metrics
 from wm_nodes.reports import Rate, Summary
 from wm_nodes.reports.tables import ROUND_COLUMNS, round_rows
@@ -65,3 +65,13 @@ def test_the_table_of_rounds_says_what_became_of_the_refreshed_model() -> None:
     assert len(rows[0]) == len(ROUND_COLUMNS)
     assert rows[0][-1] == "old one kept: worse: done recall" and rows[1][-1] == ""
     assert rows[0][4] == "25.0 % (1/4)"
+
+
+def test_a_run_goes_on_with_its_own_options_only(tmp_path: Path) -> None:
+    text, other = dump_config(load_config("smoke")), dump_config(load_config("smoke", {"seed": 1}))
+    run_dir = open_run_dir(tmp_path / "run", "name", text, from_scratch=True)
+    assert open_run_dir(run_dir, "name", text, from_scratch=True) == run_dir
+    for changed, from_scratch in ((other, True), (text, False)):
+        with pytest.raises(ConfigError, match="repeat its options or use a new folder"):
+            open_run_dir(run_dir, "name", changed, from_scratch=from_scratch)
+    assert load_config(str(run_dir / "config.yaml")) == load_config("smoke")

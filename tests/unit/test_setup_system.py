@@ -114,3 +114,9 @@ def test_without_root_the_commands_are_named_and_the_set_up_goes_on(
     assert "neither root nor sudo" in said or "no apt-get" in said
     assert "-t bookworm-backports mesa-vulkan-drivers" in said
     assert not (tmp_path / "log").exists()
+
+
+def test_a_browser_for_the_tests_is_asked_for_on_debian_where_there_is_none() -> None:
+    assert system.browser_plan(None, BOOKWORM).packages == ["chromium-headless-shell"]
+    assert system.browser_plan("/usr/bin/chromium", BOOKWORM).packages == []
+    assert system.browser_plan(None, NOBLE).packages == []  # a snap there, which does not see temporary folders

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from wm_nodes.learning.statistics import (
+from wm_nodes.statistics import (
     mcnemar_exact,
     newcombe_difference,
     paired_difference,

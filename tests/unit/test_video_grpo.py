@@ -592,14 +592,31 @@ def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(
 # refusals
 
 
-@pytest.mark.parametrize("rewards", [[math.nan] * 8, [0.7] * 8, [1.0] * 4 + [math.nan] * 3 + [2.0]])
-def test_a_buffer_from_which_nothing_can_be_learned_is_one_clear_error(rewards: list[float]) -> None:
+def test_a_group_with_too_few_valid_videos_trains_nothing_and_is_counted() -> None:
+    """Groups of six: the three valid ones of the first are enough, the two of the second are not."""
+    nan = math.nan
+    rewards = torch.tensor([0.1, nan, 0.5, nan, 0.9, nan, 0.2, nan, nan, nan, 0.8, nan])
+    learner, other = make(), make()
+    buffer = buffer_of(learner, size=6)
+    report = learner.train(buffer.with_rewards({"total": rewards}))
+    assert (report.invalid, report.dropped_groups, report.kept, report.zero_std_ratio) == (7, 1, 3, 0.5)
+    without = rewards.clone()
+    without[6:] = math.nan
+    assert other.train(buffer.with_rewards({"total": without})).dropped_groups == 1
+    assert_equal(weights(learner.model), weights(other.model))
+
+
+@pytest.mark.parametrize(
+    ("rewards", "few"), [([math.nan] * 8, 2), ([0.7] * 8, 0), ([1.0] * 4 + [math.nan] * 3 + [2.0], 1)]
+)
+def test_a_buffer_from_which_nothing_can_be_learned_is_one_clear_error(rewards: list[float], few: int) -> None:
     learner = make()
     buffer, before = buffer_of(learner).with_rewards({"total": torch.tensor(rewards)}), weights(learner.model)
     invalid = sum(math.isnan(reward) for reward in rewards)
     with pytest.raises(
-        ValueError, match=f"nothing to learn from: {invalid} of 8 rewards are invalid and 2 of 2 groups"
-    ):
+        ValueError,
+        match=f"{invalid} of 8 rewards are invalid, {few} of 2 groups have too few valid ones and {2 - few} no spread",
+    ):  # fmt: skip
         learner.train(buffer)
     assert_equal(before, weights(learner.model))
     assert learner.version == 0

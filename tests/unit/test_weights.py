@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import save
 from torch import nn
 
-from wm_nodes.learning.files import write_atomic
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.weights import (
     WeightsError,
     arch_hash,

@@ -21,14 +21,14 @@ from tqdm import tqdm
 
 from wm_nodes.config.load import ConfigError, dump_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.evaluation import evaluate
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.policies import load_policy, make_imagined_environment, models_of
-from wm_nodes.learning.statistics import wilson_interval
 from wm_nodes.reports import Rate
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.operator import Operator
 from wm_nodes.ros.runner import Runner
+from wm_nodes.statistics import wilson_interval
 from wm_nodes.types import BoolArray
 
 IMAGINED_EPISODES = 256
@@ -38,17 +38,21 @@ TRAINED = "trained.json"
 console = Console()
 
 
-def open_run_dir(given: Path | None, name: str, config_text: str) -> Path:
-    """Make the run folder (default: runs/<time>-<name>) and keep its configuration there.
+def open_run_dir(given: Path | None, name: str, config_text: str, *, from_scratch: bool = False) -> Path:
+    """Make the run folder (default: runs/<time>-<name>) and keep its configuration there, and as a comment whether the
+    run trains its own models: the one must not go on as the other.
 
     Raises:
         ConfigError: the folder was begun with another configuration.
     """
+    config_text += "# begun with --from-scratch\n" if from_scratch else ""
     run_dir = (given or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}").expanduser().absolute()
     run_dir.mkdir(parents=True, exist_ok=True)
     saved = run_dir / "config.yaml"
     if saved.exists() and saved.read_text() != config_text:
-        raise ConfigError(f"{run_dir} was begun with another configuration ({saved}); use its settings or a new folder")
+        raise ConfigError(
+            f"{run_dir} was begun with another configuration ({saved}); repeat its options or use a new folder"
+        )
     saved.write_text(config_text)
     return run_dir
 

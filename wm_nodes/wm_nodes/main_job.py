@@ -26,7 +26,6 @@ from wm_nodes.learning.pictures import write_pictures
 from wm_nodes.learning.policies import load_policy
 from wm_nodes.learning.preparation import prepare_start, start_files
 from wm_nodes.learning.pretraining import load_arrays, make_model
-from wm_nodes.learning.statistics import paired_difference
 from wm_nodes.reports import Summary, machine_facts, results_table, rounds_table, write_report, write_summary
 from wm_nodes.ros.domain import DomainInUseError
 from wm_nodes.ros.graph import GraphError
@@ -34,6 +33,7 @@ from wm_nodes.ros.operator import GoalFailed, PeerLost
 from wm_nodes.ros.readiness import NotReadyError
 from wm_nodes.ros.runner import NodeDiedError
 from wm_nodes.rounds import round_start, run_rounds
+from wm_nodes.statistics import paired_difference
 from wm_nodes.types import BoolArray
 from wm_nodes.world_model import load_model_folder
 
@@ -143,7 +143,10 @@ def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
     if arguments.rounds is not None:
         overrides["rounds.num_rounds"] = arguments.rounds
     config = load_config(arguments.preset, overrides)
-    return config, open_run_dir(arguments.run_dir, config.task, dump_config(config))
+    run_dir = open_run_dir(
+        arguments.run_dir, config.task, dump_config(config), from_scratch=arguments.from_scratch
+    )
+    return config, run_dir
 
 
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: Stages) -> Path:

@@ -17,6 +17,7 @@ from typing import Any
 from rich.table import Table
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.files import write_atomic
 from wm_nodes.job import (
     Job,
     Start,
@@ -28,7 +29,6 @@ from wm_nodes.job import (
     read_success,
     train_round,
 )
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.metrics import join_metrics
 from wm_nodes.learning.model_rounds import (
     Verdict,

@@ -28,11 +28,11 @@ from wm_nodes.learning.ppo import PpoLearner
 from wm_nodes.learning.preparation import prepare_start
 from wm_nodes.learning.pretraining import load_arrays
 from wm_nodes.learning.rollouts import collect_rollout, rollout_statistics
-from wm_nodes.learning.statistics import paired_difference, wilson_interval
 from wm_nodes.learning.weights import save_weights
 from wm_nodes.policy import ImagePolicy
 from wm_nodes.reports import machine_facts
 from wm_nodes.reward import RewardModel, RuleReward
+from wm_nodes.statistics import paired_difference, wilson_interval
 from wm_nodes.types import Environment
 
 ARMS = ("world_model", "simulator")

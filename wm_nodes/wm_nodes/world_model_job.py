@@ -20,18 +20,26 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.job import READY_S, Stages, console, open_run_dir
 from wm_nodes.learning.clip_scores import load_probe
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
-from wm_nodes.learning.video_config import VideoRlConfig, dump_video_config, load_video_config, video_preset_names
+from wm_nodes.learning.video_config import (
+    AGENT,
+    REWARDS,
+    VideoRlConfig,
+    dump_video_config,
+    load_video_config,
+    video_preset_names,
+)
 from wm_nodes.learning.video_data import load_clips
 from wm_nodes.learning.video_pretraining import make_video_model, shipped_video_model
 from wm_nodes.learning.video_run import progress
 from wm_nodes.reports import ClipSummary
+from wm_nodes.reward.judges.factory import check_judge
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.domain import DomainInUseError
 from wm_nodes.ros.graph import GraphError
 from wm_nodes.ros.operator import GoalFailed, Operator, PeerLost
 from wm_nodes.ros.readiness import NotReadyError
 from wm_nodes.ros.runner import NodeDiedError, Runner
-from wm_nodes.world_model_offline import recorded_bags, rescore_run, retrain_run
+from wm_nodes.world_model_offline import chosen_judge, recorded_bags, rescore_run, retrain_run
 from wm_nodes.world_model_results import Finished, conclude
 
 EXPECTED = (
@@ -128,8 +136,13 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
     overrides: dict[str, Any] = dict(parse_override(text) for text in arguments.set)
     if arguments.seed is not None:
         overrides["seed"] = arguments.seed
-    config = load_video_config(arguments.preset, overrides)
-    return config, open_run_dir(arguments.run_dir, "world_model_rl", dump_video_config(config))
+    config = load_video_config(arguments.preset, {**overrides, **chosen_judge(arguments)})
+    if config.rewards.get(AGENT):
+        check_judge(config.judge)
+    run_dir = open_run_dir(
+        arguments.run_dir, "world_model_rl", dump_video_config(config), from_scratch=arguments.from_scratch
+    )
+    return config, run_dir
 
 
 def _command() -> str:
@@ -154,15 +167,18 @@ def _parser() -> argparse.ArgumentParser:
         "--keep-buffers", type=int, default=4, metavar="N",
         help="rollout buffers kept on disk; as many as iterations if `retrain` shall be possible. Default: 4",
     )  # fmt: skip
+    _add_judge(parser)
     _add_tensorboard(parser)
     parser.add_argument("--domain-id", default="", help="ROS domain 0 to 101; default: $ROS_DOMAIN_ID, else 0")
     parser.add_argument("--verbose", action="store_true", help="show the nodes' logs (they are in <run>/logs anyway)")
     actions = parser.add_subparsers(dest="action", title="on a finished run, without a graph")
     again = actions.add_parser(
-        "rescore", help="score the recorded clips again and compare bit for bit; exit code 1 where they differ"
-    )
+        "rescore", help="score the recorded clips again and compare bit for bit; exit code 1 where they differ. With "
+        "--reward they may be scored by another reward than the recorded one"
+    )  # fmt: skip
     again.add_argument("run", type=Path, help="run folder whose bags hold the clips")
     again.add_argument("--json", type=Path, help="file for every score; default: <run>/rescored.json")
+    _add_judge(again)
     again = actions.add_parser(
         "retrain", help="train on the recorded clips and scores, without sampling: the same weights, file for file"
     )
@@ -174,6 +190,18 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     _add_tensorboard(again)
     return parser
+
+
+def _add_judge(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--reward", choices=REWARDS,
+        help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording. Default: what "
+        "the preset or the run weighs",
+    )  # fmt: skip
+    parser.add_argument("--judge", default="", metavar="URL[,URL]", help="the judge's servers, e.g. http://host:8000/v1")
+    parser.add_argument("--judge-model", default="", metavar="NAME", help="its name on the server")
+    parser.add_argument("--judge-key-env", default="", metavar="VARIABLE", help="environment variable with its key")
+    parser.add_argument("--rubric", default="", help="rubric pack: a name, or a .yaml file")
 
 
 def _add_tensorboard(parser: argparse.ArgumentParser) -> None:

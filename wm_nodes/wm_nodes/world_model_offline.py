@@ -2,25 +2,44 @@
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
+from torch import Tensor
 from tqdm import tqdm
 
-from wm_nodes.config.load import parse_override
+from wm_nodes.config.load import judge_overrides, parse_override
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.files import write_atomic
 from wm_nodes.job import Stages, console, open_run_dir
-from wm_nodes.learning.clip_archive import Rescored, read_clips, recorded_buffer, rescore, trained_clips
+from wm_nodes.learning.clip_archive import (
+    BufferJudge,
+    RecordedClips,
+    Rescored,
+    read_clips,
+    recorded_buffer,
+    rescore,
+    trained_clips,
+)
+from wm_nodes.learning.clip_judging import READS, ClipJudge, buffer_jobs, clip_fps
 from wm_nodes.learning.clip_scores import load_probe
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.heldout import heldout_scores
-from wm_nodes.learning.video_config import VideoRlConfig, dump_video_config, load_video_config
-from wm_nodes.learning.video_data import load_clips
+from wm_nodes.learning.video_config import (
+    AGENT,
+    VideoRlConfig,
+    dump_video_config,
+    load_video_config,
+    reward_overrides,
+)
+from wm_nodes.learning.video_data import Clips, load_clips
 from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.learning.video_run import VideoRun, progress
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.reports.summary import plain
+from wm_nodes.reward.agent import Verdict
 from wm_nodes.world_model_results import Finished, conclude
 
 RESCORED = "rescored.json"
@@ -28,20 +47,26 @@ RESCORED = "rescored.json"
 
 def rescore_run(arguments: argparse.Namespace) -> int:
     """Score every recorded picture again; 0 where all bits are the recorded ones, else 1."""
-    run_dir, config = _source(arguments.run)
+    run_dir, config = _source(arguments.run, chosen_judge(arguments))
     probe = load_probe(shipped_model(config.task))
-    contexts = load_clips(_shards(run_dir, "train"), config.model.stride)
-    rows = [
-        rescore(recorded, contexts, probe, config.rewards, config.model.num_conditioning)
-        for bag in recorded_bags(run_dir)
-        for recorded in read_clips(bag, pictures=True)
-    ]
+    bags = _shards(run_dir, "train")
+    contexts = load_clips(bags, config.model.stride)
+    with _judge(config, run_dir, clip_fps(bags[0], config.model.stride)) as judge:
+        clips = (recorded for bag in recorded_bags(run_dir) for recorded in read_clips(bag, pictures=True))
+        rows = [
+            rescore(recorded, contexts, probe, config.rewards, config.model.num_conditioning, judge)
+            for recorded in tqdm(clips, desc="rescoring", unit="buffer")
+        ]
     equal = all(not row.different for row in rows)
     content = {"equal": equal, "rewards": config.rewards, "buffers": [_row(row) for row in rows]}
     path = arguments.json or run_dir / RESCORED
     write_atomic(path, (json.dumps(plain(content), indent=1) + "\n").encode())
     console.print(_table(rows))
     words = "every score is the recorded one, bit for bit" if equal else "[bold red]scores differ from the bag's[/]"
+    if not all(row.same_reward for row in rows):
+        words += "; the total is by other rewards than recorded, so it is not compared"
+    if silent := sum(row.recorded.audit_ids.count("") for row in rows if row.verdicts):
+        words += f"; {silent} clips that got no answer then are not compared"
     console.print(f"{words}: {path}", highlight=False)
     return 0 if equal else 1
 
@@ -95,12 +120,35 @@ def recorded_bags(run_dir: Path) -> list[Path]:
     return bags
 
 
-def _source(run_dir: Path) -> tuple[Path, VideoRlConfig]:
+def chosen_judge(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The settings that the options --reward, --judge, --judge-model, --judge-key-env and --rubric stand for."""
+    words = (arguments.judge, arguments.judge_model, arguments.judge_key_env, arguments.rubric)
+    return {**reward_overrides(arguments.reward), **judge_overrides(*words)}
+
+
+@contextmanager
+def _judge(config: VideoRlConfig, run_dir: Path, fps: float) -> Iterator[BufferJudge | None]:
+    """The run's reward agent with the answers that it kept; None where it is not among the rewards."""
+    if not config.rewards.get(AGENT):
+        yield None
+        return
+
+    def verdicts(recorded: RecordedClips, frames: Tensor, references: Clips) -> list[Verdict]:
+        jobs = buffer_jobs(
+            frames, references, recorded.sha256, fps=fps, task=config.task, robot=config.judge.robot
+        )
+        return judge.judge(jobs)
+
+    with closing(ClipJudge(config.judge, seed=config.seed, reads=run_dir / READS)) as judge:
+        yield verdicts
+
+
+def _source(run_dir: Path, overrides: dict[str, Any] | None = None) -> tuple[Path, VideoRlConfig]:
     folder = run_dir.expanduser().absolute()
     saved = folder / "config.yaml"
     if not saved.is_file():
         raise ValueError(f"{folder} holds no config.yaml; name the run folder of a world_model_rl.py")
-    return folder, load_video_config(str(saved))
+    return folder, load_video_config(str(saved), overrides)
 
 
 def _shards(run_dir: Path, name: str) -> list[Path]:
@@ -115,6 +163,10 @@ def _row(row: Rescored) -> dict[str, object]:
     return {
         "iteration": recorded.iteration, "policy_version": recorded.policy_version, "sha256": recorded.sha256,
         "recorded": recorded.total.tolist(), "again": row.total.tolist(), "different": list(row.different),
+        "verdicts": [
+            {name: getattr(verdict, name) for name in ("clip_id", "status", "reward", "level", "reason", "audit_id")}
+            for verdict in row.verdicts
+        ],
     }  # fmt: skip
 
 

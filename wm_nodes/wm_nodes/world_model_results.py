@@ -13,7 +13,6 @@ from wm_nodes.learning.clip_generation import ClipGenerator
 from wm_nodes.learning.clip_scores import more_is_better
 from wm_nodes.learning.heldout import SECTION, alarm_text, alarms_of, kept_scores
 from wm_nodes.learning.metrics import FILE_NAME, read_metrics
-from wm_nodes.learning.statistics import bootstrap_mean
 from wm_nodes.learning.video_config import VideoRlConfig, dump_video_config
 from wm_nodes.learning.video_data import Clips
 from wm_nodes.learning.video_folder import load_video_folder
@@ -33,6 +32,7 @@ from wm_nodes.reports import (
     write_clip_summary,
 )
 from wm_nodes.reports.clip_report import TITLES
+from wm_nodes.statistics import bootstrap_mean
 from wm_nodes.world_model.position_probe import PositionProbe
 
 AFTER = Path("evaluations") / "after.json"

@@ -18,11 +18,11 @@ from wm_nodes.learning.clip_generation import ClipGenerator, GroupRequest
 from wm_nodes.learning.clip_scores import SEEN_MOTION, mixed, score_clips
 from wm_nodes.learning.frame_features import FrameFeatures
 from wm_nodes.learning.rollout_evaluation import OBJECT
-from wm_nodes.learning.statistics import bootstrap_mean
 from wm_nodes.learning.video_config import VideoRlConfig
 from wm_nodes.learning.video_data import Clips
 from wm_nodes.learning.video_folder import VideoFolder
 from wm_nodes.rl.diversity import rollout_diversity
+from wm_nodes.statistics import bootstrap_mean
 from wm_nodes.world_model.position_probe import PositionProbe
 
 MARGIN_PX = 4

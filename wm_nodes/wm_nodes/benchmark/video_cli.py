@@ -35,8 +35,8 @@ from wm_nodes.benchmark.video_tables import (
 )
 from wm_nodes.benchmark.video_trials import Trial, ablation_trials, hacking_trials
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.clip_scores import load_probe
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.frame_features import (
     CentredPixels,
     FrameFeatures,

@@ -12,8 +12,8 @@ from torch import Tensor
 from wm_nodes.benchmark.moving_disc import draw_scenes, opacity_at
 from wm_nodes.benchmark.video_arms import Arm
 from wm_nodes.benchmark.video_learning import sample_groups
-from wm_nodes.learning.statistics import bootstrap_mean
 from wm_nodes.rl.diversity import rollout_diversity
+from wm_nodes.statistics import bootstrap_mean
 from wm_nodes.video_model import VideoNetwork
 
 FEATURES = "centred pixels (each frame less its mean), no learned backbone"

@@ -9,9 +9,9 @@ import numpy as np
 
 from wm_nodes.benchmark.video_comparison import value
 from wm_nodes.benchmark.video_learning import alarms
-from wm_nodes.learning.files import write_atomic
-from wm_nodes.learning.statistics import bootstrap_mean
+from wm_nodes.files import write_atomic
 from wm_nodes.reports.curves import COLOURS
+from wm_nodes.statistics import bootstrap_mean
 
 FAMILIES = {"CPS": "o", "DynDiff literal": "v", "DynDiff gated, rms": "s", "DynDiff sparse, rms": "D"}
 """Samplers that share a colour, with the marker of their points."""
@@ -21,9 +21,10 @@ CURVE_SEEDS = 5
 
 def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> None:
     """Diversity (19) with its 95 % interval against the noise an arm spends; the two regimes of initial noise."""
-    figure = _figure(10.5, 4.2)
+    figure = figure_of(10.5, 4.2)
     for axes, shared in zip(figure.subplots(1, 2, sharey=True), (False, True), strict=True):
-        _style(axes, f"{'shared' if shared else 'own'} initial noise", "noise spent, rms(std) / s", "diversity (19)")
+        whose = "shared" if shared else "own"
+        style_axes(axes, f"{whose} initial noise", "noise spent, rms(std) / s", "diversity (19)")
         for (family, marker), colour in zip(FAMILIES.items(), COLOURS, strict=True):
             points = sorted(
                 (row["noise_share"], *bootstrap_mean(row["diversity"], seed=seed))
@@ -40,17 +41,17 @@ def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> Non
         if ode:
             axes.axhline(ode[0], color="gray", linewidth=1, linestyle=":", label="ODE")
         axes.legend(fontsize=8, frameon=False, loc="lower right")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Held-out reward above the base model's over the buffers, mean with standard error over seeds, and every arm's
     mean over its training, by seed.
     """
-    figure = _figure(12.0, 4.8)
+    figure = figure_of(12.0, 4.8)
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
     arms = sorted({row["arm"] for row in rows}, key=lambda arm: np.mean(_gains(rows, arm)))
-    _style(left, f"arms with {CURVE_SEEDS} seeds or more", "buffers", "held-out reward above the base model's")
+    style_axes(left, f"arms with {CURVE_SEEDS} seeds or more", "buffers", "held-out reward above the base model's")
     shown = [arm for arm in arms if len(_gains(rows, arm)) >= CURVE_SEEDS]
     colours = dict(zip(shown, (*COLOURS, "#444444", "#c2a000", "#1fa0b0", "#b04080"), strict=False))
     for arm in shown:
@@ -63,24 +64,24 @@ def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
         left.fill_between(x, mean - error, mean + error, color=colour, alpha=0.12, linewidth=0)
     if shown:
         left.legend(fontsize=7.5, frameon=False, loc="upper left")
-    _style(right, "mean over a training; a dot per seed", "held-out reward above the base model's", "")
+    style_axes(right, "mean over a training; a dot per seed", "held-out reward above the base model's", "")
     for place, arm in enumerate(arms):
         values = _gains(rows, arm)
         right.plot(values, [place] * len(values), ".", color=colours.get(arm, "gray"), alpha=0.5, markersize=7)
         right.plot(np.mean(values), place, "|", color="black", markersize=13, markeredgewidth=1.8)
     right.set_yticks(range(len(arms)), arms, fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """The reward that trains beside the truths held out of it, a panel per trial; mean over seeds, thin lines each."""
-    figure = _figure(12.0, 4.0)
+    figure = figure_of(12.0, 4.0)
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     truths = {"obeyed": COLOURS[0], "mass": COLOURS[1]}
     for axes, arm in zip(np.atleast_1d(figure.subplots(1, len(arms), sharey=True)), arms, strict=True):
         mine = [row for row in rows if row["arm"] == arm]
         proxy, fired = mine[0]["plan"]["proxy"], sum(bool(alarms(row)) for row in mine)
-        _style(axes, f"{arm}: alarm in {fired} of {len(mine)} runs", "buffers", "held-out scenes")
+        style_axes(axes, f"{arm}: alarm in {fired} of {len(mine)} runs", "buffers", "held-out scenes")
         for name, colour in {proxy: COLOURS[2], **truths}.items():
             for row in mine:
                 x, y = zip(*((point["iteration"], point[name]) for point in row["evaluations"]), strict=True)
@@ -90,7 +91,7 @@ def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
             axes.plot(x, mean, color=colour, linewidth=2, linestyle="-" if name == proxy else "--", label=label)
         axes.set_ylim(bottom=0)
         axes.legend(fontsize=8, frameon=False, loc="lower left")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def family_of(arm: str) -> str:
@@ -105,13 +106,15 @@ def _gains(rows: Sequence[dict[str, Any]], arm: str) -> list[float]:
     return [value(row, "reward_path") - row["evaluations"][0]["reward"] for row in rows if row["arm"] == arm]
 
 
-def _figure(width: float, height: float) -> Any:
+def figure_of(width: float, height: float) -> Any:
+    """An empty figure, inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), dpi=80, layout="constrained", facecolor="white")
 
 
-def _style(axes: Any, title: str, x: str, y: str) -> None:
+def style_axes(axes: Any, title: str, x: str, y: str) -> None:
+    """Title, labels, a light grid."""
     axes.set_title(title, fontsize=10, loc="left")
     axes.set_xlabel(x, fontsize=8)
     axes.set_ylabel(y, fontsize=8)
@@ -120,7 +123,8 @@ def _style(axes: Any, title: str, x: str, y: str) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _save(figure: Any, path: Path) -> None:
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a PNG, whole or not at all."""
     png = io.BytesIO()
     figure.savefig(png, format="png")
     write_atomic(path, png.getvalue())

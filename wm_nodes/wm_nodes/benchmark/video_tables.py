@@ -8,7 +8,7 @@ from rich.table import Table
 
 from wm_nodes.benchmark.video_comparison import MEASURES, Comparison, Difference
 from wm_nodes.benchmark.video_learning import alarms
-from wm_nodes.learning.statistics import bootstrap_mean
+from wm_nodes.statistics import bootstrap_mean
 
 LAST_UPDATE = ("noise_share", "clip_low_share_2", "clip_high_share_2", "kl_2")
 

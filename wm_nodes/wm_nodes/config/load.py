@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from pydantic import ValidationError
 
-from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.schema import JudgeConfig, RunConfig
 
 PRESETS = "presets"
 TASK_PREFIX = "task_"
@@ -45,6 +45,23 @@ def load_config(preset: str = "cpu", overrides: dict[str, Any] | None = None) ->
         return RunConfig.model_validate(values)
     except ValidationError as error:
         raise refusal(error, "wm_nodes/config/schema.py") from None
+
+
+def default_judge() -> JudgeConfig:
+    """The judge's settings of base.yaml, which loop 2 has too (learning/video_config.py)."""
+    return JudgeConfig.model_validate(read_preset("base")["judge"])
+
+
+def judge_overrides(endpoints: str = "", model: str = "", api_key_env: str = "", rubric: str = "") -> dict[str, Any]:
+    """The dotted settings that a user's words for the judge stand for; empty words stand for none.
+
+    Args:
+        endpoints: base URLs, separated by commas. rubric: a pack's name, or a file, from then on by its full path.
+    """
+    urls = [url.strip() for url in endpoints.split(",") if url.strip()]
+    pack = str(Path(rubric).absolute()) if rubric and Path(rubric).is_file() else rubric
+    found = {"endpoints": urls, "model": model, "api_key_env": api_key_env, "rubric": pack}
+    return {f"judge.{name}": value for name, value in found.items() if value}
 
 
 def dump_config(config: RunConfig) -> str:

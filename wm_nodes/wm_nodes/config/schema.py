@@ -110,6 +110,47 @@ class RewardConfig(Section):
     """An imagined step above it pays no sparse reward and truncates the episode; 0: off."""
 
 
+class JudgeConfig(Section):
+    """The reward agent: who judges, by which rubric, and how much it may take (reward/agent, reward/judges)."""
+
+    kind: Literal["openai", "embedded"]
+    """openai: a server that speaks chat completions, such as vLLM; embedded: a judge in this process, from `folder`."""
+    endpoints: list[str]
+    """openai: base URLs with their /v1, in the order in which they are tried; all serve `model`."""
+    model: str
+    """openai: the model's name on the server."""
+    api_key_env: str
+    """openai: name of the environment variable that holds the key; empty: the server wants none."""
+    folder: str
+    """embedded: folder of the trained judge."""
+    rubric: str
+    """Rubric pack: a name, or a .yaml file."""
+    mode: Literal["reward", "benchmark"]
+    """reward: a closed gate ends the reading of a clip; benchmark: every component is read."""
+    call_plan: Literal["auto", "pack", "fanout"]
+    """One call per stage (pack) or per component (fanout); auto: by the measured cache, not repeatable bit by bit."""
+    robot: str
+    """What the judge is told about the robot."""
+    concurrency: PositiveInt
+    """Clips judged at the same time."""
+    max_in_flight: PositiveInt
+    """Calls under way at one endpoint; halved when it is overloaded."""
+    max_reads: PositiveInt
+    """Of one clip, votes and second looks included."""
+    clip_budget_s: PositiveFloat
+    """A clip without a verdict after this time has no reward."""
+    tries: PositiveInt
+    """Requests per call, over all endpoints."""
+    json_timeout_s: PositiveFloat
+    label_timeout_s: PositiveFloat
+    """Of one try: an answer with reasons, and one of a single token."""
+    max_images: Annotated[int, Field(ge=2)]
+    """Images that the server takes in one call."""
+    keep_reads: bool
+    """Keep every answer in <run>/judge_reads, by content: the same clip is not asked about twice, and scoring a bag
+    again gives the same verdicts."""
+
+
 class PolicyConfig(Section):
     width: PositiveInt
     depth: PositiveInt
@@ -199,6 +240,7 @@ class RunConfig(Section):
     tokenizer: TokenizerConfig
     world_model: WorldModelConfig
     reward: RewardConfig
+    judge: JudgeConfig
     policy: PolicyConfig
     sft: SftConfig
     ppo: PpoConfig

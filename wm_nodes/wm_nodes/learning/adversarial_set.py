@@ -3,7 +3,11 @@
 A folder holds manifest.jsonl and one compressed .npz per clip (frames, masks, fps), named by its hash. The manifest is
 written last: a folder without one is unfinished. Equal arguments give equal bytes.
 
-    python -m wm_nodes.learning.adversarial_set FOLDER --tasks push_cube --episodes 8
+    python3 launch_scripts/make_adversarial_set.py FOLDER --tasks push_cube --episodes 8
+    python3 launch_scripts/make_adversarial_set.py FOLDER --benchmark
+
+--benchmark is the set that judges are compared on: three tasks, shapes that no judge was trained on, and seeds of its
+own; its test split is fixed by the manifest (benchmark_clips.chosen_rows) and has 400 clips or more.
 """
 
 import argparse
@@ -12,8 +16,8 @@ import sys
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +25,7 @@ from tqdm import tqdm
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import SimulationConfig
-from wm_nodes.learning.files import write_atomic
+from wm_nodes.files import write_atomic
 from wm_nodes.reward.adversarial import (
     Division,
     LabelledClip,
@@ -64,12 +68,18 @@ BEHAVIOURS = {"push_cube": PUSHING, "pull_cube": PUSHING, "reach": {"hover": 0.6
 HELD_OUT = Division(tasks=("pull_cube",), cameras=("near_high",), objects=("cube/purple",), scenes=("moss",))
 HELD_OUT_SHARE = 0.12
 """Of the episodes, for each held-out camera, object and scene; two thirds of a trained task's are none of them."""
+SHAPES = {"cube": 1.0, "post": 1.7, "slab": 0.7}
+"""Height of a box over that of the cube. The footprint is the cube's, so the recorded contacts are the shape's own,
+as long as the tool stays below its top or beside it: STEADY behaviours only.
+"""
+STEADY = ("expert", "short", "near_miss")
 
 
 @dataclass(frozen=True)
 class SetPlan:
     """tasks: in turn. num_episodes: recorded ones, each seen by one camera. edits_per_clip: (recipe, severity) pairs
     that are tried on each, None for all. seed: episode i is reset with seed + i; look and recipes follow from it.
+    shapes: besides the cube; rare, and test clips only. Not in "reach", whose end state depends on the height.
     """
 
     tasks: tuple[str, ...] = ("push_cube",)
@@ -77,10 +87,23 @@ class SetPlan:
     edits_per_clip: int | None = None
     seed: int = 0
     division: Division = HELD_OUT
+    shapes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.num_episodes < 1 or (self.edits_per_clip is not None and self.edits_per_clip < 0):
             raise ValueError(f"need at least 1 episode and 0 edits, got {self.num_episodes} and {self.edits_per_clip}")
+        if foreign := sorted(set(self.shapes) - set(SHAPES)):
+            raise ValueError(f"unknown shapes {foreign}; choose among {', '.join(SHAPES)}")
+
+    @property
+    def held_out(self) -> Division:
+        """The division with every object of another shape held out."""
+        objects = (f"{shape}/{colour}" for shape in self.shapes if shape != "cube" for colour in OBJECT_COLOURS)
+        return replace(self.division, objects=(*self.division.objects, *objects))
+
+
+BENCHMARK = SetPlan(("push_cube", "reach", "pull_cube"), 20, 26, 9000, shapes=("post", "slab"))
+"""The set that judges are compared on. Train on other seeds."""
 
 
 class ClipSource:
@@ -90,25 +113,21 @@ class ClipSource:
         NoRendererError: Vulkan finds no device.
     """
 
-    def __init__(self, task: str, config: SimulationConfig) -> None:
+    def __init__(self, task: str, config: SimulationConfig, shapes: Collection[str] = ()) -> None:
         self._task = task
+        self._shapes = shapes
         self._config = config
         self._env = ManiSkillEnvironment(task, config.model_copy(update={"image_size": 16}), end_on_success=False)
         self.stage = ClipStage(task, config.model_copy(update={"image_size": SIDE_PX}))
 
     def origin(self, seed: int) -> Origin:
-        """Behaviour, camera and colours, drawn by `seed`."""
-        rng = numpy_stream(seed, f"adversarial_origin/{self._task}")
-        behaviours = BEHAVIOURS[self._task]
-        behaviour = str(rng.choice(list(behaviours), p=list(behaviours.values())))
-        things = [f"cube/{colour}" for colour in OBJECT_COLOURS]
-        camera, thing = _pick(rng, list(CAMERAS), HELD_OUT.cameras), _pick(rng, things, HELD_OUT.objects)
-        return Origin(self._task, camera, thing, _pick(rng, list(TABLES), HELD_OUT.scenes), seed, behaviour)
+        return drawn_origin(self._task, seed, self._shapes)
 
     def clip(self, seed: int) -> LabelledClip:
         """Record one episode and draw it."""
         origin = self.origin(seed)
-        return recorded(self._drawn(scene_states(record_states(self._env, origin.behaviour, seed)), origin))
+        height = SHAPES[origin.object_id.split("/")[0]]
+        return recorded(self._drawn(scene_states(record_states(self._env, origin.behaviour, seed), height), origin))
 
     def redraw(self, parent: LabelledClip, edit: StateEdit) -> LabelledClip:
         return rendered(parent, edit, self._drawn(edit.states, parent.clip.origin))
@@ -126,8 +145,22 @@ class ClipSource:
         )  # fmt: skip
         return SourceClip(
             drawing.frames, drawing.masks, drawing.tracks, states, origin,
-            get_task(self._task).instruction.replace("blue", colour), self._config.control_hz,
+            instruction_of(origin), self._config.control_hz,
         )  # fmt: skip
+
+
+def drawn_origin(task: str, seed: int, shapes: Collection[str] = ()) -> Origin:
+    """Behaviour, camera and colours of an episode, drawn by `seed`. shapes: see SetPlan."""
+    rng = numpy_stream(seed, f"adversarial_origin/{task}")
+    behaviours = BEHAVIOURS[task]
+    behaviour = str(rng.choice(list(behaviours), p=list(behaviours.values())))
+    things = [f"cube/{colour}" for colour in OBJECT_COLOURS]
+    camera, thing = _pick(rng, list(CAMERAS), HELD_OUT.cameras), _pick(rng, things, HELD_OUT.objects)
+    others = [shape for shape in SHAPES if shape in shapes and shape != "cube" and task != "reach"]
+    if others and behaviour in STEADY:  # drawn apart, so that everything else is as without them
+        apart = numpy_stream(seed, f"adversarial_shape/{task}")
+        thing = thing.replace("cube", _pick(apart, ["cube", *others], others))
+    return Origin(task, camera, thing, _pick(rng, list(TABLES), HELD_OUT.scenes), seed, behaviour)
 
 
 def _pick(rng: np.random.Generator, values: Sequence[str], rare: Sequence[str]) -> str:
@@ -136,12 +169,21 @@ def _pick(rng: np.random.Generator, values: Sequence[str], rare: Sequence[str]) 
     return str(rng.choice(list(values), p=[HELD_OUT_SHARE if value in rare else common for value in values]))
 
 
-def scene_states(states: EpisodeStates) -> SceneStates:
-    """An episode of the cube in the benchmark's words."""
+def instruction_of(origin: Origin) -> str:
+    """The task's instruction with the object's colour in place of blue, and its shape in place of the cube."""
+    shape, _, colour = origin.object_id.partition("/")
+    return get_task(origin.task).instruction.replace("blue", colour).replace("cube", shape)
+
+
+def scene_states(states: EpisodeStates, height: float = 1.0) -> SceneStates:
+    """An episode of the cube in the benchmark's words. height: of the box in its place, over the cube's."""
     num_frames = len(states.poses)
+    half_sizes_m, poses = cube_half_sizes(1)[0], states.poses.copy()
+    poses[..., 2] += (np.float32(height) - 1) * half_sizes_m[0, 2]  # it stands on the same table
+    half_sizes_m[0, 2] *= np.float32(height)
     return SceneStates(
-        states.robot_q, states.tool, states.gripper_m, states.poses, np.ones((num_frames, 1, 3), np.float32),
-        cube_half_sizes(1)[0], states.contact, states.goal,
+        states.robot_q, states.tool, states.gripper_m, poses, np.ones((num_frames, 1, 3), np.float32), half_sizes_m,
+        states.contact, states.goal,
     )  # fmt: skip
 
 
@@ -160,7 +202,7 @@ def build(
 
     def kept() -> Iterator[LabelledClip]:
         for task in plan.tasks:
-            source = ClipSource(task, config)
+            source = ClipSource(task, config, plan.shapes)
             try:
                 for seed in tqdm(range(plan.seed, plan.seed + plan.num_episodes), desc=task, disable=not progress):
                     parent = source.clip(seed)
@@ -171,7 +213,7 @@ def build(
             finally:
                 source.close()
 
-    manifest = manifest_of(kept(), plan.division)
+    manifest = manifest_of(kept(), plan.held_out)
     write_atomic(folder / MANIFEST, to_bytes(manifest))
     return manifest, skipped
 
@@ -233,19 +275,27 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--episodes", type=int, default=8, help="recorded episodes per task")
     parser.add_argument("--edits", type=int, help="edits tried on each; all by default")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--shapes", nargs="+", choices=sorted(SHAPES), default=[], help="besides the cube, held out")
+    parser.add_argument("--benchmark", action="store_true", help="the set that judges are compared on; nothing else")
     parser.add_argument("--check", action="store_true", help="build nothing, verify the set that is there")
     arguments = parser.parse_args(argv)
     try:
         if arguments.check:
             manifest, skipped = check_set(arguments.folder), Counter[str]()
         else:
-            plan = SetPlan(tuple(arguments.tasks), arguments.episodes, arguments.edits, arguments.seed)
+            shapes = tuple(arguments.shapes)
+            plan = SetPlan(
+                tuple(arguments.tasks), arguments.episodes, arguments.edits, arguments.seed, shapes=shapes
+            )  # fmt: skip
+            plan = BENCHMARK if arguments.benchmark else plan
             manifest, skipped = build(arguments.folder, plan, load_config("cpu").simulation)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     splits = Counter(row.split for row in manifest.rows)
+    parts = Counter(row.part for row in manifest.rows)
     print(f"{len(manifest.rows)} clips in {arguments.folder}: " + ", ".join(f"{n} {s}" for s, n in splits.items()))
+    print(", ".join(f"{count} {part}" for part, count in sorted(parts.items())))
     print(f"{'label':16} {'pass':>6} {'fail':>6} {'unknown':>8}  fails")
     for name, found in manifest.prevalence["all"].items():
         share = found["fail"] / max(1, found["pass"] + found["fail"])

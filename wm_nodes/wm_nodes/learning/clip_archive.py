@@ -4,8 +4,9 @@ Shapes: N clips of a buffer, F frames, H W 3 image.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from wm_nodes.learning.clip_judging import agent_scores
 from wm_nodes.learning.clip_scores import mixed, score_clips
+from wm_nodes.learning.video_config import AGENT
 from wm_nodes.learning.video_data import Clips
 from wm_nodes.learning.video_run import rewarded
 from wm_nodes.recording import Bag, BagError, topics
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.messages import stamp_ns
+from wm_nodes.reward.agent import Verdict
 from wm_nodes.types import UInt8Array
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -28,6 +32,8 @@ from wm_nodes.world_model.position_probe import PositionProbe
 class RecordedClips:
     """One ClipBatch with its ClipScores. contexts: rows of the context bags' clips, one per clip (N,). scores, total:
     float64 (N,), NaN where missing. valid: bool (N,). picture: uint8 (N H, F W, 3), or None where not asked for.
+    weights: of the scores in the total. audit_ids: of the agent's verdicts (N,), "" where no answer came; () where it
+    was not asked.
     """
 
     iteration: int
@@ -40,6 +46,8 @@ class RecordedClips:
     total: Tensor
     valid: Tensor
     picture: UInt8Array | None
+    weights: Mapping[str, float] = field(default_factory=dict)
+    audit_ids: tuple[str, ...] = ()
 
     def frames(self, height: int, width: int) -> Tensor:
         """The clips, uint8 (N, F, H, W, 3), cut out of the picture.
@@ -61,11 +69,20 @@ class RecordedClips:
 
 @dataclass(frozen=True)
 class Rescored:
-    """A buffer scored again. different: names of scores, `total` or `valid`, whose bits are not the recorded ones."""
+    """A buffer scored again. different: names of scores, `total`, `valid` or `verdicts` whose bits are not the recorded
+    ones. same_reward: the total was recorded by the same rewards; else it is not compared. verdicts: the agent's, if it
+    was asked; a clip that got no answer then is not compared.
+    """
 
     recorded: RecordedClips
     total: Tensor
     different: tuple[str, ...]
+    same_reward: bool = True
+    verdicts: tuple[Verdict, ...] = ()
+
+
+BufferJudge = Callable[[RecordedClips, Tensor, Clips], Sequence[Verdict]]
+"""The agent's verdicts on a buffer's clips, uint8 (N, F, H, W, 3), given the recordings of their contexts."""
 
 
 def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
@@ -78,6 +95,7 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
     rows = {topics.absolute(topics.DEFAULT_NAMESPACE, topic): topic for topic in wanted}
     with Bag(bag) as opened:
         opened.check_types()
+        verdicts = _verdicts(opened)
         for name in rows:
             if not opened.count(name):
                 raise BagError(f"bag {bag} has no message on {name}; name a run of world_model_rl.py that was recorded")
@@ -85,21 +103,28 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
         for name, _, data in opened.messages(list(rows)):
             topic, message = rows[name], opened.decode(data, rows[name].msgtype)
             if topic is topics.CLIP_IMAGES:
-                picture = np.asarray(message.data).reshape(message.height, message.width, 3)
-                shown[stamp_ns(message.header.stamp)] = picture
+                shown[stamp_ns(message.header.stamp)] = np.asarray(message.data).reshape(
+                    message.height, message.width, 3
+                )
             elif topic is topics.CLIPS:
                 clips[message.sha256] = message
             elif (batch := clips.pop(message.buffer_sha256, None)) is not None:
-                yield _joined(batch, message, shown.pop(stamp_ns(batch.header.stamp), None))
+                picture = shown.pop(stamp_ns(batch.header.stamp), None)
+                yield _joined(batch, message, picture, _audit_ids(verdicts, message))
 
 
 def rescore(
-    recorded: RecordedClips, contexts: Clips, probe: PositionProbe, rewards: Mapping[str, float], num_conditioning: int
-) -> Rescored:
+    recorded: RecordedClips, contexts: Clips, probe: PositionProbe, rewards: Mapping[str, float], num_conditioning: int,
+    judge: BufferJudge | None = None,
+) -> Rescored:  # fmt: skip
     """Score the pictures against the recordings of their contexts and compare with the recorded scores, bit for bit.
 
+    Args:
+        rewards: weights of the total; where other scores are weighed than were recorded, the total is not compared.
+        judge: asked where the agent is among the rewards.
+
     Raises:
-        BagError: no picture, or scores that are not made from recordings, e.g. a judge's.
+        BagError: no picture, or scores that nobody can give again.
         ValueError: a context that the bags do not hold.
     """
     if int(recorded.contexts.max()) >= len(contexts):
@@ -110,15 +135,26 @@ def rescore(
     references = contexts.select(recorded.contexts)
     frames = recorded.frames(*references.frames.shape[2:4])
     found = score_clips(frames, references, probe, num_conditioning).named()
-    foreign = sorted(set(recorded.scores) - set(found))
+    foreign, verdicts = sorted(set(recorded.scores) - set(found) - {AGENT}), tuple[Verdict, ...]()
+    if judge is not None and rewards.get(AGENT):
+        verdicts = tuple(judge(recorded, frames, references))
+        found |= agent_scores(verdicts)
     if foreign:
         raise BagError(f"{', '.join(foreign)} cannot be scored again from pictures; only {', '.join(found)} can")
     total = mixed(found, rewards)
     valid = torch.isfinite(total)
     total = torch.where(valid, total, torch.nan)
-    pairs = {name: (values, found[name].double()) for name, values in recorded.scores.items()}
-    pairs |= {"total": (recorded.total, total), "valid": (recorded.valid, valid)}
-    return Rescored(recorded, total, tuple(name for name, pair in pairs.items() if not _bit_equal(*pair)))
+    same_reward = _weighed(recorded.weights) == _weighed(rewards)
+    pairs = {name: (values, found[name].double()) for name, values in recorded.scores.items() if name in found}
+    if same_reward:
+        pairs |= {"total": (recorded.total, total), "valid": (recorded.valid, valid)}
+    ids, answered = recorded.audit_ids, torch.ones(len(total), dtype=torch.bool)
+    if verdicts and ids:
+        answered = torch.tensor([bool(audit_id) for audit_id in ids])
+    different = [name for name, (old, new) in pairs.items() if not _bit_equal(old[answered], new[answered])]
+    if any(old and old != verdict.audit_id for old, verdict in zip(ids, verdicts)):
+        different.append("verdicts")
+    return Rescored(recorded, total, tuple(different), same_reward, verdicts)
 
 
 def recorded_buffer(
@@ -162,7 +198,32 @@ def trained_clips(bags: Sequence[Path], iterations: int) -> list[RecordedClips]:
     return [found[iteration] for iteration in range(iterations)]
 
 
-def _joined(batch: Any, scores: Any, picture: UInt8Array | None) -> RecordedClips:
+def _verdicts(bag: Bag) -> dict[tuple[str, int], list[tuple[int, str]]]:
+    """(stamp in ns, audit id) of every verdict on a clip (sha256 of its buffer, row), in the order of their stamps; the
+    id is "" where no answer came."""
+    found = defaultdict[tuple[str, int], list[tuple[int, str]]](list)
+    name = topics.absolute(topics.DEFAULT_NAMESPACE, topics.VERDICT)
+    for _, _, data in bag.messages([name]) if bag.count(name) else ():
+        message = bag.decode(data, topics.VERDICT.msgtype)
+        audit_id = "" if message.status == message.ERROR else str(message.audit_id)
+        found[message.buffer_sha256, int(message.clip)].append((stamp_ns(message.header.stamp), audit_id))
+    return {key: sorted(values) for key, values in found.items()}
+
+
+def _audit_ids(verdicts: Mapping[tuple[str, int], list[tuple[int, str]]], scores: Any) -> tuple[str, ...]:
+    """Of the verdicts behind a ClipScores: on each clip the newest one before it. Empty where one is missing."""
+    until, ids = stamp_ns(scores.header.stamp), list[str]()
+    for clip in range(int(scores.num_clips)):
+        before = [audit_id for stamp, audit_id in verdicts.get((scores.buffer_sha256, clip), ()) if stamp <= until]
+        ids += before[-1:]
+    return tuple(ids) if len(ids) == int(scores.num_clips) else ()
+
+
+def _weighed(weights: Mapping[str, float]) -> set[str]:
+    return {name for name, weight in weights.items() if weight}
+
+
+def _joined(batch: Any, scores: Any, picture: UInt8Array | None, audit_ids: tuple[str, ...]) -> RecordedClips:
     count = int(scores.num_clips)
     values = torch.from_numpy(np.array(scores.values, np.float64)).view(len(scores.names), count)
     valid = torch.from_numpy(np.array(scores.valid, np.uint8)).bool()
@@ -171,7 +232,7 @@ def _joined(batch: Any, scores: Any, picture: UInt8Array | None) -> RecordedClip
     return RecordedClips(
         int(batch.iteration), int(batch.policy_version), contexts, int(batch.num_frames), batch.buffer_uri,
         batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), valid,
-        picture,
+        picture, dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
     )  # fmt: skip
 
 

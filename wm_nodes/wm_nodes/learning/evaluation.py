@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from wm_nodes.learning.rollouts import Canceled
-from wm_nodes.learning.statistics import wilson_interval
 from wm_nodes.policy import ImagePolicy
 from wm_nodes.seeding import torch_stream
+from wm_nodes.statistics import wilson_interval
 from wm_nodes.types import BoolArray, Environment, UInt64Array
 
 

@@ -15,7 +15,7 @@ from rich.table import Table
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning.episode_arrays import EpisodeArrays
 from wm_nodes.learning.rollout_evaluation import MOVED_M, evaluate_rollouts
-from wm_nodes.learning.statistics import newcombe_difference
+from wm_nodes.statistics import newcombe_difference
 from wm_nodes.world_model import WorldModels
 
 CONTACT_FREE = ("reach",)

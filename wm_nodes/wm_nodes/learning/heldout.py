@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.clip_generation import ClipGenerator
 from wm_nodes.learning.clip_scores import ClipScores, load_probe, mixed, more_is_better, score_clips
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.video_config import VideoRlConfig
 from wm_nodes.learning.video_data import Clips, load_clips
 from wm_nodes.learning.video_folder import VideoFolder

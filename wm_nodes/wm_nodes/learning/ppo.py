@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.schema import PpoConfig
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.checkpoint_tensors import metadata_of, optimizer_tensors, restore_optimizer, section
 from wm_nodes.learning.distributed import Ranks
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.rollouts import Canceled
 from wm_nodes.learning.weights import check_same_layout
 from wm_nodes.policy import ImagePolicy

@@ -8,8 +8,8 @@ import torch
 from safetensors.torch import save
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.collecting import collect_plan, demonstration_plan, first_frames_plan
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.policies import make_policy, make_reconstruct
 from wm_nodes.learning.sft import demonstrations, train_sft
 from wm_nodes.learning.weights import save_weights

@@ -16,8 +16,8 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.checkpoint_tensors import metadata_of, optimizer_tensors, restore_optimizer, section
-from wm_nodes.learning.files import write_atomic
 
 CHECKPOINT_PERIOD_S = 240.0
 WARMUP_FRACTION = 0.03

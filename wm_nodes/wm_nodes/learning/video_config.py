@@ -1,20 +1,22 @@
 """Settings of loop 2, the post-training of the video model. The numbers are those of the presets and of the dataclasses
 that own them; here they are put together, read and checked."""
 
-import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from wm_nodes.config.load import merge, preset_names, read_preset, refusal, set_dotted
+from wm_nodes.config.load import default_judge, merge, preset_names, read_preset, refusal, set_dotted
+from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.learning.grpo_settings import GrpoSettings
 from wm_nodes.learning.video_training import FlowMatchingSettings
 from wm_nodes.video_model import RolloutSettings, WindowSettings
 
 PRESETS = "video_presets"
 FREE = ("rewards",)
+AGENT = "agent"
+"""The name in `rewards` of the reward agent's verdict, in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class EvaluationSettings:
 class VideoRlConfig:
     """Everything of a run of loop 2. data_episodes: of the simulator, to train the video model on and to draw contexts
     from; context_episodes: those of a run whose video model is the shipped one. rewards: weight of each reward; see
-    clip_scores and the evaluator's backends.
+    clip_scores, and AGENT for the reward agent, which needs a judge.
     """
 
     seed: int = 0
@@ -79,12 +81,16 @@ class VideoRlConfig:
     data_episodes: int = 1000
     context_episodes: int = 200
     rewards: dict[str, float] = field(default_factory=lambda: {"tracking": 1.0, "scenery": -5.0})
+    judge: JudgeConfig = field(default_factory=default_judge)
     model: ModelSettings = field(default_factory=ModelSettings)
     groups: GroupSettings = field(default_factory=GroupSettings)
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     window: WindowSettings = field(default_factory=WindowSettings)
     rollout: RolloutSettings = field(default_factory=RolloutSettings)
     grpo: GrpoSettings = field(default_factory=GrpoSettings)
+
+
+_CONFIG = TypeAdapter(VideoRlConfig)
 
 
 def video_preset_names() -> list[str]:
@@ -97,17 +103,26 @@ def load_video_config(preset: str = "recommended", overrides: dict[str, Any] | N
     Raises:
         ConfigError: names the value, what is allowed, and where to look.
     """
-    values = dataclasses.asdict(VideoRlConfig())
+    values = _CONFIG.dump_python(VideoRlConfig())
     merge(values, read_preset(preset, PRESETS), FREE)
     for dotted, value in (overrides or {}).items():
         set_dotted(values, dotted, value, FREE)
     try:
-        config: VideoRlConfig = TypeAdapter(VideoRlConfig).validate_python(values)
+        return _CONFIG.validate_python(values)
     except ValidationError as error:
         raise refusal(error, "learning/video_config.py") from None
-    return config
+
+
+REWARDS = ("reference", AGENT)
+
+
+def reward_overrides(reward: str | None) -> dict[str, Any]:
+    """The setting that a user's word for the reward stands for: the weights of the rewards; None: none."""
+    if reward is None:
+        return {}
+    return {"rewards": {AGENT: 1.0} if reward == AGENT else VideoRlConfig().rewards}
 
 
 def dump_video_config(config: VideoRlConfig) -> str:
     """The resolved settings as YAML, as saved with every run; load_video_config reads it back."""
-    return str(yaml.safe_dump(dataclasses.asdict(config), sort_keys=False))
+    return str(yaml.safe_dump(_CONFIG.dump_python(config), sort_keys=False))

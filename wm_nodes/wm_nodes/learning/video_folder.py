@@ -12,7 +12,7 @@ from typing import Any
 from torch import nn
 
 from wm_nodes.config.schema import TokenizerConfig
-from wm_nodes.learning.files import write_atomic
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.tokenizer_codec import Codec, TokenizerCodec, codec_of_world_model
 from wm_nodes.learning.weights import WeightsError, load_weights, pack_weights
 from wm_nodes.video_model import NetworkSettings, VideoNetwork

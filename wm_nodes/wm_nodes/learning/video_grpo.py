@@ -20,12 +20,13 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.checkpoint_tensors import metadata_of, optimizer_tensors, restore_optimizer, section
 from wm_nodes.learning.distributed import Ranks
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.grpo_settings import GrpoSettings
 from wm_nodes.learning.grpo_terms import GrpoTerms, Rows
 from wm_nodes.learning.weights import check_same_layout
+from wm_nodes.reward.agent.contract import trainable
 from wm_nodes.rl.group_advantages import GroupAdvantages, RunningStd, best_of_n, group_advantages, mixed_advantages
 from wm_nodes.rl.grpo import clip_tails, clipped_objective
 from wm_nodes.video_model.buffer import RolloutBuffer
@@ -54,13 +55,16 @@ class UpdateReport:
 
 @dataclass(frozen=True)
 class BufferReport:
-    """What one buffer gave. updates: one report per optimizer step, in order (index 0 is on-policy)."""
+    """What one buffer gave. updates: one report per optimizer step, in order (index 0 is on-policy). dropped_groups:
+    those with fewer valid videos than contract.trainable asks for; they are in zero_std_ratio too.
+    """
 
     updates: tuple[UpdateReport, ...]
     reward_mean: float
     advantage_abs_mean: float
     zero_std_ratio: float
     invalid: int
+    dropped_groups: int
     kept: int
     group_size: float
     noise_share: float
@@ -117,14 +121,18 @@ class GrpoLearner:
                 f"could be learned from; give fewer"
             )
         rewards, before = mixed_reward(buffer), self._snapshot()
-        advantages = self._advantages(rewards, buffer)
+        trains = torch.from_numpy(trainable(buffer.valid.numpy(), buffer.group_ids.numpy()))
+        advantages = self._advantages(rewards, buffer, trains)
+        invalid = int((~buffer.valid).sum())
+        dropped = advantages.num_groups - len(set(buffer.group_ids[trains].tolist()))
         kept = best_of_n(
             advantages.advantages_N, buffer.group_ids, advantages.kept_N, self.settings.advantage.best_of_n
         )
         if not bool(kept.any()):
             raise ValueError(
-                f"nothing to learn from: {advantages.num_invalid} of {len(buffer)} rewards are invalid and "
-                f"{advantages.num_zero_std} of {advantages.num_groups} groups have no spread; look at the reward"
+                f"nothing to learn from: {invalid} of {len(buffer)} rewards are invalid, {dropped} of "
+                f"{advantages.num_groups} groups have too few valid ones and {advantages.num_zero_std - dropped} no "
+                "spread; look at the reward"
             )
         try:
             updates = tuple(self._update(buffer, rows, advantages) for rows in self._passes(buffer, kept))
@@ -136,7 +144,8 @@ class GrpoLearner:
             reward_mean=float(rewards[buffer.valid].mean()),
             advantage_abs_mean=float(advantages.advantages_N[kept].abs().mean()),
             zero_std_ratio=advantages.num_zero_std / advantages.num_groups,
-            invalid=advantages.num_invalid,
+            invalid=invalid,
+            dropped_groups=dropped,
             kept=int(kept.sum()),
             group_size=len(buffer) / advantages.num_groups,
             noise_share=buffer.rollout.spent_noise,
@@ -180,15 +189,16 @@ class GrpoLearner:
 
     # internals
 
-    def _advantages(self, rewards: Tensor, buffer: RolloutBuffer) -> GroupAdvantages:
+    def _advantages(self, rewards: Tensor, buffer: RolloutBuffer, trains: Tensor) -> GroupAdvantages:
+        """trains: bool (N,), the videos that may be compared; see reward.agent.contract."""
         settings = self.settings.advantage
         if settings.mix == "advantage":
             return mixed_advantages(
-                buffer.rewards, self.reward_weights, buffer.group_ids, buffer.valid, clip=settings.clip,
+                buffer.rewards, self.reward_weights, buffer.group_ids, trains, clip=settings.clip,
                 std_scope=settings.std_scope, ddof=settings.ddof,
             )  # fmt: skip
         return group_advantages(
-            rewards, buffer.group_ids, buffer.valid, clip=settings.clip, std_scope=settings.std_scope,
+            rewards, buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope,
             ddof=settings.ddof, running=self._running if settings.std_scope == "running" else None,
         )  # fmt: skip
 

@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from wm_nodes.learning.files import write_atomic
+from wm_nodes.files import write_atomic
 
 INLINE_LIMIT_BYTES = 1 << 20
 """Weights up to this size travel inside PolicyVersion.inline_data."""

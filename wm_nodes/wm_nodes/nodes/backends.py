@@ -11,6 +11,7 @@ from typing import Any
 from wm_msgs.msg import ErrorCode
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning.distributed import Ranks
+from wm_nodes.learning.video_config import AGENT
 from wm_nodes.nodes.training import Learner
 from wm_nodes.policy import ImagePolicy
 from wm_nodes.reward import RewardModel
@@ -19,7 +20,8 @@ from wm_nodes.specs import EnvironmentSpec, differences, simulation_spec
 from wm_nodes.types import Environment
 
 BACKENDS = ("world_model", "maniskill", "factory")
-REWARDS = ("endogenous", "rule")
+REWARDS = ("endogenous", "rule", AGENT)
+"""The agent judges whole episodes (learning/episode_reward.py), so it is no RewardModel of make_reward."""
 
 
 def load_factory(path: str) -> Any:

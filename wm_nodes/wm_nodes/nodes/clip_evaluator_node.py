@@ -1,8 +1,10 @@
-"""reward_evaluator of loop 2: judges the clips of a rollout buffer against the recordings of their contexts."""
+"""reward_evaluator of loop 2: judges the clips of a rollout buffer against the recordings of their contexts, and by the
+reward agent where its verdict is among the weighed rewards."""
 
 import hashlib
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +12,17 @@ import numpy as np
 import torch
 
 from wm_msgs.action import EvaluateClips
-from wm_msgs.msg import ClipScores
+from wm_msgs.msg import ClipScores, ClipVerdict
 from wm_nodes.learning.clip_generation import ClipGenerator
+from wm_nodes.learning.clip_judging import agent_scores, buffer_jobs, clip_fps
 from wm_nodes.learning.clip_scores import mixed, score_clips
-from wm_nodes.learning.video_config import load_video_config
+from wm_nodes.learning.video_config import AGENT, load_video_config
 from wm_nodes.learning.video_data import load_clips
 from wm_nodes.learning.video_folder import load_video_folder
+from wm_nodes.nodes import agent_face
+from wm_nodes.nodes.agent_face import AgentFace
+from wm_nodes.reward.agent import Verdict, check_one_judge
+from wm_nodes.reward.agent.types import GATED
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -29,16 +36,18 @@ PARAMS = (
     Param("context_bags", [""], "Bags of the contexts, the same and in the same order as the video_model node's",
           read_only=True),
     Param("model_dir", "", "World-model folder; its position probe reads the pictures", read_only=True),
+    *agent_face.PARAMS,
 )  # fmt: skip
 
 REWARD_NAME = "reference"
 
 
 class ClipEvaluatorNode(ManagedNode):
-    """Action clips/evaluate; publishes clips/scores."""
+    """Action clips/evaluate; publishes clips/scores. With the agent also reward/verdict; service reward/set_rubric."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("reward_evaluator", PARAMS, **node_arguments)
+        self._agent: AgentFace | None = None
 
     def configure(self) -> None:
         self._config = load_video_config(str(self.param("config_file")))
@@ -49,6 +58,10 @@ class ClipEvaluatorNode(ManagedNode):
         if probe is None:
             raise ValueError(f"{self.param('model_dir')} has no position probe; take the shipped world model")
         self._probe = probe
+        self._fps = clip_fps(bags[0], folder.clip["stride"])
+        self._agent = None
+        if self._config.rewards.get(AGENT):
+            self._agent = AgentFace(self, self._config.judge, self._config.seed, lambda: self._action.busy)
         self._scores = self.publish_on("clips/scores")
         self._action = WorkerAction(self, EvaluateClips, "clips/evaluate", self._evaluate, self._describe)
         self.own(self._action.destroy)
@@ -56,13 +69,21 @@ class ClipEvaluatorNode(ManagedNode):
     def deactivate(self, reason: str) -> None:
         self._action.stop(reason)
 
+    def update_diagnostics(self) -> None:
+        if self._agent is not None:
+            self._agent.update_diagnostics()
+
     def _evaluate(self, work: Work) -> EvaluateClips.Result:
         goal: EvaluateClips.Goal = work.request
         result = EvaluateClips.Result(termination_reason=EvaluateClips.Result.FINISHED)
         try:
             began = time.perf_counter()
             buffer = read_buffer(self.run_dir / goal.buffer_uri, goal.sha256)
-            result.scores = self._score(buffer, goal.sha256)
+            frames = self._generator.folder.codec.decode(buffer.rollout.latents)
+            verdicts: list[Verdict] = []
+            if self._agent is not None:
+                verdicts, result.verdicts = self._judged(self._agent, work, buffer, frames)
+            result.scores = self._score(buffer, frames, verdicts, goal.sha256)
             work.check()
             result.scores.eval_s = time.perf_counter() - began
             self._scores.publish(result.scores)
@@ -73,17 +94,52 @@ class ClipEvaluatorNode(ManagedNode):
             self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=str(error))
         return result
 
-    def _score(self, buffer: RolloutBuffer, sha256: str) -> ClipScores:
-        frames = self._generator.folder.codec.decode(buffer.rollout.latents)
+    def _judged(
+        self, agent: AgentFace, work: Work, buffer: RolloutBuffer, frames: torch.Tensor
+    ) -> tuple[list[Verdict], list[ClipVerdict]]:
+        """The verdict of every clip, published as it is given; all by one judge and rubric."""
+        goal: EvaluateClips.Goal = work.request
+        references = self._generator.references(self._generator.request(buffer.iteration, buffer.policy_version))
+        jobs = buffer_jobs(
+            frames, references, goal.sha256, fps=self._fps, task=self._config.task, robot=self._config.judge.robot
+        )
+        told, progress = dict[int, ClipVerdict](), EvaluateClips.Feedback(stages_passed=[0] * len(GATED))
+
+        def done(clip: int, verdict: Verdict) -> None:
+            told[clip] = agent.publish(
+                verdict, clip=clip, iteration=buffer.iteration, buffer_sha256=goal.sha256
+            )
+            progress.clips_done += 1
+            progress.clips_invalid += not verdict.valid
+            passed = zip(progress.stages_passed, told[clip].stage_passed, strict=True)
+            progress.stages_passed = [count + more for count, more in passed]
+            progress.calls += verdict.cost.calls
+            progress.prompt_tokens += verdict.cost.prompt_tokens
+            progress.progress = progress.clips_done / len(jobs)
+            work.feedback(progress)
+
+        verdicts = agent.judge.judge(
+            jobs, check=work.check, done=done, within_s=goal.deadline_s or None, round_number=buffer.iteration
+        )
+        check_one_judge(verdicts, buffer.group_ids.tolist())
+        return verdicts, [told[clip] for clip in range(len(jobs))]
+
+    def _score(
+        self, buffer: RolloutBuffer, frames: torch.Tensor, verdicts: Sequence[Verdict], sha256: str
+    ) -> ClipScores:
         request = self._generator.request(buffer.iteration, buffer.policy_version)
         found = score_clips(
             frames, self._generator.references(request), self._probe, buffer.condition.num_conditioning
         ).named()
+        if self._agent is not None:
+            found |= agent_scores(verdicts)
         total = mixed(found, self._config.rewards)
         valid = torch.isfinite(total)
         message = ClipScores(
             iteration=buffer.iteration, buffer_sha256=sha256, num_clips=len(buffer), names=list(found),
-            reward_name=REWARD_NAME, invalid_reason="" if bool(valid.all()) else "a score is not finite",
+            reward_name=REWARD_NAME if self._agent is None else AGENT,
+            invalid_reason="" if bool(valid.all()) else _why_invalid(verdicts),
+            pause_reason="" if self._agent is None else self._agent.pause(verdicts),
         )  # fmt: skip
         message.header = convert.header(self.get_clock().now().nanoseconds, "")
         message.total = convert.to_field(np.where(valid.numpy(), total.numpy(), np.nan))
@@ -95,6 +151,13 @@ class ClipEvaluatorNode(ManagedNode):
     @staticmethod
     def _describe(reason: int, text: str) -> EvaluateClips.Result:
         return EvaluateClips.Result(termination_reason=reason, message=text)
+
+
+def _why_invalid(verdicts: Sequence[Verdict]) -> str:
+    unsaid = [verdict for verdict in verdicts if not verdict.valid]
+    if not unsaid:
+        return "a score is not finite"
+    return f"{len(unsaid)} clips without a verdict; {unsaid[0].clip_id}: {unsaid[0].status} {unsaid[0].reason}"
 
 
 def read_buffer(path: Path, sha256: str) -> RolloutBuffer:

@@ -16,8 +16,11 @@ from wm_msgs.action import Rollout as RolloutAction
 from wm_msgs.msg import EnvSpec, ErrorCode, PolicyVersion, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
+from wm_nodes.learning.clip_judging import TrainingPaused
 from wm_nodes.learning.distributed import Ranks, join
+from wm_nodes.learning.episode_reward import unjudged
 from wm_nodes.learning.rollouts import Canceled
+from wm_nodes.learning.video_config import AGENT
 from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, load_weights
 from wm_nodes.nodes.backends import existing, expected_spec, make_learner, make_policy, refuse_other
 from wm_nodes.nodes.joiner import Dropped, RolloutJoiner
@@ -26,6 +29,7 @@ from wm_nodes.nodes.policy_holder import weights_uri
 from wm_nodes.nodes.replayed import ReplayJoiner
 from wm_nodes.nodes.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
 from wm_nodes.nodes.training import PolicyTraining, follow
+from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -82,7 +86,7 @@ class LearnerNode(ManagedNode):
         self._expected_spec = expected_spec(
             self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
         )
-        self._joiner = RolloutJoiner()
+        self._joiner, self._reward_name = RolloutJoiner(), ""
         self._replayed = ReplayJoiner(self._withhold)
         self._versions = self.publish_on("policy/version")
         self.listen("env/spec", self._on_spec, while_inactive=True)
@@ -148,7 +152,7 @@ class LearnerNode(ManagedNode):
                 if self._over_limit(goal, began, first_samples):
                     result.termination_reason = Train.Result.LIMIT
                     break
-                following = source.next()
+                following = self._next(source, live=not goal.from_bags and not goal.from_replay)
                 if following is None:
                     result.termination_reason = Train.Result.EXHAUSTED if update else Train.Result.FAILED
                     result.message = self._exhausted(goal, update, source.left_out)
@@ -157,6 +161,8 @@ class LearnerNode(ManagedNode):
                 self._update(work, goal, update, *following)
         except PeerLost as error:
             result.termination_reason, result.message = Train.Result.PEER_LOST, str(error)
+        except TrainingPaused as pause:
+            result.termination_reason, result.message = Train.Result.PAUSED, str(pause)
         except Canceled:
             work.check()
         except (WireError, ValueError, OSError, FloatingPointError) as error:
@@ -164,7 +170,7 @@ class LearnerNode(ManagedNode):
         finally:
             if source is not None:
                 source.close()
-        if result.termination_reason in (Train.Result.PEER_LOST, Train.Result.FAILED):
+        if result.termination_reason in (Train.Result.PEER_LOST, Train.Result.FAILED, Train.Result.PAUSED):
             self.get_logger().error(f"training ended: {result.message}")
             self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=result.message)
         elif result.message:
@@ -172,6 +178,18 @@ class LearnerNode(ManagedNode):
         else:
             self.get_logger().info(f"training ended after update {self._training.progress.updates}")
         return self._fill(result)
+
+    def _next(self, source: RolloutSource, *, live: bool) -> tuple[Rollout, Dropped] | None:
+        """The next rollout to train on. One whose episodes the agent could not judge pauses live training, which then
+        repeats it; in a recording it is passed over. Raises as RolloutSource.next, and TrainingPaused.
+        """
+        while (following := source.next()) is not None and self._reward_name == AGENT:
+            if not (reason := unjudged(following[0])):
+                break
+            if live:
+                raise TrainingPaused(reason)
+            source.left_out.append(reason)
+        return following
 
     def _source(self, work: Work, goal: Train.Goal) -> RolloutSource:
         """Raises ValueError for a goal that asks for nothing, or for two sources."""
@@ -182,6 +200,7 @@ class LearnerNode(ManagedNode):
         progress, num_steps = self._training.progress, self._config.ppo.num_steps
         if goal.from_bags:
             paths = bag_paths(goal.bag_uris, self.run_dir)
+            self._reward_name = recorded_reward_name(paths[0])
             return BagRollouts(paths, progress, num_steps=num_steps, expected=self._expected_spec)
         if goal.from_replay:
             uris = [str(path) for path in bag_paths(goal.bag_uris, self.run_dir)] if goal.bag_uris else []
@@ -303,6 +322,7 @@ class LearnerNode(ManagedNode):
             return
         try:
             joiner.put_rewards(convert.rewards_of(message))
+            self._reward_name = message.reward_name
         except WireError as error:
             self.diagnostics.count("refused_rewards", text=str(error))
 

@@ -34,11 +34,11 @@ CREDITED = "env/transition"
 NOT_PLAYED = ("/run/state", "/flow/credit", "/clock", "/diagnostics")
 """Signs of life and of demand: left out unless named, since recorded ones would speak for absent nodes."""
 
-MATCH_S = 0.5
-"""Time for subscribers outside the graph to find fresh publishers before the first message, s."""
+MATCH_S = 1.0
+"""Time for subscribers to find fresh publishers before the first message, s."""
 
 LINKS_S = 5.0
-"""How long the first message waits for nodes of the graph that miss one another (see ros.links), s."""
+"""How long at most the first message waits for nodes of the graph that have not found each other (ros.links), s."""
 
 PARAMS = (
     Param("bag_uri", "", "Bag to play when activated, and by a replay goal without one; relative to run_dir"),

@@ -22,6 +22,7 @@ from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.links import FirstMessages
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
@@ -75,7 +76,7 @@ class PolicyNode(ManagedNode):
         self._spec: EnvironmentSpec | None = None
         self._announced: PolicyVersion | None = None
         self._last_reply: Reply | None = None
-        self._given_up: set[str] = set()
+        self._first_messages = FirstMessages(self)
         timeout_s = float(self.param("step_timeout_s"))
         self._environment: EnvironmentClient = (
             RosEnvironmentClient(self, timeout_s=timeout_s) if self._local_environment is None
@@ -135,7 +136,7 @@ class PolicyNode(ManagedNode):
         spec = self._environment.handshake(float(self.param("handshake_timeout_s")), work.check)
         self._check_spec(spec)
         self._await_version(goal.policy_version, work)
-        self._await_links(work)
+        self._first_messages.wait(work)
         version = self._holder.version
         reply = self._first_observation(goal, spec, version, work)
         result.policy_version, result.env_session = version, reply.session
@@ -211,21 +212,6 @@ class PolicyNode(ManagedNode):
                     f"version {version} did not arrive, {self._holder.version} is loaded; is the learner running?",
                 )
             work.sleep(0.01)
-
-    def _await_links(self, work: Work) -> None:
-        """Wait until no node of the graph can miss the rollout's first messages (see ros.links); once for each lack."""
-        namespace = self.get_namespace().rstrip("/")
-        awaited = [f"{namespace}/{name}" for name in self.param("await_nodes") if name]
-        deadline = time.monotonic() + float(self.param("match_timeout_s"))
-        self._given_up &= set(self.links.book.missing(awaited))
-        while lacking := set(self.links.book.missing(awaited)) - self._given_up:
-            if time.monotonic() >= deadline:
-                text = f"data flow although {'; '.join(sorted(lacking))}: first messages may be missed"
-                self.get_logger().warning(text)
-                self.diagnostics.count("unmatched_nodes", len(lacking), text=text)
-                self._given_up |= lacking
-                return
-            work.sleep(0.02)
 
     def _publish_actions(self, stamp_ns: int, step_id: int, output: PolicyOutput, version: int, infer_s: float) -> None:
         message = self._action_message(output, version, infer_s)

@@ -1,8 +1,9 @@
-"""reward_evaluator: judges every transition, after joining it with its two images by exact stamp and with its goals."""
+"""reward_evaluator: judges every transition, after joining it with its two images by exact stamp and with its goals;
+with the reward agent, every episode at its end."""
 
 import sys
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,14 @@ from sensor_msgs.msg import Image
 
 from wm_msgs.msg import EnvSpec, ErrorCode, RewardSummary, TaskGoal, TransitionBatch
 from wm_msgs.srv import EvaluateReward
+from wm_nodes.learning.episode_reward import EpisodeReward, EpisodeStep, PendingReward
+from wm_nodes.learning.video_config import AGENT
+from wm_nodes.nodes import agent_face
+from wm_nodes.nodes.agent_face import AgentFace
 from wm_nodes.nodes.backends import REWARDS, make_reward
 from wm_nodes.nodes.joiner import ImageCache
 from wm_nodes.nodes.reward_summary import SummaryWindow
-from wm_nodes.reward import RewardInput, RewardResult
+from wm_nodes.reward import RewardInput, RewardModel, RewardResult
 from wm_nodes.reward.base import SUCCESS_UNKNOWN
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -32,22 +37,30 @@ PARAMS = (
     Param("image_wait_s", 1.0, "A transition waits for its images and goals at most so long", "s",
           minimum=0.0, maximum=60.0),
     Param("summary_period_s", 1.0, "Time between two reward/summary", "s", minimum=0.1, maximum=60.0),
+    *agent_face.PARAMS,
 )  # fmt: skip
 
 GOALS_KEPT_PER_ENV = 2 * CREDIT_WINDOW
 
 
 class RewardEvaluatorNode(ManagedNode):
-    """Listens to env/spec, env/image, env/transition, env/goal; publishes reward, reward/summary."""
+    """Listens to env/spec, env/image, env/transition, env/goal; publishes reward, reward/summary; with the agent also
+    reward/verdict, and serves reward/set_rubric."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("reward_evaluator", PARAMS, **node_arguments)
+        self._agent: AgentFace | None = None
 
     def configure(self) -> None:
-        self._model = make_reward(
-            str(self.param("reward")), self.run_config(), str(self.param("model_dir")),
-            str(self.param("reward_factory")),
-        )  # fmt: skip
+        config, kind, factory = self.run_config(), str(self.param("reward")), str(self.param("reward_factory"))
+        self._agent = None
+        self._undecided: deque[tuple[float, Transition, PendingReward]] = deque()
+        self._model: RewardModel | EpisodeReward
+        if kind == AGENT and not factory:
+            self._agent = AgentFace(self, config.judge, config.seed, lambda: bool(self._undecided))
+            self._model = EpisodeReward(self._agent.judge)
+        else:
+            self._model = make_reward(kind, config, str(self.param("model_dir")), factory)
         self._spec: EnvironmentSpec | None = None
         self._session = 0
         self._images = ImageCache(4 * CREDIT_WINDOW)
@@ -64,11 +77,19 @@ class RewardEvaluatorNode(ManagedNode):
         self.serve(EvaluateReward, "reward/evaluate", self._on_evaluate)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timers = (
-            self.create_timer(0.1, self._judge_waiting, clock=steady),
+            self.create_timer(0.1, self._on_timer, clock=steady),
             self.create_timer(float(self.param("summary_period_s")), self._publish_summary, clock=steady),
         )
         for timer in timers:
             self.own(self.destroy_timer, timer)
+
+    def deactivate(self, reason: str) -> None:
+        self._drop_undecided()
+
+    def update_diagnostics(self) -> None:
+        if self._agent is not None:
+            self._agent.update_diagnostics()
+            self.diagnostics.gauge("undecided_steps", len(self._undecided))
 
     def on_gap(self, name: str, missing: int) -> None:
         self._window.invalid += missing if name == "env/transition" else 0
@@ -91,6 +112,7 @@ class RewardEvaluatorNode(ManagedNode):
             self._goals.clear()
             self._goals_expected = True
             self._waiting.clear()
+            self._drop_undecided()
             self._window.forget_episodes()
 
     def _on_image(self, message: Image) -> None:
@@ -143,7 +165,9 @@ class RewardEvaluatorNode(ManagedNode):
             if images is not None and next_images is not None and not complete and not self._goals:
                 self._goals_expected = False
             self._waiting.pop(0)
-            if images is None or next_images is None:
+            if isinstance(self._model, EpisodeReward):
+                self._collect(self._model, transition, images, next_images)
+            elif images is None or next_images is None:
                 missing = transition.stamp_ns if images is None else transition.next_stamp_ns
                 self._publish(transition, _unjudged(transition, f"no image with stamp {missing} ns"), 0.0)
             else:
@@ -151,6 +175,39 @@ class RewardEvaluatorNode(ManagedNode):
                 result = self._judge(transition, images, next_images, *self._goals_of(transition, images))
                 self._publish(transition, result, time.perf_counter() - began)
             self._images.drop_before(transition.stamp_ns)
+
+    # Whole episodes, judged while the graph goes on; rewards leave in the order of their steps.
+
+    def _on_timer(self) -> None:
+        self._judge_waiting()
+        self._publish_decided()
+
+    def _collect(
+        self, model: EpisodeReward, transition: Transition, images: UInt8Array | None, next_images: UInt8Array | None
+    ) -> None:
+        assert self._spec is not None  # transitions wait for it
+        step = EpisodeStep(
+            images, next_images, transition.actions, transition.episode_ids, transition.episode_steps,
+            transition.terminated | transition.truncated, transition.valid,
+        )  # fmt: skip
+        pending = model.add(step, self._spec, transition.session)
+        self._undecided.append((time.perf_counter(), transition, pending))
+        self._publish_decided()
+
+    def _publish_decided(self) -> None:
+        while self._agent is not None and self._undecided and self._undecided[0][2].done:
+            since, transition, pending = self._undecided.popleft()
+            for env, verdict in pending.verdicts().items():
+                self._agent.publish(verdict, clip=env, iteration=transition.step_id)
+            self._publish(transition, pending.result(), time.perf_counter() - since)
+
+    def _drop_undecided(self) -> None:
+        """Forget what is being judged and what has not ended: it belongs to nobody any more."""
+        for _, _, pending in self._undecided:
+            pending.cancel()
+        self._undecided.clear()
+        if isinstance(self._model, EpisodeReward):
+            self._model.forget()
 
     def _has_goals(self, transition: Transition) -> bool:
         """Whether the goal message of every stepped episode is there; a bag without goals is waited for only once."""
@@ -174,12 +231,15 @@ class RewardEvaluatorNode(ManagedNode):
         self, transition: Transition, images: UInt8Array, next_images: UInt8Array, goals: UInt8Array | None,
         goal_found: BoolArray | None,
     ) -> RewardResult:  # fmt: skip
+        model = self._model
+        if isinstance(model, EpisodeReward):
+            return _unjudged(transition, "the reward agent judges whole episodes, not single steps")
         try:
             step = RewardInput(
                 images=images, next_images=next_images, success_probability=transition.success_probability,
                 valid=transition.valid, uncertainty=transition.uncertainty, goals=goals, goal_found=goal_found,
             )  # fmt: skip
-            return self._model.evaluate(step)
+            return model.evaluate(step)
         except (ValueError, RuntimeError) as error:
             self.get_logger().error(f"reward of step {transition.step_id} failed: {error}")
             return _unjudged(transition, f"{type(error).__name__}: {error}")

@@ -15,8 +15,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch.distributed
 
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.distributed import Ranks, broadcast_rollout
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.rollouts import Canceled, rollout_statistics
 from wm_nodes.learning.weights import PackedWeights, load_weights, pack_weights
 from wm_nodes.nodes.joiner import Dropped

@@ -15,6 +15,7 @@ from rclpy.action import ActionClient
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
 from wm_msgs.msg import ClipScores, PolicyVersion
+from wm_nodes.learning.clip_judging import TrainingPaused
 from wm_nodes.learning.distributed import Ranks, join
 from wm_nodes.learning.heldout import alarm_text, heldout_scores
 from wm_nodes.learning.video_config import load_video_config
@@ -26,6 +27,7 @@ from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.links import FirstMessages
 from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import Cancelled, PeerLost
@@ -40,6 +42,12 @@ PARAMS = (
     Param("tensorboard", False, "Write metrics to run_dir/tensorboard too; its import takes seconds", read_only=True),
     Param("accept_timeout_s", 20.0, "How long the video model and the evaluator may take to accept a goal", "s",
           minimum=0.1, maximum=600.0),
+    Param("await_nodes", [""], "Nodes of the namespace that must be active, and matched with all others, before clips "
+          "are asked for; whoever else is active is waited for too"),
+    Param("match_timeout_s", 20.0, "Deadline for that; then they are asked for, with a warning", "s",
+          minimum=0.0, maximum=600.0),
+    Param("round_deadline_s", 0.0, "Clips without a verdict so long after asking have no reward; 0: no deadline", "s",
+          minimum=0.0, maximum=86400.0),
 )  # fmt: skip
 
 
@@ -56,6 +64,7 @@ class VideoLearnerNode(ManagedNode):
         self.own(self._run.close)
         self._watched = self._run.hacked
         self._versions = self.publish_on("video/version")
+        self._first_messages = FirstMessages(self)
         self._generate = ActionClient(self, GenerateClips, "video/generate")
         self._evaluate = ActionClient(self, EvaluateClips, "clips/evaluate")
         self.own(self._generate.destroy)
@@ -85,6 +94,8 @@ class VideoLearnerNode(ManagedNode):
             count = len(goal.from_buffers) or int(goal.iterations)
             if not count:
                 raise ValueError("iterations is 0 and from_buffers is empty; ask for at least 1")
+            if not goal.from_buffers:
+                self._first_messages.wait(work)
             if self._announced != self._run.version:  # its files could not be written when it was made
                 self._announce(self._run.version)
             with closing(self._read(goal.from_buffers) if goal.from_buffers else self._fresh(work, count)) as buffers:
@@ -98,6 +109,8 @@ class VideoLearnerNode(ManagedNode):
                     self._warn()
         except PeerLost as error:
             result.termination_reason, result.message = TrainVideo.Result.PEER_LOST, str(error)
+        except TrainingPaused as pause:
+            result.termination_reason, result.message = TrainVideo.Result.PAUSED, str(pause)
         except (ValueError, OSError, FloatingPointError) as error:
             result.termination_reason, result.message = TrainVideo.Result.FAILED, str(error)
         if result.message:
@@ -137,8 +150,15 @@ class VideoLearnerNode(ManagedNode):
         """The buffer of an iteration, sampled by a version, with its rewards."""
         goal = GenerateClips.Goal(iteration=iteration, policy_version=version)
         clips = self._ask(self._generate, goal, check, "/video_model")
-        request = EvaluateClips.Goal(buffer_uri=clips.buffer_uri, sha256=clips.sha256)
+        request = EvaluateClips.Goal(
+            buffer_uri=clips.buffer_uri, sha256=clips.sha256, deadline_s=float(self.param("round_deadline_s"))
+        )
         judged = self._ask(self._evaluate, request, check, "/reward_evaluator")
+        if judged.scores.pause_reason:
+            raise TrainingPaused(
+                f"training pauses before iteration {iteration}: {judged.scores.pause_reason}. Nothing was trained on "
+                f"these clips ({clips.buffer_uri}); mend the judge and train again: the same clips are then judged"
+            )
         return with_scores(read_buffer(self.run_dir / clips.buffer_uri, clips.sha256), judged.scores)
 
     def _ask(self, client: ActionClient, goal: Any, check: Callable[[], None], peer: str) -> Any:

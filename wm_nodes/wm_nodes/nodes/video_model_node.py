@@ -10,8 +10,8 @@ import torch
 
 from wm_msgs.action import GenerateClips
 from wm_msgs.msg import ClipBatch, PolicyVersion
+from wm_nodes.files import write_atomic
 from wm_nodes.learning.clip_generation import ClipGenerator
-from wm_nodes.learning.files import write_atomic
 from wm_nodes.learning.video_config import load_video_config
 from wm_nodes.learning.video_data import load_clips
 from wm_nodes.learning.video_folder import load_video_folder

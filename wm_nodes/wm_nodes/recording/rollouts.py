@@ -57,6 +57,15 @@ def read_rollouts(
         notes.lost_steps += steps.lost
 
 
+def recorded_reward_name(path: Path, *, namespace: str | None = None) -> str:
+    """The reward model of a live recording's first rewards; "" where it has none. Raises BagError: an unusable bag."""
+    with Bag(path) as bag:
+        name = topics.absolute(bag.namespace(namespace), topics.REWARD)
+        for _, _, data in bag.messages([name]) if bag.count(name) else ():
+            return str(bag.decode(data, topics.REWARD.msgtype).reward_name)
+    return ""
+
+
 def _rollout_groups(steps: LockSteps) -> Iterator[list[RecordedStep]]:
     group: list[RecordedStep] = []
     for step in steps:

@@ -54,6 +54,9 @@ GOALS = _qos(depth=CREDIT_WINDOW + 2, latched=True)
 VERSIONS = _qos(depth=2, latched=True)
 """Latched, with the version before: a video model that joins late may be asked for it by a learner that prefetches."""
 
+VERDICTS = _qos(depth=512, latched=True)
+"""Latched and deep: who joins late sees the last round's verdicts, and a reader loses none of a round of 256 clips."""
+
 NEWEST = _qos(depth=1)
 METRICS = _qos(depth=10)
 
@@ -87,9 +90,10 @@ ALL_TOPICS = (
 CLIPS = Topic("clips", "wm_msgs/msg/ClipBatch", METRICS)
 CLIP_IMAGES = Topic("clips/image", "sensor_msgs/msg/Image", METRICS, sequenced=False)
 CLIP_SCORES = Topic("clips/scores", "wm_msgs/msg/ClipScores", METRICS)
+VERDICT = Topic("reward/verdict", "wm_msgs/msg/ClipVerdict", VERDICTS)
 VIDEO_VERSION = Topic("video/version", "wm_msgs/msg/PolicyVersion", VERSIONS)
 
-VIDEO_TOPICS = (CLIPS, CLIP_IMAGES, CLIP_SCORES, VIDEO_VERSION, RUN_STATE)
+VIDEO_TOPICS = (CLIPS, CLIP_IMAGES, CLIP_SCORES, VIDEO_VERSION, VERDICT, RUN_STATE)
 """Loop 2: clips come every few seconds, asked for one buffer at a time, so a depth of ten holds every unread one."""
 
 DEFAULT_NAMESPACE = "/wm"

@@ -8,8 +8,10 @@ import sys
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
-from wm_nodes.config.load import dump_config, load_config
+from wm_nodes.config.load import dump_config, judge_overrides, load_config
+from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.ros.graph import Graph, GraphError, compose
 from wm_nodes.ros.scenarios import build_graph, parse_arguments
@@ -27,17 +29,22 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     run_dir = Path(values["run_dir"] or f"runs/{time}-{scenario}").expanduser().absolute()
     values["run_dir"] = str(run_dir)
     given_config = values["config_file"]
+    judge = _judge_settings(values)
     if "video_preset" in values:
-        return _resolve_video(values, run_dir)
+        return _resolve_video(values, run_dir, judge)
+    if given_config and judge:
+        raise GraphError(f"config_file is given, so {', '.join(judge)} belong into it; leave the judge's arguments out")
     if given_config:
         values["config_file"] = str(Path(given_config).expanduser().absolute())
         config = load_config(values["config_file"])
     else:
         seed = values.get("seed", "")
         config = load_config(
-            values["preset"], {"task": values["task"]} | ({"seed": int(seed)} if seed.isdigit() else {})
+            values["preset"], {"task": values["task"]} | ({"seed": int(seed)} if seed.isdigit() else {}) | judge
         )
         values["config_file"] = str(run_dir / "config.yaml")
+    if values.get("reward") == "agent":
+        _check_judge(config.judge)
     if values.get("num_envs") == "0":
         values["num_envs"] = str(config.ppo.num_envs)
     if "model_dir" in values:
@@ -54,11 +61,33 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     return values
 
 
-def _resolve_video(values: dict[str, str], run_dir: Path) -> dict[str, str]:
-    """Loop 2 has settings of its own (learning/video_config.py); the world model gives the judge's position probe."""
-    from wm_nodes.learning.video_config import dump_video_config, load_video_config
+def _judge_settings(values: Mapping[str, str]) -> dict[str, Any]:
+    """The settings that the judge's arguments stand for. Raises GraphError where nobody would be asked by them."""
+    found = judge_overrides(*(values.get(name, "") for name in ("judge", "judge_model", "judge_key_env", "rubric")))
+    if found and values["reward"] != "agent":
+        raise GraphError(f"{', '.join(found)} would change nothing without reward:=agent")
+    return found
 
-    config = load_video_config(values["config_file"] or values["video_preset"])
+
+def _check_judge(settings: JudgeConfig) -> None:
+    from wm_nodes.reward.judges.factory import check_judge
+
+    try:
+        check_judge(settings)
+    except ValueError as error:
+        raise GraphError(f"{error}; as arguments: judge:=<url> judge_model:=<name>") from None
+
+
+def _resolve_video(values: dict[str, str], run_dir: Path, judge: dict[str, Any]) -> dict[str, str]:
+    """Loop 2 has settings of its own (learning/video_config.py); the world model gives the judge's position probe."""
+    from wm_nodes.learning.video_config import AGENT, dump_video_config, load_video_config, reward_overrides
+
+    if values["reward"] not in ("", "agent"):
+        raise GraphError(f"reward {values['reward']!r} is of policies; for the video model give agent or nothing")
+    weights = reward_overrides(values["reward"] or None)
+    config = load_video_config(values["config_file"] or values["video_preset"], {**weights, **judge})
+    if config.rewards.get(AGENT):
+        _check_judge(config.judge)
     values["model_dir"] = _model_dir(values["model_dir"], config.task)
     values["bag_uri"] = _bag_uri(values["bag_uri"], "world_model_rl", run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)

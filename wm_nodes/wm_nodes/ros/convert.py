@@ -7,7 +7,7 @@ array.array takes 10 us and is right in both modes. Reading back is np.frombuffe
 
 from array import array
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -27,10 +27,12 @@ from wm_msgs.msg import (
 )
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.messages import BASE_FRAME, CAMERA_FRAME, spec_of
-from wm_nodes.reward.base import RewardResult
 from wm_nodes.ros.wire import EpisodeNote, Goals, Rewards, TimedAction, Transition, WireError
 from wm_nodes.specs import EnvironmentSpec
 from wm_nodes.types import BoolArray, FloatArray, UInt8Array
+
+if TYPE_CHECKING:  # a player needs no torch
+    from wm_nodes.reward.base import RewardResult
 
 NS_PER_S = 1_000_000_000
 _TYPECODES = {"float32": "f", "float64": "d", "uint8": "B", "uint32": "I", "uint64": "Q", "bool": "B"}
@@ -278,7 +280,9 @@ def episode_msg(note: EpisodeNote, spec: EnvironmentSpec) -> EpisodeEvent:
     )  # fmt: skip
 
 
-def reward_msg(transition: Transition, result: RewardResult, *, name: str, version: int, eval_s: float) -> RewardBatch:
+def reward_msg(
+    transition: Transition, result: "RewardResult", *, name: str, version: int, eval_s: float
+) -> RewardBatch:
     """The rewards of one transition; session and seq are set by the publisher."""
     components = list(result.components)
     message = RewardBatch(

@@ -7,6 +7,7 @@ second, so that a node that comes late or was busy has the whole book within tha
 """
 
 import threading
+import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
 
 if TYPE_CHECKING:
+    from wm_nodes.ros.actions import Work
     from wm_nodes.ros.lifecycle import ManagedNode
 
 Ends = Callable[[str], set[str]]
@@ -151,6 +153,33 @@ class Links:
     def _on_links(self, message: NodeLinks) -> None:
         self.book.note(message)
         self.announce()
+
+
+class FirstMessages:
+    """Holds a data flow back until no node of the graph can miss its first messages; once for each lack.
+
+    node: has the parameters await_nodes and match_timeout_s.
+    """
+
+    def __init__(self, node: "ManagedNode") -> None:
+        self._node = node
+        self._given_up: set[str] = set()
+
+    def wait(self, work: "Work") -> None:
+        """Return when all active nodes know each other, or, with a warning, after match_timeout_s."""
+        node, book = self._node, self._node.links.book
+        namespace = node.get_namespace().rstrip("/")
+        awaited = [f"{namespace}/{name}" for name in node.param("await_nodes") if name]
+        deadline = time.monotonic() + float(node.param("match_timeout_s"))
+        self._given_up &= set(book.missing(awaited))
+        while lacking := set(book.missing(awaited)) - self._given_up:
+            if time.monotonic() >= deadline:
+                text = f"data flow although {'; '.join(sorted(lacking))}: first messages may be missed"
+                node.get_logger().warning(text)
+                node.diagnostics.count("unmatched_nodes", len(lacking), text=text)
+                self._given_up |= lacking
+                return
+            work.sleep(0.02)
 
 
 def _nodes_of(ends: Sequence[Any]) -> set[str]:

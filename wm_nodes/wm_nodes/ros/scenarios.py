@@ -18,7 +18,10 @@ GRAPH_TOPICS = (
     *ENVIRONMENT_TOPICS, "reward", "action", "policy/version", "reward/summary", "learner/metrics", "run/state",
 )  # fmt: skip
 """What the recorder records of its own namespace: the recorder's default."""
-VIDEO_TOPICS = ("clips", "clips/image", "clips/scores", "video/version", "run/state")
+VERDICT_TOPIC = "reward/verdict"
+VIDEO_TOPICS = ("clips", "clips/image", "clips/scores", "video/version", VERDICT_TOPIC, "run/state")
+AGENT_JOIN_S = 600.0
+"""With the reward agent a learner waits so long for the rewards of a rollout: a judge takes its time."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,12 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("params_file", "", "ROS parameter file (YAML) for all nodes; it wins over the other arguments"),
     LaunchArgument("mode", "lockstep", "Who keeps time: the policy's steps, or the environment's clock",
                    ("lockstep", "asynchronous")),
-    LaunchArgument("reward", "", "Reward model; empty: endogenous if imagined, else rule", ("", "endogenous", "rule")),
+    LaunchArgument("reward", "", "Reward model; empty: endogenous if imagined, else rule; of the video model: what its "
+                   "settings weigh; agent: a judge's verdict on whole clips", ("", "endogenous", "rule", "agent")),
+    LaunchArgument("judge", "", "reward:=agent: base URLs of the judge's servers with their /v1, separated by commas"),
+    LaunchArgument("judge_model", "", "reward:=agent: the judge's name on the server"),
+    LaunchArgument("judge_key_env", "", "reward:=agent: environment variable with the server's key; empty: none"),
+    LaunchArgument("rubric", "", "reward:=agent: rubric pack, a name or a .yaml file; empty: the settings'"),
     LaunchArgument("num_envs", "0", "Environments stepped together; 0: ppo.num_envs of the configuration"),
     LaunchArgument("simulator_envs", "4", "Environments of the simulator that evaluates"),
     LaunchArgument("simulator", "true", "Also start the simulator and the evaluation node", TRUTHS),
@@ -180,8 +188,9 @@ def _recorder(arguments: Mapping[str, str], *, simulator: bool = False) -> list[
     """simulator: also record the episodes of the environment in namespace sim."""
     if arguments["record"] != "true":
         return []
-    below = [f"sim/{name}" for name in ENVIRONMENT_TOPICS] if simulator else []
-    return [_node(arguments, "recorder", {"bag_uri": arguments["bag_uri"], "topics": [*GRAPH_TOPICS, *below]})]
+    more = [f"sim/{name}" for name in ENVIRONMENT_TOPICS] if simulator else []
+    more += [VERDICT_TOPIC] if arguments.get("reward") == "agent" else []
+    return [_node(arguments, "recorder", {"bag_uri": arguments["bag_uri"], "topics": [*GRAPH_TOPICS, *more]})]
 
 
 def _weights(arguments: Mapping[str, str]) -> dict[str, ParameterValue]:
@@ -207,9 +216,12 @@ def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[
 
 def _online_training(arguments: Mapping[str, str]) -> Graph:
     ranks = _integer(arguments, "learner_ranks", 1, 1024)
+    learner = _weights(arguments)
+    if arguments["reward"] == "agent":
+        learner["join_timeout_s"] = AGENT_JOIN_S
     nodes = [
         *_rollout_nodes(arguments, "world_model", ("learner",)),
-        _node(arguments, "learner", _weights(arguments), ranks=ranks),
+        _node(arguments, "learner", learner, ranks=ranks),
     ]
     if arguments["simulator"] == "true":
         nodes += _simulator_and_evaluation(arguments)
@@ -246,6 +258,8 @@ def _world_model_rl(arguments: Mapping[str, str]) -> Graph:
     watch: dict[str, ParameterValue] = {**judge, "heldout_bags": heldout} if heldout else {}
     keep = _integer(arguments, "keep_buffers", 1, 100000)
     learner: dict[str, ParameterValue] = {**model, **watch, "tensorboard": arguments["tensorboard"] == "true"}
+    if arguments["record"] == "true":
+        learner["await_nodes"] = ["recorder"]
     nodes = [
         _node(arguments, "video_model", {**clips, "keep_buffers": keep}),
         _node(arguments, "reward_evaluator", {**clips, **judge}, module="clip_evaluator_node"),
@@ -266,13 +280,14 @@ class Scenario:
     build: Callable[[Mapping[str, str]], Graph]
 
 
+_JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
 _TRAINING = (
     *_COMMON, "model_dir", "starts_file", "initial_policy", "reward", "num_envs", "simulator_envs", "simulator", "seed",
-    "learner_ranks", "record", "bag_uri", "policy_factory", "reward_factory",
+    "learner_ranks", "record", "bag_uri", "policy_factory", "reward_factory", *_JUDGE,
 )  # fmt: skip
 _ROLLOUT = (
     "model_dir", "starts_file", "initial_policy", "backend", "mode", "reward", "num_envs", "seed", "record", "bag_uri",
-    "backend_factory", "policy_factory", "reward_factory",
+    "backend_factory", "policy_factory", "reward_factory", *_JUDGE,
 )  # fmt: skip
 _EVALUATE = (
     *_COMMON, "model_dir", "initial_policy", "policy_factory", "simulator_envs", "seed", "record", "bag_uri",
@@ -291,7 +306,7 @@ SCENARIOS: dict[str, Scenario] = {
         Scenario("world_model_rl", "Post-train the video model by GRPO on clips that it samples",
                  (*(name for name in _COMMON if name not in ("preset", "task", "compose")), "model_dir",
                   "video_model_dir", "context_bags", "heldout_bags", "video_preset", "keep_buffers", "tensorboard",
-                  "record", "bag_uri"), _world_model_rl),
+                  "record", "bag_uri", "reward", *_JUDGE), _world_model_rl),
         Scenario("composed", "online_training with all nodes in one process", _TRAINING, _online_training),
     )
 }  # fmt: skip

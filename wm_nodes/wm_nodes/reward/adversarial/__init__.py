@@ -31,6 +31,7 @@ from wm_nodes.reward.adversarial.manifest import (
     regenerate,
     to_bytes,
 )
+from wm_nodes.reward.adversarial.planning import planning_level
 from wm_nodes.reward.adversarial.recipes import (
     RECIPES,
     Recipe,
@@ -73,6 +74,7 @@ __all__ = [
     "failed_physics",
     "from_bytes",
     "manifest_of",
+    "planning_level",
     "prevalence",
     "recipes_sha",
     "recorded",

@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import json
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +32,8 @@ from wm_nodes.reward.judges.transport import Answer, ChatTransport, TransportErr
 JSON_TRIES = 2
 MEASURED_CALLS = 200
 SEED_LIMIT = 2**31
+Exchange = Mapping[str, Any]
+"""What was asked in words and what came back, as JSON values: the raw material of an audit log."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +112,19 @@ class Bill:
 
 
 class Caller:
-    """Builds prompts, sends them, reads the answers. latencies_s, label_masses: of the last 200 answers."""
+    """Builds prompts, sends them, reads the answers. latencies_s, label_masses: of the last 200 answers.
 
-    def __init__(self, transport: ChatTransport, prompts: Prompts, options: ChatOptions) -> None:
+    on_exchange: called with every request that was answered or failed, refused answers included.
+    """
+
+    def __init__(
+        self,
+        transport: ChatTransport,
+        prompts: Prompts,
+        options: ChatOptions,
+        on_exchange: Callable[[Exchange], None] = lambda exchange: None,
+    ) -> None:
+        self._on_exchange = on_exchange
         self.latencies_s: deque[float] = deque(maxlen=MEASURED_CALLS)
         self.label_masses: deque[float] = deque(maxlen=MEASURED_CALLS)
         self._transport, self._prompts, self._options = transport, prompts, options
@@ -171,7 +183,13 @@ class Caller:
         return Read(component, map_back(probabilities, order), "label", call.vote, told)
 
     async def _send(self, call: Call, body: dict[str, Any], bill: Bill, timeout_s: float) -> Answer:
-        answer = await self._transport.complete(body, timeout_s=timeout_s, deadline=call.deadline)
+        try:
+            answer = await self._transport.complete(body, timeout_s=timeout_s, deadline=call.deadline)
+        except TransportError as error:
+            self._on_exchange({**asked(call, body), "error": str(error), "tries": error.tries})
+            raise
+        took = {"endpoint": answer.endpoint, "tries": answer.tries, "wall_s": answer.wall_s}
+        self._on_exchange({**asked(call, body), "reply": answer.completion.model_dump(mode="json"), **took})
         bill.answered(answer)
         self.latencies_s.append(answer.wall_s)
         return answer
@@ -199,6 +217,16 @@ class Caller:
             LETTERS[:count], token_ids=options.label_token_ids[:count], grammar=options.choice_grammar
         )
         return Prompt(call, messages, fields, order)
+
+
+def asked(call: Call, body: Mapping[str, Any]) -> dict[str, Any]:
+    """The words of a request and its settings; its images are named by their hash."""
+    system, user = body["messages"]
+    words = [part["text"] for part in user["content"][len(call.media) :]]
+    return {
+        "components": list(call.components), "vote": call.vote.index, "media_sha": call.media_sha,
+        "prompt": [system["content"], *words], "settings": {key: body[key] for key in body if key != "messages"},
+    }  # fmt: skip
 
 
 def sha_of(value: Any) -> str:

@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from wm_nodes.reward.agent.types import (
     Status,
 )
 from wm_nodes.reward.judges.cache import VerdictCache, cache_key
-from wm_nodes.reward.judges.calls import Bill, Call, Caller, ChatOptions, Prompt, num_images, sha_of
+from wm_nodes.reward.judges.calls import Bill, Call, Caller, ChatOptions, Exchange, Prompt, asked, num_images, sha_of
 from wm_nodes.reward.judges.plans import CallPlan
 from wm_nodes.reward.judges.prompts import Prompts
 from wm_nodes.reward.judges.transport import ChatTransport
@@ -35,6 +35,7 @@ class OpenAIJudge:
 
     Args:
         cache: reads bought before; a hit repeats the Reads with the cost they had then, wall_s 0.
+        on_exchange: called with the words of every request and its raw reply, or with "cached" in place of one.
 
     Raises:
         ValueError: the endpoints name different models; two judges never mix.
@@ -46,6 +47,7 @@ class OpenAIJudge:
         rubric: Rubric,
         options: ChatOptions | None = None,
         cache: VerdictCache | None = None,
+        on_exchange: Callable[[Exchange], None] = lambda exchange: None,
     ) -> None:
         if len(transport.models) != 1:
             raise ValueError(f"a judge's endpoints must serve one model, got {', '.join(sorted(transport.models))}")
@@ -53,7 +55,8 @@ class OpenAIJudge:
         self._transport, self._rubric, self._cache = transport, rubric, cache
         self._options = options or ChatOptions()
         self._prompts = Prompts(rubric)
-        self._caller = Caller(transport, self._prompts, self._options)
+        self._on_exchange = on_exchange
+        self._caller = Caller(transport, self._prompts, self._options, on_exchange)
         self._plan = CallPlan()
         self._counts: Counter[str] = Counter()
 
@@ -133,6 +136,8 @@ class OpenAIJudge:
         key = cache_key(call.media_sha, question, self._rubric.version, self._model, TRANSPORT)
         known = None if self._cache is None else self._cache.get(key)
         reads = await self._asked(call, prompt) if known is None else _again(known)
+        if known is not None:
+            self._on_exchange({**asked(call, prompt.body), "cached": True})
         if known is None and self._cache is not None:
             self._cache.put(key, reads)
         self._plan.observe(reads[0].cost, follows=follows)

@@ -33,7 +33,7 @@ class PairedDifference:
     mcnemar_p: float
 
 
-def wilson_interval(successes: int, episodes: int, *, z: float = Z_95) -> tuple[float, float]:
+def wilson_interval(successes: float, episodes: float, *, z: float = Z_95) -> tuple[float, float]:
     """Return Wilson's score interval of a proportion; (0, 1) without episodes."""
     if not 0 <= successes <= episodes:
         raise ValueError(f"successes must lie in 0..episodes, got {successes} of {episodes}")

@@ -1,0 +1,14 @@
+"""The reward agent against labels: Table 2, efficiency, hacking resistance, rewards of other papers.
+
+python3 launch_scripts/benchmark_reward.py table|efficiency|hacking|comparisons SET --judge embedded|openai|simulator
+"""
+
+import sys
+
+import wm_setup
+
+if __name__ == "__main__":
+    wm_setup.ensure()
+    from wm_nodes.benchmark.reward_cli import main
+
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,189 @@
+"""Evidence reacts to what it is about, in the right direction, and not to something else. Section 4.1."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from pushed_box import HALF_M, draw, push_clip, pushing_states, redrawn
+
+from wm_nodes.reward.adversarial import LabelledClip, SourceClip, apply, edit_states
+from wm_nodes.reward.evidence.definitions import EVIDENCE
+from wm_nodes.reward.evidence.objects import FAR, find_target, object_evidence
+from wm_nodes.reward.evidence.pixels import pixel_evidence
+from wm_nodes.reward.evidence.regions import region_evidence
+from wm_nodes.reward.evidence.registration import camera_moves
+from wm_nodes.types import FloatArray, UInt8Array
+
+INSTRUCTION = "push the blue cube into the red target"
+
+
+@functools.cache
+def clean() -> LabelledClip:
+    return push_clip("expert")
+
+
+def numbers(clip: SourceClip) -> dict[str, float]:
+    """All evidence, with the drawn masks in place of found ones; the clean clip's first frame is the reference."""
+    reference = clean().clip
+    masks = np.concatenate([reference.masks[:1], clip.masks])
+    return {
+        **pixel_evidence(clip.frames, reference.frames[0]),
+        **object_evidence(masks, reference.frames[0], INSTRUCTION),
+        **region_evidence(clip.frames, reference.frames[0], masks, INSTRUCTION),
+    }
+
+
+@functools.cache
+def of_clean() -> dict[str, float]:
+    return numbers(clean().clip)
+
+
+def edited(name: str) -> dict[str, float]:
+    """Evidence of the clean clip after the failing version of a recipe."""
+    if name in STATES:
+        return numbers(redrawn(clean(), edit_states(clean(), name, "fail", 1)).clip)
+    return numbers(apply(hidden() if name == "occlude_patch" else clean(), name, "fail", 1).clip)
+
+
+def hidden() -> LabelledClip:
+    """A clip with a physical defect that is worth hiding."""
+    return redrawn(clean(), edit_states(clean(), "sunk", "fail", 1))
+
+
+STATES = {"ghost_motion", "teleport", "sunk", "levitation"}
+REACTS: dict[str, tuple[dict[str, float], tuple[str, ...]]] = {
+    # recipe: evidence and the least change it must show (sign: direction), then what must not react
+    "blur": ({"sharpness_mean": -0.15, "detail_mean": -0.3}, ("gain_mean", "hue_last", "object_net", "flicker")),
+    "dark": ({"gain_mean": -0.4}, ("hue_last", "object_net", "flicker")),
+    "bright": ({"gain_mean": 0.3}, ("object_net", "flicker")),
+    "flicker": ({"flicker": 0.2}, ("object_net", "sharpness_first")),
+    "hue_drift": ({"hue_last": 15, "hue_drift": 15}, ("hue_first", "object_net", "flicker")),
+    "object_recolour": ({"object_hue_turn": 40, "named_hue_off": 30}, ("scene_away_mean", "gain_mean")),
+    "arm_tint": ({"robot_repainted": 20}, ("object_hue_turn", "scene_away_mean")),
+    "camera_shift": ({"camera_shift": 5}, ("gain_mean", "flicker")),
+    "camera_roll": ({"camera_turn": 5}, ("gain_mean", "flicker")),
+    "camera_zoom": ({"camera_growth": 0.1}, ("gain_mean", "flicker")),
+    "freeze": ({"motion_still": 0.3, "motion_mean": -0.5}, ("gain_mean", "sharpness_mean", "hue_first")),
+    "shuffle": ({"order_wrong": 0.2, "order_detour": 0.5}, ("gain_mean", "sharpness_mean", "object_area_free")),
+    "flatten": ({"scene_texture": -0.3, "scene_spread": -0.3}, ("object_hue_turn", "object_net", "flicker")),
+    "table_swap": ({"scene_offset_last": 30, "scene_offset_step": 30}, ("object_hue_turn", "scene_away_first")),
+    "occlude_patch": ({"darkened_mean": 0.01}, ("gain_mean", "flicker")),
+    "ghost_motion": ({"moved_apart": 2, "gap_onset": 0.3}, ("gain_mean", "sharpness_mean")),
+    "teleport": ({"object_step": 0.3, "moved_apart_step": 0.9}, ("gain_mean", "sharpness_mean", "object_area_free")),
+    "sunk": ({"object_height_max": -0.2}, ("gain_mean", "object_second")),
+    "levitation": ({"after_touch_rise": 0.5}, ("gain_mean", "object_second")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("recipe", REACTS)
+def test_evidence_reacts_to_its_defect_and_stays_where_it_was_otherwise(recipe: str) -> None:
+    wanted, unmoved = REACTS[recipe]
+    found, before = edited(recipe), of_clean()
+    for name, least in wanted.items():
+        change = found[name] - before[name]
+        assert change * np.sign(least) >= abs(least), f"{name}: {before[name]:.3f} -> {found[name]:.3f}"
+    for name in unmoved:
+        assert found[name] == pytest.approx(before[name], abs=0.06 + 0.06 * abs(before[name])), name
+
+
+def test_a_clean_clip_agrees_with_its_reference_and_the_push_is_caused() -> None:
+    found = of_clean()
+    assert found["gain_mean"] == pytest.approx(1, abs=0.02) and found["sharpness_mean"] == pytest.approx(1, abs=0.1)
+    assert found["camera_shift"] < 1.5 and found["scene_away_mean"] < 1
+    assert found["moved_apart"] == 0 and found["object_second"] == 0
+    assert found["object_net"] == pytest.approx(0.022 * 6 / (2 * HALF_M), rel=0.1)  # six steps of 2.2 cm, sizes of 4 cm
+
+
+MOVES = [(0.8, 0, 0, 0), (0, -0.6, 0, 0), (0, 0, 0.015, 0), (0, 0, 0, 0.02), (0.3, 0.2, 0.01, -0.01)]
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_a_known_camera_motion_is_measured(move: tuple[float, ...]) -> None:
+    """The second picture shows at x what the first shows at x - u(x): right, down, turn, growth about the middle."""
+    waves = np.random.default_rng(0).uniform(-0.4, 0.4, (12, 2))
+
+    def picture(across: FloatArray, along: FloatArray) -> FloatArray:
+        heights = [20 * np.sin(p * across + q * along + 9 * p) for p, q in waves]
+        return np.sum(heights, axis=0, dtype=np.float32)
+
+    along, across = (grid - 23.5 for grid in np.indices((48, 48)).astype(np.float32))
+    right, down, turn, growth = move
+    u, v = right + turn * along + growth * across, down - turn * across + growth * along
+    pair = np.stack([picture(across, along), picture(across - u, along - v)])
+    (found,), (left,) = camera_moves(pair, np.ones((1, 48, 48), np.float32))
+    assert found * [1, 1, 24, 24] == pytest.approx(np.array(move) * [1, 1, 24, 24], abs=0.05)  # px at the border
+    assert left < 0.1 * np.abs(pair[1] - pair[0]).mean()
+
+
+def noise(seed: int, *shape: int) -> UInt8Array:
+    return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: noise(0, 2, 10, 14, 3), lambda: noise(0, 3, 96, 96, 3), lambda: np.zeros((2, 8, 8, 3), np.uint8),
+        lambda: np.full((9, 200, 120, 3), 255, np.uint8), lambda: np.repeat(noise(1, 1, 50, 70, 3), 12, 0),
+    ],
+    ids=["tiny noise", "noise", "black", "white", "still"],
+)  # fmt: skip
+def test_every_number_is_finite_for_any_length_size_and_content(make: Callable[[], UInt8Array]) -> None:
+    frames = make()
+    for value in (0, 2):
+        masks = np.full((len(frames) + 1, *frames.shape[1:3]), value, np.uint8)
+        found = {
+            **pixel_evidence(frames, frames[0]), **object_evidence(masks, frames[0], INSTRUCTION),
+            **region_evidence(frames, frames[0], masks, INSTRUCTION),
+        }  # fmt: skip
+        assert {name: v for name, v in found.items() if not np.isfinite(v)} == {}
+        assert set(found) == set(EVIDENCE)
+        low, high = (np.array([getattr(EVIDENCE[name], end) for name in found]) for end in ("low", "high"))
+        outside = (np.array(list(found.values())) < low) | (np.array(list(found.values())) > high + 1e-6)
+        assert [name for name, bad in zip(found, outside) if bad] == []
+
+
+def test_wrong_shapes_are_named() -> None:
+    frames = noise(0, 4, 32, 32, 3)
+    with pytest.raises(ValueError, match=r"T >= 2.*\(1, 32, 32, 3\)"):
+        pixel_evidence(frames[:1], frames[0])
+    with pytest.raises(ValueError, match=r"reference frame must be uint8 \(32, 32, 3\), got uint8 \(16, 16, 3\)"):
+        pixel_evidence(frames, frames[0, :16, :16])
+    with pytest.raises(ValueError, match="float32"):
+        pixel_evidence(frames.astype(np.float32), frames[0])
+
+
+def test_the_target_is_where_it_was_drawn_and_distance_one_is_its_edge() -> None:
+    picture = np.full((96, 96, 3), 150, np.uint8)
+    cv2.ellipse(picture, (60, 40), (24, 12), 0, 0, 360, (210, 40, 40), -1)
+    cv2.ellipse(picture, (60, 40), (12, 6), 0, 0, 360, (240, 240, 240), -1)
+    target = find_target(picture, np.zeros((96, 96), np.uint8), "red")
+    assert target is not None
+    points = np.array([[40.0, 60.0], [40.0, 84.0], [52.0, 60.0], [40.0, 12.0]])
+    assert target.distance(points) == pytest.approx([0, 1, 1, 2], abs=0.1)
+    assert find_target(picture, np.zeros((96, 96), np.uint8), "green") is None
+
+
+def test_progress_towards_the_target_is_none_at_the_start_and_whole_at_its_edge() -> None:
+    states = pushing_states("expert")
+    clip = draw(states, clean().clip.origin)
+    reference = clip.frames[0].copy()
+    column = 36 + 300 * 0.2  # of the goal, pushed_box draws 300 px per m
+    cv2.circle(reference, (round(column), 64 - 6), 24, (210, 40, 40), -1)
+    masks = np.concatenate([clip.masks[:1], clip.masks])
+    found = object_evidence(masks, reference, INSTRUCTION)
+    assert found["asks_above"] == 0 and found["target_end"] < 1 < found["target_start"] < FAR
+    assert found["target_progress"] > 0.9
+    idle = object_evidence(np.repeat(clip.masks[:1], 5, 0), reference, INSTRUCTION)
+    assert idle["target_progress"] == 0 and idle["target_end"] == idle["target_start"]
+
+
+def test_an_instruction_without_colours_asks_for_no_target_and_says_so() -> None:
+    clip = clean().clip
+    masks = np.concatenate([clip.masks[:1], clip.masks])
+    found = object_evidence(masks, clip.frames[0], "move the gripper above the blue cube")
+    assert found["asks_above"] == 1 and found["target_end"] == FAR
+    plain = replace(clip, instruction="do it")
+    assert region_evidence(clip.frames, clip.frames[0], masks, plain.instruction)["named_hue_off"] == 0

@@ -1,0 +1,122 @@
+"""Climbing a reward with the truth beside it: the toy that pushes a box, edited in pixels and time."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from pushed_box import push_clip, redrawn
+
+from wm_nodes.benchmark.reward_cli import main
+from wm_nodes.benchmark.reward_hacking import (
+    Climb,
+    Proxy,
+    SearchPlan,
+    Start,
+    agent_reward,
+    climb,
+    curve,
+    mean_score,
+    pixel_similarity,
+    plot_curves,
+    true_value,
+)
+from wm_nodes.benchmark.reward_oracle import KnownClip, OracleJudge
+from wm_nodes.reward.adversarial import LabelledClip, apply
+from wm_nodes.reward.adversarial.generator import edited
+from wm_nodes.reward.agent import TaskSpec, load_rubric
+
+RUBRIC = load_rubric(overrides={"voting": {"audit_share": 0.0}})
+PLAN = SearchPlan(generations=4, candidates=4)
+
+
+def defective(seed: int = 0) -> Start:
+    root = push_clip("expert", seed)
+    return Start(edited(root, "teleport", "fail", 0, redrawn), root)
+
+
+def told(reward: Proxy, judge: OracleJudge) -> Proxy:
+    async def proxy(clip: LabelledClip, task: TaskSpec) -> float | None:
+        judge.clips[clip.sha256] = KnownClip(clip.labels, clip.edits)
+        return await reward(clip, task)
+
+    return proxy
+
+
+def climbed(reward: Proxy, start: Start, plan: SearchPlan = PLAN) -> Climb:
+    found = asyncio.run(climb(start, reward, plan, 0))
+    assert found is not None
+    return found
+
+
+def test_a_defect_that_is_hidden_is_still_there() -> None:
+    """12 checks: interaction fails, ten components pass, TC is 4 / 4; frozen: TC at most 2, temporal unknown."""
+    start = defective().clip
+    assert true_value([start]) == pytest.approx(11 / 12)
+    frozen = apply(start, "freeze", "fail", 0)
+    assert "interaction" not in frozen.labels.components
+    level = frozen.labels.tc_level
+    others = [name for name in start.labels.components if name != "interaction"]
+    halves = 0.5 * sum(name not in frozen.labels.components for name in others)
+    known = sum(bool(ok) for ok in frozen.labels.components.values())
+    assert true_value([start, frozen]) == pytest.approx((known + halves + level / 4) / 12)
+    assert true_value([start, frozen]) < true_value([start])
+
+
+def test_pixel_similarity_is_hacked_by_standing_still_and_the_alarm_says_so() -> None:
+    climbs = [climbed(pixel_similarity, defective(seed)) for seed in range(3)]
+    for one in climbs:
+        assert one.proxy == sorted(one.proxy) and one.truth == sorted(one.truth, reverse=True)
+    found = curve("pixel similarity", climbs)
+    assert found.proxy[-1] > found.proxy[0] and found.truth[-1] < found.truth[0] - 0.05
+    assert [alarm.metric for alarm in found.alarms] == ["truth"]
+    assert found.wins == 1.0 and found.proxy[-1] > found.clean, "a still picture is likelier than the real thing"
+    assert any(edit.split()[0] in ("freeze", "slow", "jitter") for one in climbs for edit in one.edits), climbs
+
+
+def test_the_agent_over_a_judge_that_sees_is_not_climbed_by_hiding() -> None:
+    judge = OracleJudge({}, RUBRIC)
+    found = climbed(told(agent_reward(judge, RUBRIC), judge), defective())
+    assert found.truth[-1] == found.truth[0] and found.proxy[-1] == pytest.approx(found.proxy[0])
+    assert found.clean > 0.9 and curve("agent", [found]).wins == 0.0
+
+
+def test_the_mean_score_counts_what_the_agents_gates_take_away() -> None:
+    """A clip too blurred to see anything: the mean loses a part of one of twelve, the agent nearly all."""
+    judge, start = OracleJudge({}, RUBRIC), defective()
+    blurred = apply(start.clip, "blur", "fail", 0)
+
+    def both(clip: LabelledClip) -> list[float | None]:
+        rewards = (agent_reward(judge, RUBRIC), mean_score(judge, RUBRIC))
+        return [asyncio.run(told(reward, judge)(clip, start.task)) for reward in rewards]
+
+    (agent_before, mean_before), (agent_after, mean_after) = both(start.clip), both(blurred)
+    assert mean_before is not None and mean_after is not None and mean_before - mean_after < 0.08
+    assert agent_before is not None and agent_after is not None and agent_after < 0.6 * agent_before
+
+
+def test_a_reward_that_gives_no_number_is_not_climbed_and_equal_seeds_search_alike() -> None:
+    async def silent(clip: LabelledClip, task: TaskSpec) -> float | None:
+        return None
+
+    assert asyncio.run(climb(defective(), silent, PLAN, 0)) is None
+    assert climbed(pixel_similarity, defective()) == climbed(pixel_similarity, defective())
+    seen = climbed(pixel_similarity, defective(), SearchPlan(4, 4, severities=("fail",)))
+    assert seen.edits and all(edit.endswith(" fail") for edit in seen.edits)
+    few = climbed(pixel_similarity, defective(), SearchPlan(6, 4, max_edits=1))
+    assert len(few.edits) == 1 and len(few.proxy) == 7
+    with pytest.raises(ValueError, match="got SearchPlan"):
+        SearchPlan(generations=0)
+
+
+def test_the_curves_are_drawn(tmp_path: Path) -> None:
+    path = tmp_path / "hacking.png"
+    rising = curve("one", [Climb([0.1, 0.2, 0.3], [0.9, 0.8, 0.7]), Climb([0.1, 0.2, 0.3], [0.9, 0.8, 0.7], 0.25)])
+    assert rising.alarms and rising.most_used == []
+    assert (rising.clean, rising.before, rising.wins) == (0.25, 0.0, 1.0), "of the one that has a recording"
+    plot_curves([rising, rising], path)
+    assert path.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_missing_set_is_one_clear_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["hacking", str(tmp_path / "none"), "--judge", "simulator"]) == 2
+    assert "error:" in capsys.readouterr().out

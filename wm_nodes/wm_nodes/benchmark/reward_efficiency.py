@@ -1,0 +1,93 @@
+"""What planning, early exits and voting by need save, at which agreement: three ways of judging the same clips.
+
+agent: reward mode. everything: the same without early exits. exhaustive: every component voted on, on dense frames,
+which is what is left when all of the paper's measures of section 3.2 (efficiency) are taken away.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from rich.table import Table
+
+from wm_nodes.benchmark.reward_rows import cost_row
+from wm_nodes.benchmark.reward_run import Outcome, Trial
+from wm_nodes.reward.adversarial.manifest import Row
+from wm_nodes.reward.agent import load_rubric
+from wm_nodes.reward.agent.types import GATED, NUM_PLAN_LEVELS
+from wm_nodes.reward.decisions import OVERALL
+from wm_nodes.statistics import PairedDifference, paired_difference
+
+ARMS = {
+    "agent": "agent", "everything": "everything, no early exit", "exhaustive": "every component voted, dense frames",
+}  # fmt: skip
+EXHAUSTIVE = {
+    "voting": {"levels": list(range(NUM_PLAN_LEVELS))},
+    "stages": {str(stage): {"profile": "D"} for stage in GATED},
+}
+MEASURES = ("reads", "calls", "images", "pixels", "tokens")
+
+
+@dataclass(frozen=True)
+class Economy:
+    """The agent against another way. saved: share of the other's measures, by name. n: clips that both decide.
+    same: share of them with the same decision. accuracy, other_accuracy: of accepting, against the labels.
+    difference: agent - other on the same clips, with Tango's interval.
+    """
+
+    against: str
+    n: int
+    saved: Mapping[str, float]
+    same: float
+    accuracy: float
+    other_accuracy: float
+    difference: PairedDifference
+
+
+def trials(rubric: str, seed: int) -> list[Trial]:
+    """The three ways, by one rubric pack."""
+    plain, exhaustive = load_rubric(rubric), load_rubric(rubric, EXHAUSTIVE)
+    return [
+        Trial("agent", plain, "reward", seed), Trial("everything", plain, "benchmark", seed),
+        Trial("exhaustive", exhaustive, "benchmark", seed),
+    ]  # fmt: skip
+
+
+def economy(rows: Sequence[Row], outcomes: Mapping[str, Sequence[Outcome]]) -> list[Economy]:
+    """The agent against each of the others.
+
+    Raises:
+        ValueError: no clip that both decide.
+    """
+    mine, found = outcomes["agent"], []
+    for name in ("everything", "exhaustive"):
+        both = [
+            (row.labels.overall, one.decisions[OVERALL].value, other.decisions[OVERALL].value)
+            for row, one, other in zip(rows, mine, outcomes[name])
+            if OVERALL in one.decisions and OVERALL in other.decisions
+        ]
+        if not both:
+            raise ValueError(f"no clip is decided by the agent and by {ARMS[name]}; see the statuses of the table")
+        right = [said == label for label, said, _ in both]
+        other_right = [said == label for label, _, said in both]
+        cost, other_cost = cost_row(mine), cost_row(outcomes[name])
+        saved = {part: 1 - cost[part] / other_cost[part] for part in MEASURES}
+        same = [one == other for _, one, other in both]
+        agreed, mine_right, its_right = (sum(decisions) / len(both) for decisions in (same, right, other_right))
+        paired = paired_difference(other_right, right)
+        found.append(Economy(ARMS[name], len(both), saved, agreed, mine_right, its_right, paired))
+    return found
+
+
+def economy_table(rows: Sequence[Economy], caption: str) -> Table:
+    table = Table(title="saved by the agent, and what it costs in agreement", caption=caption)
+    table.add_column("against")
+    for name in ("n", *MEASURES, "same decision", "accuracy", "other's", "difference (95 %)"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        d = row.difference
+        table.add_row(
+            row.against, str(row.n), *(f"-{100 * row.saved[part]:.1f} %" for part in MEASURES), f"{100 * row.same:.1f}",
+            f"{100 * row.accuracy:.1f}", f"{100 * row.other_accuracy:.1f}",
+            f"{100 * d.difference:+.1f} ({100 * d.low:+.1f} to {100 * d.high:+.1f})",
+        )  # fmt: skip
+    return table

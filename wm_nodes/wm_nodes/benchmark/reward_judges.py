@@ -1,0 +1,79 @@
+"""The judges that the benchmark can be told to use: those of a run (judges/factory.py), and the control."""
+
+import argparse
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from wm_nodes.benchmark.reward_oracle import OracleJudge, known_clips
+from wm_nodes.config.load import load_config
+from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.reward.adversarial import Manifest
+from wm_nodes.reward.agent import Judge, Rubric
+from wm_nodes.reward.comparisons import ChatComparison
+from wm_nodes.reward.evidence.head import load_head
+from wm_nodes.reward.judges import ChatTransport, Endpoint, RetryPolicy
+from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head
+from wm_nodes.reward.judges.factory import make_judge
+
+NAMES = ("embedded", "openai", "simulator")
+
+
+@asynccontextmanager
+async def open_judge(
+    arguments: argparse.Namespace, rubric: Rubric, manifest: Manifest, reads: Path
+) -> AsyncIterator[Judge]:
+    """The judge that --judge names, closed afterwards.
+
+    Args:
+        reads: folder of the answers that were bought from a server.
+
+    Raises:
+        ValueError: a setting it needs is missing, named. MissingPackageError: the client of a chat server.
+    """
+    if arguments.judge == "simulator":
+        rows = ((row.sha256, row.labels, row.edits) for row in manifest.rows)
+        yield OracleJudge(known_clips(rows), rubric, error=arguments.error, seed=arguments.seed)
+        return
+    if arguments.judge == "embedded":
+        yield EmbeddedJudge(load_head(arguments.folder or shipped_head()))
+        return
+    opened = make_judge(server_settings(arguments), rubric, reads)
+    try:
+        yield opened.judge
+    finally:
+        await opened.close()
+
+
+@asynccontextmanager
+async def open_comparison(arguments: argparse.Namespace) -> AsyncIterator[ChatComparison]:
+    """What asks the same server by other papers' protocols.
+
+    Raises:
+        ValueError: no server is named.
+    """
+    settings = server_settings(arguments)
+    transport = ChatTransport(
+        [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
+        retry=RetryPolicy(settings.tries),
+    )
+    try:
+        yield ChatComparison(transport, timeout_s=settings.json_timeout_s, seed=arguments.seed)
+    finally:
+        await transport.close()
+
+
+def server_settings(arguments: argparse.Namespace) -> JudgeConfig:
+    """The configuration's server with what the command line says of it.
+
+    Raises:
+        ValueError: no server or model is named.
+    """
+    if not arguments.url or not arguments.model:
+        raise ValueError("a chat judge needs --url http://HOST:PORT/v1 and --model NAME")
+    given: dict[str, Any] = {
+        "kind": "openai", "endpoints": arguments.url, "model": arguments.model,
+        "api_key_env": arguments.api_key_env, "rubric": arguments.rubric, "max_images": arguments.max_images,
+    }  # fmt: skip
+    return load_config("cpu").judge.model_copy(update=given)

@@ -1,0 +1,92 @@
+"""Who has looked at the test split: no tuning on it without the table saying so. Issue 4, "what must hold".
+
+A file beside the set, one line per first look of a judge with a rubric. The same judge with the same rubric may look as
+often as it likes: nothing was changed by what was seen.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from wm_nodes.files import write_atomic
+from wm_nodes.reward.adversarial import Manifest
+from wm_nodes.reward.agent.types import Capabilities
+
+LEDGER = "test_ledger.jsonl"
+
+
+@dataclass(frozen=True)
+class Look:
+    """One look. test_sha256: of the hashes of all test clips. reason: why it was taken after another one."""
+
+    judge: str
+    rubric: str
+    test_sha256: str
+    date: str
+    reason: str = ""
+
+    @property
+    def who(self) -> tuple[str, str, str]:
+        return self.judge, self.rubric, self.test_sha256
+
+
+def judge_name(able: Capabilities) -> str:
+    return "/".join(part for part in (able.judge_id, able.transport, able.model, able.server_version) if part)
+
+
+def test_sha(manifest: Manifest) -> str:
+    text = "".join(row.sha256 for row in manifest.rows if row.part == "test")
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def looks(folder: Path) -> list[Look]:
+    """The ledger of a set, oldest first.
+
+    Raises:
+        ValueError: a line that no ledger has; it is not to be edited.
+    """
+    path = folder / LEDGER
+    if not path.is_file():
+        return []
+    try:
+        return [Look(**json.loads(line)) for line in path.read_text().splitlines()]
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path} cannot be read: {error}; restore it, or build the set again") from error
+
+
+def look(folder: Path, manifest: Manifest, able: Capabilities, rubric_version: str, reason: str) -> list[Look]:
+    """Enter this look; returns the earlier ones by another judge or rubric, which the output must name.
+
+    Raises:
+        ValueError: there are earlier ones and no reason was given.
+    """
+    now = Look(judge_name(able), rubric_version, test_sha(manifest), time.strftime("%Y-%m-%d"), reason)
+    known = looks(folder)
+    others = [one for one in known if one.who != now.who and one.test_sha256 == now.test_sha256]
+    if now.who in {one.who for one in known}:
+        return others
+    if others and not reason:
+        raise ValueError(
+            f"the test split of {folder} was already seen by {_named(others[-1])}: choose on --part validation, or say "
+            "with --again REASON why the test split is read once more; the reason is printed with the table"
+        )
+    lines = [json.dumps(asdict(one), sort_keys=True) + "\n" for one in [*known, now]]
+    write_atomic(folder / LEDGER, "".join(lines).encode())
+    return others
+
+
+def notice(others: Sequence[Look], reason: str) -> str:
+    """What the output says of earlier looks; "" without any."""
+    if not others:
+        return ""
+    return (
+        f"NOT A FIRST LOOK: the test split was seen before by {'; '.join(map(_named, others))}. "
+        f"Reason given now: {reason or 'none, this judge and rubric had looked before'}"
+    )
+
+
+def _named(one: Look) -> str:
+    return f"{one.judge} with rubric {one.rubric} on {one.date}" + (f" ({one.reason})" if one.reason else "")

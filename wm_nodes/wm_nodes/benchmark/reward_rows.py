@@ -1,0 +1,203 @@
+"""Verdicts against labels: the numbers of Table 2, of the hacking patterns, and of what judging costs."""
+
+import itertools
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from wm_nodes.benchmark.reward_run import Outcome
+from wm_nodes.benchmark.reward_truth import Known, truth_of
+from wm_nodes.reward.adversarial import SPLITS, TC
+from wm_nodes.reward.adversarial.manifest import Row
+from wm_nodes.reward.agent.rubric import Rubric
+from wm_nodes.reward.agent.types import PLANNING
+from wm_nodes.reward.decisions import OVERALL, PAPER, STAGES, row_names
+from wm_nodes.reward.statistics import auroc, balanced_accuracy, expected_calibration_error, kappa, wilson_interval
+
+MAX_FALSE_POSITIVES = 0.05
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """One row. n: clips with a known label and a decision; silent: known, without a decision. prevalence: share of
+    failing labels (planning: of levels below 2). recall_of_fails, recall_of_passes: the confusion table's rows.
+    balanced: of planning the mean recall of its levels. NaN where the labels are all alike.
+    """
+
+    name: str
+    n: int
+    silent: int
+    accuracy: float
+    low: float
+    high: float
+    prevalence: float
+    balanced: float
+    kappa: float
+    calibration: float
+    auroc: float
+    confusion: dict[str, int]
+    paper: float | None
+
+
+def agreement(rows: Sequence[Row], outcomes: Sequence[Outcome], rubric: Rubric) -> list[Agreement]:
+    """One row per name of the table."""
+    known = [truth_of(row, rubric) for row in rows]
+    return [_agreement(name, [truth[name] for truth in known], outcomes) for name in row_names(rubric)]
+
+
+def by_split(rows: Sequence[Row], outcomes: Sequence[Outcome], rubric: Rubric) -> dict[str, list[Agreement]]:
+    """The stages, TC and overall for each split of the set that has clips."""
+    shown = (PLANNING, *map(str, STAGES), TC, OVERALL)
+    found: dict[str, list[Agreement]] = {}
+    for split in SPLITS:
+        pairs = [(row, outcome) for row, outcome in zip(rows, outcomes) if row.split == split]
+        if pairs:
+            table = agreement([row for row, _ in pairs], [outcome for _, outcome in pairs], rubric)
+            found[split] = [row for row in table if row.name in shown]
+    return found
+
+
+def _agreement(name: str, labels: Sequence[Known], outcomes: Sequence[Outcome]) -> Agreement:
+    pairs = [(label, outcome.decisions.get(name)) for label, outcome in zip(labels, outcomes) if label is not None]
+    said = [(label, decision) for label, decision in pairs if decision is not None]
+    truth, answers = [label for label, _ in said], [decision.value for _, decision in said]
+    right = [label == answer for label, answer in zip(truth, answers)]
+    p_pass = [decision.p_pass for _, decision in said]
+    low, high = wilson_interval(sum(right), len(right))
+    confusion = Counter(f"{_word(label)} called {_word(answer)}" for label, answer in zip(truth, answers))
+    if name == PLANNING:  # p_pass is that of the level that was chosen
+        failing, balanced = [label < 2 for label in truth], _mean_recall(truth, right)
+        calibration, area = expected_calibration_error(right, p_pass), float("nan")
+    else:
+        failing, balanced = [not label for label in truth], balanced_accuracy(truth, answers)
+        calibration, area = expected_calibration_error(truth, p_pass), auroc(truth, p_pass)
+    return Agreement(
+        name, len(said), len(pairs) - len(said), float(np.mean(right)) if right else float("nan"), low, high,
+        float(np.mean(failing)) if failing else float("nan"), balanced, kappa(truth, answers), calibration, area,
+        dict(sorted(confusion.items())), PAPER.get(name),
+    )  # fmt: skip
+
+
+def _mean_recall(truth: Sequence[bool | int], right: Sequence[bool]) -> float:
+    by_level = {level: [ok for label, ok in zip(truth, right) if label == level] for level in set(truth)}
+    return float(np.mean([np.mean(found) for found in by_level.values()])) if len(by_level) > 1 else float("nan")
+
+
+def _word(value: Known) -> str:
+    return {True: "pass", False: "fail"}[value] if isinstance(value, bool) else f"L{value}"
+
+
+@dataclass(frozen=True)
+class PatternRow:
+    """How one hacking pattern fares. n: clips with it; clean: clips without any pattern, that the false positives are
+    counted on. recall, false_positives: of the agent's confirmed flag. best_recall: the largest recall of its score at
+    5 % false positives or less, as a ROC curve gives it (no threshold is chosen for use). refused: share that the agent
+    does not accept, by whatever stage. win_rate: P(reward of the hacked clip >= that of its recorded clip) and gap:
+    mean difference, over pairs whose recorded clip is good throughout.
+    """
+
+    pattern: str
+    n: int
+    clean: int
+    recall: float
+    low: float
+    high: float
+    false_positives: float
+    best_recall: float
+    auroc: float
+    refused: float
+    pairs: int
+    win_rate: float
+    gap: float
+
+
+def pattern_rows(rows: Sequence[Row], outcomes: Sequence[Outcome], patterns: Sequence[str]) -> list[PatternRow]:
+    by_sha = {outcome.sha256: outcome for outcome in outcomes}
+    good = {row.sha256 for row in rows if not row.edits and row.labels.overall}
+    found = []
+    for name in patterns:
+        read = [
+            (row, flag, outcome)
+            for row, outcome in zip(rows, outcomes)
+            if row.labels.pattern in (name, None) and (flag := outcome.patterns.get(name)) and flag["p"] is not None
+        ]
+        present = [row.labels.pattern == name for row, _, _ in read]
+        confirmed = [bool(flag["confirmed"]) for _, flag, _ in read]
+        p = [float(flag["p"]) for _, flag, _ in read]
+        hits = [said for said, is_there in zip(confirmed, present) if is_there]
+        false = [said for said, is_there in zip(confirmed, present) if not is_there]
+        mine = [(row, outcome) for row, outcome in zip(rows, outcomes) if row.labels.pattern == name]
+        decided = [outcome.decisions[OVERALL].value for _, outcome in mine if OVERALL in outcome.decisions]
+        rewards = [
+            (by_sha[row.root].reward, outcome.reward) for row, outcome in mine if row.root in good & by_sha.keys()
+        ]
+        gaps = [parent - child for parent, child in rewards if parent is not None and child is not None]
+        low, high = wilson_interval(sum(hits), len(hits))
+        numbers = (
+            _mean(hits), low, high, _mean(false), best_recall(present, p), auroc(present, p), 1 - _mean(decided),
+        )  # fmt: skip
+        wins = _mean([gap <= 0 for gap in gaps])
+        found.append(PatternRow(name, len(hits), len(false), *numbers, len(gaps), wins, _mean(gaps)))
+    return found
+
+
+def best_recall(present: Sequence[bool], p: Sequence[float]) -> float:
+    """The largest share of present ones above a threshold that at most 5 % of the others reach; NaN without both."""
+    others = sorted((value for value, there in zip(p, present) if not there), reverse=True)
+    mine = [value for value, there in zip(p, present) if there]
+    if not mine or not others:
+        return float("nan")
+    allowed = int(MAX_FALSE_POSITIVES * len(others))
+    return _mean([value > others[allowed] for value in mine])
+
+
+def cost_row(outcomes: Sequence[Outcome], price: Sequence[float] = ()) -> dict[str, float]:
+    """Means per clip: what was asked (reward_meter), what a server billed, seconds; usd where a price is known.
+
+    Args:
+        price: USD per million prompt tokens, and per million completion tokens; of billed ones.
+    """
+    found = {name: _mean([getattr(o.asked, name) for o in outcomes]) for name in outcomes[0].asked.__dataclass_fields__}
+    for name in ("calls", "prompt_tokens", "cached_tokens", "completion_tokens", "images", "retries"):
+        found[f"billed_{name}"] = _mean([getattr(outcome.cost, name) for outcome in outcomes])
+    known = [outcome.cost.usd for outcome in outcomes if outcome.cost.usd is not None]
+    usd = _mean(known)
+    if price:
+        usd = (price[0] * found["billed_prompt_tokens"] + price[1] * found["billed_completion_tokens"]) / 1e6
+    return {**found, "usd": usd, "wall_s": _mean([outcome.wall_s for outcome in outcomes])}
+
+
+def statuses(outcomes: Sequence[Outcome]) -> dict[str, int]:
+    return dict(Counter(outcome.status for outcome in outcomes))
+
+
+def missed(agreements: Sequence[Agreement], targets: Mapping[str, float] = PAPER) -> list[str]:
+    """The rows below their figure in the paper, in words."""
+    return [
+        f"{row.name} {100 * row.accuracy:.1f} < {targets[row.name]:.0f}"
+        for row in agreements
+        if row.name in targets and not 100 * row.accuracy >= targets[row.name]
+    ]
+
+
+def worst(confusions: Sequence[tuple[str, str]], count: int = 6) -> list[tuple[str, int]]:
+    """Which recipe makes a row wrong most often: (row, recipe) pairs counted."""
+    return [(f"{name}: {recipe}", times) for (name, recipe), times in Counter(confusions).most_common(count)]
+
+
+def mistakes(rows: Sequence[Row], outcomes: Sequence[Outcome], rubric: Rubric) -> list[tuple[str, str]]:
+    """(row of the table, last recipe and severity) of every wrong decision."""
+    found = []
+    for row, outcome in zip(rows, outcomes):
+        edit = f"{row.edits[-1].recipe} {row.edits[-1].severity}" if row.edits else "recording"
+        truth = truth_of(row, rubric)
+        wrong = (n for n, d in outcome.decisions.items() if truth.get(n) is not None and truth[n] != d.value)
+        found += list(itertools.product(wrong, [edit]))
+    return found
+
+
+def _mean(values: Sequence[Any]) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")

@@ -1,0 +1,54 @@
+"""Clips to begin a search with: recorded anew from a set's origins, good but for one physical defect."""
+
+from collections.abc import Iterator, Sequence
+
+from wm_nodes.benchmark.reward_hacking import Start
+from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.learning.adversarial_set import ClipSource
+from wm_nodes.reward.adversarial import RECIPES, Division, LabelledClip, ManifestError, NotApplicableError
+from wm_nodes.reward.adversarial.generator import edited
+from wm_nodes.reward.adversarial.manifest import Row
+from wm_nodes.seeding import numpy_stream
+
+DEFECTS = tuple(recipe.name for recipe in RECIPES.values() if recipe.kind == "S")
+
+
+def hacking_starts(
+    rows: Sequence[Row], division: Division, config: SimulationConfig, count: int, seed: int
+) -> Iterator[Start]:
+    """Yield `count` clips, or as many as there are: of every recorded clip that is good throughout the one with a
+    defect, by a recipe on states that the seed draws.
+
+    Raises:
+        ManifestError: a recorded clip comes out otherwise than in the set: another renderer or version.
+        NoRendererError: Vulkan finds no device.
+    """
+    roots = [row for row in rows if not row.edits and row.labels.overall]
+    shapes = {name.split("/")[0] for name in division.objects}
+    done = 0
+    for task in dict.fromkeys(row.origin.task for row in roots):
+        source = ClipSource(task, config, shapes)
+        try:
+            for row in (row for row in roots if row.origin.task == task):
+                if done == count:
+                    return
+                parent = source.clip(row.origin.seed)
+                if parent.sha256 != row.sha256:
+                    raise ManifestError(
+                        f"clip {row.sha256[:12]} came out as {parent.sha256[:12]}: another renderer; build the set here"
+                    )
+                start = _defective(parent, source, seed)
+                if start is not None:
+                    done += 1
+                    yield Start(start, parent)
+        finally:
+            source.close()
+
+
+def _defective(parent: LabelledClip, source: ClipSource, seed: int) -> LabelledClip | None:
+    for index in numpy_stream(seed, f"hack_start/{parent.sha256}").permutation(len(DEFECTS)):
+        try:
+            return edited(parent, DEFECTS[index], "fail", seed, source.redraw)
+        except NotApplicableError:
+            continue
+    return None

@@ -1,0 +1,259 @@
+"""The reward agent at work on many clips, for callers that do not await. Specification: sections 2.3, 2.6.
+
+Shapes: N clips, F frames, H W 3 image, A action.
+"""
+
+import asyncio
+import math
+import threading
+import time
+from collections.abc import Callable, Coroutine, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.learning.video_config import AGENT
+from wm_nodes.learning.video_data import Clips
+from wm_nodes.recording.reader import read_spec
+from wm_nodes.reward.agent import ClipRef, RewardAgent, Rubric, Status, TaskSpec, Verdict, clip_ref, load_rubric
+from wm_nodes.reward.agent.scoring import skipped
+from wm_nodes.reward.agent.types import GATED, Cost, Health, Provenance, content_hash
+from wm_nodes.reward.audit import AuditedAgent, AuditLog, write_exchange
+from wm_nodes.reward.judges.factory import OpenedJudge, make_judge
+
+READS = "judge_reads"
+"""Folder of a run that keeps the judge's answers."""
+POLL_S = 0.05
+"""How often a waiting caller looks whether it must stop."""
+HEALTH_S = 10.0
+"""Time between two questions to the servers whether they are there."""
+CLOSE_S = 5.0
+
+T = TypeVar("T")
+
+
+class TrainingPaused(Exception):
+    """Too much of a round has no reward to train on: says why, and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClipJob:
+    """A clip and what it should show."""
+
+    clip: ClipRef
+    task: TaskSpec
+
+
+@dataclass
+class Tally:
+    """What verdicts were given since the start, and what they took."""
+
+    verdicts: int = 0
+    by_status: dict[Status, int] = field(default_factory=dict)
+    cost: Cost = field(default_factory=Cost)
+
+    def add(self, verdict: Verdict) -> None:
+        self.verdicts += 1
+        self.by_status[verdict.status] = self.by_status.get(verdict.status, 0) + 1
+        self.cost += verdict.cost
+
+    @property
+    def invalid_rate(self) -> float:
+        return 1 - self.by_status.get(Status.OK, 0) / self.verdicts if self.verdicts else 0.0
+
+    @property
+    def cached_ratio(self) -> float:
+        """Share of prompt tokens that the server had in its prefix cache."""
+        return self.cost.cached_tokens / self.cost.prompt_tokens if self.cost.prompt_tokens else 0.0
+
+
+class ClipJudge:
+    """A reward agent with its judge on an event loop in a thread of its own; at most `concurrency` clips at a time.
+
+    Args:
+        reads: folder that keeps the judge's answers; None: none are kept.
+        audit: folder of the audit log that every question, answer and verdict goes into; None: none is written.
+
+    Raises:
+        ValueError, MissingPackageError: as make_judge. ConfigError: the rubric is refused. AuditError: as AuditLog.
+    """
+
+    def __init__(
+        self, settings: JudgeConfig, *, seed: int, reads: Path | None = None, audit: Path | None = None
+    ) -> None:
+        self.settings, self._seed, self._reads = settings, seed, reads
+        self._log = None if audit is None else AuditLog(audit)
+        self.pack, self.tally, self.health = settings.rubric, Tally(), Health(True, "not asked yet")
+        self._opened, self._agent = self._made(load_rubric(settings.rubric))
+        self._places = asyncio.Semaphore(settings.concurrency)
+        self._asked_s = -math.inf
+        self._asking: Future[None] | None = None
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="reward agent", daemon=True)
+        self._thread.start()
+
+    @property
+    def rubric(self) -> Rubric:
+        return self._agent.rubric
+
+    @property
+    def judge_id(self) -> str:
+        return self._agent.judge.capabilities.judge_id
+
+    def set_rubric(self, pack: str, base: Path) -> None:
+        """Judge by another rubric from now on; call it while nothing is being judged.
+
+        Args:
+            pack: a pack's name, or a YAML file, absolute or relative to `base`.
+
+        Raises:
+            ConfigError: no such pack, or one that is refused; the rubric is then the one before.
+            ValueError: the judge cannot read all of its components, or max_reads does not cover them.
+        """
+        path = base / pack
+        rubric = load_rubric(str(path) if path.is_file() else pack)
+        old, (self._opened, self._agent) = self._opened, self._made(rubric)
+        self.pack = pack
+        self._run(old.close())
+
+    def submit(self, job: ClipJob, deadline: float | None = None) -> "Future[Verdict]":
+        """Judge one clip as soon as there is a place. deadline: on the time.monotonic clock, s; see judge."""
+        return self._run(self._judged(self._agent, job, deadline))
+
+    def judge(
+        self, jobs: Sequence[ClipJob], *, check: Callable[[], None] = lambda: None,
+        done: Callable[[int, Verdict], None] = lambda index, verdict: None, within_s: float | None = None,
+        round_number: int = 0,
+    ) -> list[Verdict]:  # fmt: skip
+        """Judge clips by one judge and one rubric; the verdicts are in the order of the jobs.
+
+        Args:
+            check: called at least every POLL_S; what it raises ends the judging, and calls under way are dropped.
+            done: called in this thread with the index and verdict of every clip as it is judged.
+            within_s: clips without a verdict by then get one that says so, without a reward; None: no limit.
+            round_number: what the audit log calls these clips' round.
+        """
+        if isinstance(self._agent, AuditedAgent):
+            self._agent.round_number = round_number
+        deadline = None if within_s is None else time.monotonic() + within_s
+        futures = {self.submit(job, deadline): index for index, job in enumerate(jobs)}
+        open_ = set(futures)
+        try:
+            while open_:
+                check()
+                finished, open_ = wait(open_, POLL_S, FIRST_COMPLETED)
+                for future in finished:
+                    done(futures[future], future.result())
+        finally:
+            for future in open_:
+                future.cancel()
+        return [future.result() for future in futures]
+
+    def refresh_health(self) -> None:
+        """Ask the judge how it is, at most every HEALTH_S and without waiting: `health` is the newest answer."""
+        idle = self._asking is None or self._asking.done()
+        if idle and not self._loop.is_closed() and time.monotonic() - self._asked_s >= HEALTH_S:
+            self._asked_s = time.monotonic()
+            self._asking = self._run(self._ask_health())
+
+    def close(self) -> None:
+        """Drop what is under way and end the thread."""
+        with suppress(TimeoutError):
+            self._run(self._end()).result(CLOSE_S)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(CLOSE_S)
+        self._loop.close()
+        if self._log is not None:
+            self._log.close()
+
+    # internals
+
+    def _made(self, rubric: Rubric) -> tuple[OpenedJudge, RewardAgent | AuditedAgent]:
+        settings, log = self.settings, self._log
+        limits: dict[str, Any] = {
+            "mode": settings.mode, "seed": self._seed, "max_reads": settings.max_reads,
+            "budget_s": settings.clip_budget_s, "call_plan": settings.call_plan,
+        }  # fmt: skip
+        if log is None:
+            opened = make_judge(settings, rubric, self._reads)
+            return opened, RewardAgent(opened.judge, rubric, **limits)
+        opened = make_judge(settings, rubric, self._reads, partial(write_exchange, log))
+        return opened, AuditedAgent(opened.judge, rubric, log, **limits)
+
+    def _run(self, work: Coroutine[Any, Any, T]) -> "Future[T]":
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    async def _judged(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
+        left_s = None if deadline is None else deadline - time.monotonic()
+        try:
+            async with asyncio.timeout(left_s), self._places:
+                verdict = await agent.evaluate(job.clip, job.task)
+        except TimeoutError:
+            verdict = _late(agent, job, self._seed)
+        self.tally.add(verdict)
+        return verdict
+
+    async def _ask_health(self) -> None:
+        self.health = await self._opened.judge.health()
+
+    async def _end(self) -> None:
+        others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+        await self._opened.close()
+
+
+def _late(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict:
+    """The verdict on a clip that the round did not wait for."""
+    able, now = agent.judge.capabilities, time.time()
+    verdict = Verdict(
+        clip_id=job.clip.clip_id, status=Status.ERROR, reward=math.nan, level=-1,
+        stages=tuple(map(skipped, GATED)), plan=None, reflections=(), hack_flags=(), cost=Cost(),
+        provenance=Provenance(
+            able.judge_id, able.transport, able.model, able.server_version, agent.rubric.version, "", job.clip.sha256,
+            seed, now, now,
+        ),
+        reason="no verdict by the round's deadline",
+    )  # fmt: skip
+    return replace(verdict, audit_id=content_hash(verdict))
+
+
+def buffer_jobs(frames: Tensor, references: Clips, sha256: str, *, fps: float, task: str, robot: str) -> list[ClipJob]:
+    """One job per clip of a buffer.
+
+    Args:
+        frames: decoded clips, uint8 (N, F, H, W, 3). references: the recordings of their contexts, a row per clip.
+        sha256: of the buffer's file; names the clips. fps: clip frames per second.
+    """
+    shown, first = frames.numpy(), references.frames[:, 0].numpy()
+    actions = references.actions.numpy().astype(np.float32)
+    return [
+        ClipJob(
+            clip_ref(f"{sha256[:12]}/{row}", shown[row], fps),
+            TaskSpec(references.instructions[row], task, robot, first[row], actions=actions[row]),
+        )
+        for row in range(len(shown))
+    ]
+
+
+def agent_scores(verdicts: Sequence[Verdict]) -> dict[str, Tensor]:
+    """The reward of each verdict, float64 (N,), NaN where there is none."""
+    return {AGENT: torch.tensor([verdict.reward for verdict in verdicts], dtype=torch.float64)}
+
+
+def clip_fps(bag: Path, stride: int) -> float:
+    """Frames per second of clips that are cut from a bag at every `stride`-th frame.
+
+    Raises:
+        BagError: an unusable bag.
+    """
+    return 1.0 / (read_spec(bag).control_period_s * stride)

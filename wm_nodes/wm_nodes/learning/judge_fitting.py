@@ -1,0 +1,180 @@
+"""Fit the heads of the embedded judge to labels, and say how well they do. Specification: sections 4.2, 4.3.
+
+Trees come from the training part; what turns log-odds into probabilities, and where a clip is too foreign to judge,
+from the validation part. Shapes: N clips, F evidence.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from wm_nodes.reward.adversarial import COMPONENTS, TC
+from wm_nodes.reward.adversarial.manifest import Row
+from wm_nodes.reward.adversarial.planning import planning_level
+from wm_nodes.reward.agent.types import PLANNING
+from wm_nodes.reward.evidence.head import CLIP_AT, HACK, Familiarity, Question, above_levels, num_questions
+from wm_nodes.reward.evidence.trees import TreeSettings, fit_trees
+from wm_nodes.reward.statistics import auroc, balanced_accuracy, expected_calibration_error
+from wm_nodes.seeding import numpy_stream
+from wm_nodes.types import BoolArray, FloatArray
+
+PATTERNS = ("occlusion", "motion", "background", "physics")
+TARGETS = (*COMPONENTS, TC, PLANNING, *(HACK + name for name in PATTERNS))
+UNKNOWN = -1
+SHRINKAGE = 0.3
+"""Share of the identity in the covariance of standardised evidence."""
+COVERAGE = 0.99
+"""Share of the validation part that is near enough to training to be judged."""
+MIN_SLOPE, MAX_SLOPE = 0.1, 3.0
+FLAG, MAX_FALSE_FLAGS = 0.8, 0.02
+"""The agent confirms a pattern from this probability on (rubrics: hack.confirm)."""
+MIN_CASES = 5
+"""With fewer passes or fails in the validation part, log-odds are only corrected for the balance of training."""
+
+Levels = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Examples:
+    """evidence: (N, F) in the order of `names`. rows: what is known of each clip."""
+
+    names: tuple[str, ...]
+    evidence: FloatArray
+    rows: Sequence[Row]
+
+    def __post_init__(self) -> None:
+        if self.evidence.shape != (len(self.rows), len(self.names)):
+            raise ValueError(f"evidence {self.evidence.shape} is not {len(self.rows)} clips of {len(self.names)}")
+
+    @property
+    def clean(self) -> BoolArray:
+        """(N,), nothing fails."""
+        return np.array([row.labels.overall for row in self.rows], bool)
+
+
+def true_levels(target: str, rows: Sequence[Row]) -> Levels:
+    """(N,) of levels; 0 or 1 for components (passes) and patterns (absent); UNKNOWN where nobody knows."""
+    return np.array([_true_level(target, row) for row in rows], np.int64)
+
+
+def _true_level(target: str, row: Row) -> int:
+    if target == PLANNING:
+        level = planning_level(row.labels, row.edits)
+        return UNKNOWN if level is None else level
+    if target == TC:
+        return row.labels.tc_level
+    if target.startswith(HACK):
+        return int(row.labels.pattern != target.removeprefix(HACK))
+    passed: Mapping[str, bool] = row.labels.passed
+    return int(passed[target]) if target in passed else UNKNOWN
+
+
+def fit_questions(
+    target: str, train: Examples, validation: Examples, settings: TreeSettings, seed: int
+) -> tuple[Question, ...]:
+    """Fit every question of a target.
+
+    Raises:
+        ValueError: a question has only one answer in the training part; names target and level.
+    """
+    levels, held = true_levels(target, train.rows), true_levels(target, validation.rows)
+    known, held_known = levels != UNKNOWN, held != UNKNOWN
+    questions = []
+    for k in range(num_questions(target)):
+        above = levels[known] > k
+        if above.all() or not above.any():
+            where = "above" if above.all() else "at most"
+            raise ValueError(f"training clips of {target} are all {where} level {k}; build larger sets")
+        weights = np.where(above, 0.5 / above.mean(), 0.5 / (1 - above.mean()))
+        rng = numpy_stream(seed, f"judge_trees/{target}", k)
+        trees = fit_trees(train.evidence[known], above, weights, settings, rng)
+        odds = trees.log_odds(validation.evidence[held_known]).astype(np.float64)
+        line = _line(odds, held[held_known] > k, float(above.mean()))
+        if target.startswith(HACK):
+            line = _flagging_line(line[0], odds, held[held_known] > k)
+        questions.append(Question(trees, *line))
+    return tuple(questions)
+
+
+def _flagging_line(slope: float, odds: Floats, absent: BoolArray) -> tuple[float, float]:
+    """A line that puts the threshold with the best recall less false flags at a pattern's probability of FLAG.
+
+    The agent confirms a pattern by this probability, so that it is a decision first and a probability second. At most
+    MAX_FALSE_FLAGS of the clips without the pattern are flagged; the threshold lies midway between two clips.
+    """
+    ordered = np.unique(odds)
+    thresholds = np.concatenate([[ordered[0] - 1], (ordered[1:] + ordered[:-1]) / 2])
+    recall = np.array([(odds[~absent] <= t).mean() if not absent.all() else 0.0 for t in thresholds])
+    false = np.array([(odds[absent] <= t).mean() if absent.any() else 0.0 for t in thresholds])
+    worth = np.where(false <= MAX_FALSE_FLAGS, recall - false, -1.0)
+    best = np.flatnonzero(worth >= worth.max() - 1e-12)
+    threshold = float(thresholds[best[len(best) // 2]])
+    return slope, float(np.log((1 - FLAG) / FLAG)) - slope * threshold
+
+
+def _line(odds: Floats, above: BoolArray, share: float) -> tuple[float, float]:
+    """(slope, offset) of the likeliest sigmoid, by Newton steps; Platt's smoothed targets keep it finite.
+
+    share: of the training labels; what balanced training took out of the odds where too few cases can say.
+    """
+    passes, fails = int(above.sum()), int((~above).sum())
+    if min(passes, fails) < MIN_CASES:
+        return 1.0, float(np.log(share / (1 - share)))
+    aim = np.where(above, (passes + 1) / (passes + 2), 1 / (fails + 2))
+    design = np.stack([odds, np.ones_like(odds)], 1)
+    line = np.array([1.0, 0.0])
+    for _ in range(50):
+        p = 1 / (1 + np.exp(-np.clip(design @ line, -30, 30)))
+        pull = design.T @ (aim - p) - 0.1 * (line - [1.0, 0.0])  # a weak pull to the odds as they are
+        curvature = (design * (p * (1 - p))[:, None]).T @ design + 0.1 * np.eye(2)
+        line = line + np.clip(np.linalg.solve(curvature, pull), -1, 1)
+    return float(np.clip(line[0], MIN_SLOPE, MAX_SLOPE)), float(line[1])
+
+
+def fit_familiarity(train: Examples, validation: Examples) -> Familiarity:
+    """Learn what evidence looks like, faults included, and the distance within which COVERAGE of validation lies."""
+    low, centre, high = np.quantile(train.evidence.astype(np.float64), (0.25, 0.5, 0.75), axis=0)
+    spread = train.evidence.std(0, dtype=np.float64)
+    scale = np.maximum(np.maximum((high - low) / 1.35, 0.5 * spread), 1e-3)
+    z = np.clip((train.evidence - centre) / scale, -CLIP_AT, CLIP_AT)
+    covariance = (1 - SHRINKAGE) * (z.T @ z) / len(z) + SHRINKAGE * np.eye(z.shape[1])
+    found = Familiarity(
+        centre.astype(np.float32), scale.astype(np.float32), np.linalg.inv(covariance).astype(np.float32), 0.0
+    )
+    limit = float(np.quantile(found.distance(validation.evidence), COVERAGE))
+    return Familiarity(found.centre, found.scale, found.precision, limit)
+
+
+def fit_all(
+    train: Examples, validation: Examples, settings: TreeSettings, seed: int, *, progress: bool = True
+) -> dict[str, tuple[Question, ...]]:
+    """Questions of every target."""
+    targets = tqdm(TARGETS, desc="heads", disable=not progress)
+    return {target: fit_questions(target, train, validation, settings, seed) for target in targets}
+
+
+def measured(
+    questions: Mapping[str, tuple[Question, ...]], target: str, examples: Examples
+) -> dict[str, Any]:
+    """n, prevalence of fails, accuracy, balanced accuracy, AUROC and ECE of a target; of task completion's pass is
+    meant from "nearly" on; planning also says how often the likeliest level is the true one.
+    """
+    levels = true_levels(target, examples.rows)
+    known = levels != UNKNOWN
+    above = np.minimum.accumulate(above_levels(questions, target, examples.evidence[known]), 0)
+    k = {PLANNING: 1, TC: 2}.get(target, 0)
+    truth, p = levels[known] > k, above[k]
+    found = {
+        "n": int(known.sum()), "fails": int((~truth).sum()), "accuracy": float(((p >= 0.5) == truth).mean()),
+        "balanced_accuracy": balanced_accuracy(truth, p >= 0.5), "auroc": auroc(truth, p),
+        "ece": expected_calibration_error(truth, p),
+    }  # fmt: skip
+    if len(above) > 1:
+        full = np.concatenate([np.ones((1, len(p))), above, np.zeros((1, len(p)))])
+        found["level_accuracy"] = float(((full[:-1] - full[1:]).argmax(0) == levels[known]).mean())
+    return {name: round(value, 4) if isinstance(value, float) else value for name, value in found.items()}

@@ -1,0 +1,136 @@
+"""Make the embedded judge from adversarial sets: segmenter, evidence, heads, limits. Specification: section 4.3.
+
+Finished stages lie in the folder and are taken up again: segmenter.safetensors, and evidence-*.npz per set and part,
+named by everything they depend on.
+"""
+
+import hashlib
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.torch import load_file, save
+from tqdm import tqdm
+
+import wm_nodes.reward.evidence
+from wm_nodes.files import write_atomic
+from wm_nodes.learning.judge_data import load_sets, rows_of, set_clips
+from wm_nodes.learning.judge_fitting import TARGETS, Examples, fit_all, fit_familiarity, measured
+from wm_nodes.learning.judge_segmenter import overlaps, segmentation_data, train_segmenter
+from wm_nodes.reward.adversarial import Manifest
+from wm_nodes.reward.adversarial.manifest import Part, to_bytes
+from wm_nodes.reward.evidence.clip import clip_evidence
+from wm_nodes.reward.evidence.head import JudgeHead
+from wm_nodes.reward.evidence.segmentation import Segmenter
+from wm_nodes.reward.evidence.trees import TreeSettings
+
+SEGMENTER = "segmenter.safetensors"
+Sets = Sequence[tuple[Path, Manifest]]
+
+
+@dataclass(frozen=True)
+class JudgePlan:
+    """sets: folders of adversarial sets. segmenter_steps: batches. seed: of everything drawn."""
+
+    sets: tuple[Path, ...]
+    segmenter_steps: int = 2800
+    trees: TreeSettings = field(default_factory=TreeSettings)
+    seed: int = 0
+
+
+def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> JudgeHead:
+    """Train every part; the head's story holds data, seeds and what the validation part measures, not yet who and when.
+
+    Raises:
+        ManifestError: a damaged set. ValueError: sets too small to learn from. OSError: a full disk.
+    """
+    sets = load_sets(plan.sets)
+    segmenter, segmenter_story = _segmenter(folder, sets, plan, progress)
+    train, validation = (
+        collect_evidence(folder, sets, part, segmenter, progress=progress) for part in ("train", "validation")
+    )
+    if not len(train.rows) or not len(validation.rows):
+        raise ValueError(f"{len(train.rows)} training and {len(validation.rows)} validation clips; build larger sets")
+    questions = fit_all(train, validation, plan.trees, plan.seed, progress=progress)
+    low, high = np.quantile(train.evidence[train.clean], (0.05, 0.95), axis=0).astype(np.float32)
+    first = next(set_clips(sets, ["train"]))
+    length = len(first.frames)
+    lengths = (-(-2 * length // 3), 3 * length // 2)
+    story = {
+        "data": [_described(path, manifest) for path, manifest in sets], "seed": plan.seed,
+        "segmenter": segmenter_story, "trees": vars(plan.trees),
+        "tasks": sorted({row.origin.task for row in train.rows}),
+        "cameras": sorted({row.origin.camera for row in train.rows}),
+        "validation": {target: measured(questions, target, validation) for target in TARGETS},
+    }  # fmt: skip
+    known = fit_familiarity(train, validation)
+    size = (first.frames.shape[1], first.frames.shape[2])
+    return JudgeHead(segmenter, train.names, questions, known, low, high, size, lengths, story)
+
+
+def collect_evidence(
+    folder: Path, sets: Sets, part: Part, segmenter: Segmenter, *, progress: bool = True
+) -> Examples:
+    """Evidence of every clip of a part of all sets, kept in `folder` per set."""
+    names: tuple[str, ...] = ()
+    found, rows = [], []
+    for path, manifest in sets:
+        chosen = rows_of(manifest, [part])
+        if not chosen:
+            continue
+        key = hashlib.sha256(to_bytes(manifest) + _state(segmenter) + _sources() + part.encode()).hexdigest()[:16]
+        kept = folder / f"evidence-{key}.npz"
+        if not kept.exists():
+            name = f"evidence of {path.name} {part}"
+            clips = tqdm(set_clips([(path, manifest)], [part]), name, len(chosen), disable=not progress)
+            numbers = [clip_evidence(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
+            buffer = io.BytesIO()
+            values = np.array([list(evidence.values()) for evidence in numbers], np.float32)
+            np.savez_compressed(buffer, names=np.array(list(numbers[0])), values=values)
+            write_atomic(kept, buffer.getvalue())
+        with np.load(kept, allow_pickle=False) as arrays:
+            names = tuple(str(name) for name in arrays["names"])
+            found.append(arrays["values"])
+        rows += chosen
+    return Examples(names, np.concatenate(found) if found else np.zeros((0, 0), np.float32), rows)
+
+
+def _segmenter(
+    folder: Path, sets: Sets, plan: JudgePlan, progress: bool
+) -> tuple[Segmenter, dict[str, Any]]:
+    """Train the segmenter, or take up the one that lies there; and say how it was made. Weights are float16's."""
+    path = folder / SEGMENTER
+    if not path.exists():
+        images, masks = segmentation_data(set_clips(sets, ["train"]), plan.seed)
+        model = train_segmenter(images, masks, num_steps=plan.segmenter_steps, seed=plan.seed, progress=progress)
+        held = segmentation_data(set_clips(sets, ["validation"]), plan.seed)
+        story = {
+            "sets": [str(folder.name) for folder, _ in sets], "pictures": len(images), "steps": plan.segmenter_steps,
+            "seed": plan.seed, "overlap": {name: round(value, 4) for name, value in overlaps(model, *held).items()},
+        }  # fmt: skip
+        write_atomic(path.with_suffix(".json"), (json.dumps(story, indent=1) + "\n").encode())
+        write_atomic(path, save({name: tensor.half() for name, tensor in model.state_dict().items()}))
+    segmenter = Segmenter()
+    segmenter.load_state_dict({name: tensor.float() for name, tensor in load_file(path).items()})
+    story = json.loads(path.with_suffix(".json").read_text())
+    return segmenter.eval().requires_grad_(False), story
+
+
+def _described(path: Path, manifest: Manifest) -> dict[str, Any]:
+    parts = {part: sum(row.part == part for row in manifest.rows) for part in ("train", "validation", "test")}
+    return {"set": path.name, "manifest_sha256": hashlib.sha256(to_bytes(manifest)).hexdigest(), "clips": parts}
+
+
+def _state(segmenter: Segmenter) -> bytes:
+    return hashlib.sha256(save(dict(segmenter.state_dict()))).digest()
+
+
+def _sources() -> bytes:
+    """Of the code that computes evidence: a changed number is another number."""
+    folder = Path(str(wm_nodes.reward.evidence.__path__[0]))
+    names = ("pixels", "registration", "objects", "regions", "segmentation", "clip")
+    return hashlib.sha256(b"".join((folder / f"{name}.py").read_bytes() for name in names)).digest()

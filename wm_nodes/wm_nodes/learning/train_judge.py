@@ -1,0 +1,95 @@
+"""Train the embedded judge from adversarial sets, or measure a trained one. Specification: sections 4.2 and 4.3.
+
+The sets' own division says which episodes train, which calibrate, and which nobody has seen. Started again, it takes up
+finished stages that lie in OUT.
+
+    python -m wm_nodes.learning.train_judge OUT SET [SET ...] --seed 0
+    python -m wm_nodes.learning.train_judge OUT SET [SET ...] --measure test
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from wm_nodes.files import write_atomic
+from wm_nodes.learning.judge_data import load_sets
+from wm_nodes.learning.judge_fitting import TARGETS, measured
+from wm_nodes.learning.judge_training import JudgePlan, collect_evidence, make_judge
+from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reward.evidence.head import load_head, save_head
+from wm_nodes.reward.evidence.trees import TreeSettings
+
+
+def main(argv: Sequence[str]) -> int:
+    """Train or measure. Return the exit code: 0 done, 2 a clear error."""
+    parser = argparse.ArgumentParser(prog="train_judge", description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path, help="folder of the judge, and of finished stages")
+    parser.add_argument("sets", type=Path, nargs="+", help="folders made by adversarial_set, of one division")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--segmenter-steps", type=int, default=JudgePlan.segmenter_steps, help="batches of 16 pictures")
+    parser.add_argument("--trees", type=int, default=TreeSettings.num_trees, help="per question")
+    parser.add_argument("--threads", type=int, default=1, help="cores; other numbers give other last bits")
+    parser.add_argument("--measure", choices=("train", "validation", "test"), help="train nothing, measure this part")
+    arguments = parser.parse_args(argv)
+    torch.set_num_threads(arguments.threads)
+    try:
+        if arguments.measure:
+            report = _measured(arguments)
+        else:
+            plan = JudgePlan(
+                tuple(arguments.sets), arguments.segmenter_steps, TreeSettings(arguments.trees), arguments.seed
+            )
+            made = {
+                "command": "python -m wm_nodes.learning.train_judge " + " ".join(argv), "machine": machine_facts(),
+            }  # fmt: skip
+            head = make_judge(arguments.out, plan)
+            head = replace(head, story={"made": made, **head.story})
+            save_head(arguments.out, head)
+            report = dict(head.story["validation"])
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(table(report))
+    return 0
+
+
+def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
+    head = load_head(arguments.out)
+    part = arguments.measure
+    examples = collect_evidence(arguments.out, load_sets(arguments.sets), part, head.segmenter)
+    if not len(examples.rows):
+        raise ValueError(f"the sets have no {part} clips; build larger ones")
+    found: dict[str, Any] = {t: measured(head.questions, t, examples) for t in TARGETS}
+    known = head.familiarity
+    foreign = known.distance(examples.evidence) > known.limit
+    found["foreign"] = {
+        split: [int(sum(foreign[i] for i in chosen)), len(chosen)]
+        for split in sorted({row.split for row in examples.rows})
+        if (chosen := [i for i, row in enumerate(examples.rows) if row.split == split])
+    }
+    write_atomic(arguments.out / f"measured-{part}.json", (json.dumps(found, indent=1) + "\n").encode())
+    return found
+
+
+def table(report: Mapping[str, Any]) -> str:
+    """One line per target; then how many clips of each split are too foreign to judge."""
+    lines = [f"{'target':16} {'n':>6} {'fails':>6} {'acc':>6} {'bal.':>6} {'AUROC':>6} {'ECE':>6} {'level':>6}"]
+    for name in TARGETS:
+        found = report[name]
+        level = f"{100 * found['level_accuracy']:6.1f}" if "level_accuracy" in found else ""
+        lines.append(
+            f"{name:16} {found['n']:6} {found['fails']:6} {100 * found['accuracy']:6.1f} "
+            f"{100 * found['balanced_accuracy']:6.1f} {found['auroc']:6.3f} {found['ece']:6.3f} {level}"
+        )
+    lines += [f"too foreign to judge, {split}: {a} of {n}" for split, (a, n) in report.get("foreign", {}).items()]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

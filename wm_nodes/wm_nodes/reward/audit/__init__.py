@@ -1,0 +1,26 @@
+"""Everything a reward agent was asked and answered, in a log that cannot be changed unseen; and people's say on it.
+
+    with AuditLog(folder) as log:
+        agent = AuditedAgent(judge, rubric, log, round_number=3)    # in place of RewardAgent(judge, rubric)
+        verdict = await agent.evaluate(clip, task)
+
+    python -m wm_nodes.reward.audit --help
+"""
+
+from wm_nodes.reward.audit.log import AuditError, AuditLog
+from wm_nodes.reward.audit.reading import Record, read_record, verify
+from wm_nodes.reward.audit.recording import AuditedAgent, RecordingJudge, write_exchange
+from wm_nodes.reward.audit.replay import ReplayJudge, replayed
+
+__all__ = [
+    "AuditError",
+    "AuditLog",
+    "AuditedAgent",
+    "Record",
+    "RecordingJudge",
+    "ReplayJudge",
+    "read_record",
+    "replayed",
+    "verify",
+    "write_exchange",
+]

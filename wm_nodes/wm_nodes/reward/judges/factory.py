@@ -1,0 +1,85 @@
+"""A judge from the configuration's `judge` section. Specification: sections 2.6 and 4.4."""
+
+import re
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.reward.agent.rubric import Rubric
+from wm_nodes.reward.agent.types import Judge
+from wm_nodes.reward.evidence.head import load_head
+from wm_nodes.reward.judges.cache import VerdictCache
+from wm_nodes.reward.judges.calls import ChatOptions, Exchange
+from wm_nodes.reward.judges.embedded import EmbeddedJudge
+from wm_nodes.reward.judges.openai_client import OpenAIJudge
+from wm_nodes.reward.judges.transport import ChatTransport, Endpoint, RetryPolicy
+
+_VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class OpenedJudge:
+    """A judge and what ends it: `close` is awaited on the event loop that asked the judge."""
+
+    judge: Judge
+    close: Callable[[], Coroutine[Any, Any, None]]
+
+
+def check_judge(settings: JudgeConfig) -> None:
+    """Refuse settings that name no judge, before anything is made from them or written with them.
+
+    Raises:
+        ValueError: names the setting and the remedy; never repeats what may be a key.
+    """
+    if settings.kind == "embedded":
+        if not settings.folder or not Path(settings.folder).is_dir():
+            raise ValueError(
+                f"judge.kind embedded needs the folder of a trained judge in judge.folder, got {settings.folder!r}; "
+                "make one with python -m wm_nodes.learning.train_judge"
+            )
+        return
+    if not settings.endpoints or not settings.model:
+        raise ValueError(
+            "the reward agent needs a judge: set judge.endpoints, e.g. [http://127.0.0.1:8000/v1], and judge.model "
+            f"(got {settings.endpoints} and {settings.model!r})"
+        )
+    if settings.api_key_env and not _VARIABLE.fullmatch(settings.api_key_env):
+        raise ValueError(
+            "judge.api_key_env must be the name of an environment variable, e.g. JUDGE_API_KEY; what is there is no "
+            "name, perhaps a key, and is not repeated here"
+        )
+
+
+def make_judge(
+    settings: JudgeConfig, rubric: Rubric, reads: Path | None = None,
+    on_exchange: Callable[[Exchange], None] = lambda exchange: None,
+) -> OpenedJudge:  # fmt: skip
+    """Make the judge that the settings name; nothing is asked yet.
+
+    Args:
+        reads: folder of the reads that were bought before, see VerdictCache; None: none are kept. Of servers only.
+        on_exchange: called with the words of every request to a server and its raw reply.
+
+    Raises:
+        ValueError: as check_judge; the key's environment variable is not set, or the folder holds no judge.
+        MissingPackageError: the client package is not installed.
+    """
+    check_judge(settings)
+    if settings.kind == "embedded":
+        return OpenedJudge(EmbeddedJudge(load_head(Path(settings.folder))), _nothing)
+    transport = ChatTransport(
+        [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
+        retry=RetryPolicy(settings.tries),
+    )
+    options = ChatOptions(
+        json_timeout_s=settings.json_timeout_s, label_timeout_s=settings.label_timeout_s,
+        budget_s=settings.clip_budget_s, max_images=settings.max_images,
+    )  # fmt: skip
+    cache = VerdictCache(reads) if reads is not None and settings.keep_reads else None
+    return OpenedJudge(OpenAIJudge(transport, rubric, options, cache, on_exchange), transport.close)
+
+
+async def _nothing() -> None:
+    """What ends a judge that holds nothing."""
