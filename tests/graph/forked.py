@@ -71,6 +71,7 @@ class Forks:
 
     def start(self, module: str, args: list[str], environment: dict[str, str], log: Path) -> ForkedNode:
         """Run module.main() with sys.argv[1:] = args, its output appended to `log`."""
+        log.touch()
         request = {"module": module, "args": args, "environment": environment, "log": str(log)}
         with self._lock:
             self._connection.send_bytes(json.dumps(request).encode())

@@ -29,7 +29,7 @@ MEASURES = ("reads", "calls", "images", "pixels", "tokens")
 
 @dataclass(frozen=True)
 class Economy:
-    """The agent against another way. saved: share of the other's measures, by name. n: clips that both decide.
+    """The agent against another way, on the n clips that both decide. saved: share of the other's measures, by name.
     same: share of them with the same decision. accuracy, other_accuracy: of accepting, against the labels.
     difference: agent - other on the same clips, with Tango's interval.
     """
@@ -58,18 +58,18 @@ def economy(rows: Sequence[Row], outcomes: Mapping[str, Sequence[Outcome]]) -> l
     Raises:
         ValueError: no clip that both decide.
     """
-    mine, found = outcomes["agent"], []
+    found = []
     for name in ("everything", "exhaustive"):
-        both = [
-            (row.labels.overall, one.decisions[OVERALL].value, other.decisions[OVERALL].value)
-            for row, one, other in zip(rows, mine, outcomes[name])
+        kept = [
+            (row, one, other) for row, one, other in zip(rows, outcomes["agent"], outcomes[name])
             if OVERALL in one.decisions and OVERALL in other.decisions
-        ]
+        ]  # fmt: skip
+        both = [(row.labels.overall, a.decisions[OVERALL].value, b.decisions[OVERALL].value) for row, a, b in kept]
         if not both:
             raise ValueError(f"no clip is decided by the agent and by {ARMS[name]}; see the statuses of the table")
         right = [said == label for label, said, _ in both]
         other_right = [said == label for label, _, said in both]
-        cost, other_cost = cost_row(mine), cost_row(outcomes[name])
+        cost, other_cost = cost_row([one for _, one, _ in kept]), cost_row([other for _, _, other in kept])
         saved = {part: 1 - cost[part] / other_cost[part] for part in MEASURES}
         same = [one == other for _, one, other in both]
         agreed, mine_right, its_right = (sum(decisions) / len(both) for decisions in (same, right, other_right))
