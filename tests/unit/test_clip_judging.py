@@ -211,10 +211,9 @@ def test_a_judge_that_is_down_leaves_the_last_step_without_a_reward_and_says_why
         ({}, r"set judge\.endpoints"),
         ({"endpoints": ["http://localhost/v1"]}, r"judge\.model"),
         ({"endpoints": ["http://localhost/v1"], "model": "m", "api_key_env": "sk-secret"}, "name of an environment"),
-        ({"kind": "embedded"}, r"judge\.folder, got ''"),
         ({"kind": "embedded", "folder": "/no/folder"}, "/no/folder"),
     ],
-    ids=["nobody", "no_model", "a_key", "embedded", "embedded_elsewhere"],
+    ids=["nobody", "no_model", "a_key", "embedded_elsewhere"],
 )
 def test_settings_that_name_no_judge_are_refused_by_name_and_no_key_is_repeated(
     changes: dict[str, object], words: str

@@ -15,6 +15,7 @@ from wm_nodes.reward.agent.types import ClipRef, Stage, Status, TaskSpec, Verdic
 from wm_nodes.reward.evidence.definitions import EVIDENCE
 from wm_nodes.reward.evidence.head import load_head
 from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head
+from wm_nodes.reward.judges.factory import make_judge
 
 FIRST_SEED = 70_000
 
@@ -33,6 +34,12 @@ def test_it_is_small_says_how_it_was_made_and_knows_its_evidence() -> None:
     assert head.story["made"]["command"].startswith("python -m wm_nodes.learning.train_judge")
     card = EmbeddedJudge(head).card
     assert "96 x 96 px" in card and all(name in card for name in head.questions)
+
+
+def test_the_settings_name_it_by_its_kind_alone() -> None:
+    settings = load_config("smoke", {"judge.kind": "embedded"}).judge
+    shipped = EmbeddedJudge(load_head(shipped_head()))
+    assert make_judge(settings, load_rubric()).judge.capabilities == shipped.capabilities
 
 
 def test_noise_and_another_size_are_not_judged() -> None:

@@ -122,7 +122,7 @@ class JudgeConfig(Section):
     api_key_env: str
     """openai: name of the environment variable that holds the key; empty: the server wants none."""
     folder: str
-    """embedded: folder of the trained judge."""
+    """embedded: folder of the trained judge; empty: the shipped one."""
     rubric: str
     """Rubric pack: a name, or a .yaml file."""
     mode: Literal["reward", "benchmark"]

@@ -12,7 +12,7 @@ from wm_nodes.reward.agent.types import Judge
 from wm_nodes.reward.evidence.head import load_head
 from wm_nodes.reward.judges.cache import VerdictCache
 from wm_nodes.reward.judges.calls import ChatOptions, Exchange
-from wm_nodes.reward.judges.embedded import EmbeddedJudge
+from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head
 from wm_nodes.reward.judges.openai_client import OpenAIJudge
 from wm_nodes.reward.judges.transport import ChatTransport, Endpoint, RetryPolicy
 
@@ -34,10 +34,10 @@ def check_judge(settings: JudgeConfig) -> None:
         ValueError: names the setting and the remedy; never repeats what may be a key.
     """
     if settings.kind == "embedded":
-        if not settings.folder or not Path(settings.folder).is_dir():
+        if settings.folder and not Path(settings.folder).is_dir():
             raise ValueError(
-                f"judge.kind embedded needs the folder of a trained judge in judge.folder, got {settings.folder!r}; "
-                "make one with python -m wm_nodes.learning.train_judge"
+                f"judge.folder {settings.folder!r} is no folder; name that of a trained judge (make one with "
+                "python -m wm_nodes.learning.train_judge), or leave it empty for the shipped one"
             )
         return
     if not settings.endpoints or not settings.model:
@@ -68,7 +68,8 @@ def make_judge(
     """
     check_judge(settings)
     if settings.kind == "embedded":
-        return OpenedJudge(EmbeddedJudge(load_head(Path(settings.folder))), _nothing)
+        folder = Path(settings.folder) if settings.folder else shipped_head()
+        return OpenedJudge(EmbeddedJudge(load_head(folder)), _nothing)
     transport = ChatTransport(
         [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
         retry=RetryPolicy(settings.tries),
