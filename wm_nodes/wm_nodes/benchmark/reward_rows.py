@@ -14,8 +14,8 @@ from wm_nodes.reward.adversarial import SPLITS, TC
 from wm_nodes.reward.adversarial.manifest import Row
 from wm_nodes.reward.agent.rubric import Rubric
 from wm_nodes.reward.agent.types import PLANNING
-from wm_nodes.reward.decisions import OVERALL, PAPER, STAGES, row_names
-from wm_nodes.reward.statistics import auroc, balanced_accuracy, expected_calibration_error, kappa, wilson_interval
+from wm_nodes.reward.decisions import OVERALL, PAPER, STAGES, match, row_names
+from wm_nodes.reward.statistics import auroc, wilson_interval
 
 MAX_FALSE_POSITIVES = 0.05
 
@@ -63,27 +63,13 @@ def by_split(rows: Sequence[Row], outcomes: Sequence[Outcome], rubric: Rubric) -
 def _agreement(name: str, labels: Sequence[Known], outcomes: Sequence[Outcome]) -> Agreement:
     pairs = [(label, outcome.decisions.get(name)) for label, outcome in zip(labels, outcomes) if label is not None]
     said = [(label, decision) for label, decision in pairs if decision is not None]
-    truth, answers = [label for label, _ in said], [decision.value for _, decision in said]
-    right = [label == answer for label, answer in zip(truth, answers)]
-    p_pass = [decision.p_pass for _, decision in said]
-    low, high = wilson_interval(sum(right), len(right))
-    confusion = Counter(f"{_word(label)} called {_word(answer)}" for label, answer in zip(truth, answers))
-    if name == PLANNING:  # p_pass is that of the level that was chosen
-        failing, balanced = [label < 2 for label in truth], _mean_recall(truth, right)
-        calibration, area = expected_calibration_error(right, p_pass), float("nan")
-    else:
-        failing, balanced = [not label for label in truth], balanced_accuracy(truth, answers)
-        calibration, area = expected_calibration_error(truth, p_pass), auroc(truth, p_pass)
+    truth, decisions = [label for label, _ in said], [decision for _, decision in said]
+    area = float("nan") if name == PLANNING else auroc(truth, [decision.p_pass for decision in decisions])
+    confusion = Counter(f"{_word(label)} called {_word(decision.value)}" for label, decision in said)
     return Agreement(
-        name, len(said), len(pairs) - len(said), float(np.mean(right)) if right else float("nan"), low, high,
-        float(np.mean(failing)) if failing else float("nan"), balanced, kappa(truth, answers), calibration, area,
+        name, len(said), len(pairs) - len(said), *match(name, truth, decisions), area,
         dict(sorted(confusion.items())), PAPER.get(name),
     )  # fmt: skip
-
-
-def _mean_recall(truth: Sequence[bool | int], right: Sequence[bool]) -> float:
-    by_level = {level: [ok for label, ok in zip(truth, right) if label == level] for level in set(truth)}
-    return float(np.mean([np.mean(found) for found in by_level.values()])) if len(by_level) > 1 else float("nan")
 
 
 def _word(value: Known) -> str:

@@ -8,7 +8,6 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,7 +33,7 @@ from wm_nodes.benchmark.video_tables import (
     training_table,
 )
 from wm_nodes.benchmark.video_trials import Trial, ablation_trials, hacking_trials
-from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.shipped import PRETRAINED, shipped_model
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.clip_scores import load_probe
 from wm_nodes.learning.frame_features import (
@@ -87,8 +86,7 @@ def main(argv: Sequence[str]) -> int:
 
 def load_base(path: Path | None = None) -> VideoNetwork:
     """The base model: the one at `path`, or the shipped one."""
-    shipped = resources.files("wm_nodes") / "pretrained" / "moving_disc" / "video_model.safetensors"
-    data = path.read_bytes() if path is not None else shipped.read_bytes()
+    data = (path or PRETRAINED / "moving_disc" / "video_model.safetensors").read_bytes()
     model = VideoNetwork(NETWORK)
     tensors, _ = unpack_weights(data)
     model.load_state_dict(tensors)

@@ -1,8 +1,10 @@
-"""The world models inside the package. Standard library only: launch files ask before torch is needed."""
+"""The models inside the package. Standard library only: launch files ask before torch is needed."""
 
 import json
 from importlib import resources
 from pathlib import Path
+
+PRETRAINED = Path(str(resources.files("wm_nodes"))) / "pretrained"
 
 
 def shipped_model(task: str) -> Path:
@@ -11,9 +13,8 @@ def shipped_model(task: str) -> Path:
     Raises:
         FileNotFoundError: none does; says how to train one.
     """
-    base = Path(str(resources.files("wm_nodes"))) / "pretrained"
     known: list[str] = []
-    for manifest in sorted(base.glob("*/manifest.json")):
+    for manifest in sorted(PRETRAINED.glob("*/manifest.json")):
         tasks = json.loads(manifest.read_text())["tasks"]
         if task in tasks:
             return manifest.parent

@@ -5,12 +5,17 @@ as the agent's gates decide them, TC as completion (level 3 or more): its gate a
 is what a trainer would accept: every gate passed and the task completed. [inferred], the paper does not say it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from wm_nodes.reward.adversarial import TC
 from wm_nodes.reward.agent.rubric import Rubric
 from wm_nodes.reward.agent.types import PLANNING, Stage, Status, Verdict
+from wm_nodes.reward.statistics import balanced_accuracy, expected_calibration_error, kappa, wilson_of_share
 
 OVERALL = "overall"
 STAGES = (Stage.VQ, Stage.IF, Stage.PC)
@@ -20,6 +25,8 @@ PAPER: Mapping[str, float] = {
     "deformation": 82.0, "geometry": 86.0, TC: 87.0, OVERALL: 91.0,
 }  # fmt: skip
 """Table 2 of the paper, accuracy in percent on 100 clips."""
+FAIR_LEVEL = 2
+"""A planning label below this counts as a fail in the prevalence."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +35,41 @@ class Decision:
 
     value: bool | int
     p_pass: float
+
+
+class Match(NamedTuple):
+    """How well decisions match labels. accuracy, low, high: share of equal ones with its 95 % Wilson interval.
+    prevalence: share of failing labels (planning: of levels below 2). balanced: balanced accuracy, of planning the mean
+    recall of its levels. calibration: expected calibration error of p_pass, of planning of the chosen level. NaN where
+    the labels are all alike.
+    """
+
+    accuracy: float
+    low: float
+    high: float
+    prevalence: float
+    balanced: float
+    kappa: float
+    calibration: float
+
+
+def match(
+    name: str, labels: Sequence[bool | int], decisions: Sequence[Decision], weights: ArrayLike | None = None
+) -> Match:
+    """The numbers of the row `name`. weights: what each decision stands for; kappa and level recall count decisions."""
+    values, p_pass = [decision.value for decision in decisions], [decision.p_pass for decision in decisions]
+    right, planning = [label == value for label, value in zip(labels, values, strict=True)], name == PLANNING
+    failing = [label < FAIR_LEVEL if planning else not label for label in labels]
+    return Match(
+        *wilson_of_share(right, weights), wilson_of_share(failing, weights)[0],
+        _level_recall(labels, right) if planning else balanced_accuracy(labels, values, weights),
+        kappa(labels, values), expected_calibration_error(right if planning else labels, p_pass, weights),
+    )  # fmt: skip
+
+
+def _level_recall(labels: Sequence[int], right: Sequence[bool]) -> float:
+    recalls = [np.mean([ok for label, ok in zip(labels, right) if label == level]) for level in set(labels)]
+    return float(np.mean(recalls)) if len(recalls) > 1 else float("nan")
 
 
 def row_names(rubric: Rubric) -> list[str]:

@@ -120,6 +120,8 @@ def wilson_of_share(correct: ArrayLike, weights: ArrayLike | None = None) -> tup
     sample gains over a random one.
     """
     right, _, weight = _aligned(correct, correct, weights)
+    if weights is None:
+        return (_share(right, weight), *wilson_interval(int(right.sum()), len(right)))
     share, size = _share(right, weight), effective_size(weight)
     return (share, *wilson_interval(share * size, size)) if size else (NAN, 0.0, 1.0)
 

@@ -10,15 +10,12 @@ from rich.table import Table
 
 from wm_nodes.reward.agent.levels import settled
 from wm_nodes.reward.agent.rubric import Rubric
-from wm_nodes.reward.agent.types import PLANNING, Status
+from wm_nodes.reward.agent.types import Status
 from wm_nodes.reward.audit.labels import HACK, ClipLabel, Labels, annotators, known_of, of_evaluation
 from wm_nodes.reward.audit.reading import Evaluation, Record
 from wm_nodes.reward.audit.sampling import Sample
-from wm_nodes.reward.decisions import PAPER, Decision, decisions_of, row_names
-from wm_nodes.reward.statistics import balanced_accuracy, expected_calibration_error, kappa, wilson_of_share
-
-FAIR_LEVEL = 2
-"""A planning label below this counts as a fail in the prevalence."""
+from wm_nodes.reward.decisions import PAPER, Decision, decisions_of, match, row_names
+from wm_nodes.reward.statistics import kappa
 
 
 @dataclass(frozen=True)
@@ -169,22 +166,12 @@ def _row(name: str, clips: Sequence[Judged]) -> Row | None:
         return None
     sure = [(clip, next(iter(answers.values())), clip.decisions().get(name)) for clip, answers in given if answers]
     said = [(answer, decision, clip.weight) for clip, answer, decision in sure if decision is not None]
-    labels: list[Any] = [answer for answer, _, _ in said]
-    values = [decision.value for _, decision, _ in said]
+    labels, decisions = [answer for answer, _, _ in said], [decision for _, decision, _ in said]
     weights = [weight for _, _, weight in said]
-    right = [label == value for label, value in zip(labels, values)]
-    accuracy, low, high = wilson_of_share(right, weights)
-    p_pass = [decision.p_pass for _, decision, _ in said]
-    planning = name == PLANNING
-    failing = [label < FAIR_LEVEL if planning else not label for label in labels]
     pairs = [list(answers.values())[:2] for _, answers in given if len(answers) > 1]
     reasons = [ok for clip in clips if (ok := _reason(clip, name)) is not None]
     return Row(
-        name, len(said), len(sure) - len(said), len(asked) - len(sure), accuracy, low, high,
-        wilson_of_share(failing, weights)[0],
-        _level_recall(labels, right) if planning else balanced_accuracy(labels, values, weights),
-        kappa(labels, values),
-        expected_calibration_error(right if planning else labels, p_pass, weights),
+        name, len(said), len(sure) - len(said), len(asked) - len(sure), *match(name, labels, decisions, weights),
         len(pairs), kappa([one for one, _ in pairs], [other for _, other in pairs]),
         len(reasons), float(np.mean(reasons)) if reasons else math.nan, PAPER.get(name),
     )  # fmt: skip
@@ -194,11 +181,6 @@ def _reason(clip: Judged, name: str) -> bool | None:
     """Whether the judge's explanation of a row is right, by the first who said so."""
     rows = (label.rows.get(name) for label in clip.by.values())
     return next((row.explanation for row in rows if row is not None and row.explanation is not None), None)
-
-
-def _level_recall(labels: Sequence[int], right: Sequence[bool]) -> float:
-    recalls = [np.mean([ok for label, ok in zip(labels, right) if label == level]) for level in set(labels)]
-    return float(np.mean(recalls)) if len(recalls) > 1 else math.nan
 
 
 def _reflected(clips: Sequence[Judged]) -> Reflected:

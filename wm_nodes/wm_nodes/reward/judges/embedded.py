@@ -18,6 +18,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from wm_nodes.config.shipped import PRETRAINED
 from wm_nodes.reward.agent.levels import first_vote, p_fail_of
 from wm_nodes.reward.agent.types import (
     PLANNING,
@@ -191,4 +192,4 @@ def _unfit(head: JudgeHead, clip: ClipRef) -> str:
 
 def shipped_head() -> Path:
     """The folder of the judge inside the package."""
-    return Path(__file__).parents[2] / "pretrained" / "clip_judge"
+    return PRETRAINED / "clip_judge"
