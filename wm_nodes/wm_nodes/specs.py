@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -65,7 +66,7 @@ class EnvironmentSpec:
     def ground_truth_dim(self) -> int:
         return len(self.ground_truth_names)
 
-    @property
+    @cached_property
     def spec_hash(self) -> str:
         """sha256 over every field: two sides with equal hashes agree on shapes, units and order."""
         return _hash(asdict(self))

@@ -7,6 +7,7 @@ else. In a composed process a local policy steps it from its worker thread inste
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from typing import Any
 
 from rclpy.timer import Timer
@@ -65,6 +66,7 @@ class EnvironmentNode(ManagedNode):
         super().__init__("environment", PARAMS, **node_arguments)
         self.served: LockstepEnvironment | None = None
         self._timer: Timer | None = None
+        self._unsent: list[Callable[[], object]] | None = None
 
     def configure(self) -> None:
         environment = make_environment(
@@ -118,6 +120,7 @@ class EnvironmentNode(ManagedNode):
         if self._timer is not None:
             self.destroy_timer(self._timer)
             self._timer = None
+        self._send_rest()
         if self.served is not None:
             self.served.end_episodes(EpisodeEvent.REASON_DEACTIVATED)
 
@@ -139,24 +142,39 @@ class EnvironmentNode(ManagedNode):
 
     def image(self, images: UInt8Array, stamp_ns: int) -> None:
         message = convert.mosaic_msg(images, stamp_ns, self._spec)
-        if self._clock_publisher is not None:
-            self._clock_publisher.publish(Clock(clock=message.header.stamp))
-        self._images.publish(message)
         self._shown = message
-        self._views.show(images, message)
+        if self._clock_publisher is not None:
+            self._send(lambda: self._clock_publisher.publish(Clock(clock=message.header.stamp)))
+        self._send(lambda: self._images.publish(message))
+        self._send(lambda: self._views.show(images, message))
 
     def goals(self, goals: Goals) -> None:
-        self._goals.publish(convert.goal_msg(goals, self._spec))
+        self._send(lambda: self._goals.publish(convert.goal_msg(goals, self._spec)))
 
     def transition(self, transition: Transition) -> None:
-        self._transitions.publish(convert.transition_msg(transition))
+        self._send(lambda: self._transitions.publish(convert.transition_msg(transition)))
 
     def episode(self, note: EpisodeNote) -> None:
-        self._episodes.publish(convert.episode_msg(note, self._spec))
+        self._send(lambda: self._episodes.publish(convert.episode_msg(note, self._spec)))
+
+    def _send(self, publish: Callable[[], object]) -> None:
+        """Publish: now, or after the answer where a step is being answered, while the client works with it."""
+        if self._unsent is None:
+            publish()
+        else:
+            self._unsent.append(publish)
+
+    def _send_rest(self) -> None:
+        unsent, self._unsent = self._unsent or (), None
+        for publish in unsent:
+            publish()
 
     # Callbacks.
 
     def _on_step(self, request: StepBatch.Request, response: StepBatch.Response) -> StepBatch.Response:
+        self._send_rest()
+        self._unsent = []
+        self.executor.create_task(self._send_rest)
         try:
             served = self._ready()
             if self._asynchronous is not None:

@@ -146,4 +146,4 @@ class Tokenizer(nn.Module):
         """Images uint8 (B, H, W, 3) of latents (B, S, D)."""
         with compute_context(self.device):
             pixels = self.decode_pixels(latents_BSD)
-        return (pixels.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+        return pixels.clamp_(0, 1).mul_(255).round_().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
