@@ -5,8 +5,10 @@ else. In a composed process a local policy steps it from its worker thread inste
 """
 
 import sys
+import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -66,7 +68,9 @@ class EnvironmentNode(ManagedNode):
         super().__init__("environment", PARAMS, **node_arguments)
         self.served: LockstepEnvironment | None = None
         self._timer: Timer | None = None
-        self._unsent: list[Callable[[], object]] | None = None
+        self._unsent = deque[Callable[[], object]]()
+        self._sending = threading.Lock()
+        self._answering = False
 
     def configure(self) -> None:
         environment = make_environment(
@@ -159,22 +163,27 @@ class EnvironmentNode(ManagedNode):
 
     def _send(self, publish: Callable[[], object]) -> None:
         """Publish: now, or after the answer where a step is being answered, while the client works with it."""
-        if self._unsent is None:
-            publish()
-        else:
-            self._unsent.append(publish)
+        self._unsent.append(publish)
+        if not self._answering:
+            self._send_rest()
 
     def _send_rest(self) -> None:
-        unsent, self._unsent = self._unsent or (), None
-        for publish in unsent:
-            publish()
+        with self._sending:
+            while self._unsent:
+                self._unsent.popleft()()
 
     # Callbacks.
 
     def _on_step(self, request: StepBatch.Request, response: StepBatch.Response) -> StepBatch.Response:
         self._send_rest()
-        self._unsent = []
-        self.executor.create_task(self._send_rest)
+        self._answering = True
+        try:
+            return self._answer_step(request, response)
+        finally:
+            self._answering = False
+            self.executor.create_task(self._send_rest)
+
+    def _answer_step(self, request: StepBatch.Request, response: StepBatch.Response) -> StepBatch.Response:
         try:
             served = self._ready()
             if self._asynchronous is not None:
