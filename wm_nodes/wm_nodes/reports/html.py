@@ -24,7 +24,7 @@ h1 { font-size: 1.7rem; margin: 0 0 .3rem; } h2 { font-size: 1.15rem; margin: 2.
 p.lead { font-size: 1.1rem; margin: 0; } .faint, figcaption { color: var(--faint); font-size: .92rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; background: var(--card); border: 1px solid var(--line); }
-th, td { padding: .4rem .8rem; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
+th, td { padding: .4rem .65rem; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 tr.last td { font-weight: 600; border-bottom: 0; }
 .good { color: var(--good); font-weight: 600; } .bad { color: var(--bad); font-weight: 600; }
@@ -54,7 +54,7 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
     body = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="lead">{escape(verdict(summary))}</p>',
-        f'<p class="faint">preset {escape(summary.preset)}, seed {summary.seed}, '
+        f'<p class="faint">preset {escape(summary.preset)}, seed {summary.seed}, reward {escape(_reward(summary))}, '
         f"{summary.samples} imagined environment steps at {summary.imagined_steps_per_s:.0f} per second, "
         f"{summary.minutes:.1f} minutes in all</p>",
         "<h2>Success</h2>", _results(summary),
@@ -65,6 +65,10 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
         *made_on(summary.machine, config_text),
     ]  # fmt: skip
     return write_page(run_dir, title, body)
+
+
+def _reward(summary: Summary) -> str:
+    return f"{summary.reward} ({summary.judge})" if summary.judge else summary.reward
 
 
 def write_page(run_dir: Path, title: str, body: Iterable[str]) -> Path:
@@ -111,13 +115,14 @@ def number_cell(text: str) -> str:
 
 def _results(summary: Summary) -> str:
     head = "".join(
-        f'<th class="number">{side}</th><th class="number"></th><th class="number">interval</th>'
+        f'<th class="number">{side}</th><th class="number"></th><th class="number">95 % interval</th>'
         for side in ("real simulator", "imagined")
     )
     rows = result_rows(summary)
     lines = []
     for row in rows:
-        cells = (text for cell in (row.real, row.imagined) for text in (cell.count, cell.percent, cell.interval))
+        sides = (row.real, row.imagined)
+        cells = (text for c in sides for text in (c.count, c.percent, c.interval.removeprefix("95 %: ")))
         kind = ' class="last"' if row is rows[-1] else ""
         lines.append(f"<tr{kind}><td>{escape(row.label)}</td>{''.join(map(number_cell, cells))}</tr>")
     return (
@@ -146,19 +151,19 @@ def _gate(gate: Mapping[str, Any]) -> str:
     rows = []
     for criterion in gate["criteria"]:
         passed = criterion["passed"]
-        mark = '<span class="good">passed</span>' if passed else '<span class="bad">failed</span>'
-        remedy = "" if passed else escape(str(criterion["remedy"]))
+        mark = '<span class="good">passed</span>'
+        if not passed:
+            mark = f'<span class="bad">failed</span>: {escape(str(criterion["remedy"]))}'
         rows.append(
             f"<tr><td>{escape(str(criterion['name']))}</td>{number_cell(_value(criterion['value']))}"
-            f"<td>{escape(str(criterion['rule']))} {escape(_threshold(criterion))}</td><td>{mark}</td>"
-            f"<td>{remedy}</td></tr>"
+            f"<td>{escape(str(criterion['rule']))} {escape(_threshold(criterion))}</td><td>{mark}</td></tr>"
         )
     notes = "".join(f'<p class="faint">{escape(str(note))}</p>' for note in gate.get("notes", ()))
     words = "Passed" if gate["passed"] else "Failed: trained in it all the same"
     return (
         f"<p>{words}. Judged on {gate['episodes']} held-out real episodes.</p>"
-        '<div class="wide"><table><tr><th>criterion</th><th class="number">value</th><th>must be</th><th></th>'
-        f"<th>remedy</th></tr>{''.join(rows)}</table></div>{notes}{_metrics(gate.get('metrics', {}))}"
+        '<div class="wide"><table><tr><th>criterion</th><th class="number">value</th><th>must be</th><th></th></tr>'
+        f"{''.join(rows)}</table></div>{notes}{_metrics(gate.get('metrics', {}))}"
     )
 
 
