@@ -65,5 +65,7 @@ def _environment():
 
 
 if __name__ == "__main__":
+    if {"-h", "--help"} & {*sys.argv[1:]}:
+        raise SystemExit(print(__doc__.rstrip()))
     wm_setup.ensure()
     raise SystemExit(main(sys.argv[1:]))
