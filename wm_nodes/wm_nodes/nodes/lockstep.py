@@ -154,7 +154,8 @@ class LockstepEnvironment:
             if self._current is None:
                 raise WireError(ErrorCode.OUT_OF_ORDER, "never reset; call env/reset first")
             actions = self.check_actions(command.actions)
-            seeds = self._seeds(command.reset_seeds)
+            resets = command.reset_seeds is not None or (command.reset_mask is not None and command.reset_mask.any())
+            seeds = self._seeds(command.reset_seeds) if resets else None
             self._gate()
             return self._step(command, actions, seeds)
 
@@ -166,7 +167,7 @@ class LockstepEnvironment:
     def close(self) -> None:
         self.environment.close()
 
-    def _step(self, command: StepCommand, actions: FloatArray, seeds: UInt64Array) -> Reply:
+    def _step(self, command: StepCommand, actions: FloatArray, seeds: UInt64Array | None) -> Reply:
         started = time.perf_counter()
         before, before_stamp = self._current, self._stamp_ns()
         assert before is not None
@@ -225,6 +226,7 @@ class LockstepEnvironment:
         )
         self._note_progress(valid, reply, command.policy_version, stamp)
         if mask is not None and mask.any():
+            assert seeds is not None
             self._start_episodes(mask, seeds, stamp)
         self._last_reply = reply
         if broken.any():
