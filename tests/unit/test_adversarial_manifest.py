@@ -22,6 +22,7 @@ from wm_nodes.reward.adversarial import (
     Origin,
     apply,
     children,
+    doubted,
     from_bytes,
     manifest_of,
     regenerate,
@@ -69,6 +70,15 @@ def test_parts_have_about_their_shares_and_an_episode_is_in_one_of_them() -> Non
     assert Counter(parts)["validation"] == pytest.approx(400, abs=60)
     assert [DIVISION.part(replace(origin, camera="left", behaviour="short")) for origin in origins] == parts
     assert {DIVISION.part(replace(origin, camera="top")) for origin in origins[:50]} == {"test"}
+
+
+def test_a_recording_that_fails_by_its_label_puts_all_of_its_clips_in_doubt() -> None:
+    rows = manifest().rows
+    assert doubted(rows) == frozenset(), "a fault that a recipe made is none of the recording's"
+    first = next(row for row in rows if not row.edits)
+    wrong = replace(first.labels, components={**first.labels.components, "interaction": False})
+    changed = [replace(row, labels=wrong) if row is first else row for row in rows]
+    assert doubted(changed) == {row.sha256 for row in rows if row.root == first.sha256}
 
 
 def test_prevalence_adds_up() -> None:

@@ -11,10 +11,12 @@ from pushed_box import HALF_M, draw, push_clip, pushing_states, redrawn
 
 from wm_nodes.reward.adversarial import LabelledClip, SourceClip, apply, edit_states
 from wm_nodes.reward.evidence.definitions import EVIDENCE
+from wm_nodes.reward.evidence.motion import motion_evidence
 from wm_nodes.reward.evidence.objects import FAR, find_target, object_evidence
 from wm_nodes.reward.evidence.pixels import pixel_evidence
 from wm_nodes.reward.evidence.regions import region_evidence
 from wm_nodes.reward.evidence.registration import camera_moves
+from wm_nodes.reward.evidence.segmentation import OBJECT, ROBOT
 from wm_nodes.types import FloatArray, UInt8Array
 
 INSTRUCTION = "push the blue cube into the red target"
@@ -33,6 +35,7 @@ def numbers(clip: SourceClip) -> dict[str, float]:
         **pixel_evidence(clip.frames, reference.frames[0]),
         **object_evidence(masks, reference.frames[0], INSTRUCTION),
         **region_evidence(clip.frames, reference.frames[0], masks, INSTRUCTION),
+        **motion_evidence(masks, np.concatenate([reference.frames[:1], clip.frames])),
     }
 
 
@@ -53,7 +56,7 @@ def hidden() -> LabelledClip:
     return redrawn(clean(), edit_states(clean(), "sunk", "fail", 1))
 
 
-STATES = {"ghost_motion", "teleport", "sunk", "levitation"}
+STATES = {"ghost_motion", "teleport", "sunk", "levitation", "stretch", "pulled_in", "pass_through"}
 REACTS: dict[str, tuple[dict[str, float], tuple[str, ...]]] = {
     # recipe: evidence and the least change it must show (sign: direction), then what must not react
     "blur": ({"sharpness_mean": -0.15, "detail_mean": -0.3}, ("gain_mean", "hue_last", "object_net", "flicker")),
@@ -72,9 +75,13 @@ REACTS: dict[str, tuple[dict[str, float], tuple[str, ...]]] = {
     "table_swap": ({"scene_offset_last": 30, "scene_offset_step": 30}, ("object_hue_turn", "scene_away_first")),
     "occlude_patch": ({"darkened_mean": 0.01}, ("gain_mean", "flicker")),
     "ghost_motion": ({"moved_apart": 2, "gap_onset": 0.3}, ("gain_mean", "sharpness_mean")),
-    "teleport": ({"object_step": 0.3, "moved_apart_step": 0.9}, ("gain_mean", "sharpness_mean", "object_area_free")),
+    "teleport": ({"object_step": 0.3, "moved_apart_step": 0.9, "jump_unhit": 0.3},
+                 ("gain_mean", "sharpness_mean", "object_area_free")),
     "sunk": ({"object_height_max": -0.2}, ("gain_mean", "object_second")),
     "levitation": ({"after_touch_rise": 0.5}, ("gain_mean", "object_second")),
+    "stretch": ({"outline_tall_seen_last": -0.15}, ("gain_mean", "jump_alone", "pulled_sum", "pass_through")),
+    "pulled_in": ({"pulled_step": 0.3, "jump_against": 0.3}, ("gain_mean", "outline_tall_clear_max")),
+    "pass_through": ({"pass_through": 0.3, "pass_near_fast": -0.3}, ("gain_mean", "outline_tall_clear_max")),
 }  # fmt: skip
 
 
@@ -95,6 +102,38 @@ def test_a_clean_clip_agrees_with_its_reference_and_the_push_is_caused() -> None
     assert found["camera_shift"] < 1.5 and found["scene_away_mean"] < 1
     assert found["moved_apart"] == 0 and found["object_second"] == 0
     assert found["object_net"] == pytest.approx(0.022 * 6 / (2 * HALF_M), rel=0.1)  # six steps of 2.2 cm, sizes of 4 cm
+
+
+def test_the_colour_at_an_edge_tells_parts_of_a_pixel() -> None:
+    """Half-covered rows at both ends of a blue box make it one pixel taller: 11 px for 10, and a tenth more area."""
+    grey, blue = np.array([150, 150, 150]), np.array([40, 60, 200])
+    pictures = np.full((3, 96, 96, 3), grey, np.uint8)
+    masks = np.zeros((3, 96, 96), np.uint8)
+    pictures[:, 40:50, 30:40], masks[:, 40:50, 30:40] = blue, OBJECT
+    pictures[2, [39, 50], 30:40] = (grey + blue) // 2
+    found = motion_evidence(masks, pictures)
+    assert found["outline_area_seen_last"] == pytest.approx(0, abs=1e-6), "the median of three is a sharp one"
+    assert found["outline_area_step"] == pytest.approx(np.log(1.1), abs=0.02)
+    assert found["outline_tall_step"] == pytest.approx(np.log(11 / 10), abs=0.02) and found["outline_wide_step"] < 1e-6
+    assert found["jump_alone"] == 0 and found["hollow_max"] == 0
+
+
+def test_a_late_jump_is_one_that_no_tool_hit_and_a_hit_is_none() -> None:
+    """A box of 10 px goes 8 px right in one step, the robot's tip 8 px left of it follows, or stands still."""
+    pictures = np.full((9, 96, 96, 3), 150, np.uint8)
+    masks = np.zeros((2, 9, 96, 96), np.uint8)
+    for t in range(9):
+        left = 40 + 8 * (t > 5)
+        pictures[t, 50:60, left : left + 10] = (40, 60, 200)
+        masks[:, t, 50:60, left : left + 10] = OBJECT
+    masks[0, :, 20:58, 26:30] = ROBOT
+    for t in range(9):
+        masks[1, t, 20:58, 26 + 8 * (t > 5) : 30 + 8 * (t > 5)] = ROBOT
+    free, hit = (motion_evidence(one, pictures) for one in masks)
+    assert free["jump_sudden"] == hit["jump_sudden"] == pytest.approx(0.8, abs=0.01)
+    assert free["jump_unhit"] == free["still_jump"] == pytest.approx(0.8, abs=0.01)
+    assert hit["jump_unhit"] <= 0.05 and hit["still_jump"] == 0 and hit["jump_sudden_closing"] > 0.7
+    assert free["jump_sudden_pulled"] < -0.7, "away from the tool"
 
 
 MOVES = [(0.8, 0, 0, 0), (0, -0.6, 0, 0), (0, 0, 0.015, 0), (0, 0, 0, 0.02), (0.3, 0.2, 0.01, -0.01)]
@@ -137,6 +176,7 @@ def test_every_number_is_finite_for_any_length_size_and_content(make: Callable[[
         found = {
             **pixel_evidence(frames, frames[0]), **object_evidence(masks, frames[0], INSTRUCTION),
             **region_evidence(frames, frames[0], masks, INSTRUCTION),
+            **motion_evidence(masks, np.concatenate([frames[:1], frames])),
         }  # fmt: skip
         assert {name: v for name, v in found.items() if not np.isfinite(v)} == {}
         assert set(found) == set(EVIDENCE)

@@ -73,7 +73,7 @@ def head() -> JudgeHead:
             np.array([[-5.0, 5.0]], np.float32), np.ones((1, 1), np.float32), 0.0,
         )  # fmt: skip
         questions[target] = (Question(trees, 1.0, 0.0),) * num_questions(target)
-    known = Familiarity(values, np.abs(values) + 1, np.eye(len(names), dtype=np.float32), 1.35)
+    known = Familiarity(values, np.abs(values) + 1, np.eye(len(names), dtype=np.float32), 1.15)
     return JudgeHead(
         segmenter(), names, questions, known, values - 0.1, values + 0.1, (96, 96), (12, 25), STORY, "a" * 64
     )  # fmt: skip

@@ -301,6 +301,7 @@ def test_the_command_prints_and_writes_the_table(
     assert found["statuses"] == {"OK": found["clips"]} and found["machine"] and found["seed"] == 0
     assert {row["name"]: row["paper"] for row in found["rows"]} == {name: PAPER[name] for name in row_names(RUBRIC)}
     assert {row["name"]: row["accuracy"] for row in found["rows"]}["overall"] == 1.0
+    assert found["doubted"] == 0 and found["rows_without_doubted"] == found["rows"] and "recording fails" in shown
     overall = [row for row in found["splits"]["new_scene"] if row["name"] == "overall"]
     assert [row["n"] for row in overall] == [found["clips"]] and list(found["splits"]) == ["new_scene"]
     for wrong, complaint in (

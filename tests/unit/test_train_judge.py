@@ -1,5 +1,6 @@
 """The command that trains the embedded judge: what it keeps, what it refuses. On a toy set; section 4.3."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ from pushed_box import push_clip, redrawn
 
 from wm_nodes.learning.adversarial_set import MANIFEST, clip_path, to_file
 from wm_nodes.learning.judge_data import load_sets, set_clips
+from wm_nodes.learning.judge_fitting import Examples
 from wm_nodes.learning.judge_segmenter import masks_hold, overlaps, segmentation_data, train_segmenter
+from wm_nodes.learning.judge_training import without_doubt
 from wm_nodes.learning.train_judge import main
 from wm_nodes.reward.adversarial import Division, LabelledClip, children, manifest_of, to_bytes
 from wm_nodes.reward.evidence.definitions import EVIDENCE
@@ -61,6 +64,18 @@ def test_what_cannot_be_trained_or_measured_is_named(
     assert "use sets of one division" in error(str(tmp_path), str(toy_set), str(other))
     tests = write_set(tmp_path / "tests", Division(scenes=("gravel",)))
     assert "no clip has masks that show what is seen" in error(str(tmp_path / "out"), str(tests))
+
+
+def test_clips_of_a_recording_that_fails_by_its_own_label_train_nothing(toy_set: Path) -> None:
+    rows = load_sets([toy_set])[0][1].rows
+    first = next(row for row in rows if not row.edits)
+    wrong = replace(first.labels, components={**first.labels.components, "interaction": False})
+    changed = [replace(row, labels=wrong) if row is first else row for row in rows]
+    numbers = np.arange(len(rows), dtype=np.float32)[:, None]
+    kept = without_doubt(Examples(("number",), numbers, changed))
+    assert [row.sha256 for row in kept.rows] == [row.sha256 for row in rows if row.root != first.sha256]
+    assert [changed[int(value)] for value in kept.evidence[:, 0]] == list(kept.rows)
+    assert len(without_doubt(Examples(("number",), numbers, rows)).rows) == len(rows)
 
 
 def test_the_segmenter_learns_the_toy_and_leaves_out_masks_of_what_is_not_there(toy_set: Path) -> None:

@@ -21,7 +21,7 @@ from wm_nodes.files import write_atomic
 from wm_nodes.learning.judge_data import load_sets, rows_of, set_clips
 from wm_nodes.learning.judge_fitting import TARGETS, Examples, fit_all, fit_familiarity, measured
 from wm_nodes.learning.judge_segmenter import overlaps, segmentation_data, train_segmenter
-from wm_nodes.reward.adversarial import Manifest
+from wm_nodes.reward.adversarial import Manifest, doubted
 from wm_nodes.reward.adversarial.manifest import Part, to_bytes
 from wm_nodes.reward.evidence.clip import clip_evidence
 from wm_nodes.reward.evidence.head import JudgeHead
@@ -51,7 +51,8 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     sets = load_sets(plan.sets)
     segmenter, segmenter_story = _segmenter(folder, sets, plan, progress)
     train, validation = (
-        collect_evidence(folder, sets, part, segmenter, progress=progress) for part in ("train", "validation")
+        without_doubt(collect_evidence(folder, sets, part, segmenter, progress=progress))
+        for part in ("train", "validation")
     )
     if not len(train.rows) or not len(validation.rows):
         raise ValueError(f"{len(train.rows)} training and {len(validation.rows)} validation clips; build larger sets")
@@ -62,6 +63,7 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     lengths = (-(-2 * length // 3), 3 * length // 2)
     story = {
         "data": [_described(path, manifest) for path, manifest in sets], "seed": plan.seed,
+        "fitted": {"train": len(train.rows), "validation": len(validation.rows)},
         "segmenter": segmenter_story, "trees": vars(plan.trees),
         "tasks": sorted({row.origin.task for row in train.rows}),
         "cameras": sorted({row.origin.camera for row in train.rows}),
@@ -99,6 +101,13 @@ def collect_evidence(
     return Examples(names, np.concatenate(found) if found else np.zeros((0, 0), np.float32), rows)
 
 
+def without_doubt(examples: Examples) -> Examples:
+    """Leave out clips whose label is in doubt, see manifest.doubted."""
+    wrong = doubted(examples.rows)
+    kept = [i for i, row in enumerate(examples.rows) if row.sha256 not in wrong]
+    return Examples(examples.names, examples.evidence[kept], [examples.rows[i] for i in kept])
+
+
 def _segmenter(
     folder: Path, sets: Sets, plan: JudgePlan, progress: bool
 ) -> tuple[Segmenter, dict[str, Any]]:
@@ -132,5 +141,5 @@ def _state(segmenter: Segmenter) -> bytes:
 def _sources() -> bytes:
     """Of the code that computes evidence: a changed number is another number."""
     folder = Path(str(wm_nodes.reward.evidence.__path__[0]))
-    names = ("pixels", "registration", "objects", "regions", "segmentation", "clip")
+    names = ("pixels", "registration", "objects", "motion", "regions", "segmentation", "clip")
     return hashlib.sha256(b"".join((folder / f"{name}.py").read_bytes() for name in names)).digest()

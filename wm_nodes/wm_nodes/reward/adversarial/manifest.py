@@ -122,6 +122,16 @@ def prevalence(rows: Sequence[Row]) -> Prevalence:
     return counts
 
 
+def doubted(rows: Sequence[Row]) -> frozenset[str]:
+    """Hashes of the clips whose recording fails a component by its own label.
+
+    A recording is what the simulator did, so that its physics holds; truth.py, which sees one state per frame, takes a
+    cube that was knocked ahead for one that moves by itself. All clips made of such a recording bear that label on.
+    """
+    roots = {row.sha256 for row in rows if not row.edits and not all(row.labels.components.values())}
+    return frozenset(row.sha256 for row in rows if row.root in roots)
+
+
 def check(manifest: Manifest) -> None:
     """Check what must hold between the rows.
 

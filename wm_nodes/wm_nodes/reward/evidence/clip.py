@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from wm_nodes.reward.evidence.motion import motion_evidence
 from wm_nodes.reward.evidence.objects import object_evidence
 from wm_nodes.reward.evidence.pixels import check_clip, pixel_evidence
 from wm_nodes.reward.evidence.regions import region_evidence
@@ -22,9 +23,11 @@ def clip_evidence(
         ValueError: wrong shapes or types; names them.
     """
     check_clip(frames, reference)
-    masks = segmenter.masks(np.concatenate([reference[None], frames]))
+    pictures = np.concatenate([reference[None], frames])
+    masks = segmenter.masks(pictures)
     return {
         **pixel_evidence(frames, reference),
         **object_evidence(masks, reference, instruction),
+        **motion_evidence(masks, pictures),
         **region_evidence(frames, reference, masks, instruction),
     }

@@ -2,7 +2,8 @@
 
 "Against the reference" is a ratio to, or a difference from, the reference frame: about 1 or 0 where nothing is wrong.
 Shares lie in [0, 1]; levels are grey levels of 0 to 255; sizes are object sizes, the square root of the object's area
-in the reference frame, and end at 20; steps are from one frame to the next. First and last are frames of the clip.
+in the reference frame, and end at 20; steps are from one frame to the next. First and last are frames of the clip;
+in uncovered ones no robot is within 0.15 sizes of the object, its lowest point is its tool.
 """
 
 from dataclasses import dataclass
@@ -140,6 +141,68 @@ tool_net              0 20   distance between its ends, sizes
 tool_passed         -20 20   how far it gets beyond the object along its own way, sizes
 slipped             -20 20   way of the robot less the object's while they touch, sizes
 tool_near_min         0 20   smallest distance of the lowest point from the object, sizes
+jump_alone          -20 20   by how much its step is longer than the lowest point's, most, sizes
+jump_alone_seen       0 20   the same of steps between frames that show half of its reference area
+jump_sudden         -20 20   by how much a step is longer than those before and after it, most, sizes
+jump_sudden_tool      0 20   step of the lowest point at that time, sizes
+jump_sudden_gap       0 20   distance of robot and object at that time, sizes
+jump_sudden_seen      0 20   area of the object against the reference at that time
+jump_sudden_when      0 1    when that is
+jump_sudden_along   -20 20   its step along that of the lowest point at that time, sizes
+jump_sudden_pulled  -20 20   its step towards the lowest point at that time, sizes
+jump_sudden_closing -20 20   step of the lowest point towards it at that time, sizes
+jump_unhit          -20 20   by how much its step is longer than twice that of the lowest point towards it, most, sizes
+jump_unhit_seen       0 20   the same of steps between frames that show half of its reference area
+jump_against        -20 20   its step against the direction of the lowest point, most, sizes
+jump_side             0 20   its step across that direction, most, sizes
+pulled_step         -20 20   its step towards the lowest point, most, sizes
+pulled_sum            0 20   sum of such steps with the robot within a size
+still_moved           0 20   its path while the lowest point stands still, sizes
+still_jump            0 20   its largest step of that
+rest_jump             0 20   its largest step after two steps of rest, sizes
+rest_jump_gap         0 20   the same times the distance to the robot, at most 2 sizes
+pass_near             0 20   distance of the lowest point's path from it while it rests, smallest, sizes
+pass_near_fast        0 20   the same of steps of more than 0.3 sizes
+pass_through          0 20   path of the lowest point within 0.6 sizes of it while it rests
+tool_inside           0 1    share of frames with the lowest point within half a size of its middle
+ring_max              0 1    share of the pixels around it that are robot, largest
+ring_mean             0 1    the same, mean while the robot touches it
+ring_last             0 1    the same, mean of the last three frames
+hollow_max            0 1    share of its convex hull that is something else, largest
+hollow_touch          0 1    the same, mean while the robot touches it
+hollow_free           0 1    the same, largest while the robot does not
+outline_tall_clear_max  -20 20  log of its extent in rows against the reference, largest of uncovered frames
+outline_tall_clear_min  -20 20  the same, smallest
+outline_tall_clear_last -20 20  the same, median of the last three
+outline_tall_seen_last  -20 20  the same of the last three frames that show it
+outline_tall_seen_most  -20 20  85 % quantile of all that show it
+outline_tall_step       0 20  its largest step while no robot is near and it stays
+outline_tall_start      0 20  its largest size while no robot is near and it is where it began
+outline_tall_end        0 20  its range while no robot is near and it is where it ends
+outline_wide_clear_max  -20 20  log of its extent in columns against the reference, largest of uncovered frames
+outline_wide_clear_min  -20 20  the same, smallest
+outline_wide_clear_last -20 20  the same, median of the last three
+outline_wide_seen_last  -20 20  the same of the last three frames that show it
+outline_wide_seen_most  -20 20  85 % quantile of all that show it
+outline_wide_step       0 20  its largest step while no robot is near and it stays
+outline_wide_start      0 20  its largest size while no robot is near and it is where it began
+outline_wide_end        0 20  its range while no robot is near and it is where it ends
+outline_area_clear_max  -20 20  log of its coloured area against the reference, largest of uncovered frames
+outline_area_clear_min  -20 20  the same, smallest
+outline_area_clear_last -20 20  the same, median of the last three
+outline_area_seen_last  -20 20  the same of the last three frames that show it
+outline_area_seen_most  -20 20  85 % quantile of all that show it
+outline_area_step       0 20  its largest step while no robot is near and it stays
+outline_area_start      0 20  its largest size while no robot is near and it is where it began
+outline_area_end        0 20  its range while no robot is near and it is where it ends
+outline_long_clear_max  -20 20  log of longer over shorter extent less the reference's, largest of uncovered frames
+outline_long_clear_min  -20 20  the same, smallest
+outline_long_clear_last -20 20  the same, median of the last three
+outline_long_seen_last  -20 20  the same of the last three frames that show it
+outline_long_seen_most  -20 20  85 % quantile of all that show it
+outline_long_step       0 20  its largest step while no robot is near and it stays
+outline_long_start      0 20  its largest size while no robot is near and it is where it began
+outline_long_end        0 20  its range while no robot is near and it is where it ends
 asks_above            0 1    the instruction says "above"
 target_start          0 20   distance of the object from the target's middle in the reference, 1 is its edge
 target_end            0 20   the same, last frame

@@ -68,11 +68,11 @@ def object_evidence(masks: UInt8Array, reference: UInt8Array, instruction: str) 
     thing = track(masks == OBJECT)
     arm = masks == ROBOT
     size = float(np.sqrt(thing.area[0])) if thing.area[0] >= SMALLEST_PX else np.sqrt(masks[0].size) / 10
-    gap = np.minimum(_gaps(arm, masks == OBJECT) / size, FAR)
+    gap = np.minimum(robot_gaps(arm, masks == OBJECT) / size, FAR)
     tool = tool_points(arm)
     colours = [word for word in instruction.lower().replace(",", " ").split() if word in HUES_DEGREES]
     target = find_target(reference, masks[0], colours[1]) if len(colours) > 1 else None
-    place, known = _filled(thing.centre), np.isfinite(thing.area)
+    place, known = filled(thing.centre), np.isfinite(thing.area)
     return {
         **_shape(thing, gap, known),
         **_outline(thing, known),
@@ -137,7 +137,7 @@ def find_target(reference: UInt8Array, mask: UInt8Array, colour: str) -> Target 
     return Target(points.mean(0), np.linalg.inv(4 * spread))  # a disc's variance is r^2 / 4
 
 
-def _gaps(arm: NDArray[np.bool_], thing: NDArray[np.bool_]) -> Floats:
+def robot_gaps(arm: NDArray[np.bool_], thing: NDArray[np.bool_]) -> Floats:
     """(T,) px from the object to the robot; FAR where either is missing."""
     gaps = np.full(len(arm), np.inf)
     for t, (robot, mask) in enumerate(zip(arm, thing)):
@@ -147,7 +147,7 @@ def _gaps(arm: NDArray[np.bool_], thing: NDArray[np.bool_]) -> Floats:
     return gaps
 
 
-def _filled(points: Floats) -> Floats:
+def filled(points: Floats) -> Floats:
     """The last known place stands for a missing one; the first known one before it; zeros where none is known."""
     known = np.flatnonzero(np.isfinite(points[:, 0]))
     if not len(known):
@@ -229,7 +229,7 @@ def _covered(masks: UInt8Array, thing: Track) -> Numbers:
     lost = ~np.isfinite(thing.area[1:])
     reach = np.zeros(len(lost))
     for t in np.flatnonzero(lost):  # the robot around the place where the object was last
-        place = _filled(thing.centre)[t]
+        place = filled(thing.centre)[t]
         row, column = (int(np.clip(value, 0, size - 1)) for value, size in zip(place, masks.shape[1:]))
         side = int(np.ceil(np.sqrt(thing.area[0] if np.isfinite(thing.area[0]) else SMALLEST_PX))) + 1
         window = masks[t + 1, max(0, row - side) : row + side + 1, max(0, column - side) : column + side + 1]
@@ -278,7 +278,7 @@ def _causes(place: Floats, known: NDArray[np.bool_], gap: Floats, tool: Floats, 
     last_touch = int(np.flatnonzero(touched)[-1]) if touched.any() else 0
     after = (place[-1] - place[last_touch]) / size
     loose = place[last_touch:, 0] if last_touch < len(place) - 1 else place[-1:, 0]
-    hand = _filled(tool)
+    hand = filled(tool)
     sweep = np.diff(hand, axis=0) / size
     way = hand[-1] - hand[0]
     course = way / (np.linalg.norm(way) + 1e-6)
@@ -306,7 +306,7 @@ def _causes(place: Floats, known: NDArray[np.bool_], gap: Floats, tool: Floats, 
 def _task(place: Floats, tool: Floats, target: Target | None, size: float, instruction: str) -> Numbers:
     """How far the clip gets: the object towards the target, the tool towards a place above the object."""
     distance = np.full(len(place), FAR) if target is None else np.minimum(target.distance(place), FAR)
-    relative = np.clip((_filled(tool) - place) / size, -FAR, FAR)
+    relative = np.clip((filled(tool) - place) / size, -FAR, FAR)
     length = np.linalg.norm(relative, axis=1)
     start, end = float(distance[0]), float(distance[-1])
     return {
