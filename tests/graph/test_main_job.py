@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from judge_server import PickyServer, serving
 from model_folders import make_model_folder
 from safetensors.numpy import save_file
 
 from wm_nodes.learning.metrics import read_metrics
-from wm_nodes.recording import read_episodes
+from wm_nodes.recording import Bag, read_episodes
+from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports import read_summary
 from wm_nodes.world_model import load_model_folder
 
@@ -84,6 +86,33 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
         path: path.stat().st_mtime_ns for path in (run_dir / "rounds" / "2").rglob("*") if path.is_file()
     } == finished
     assert [line["step"] for line in read_metrics(run_dir, "ppo")] == [1, 2]
+
+
+@pytest.mark.slow
+def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(ros_domain: int, tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    write_some_starts(run_dir / "starts.safetensors")
+    arguments = ["--preset", "smoke", "--force", "--model-dir", str(make_model_folder(tmp_path / "model")),
+                 "--run-dir", str(run_dir), "--set", "evaluation.episodes=2", "--set", "data.num_workers=1",
+                 "--set", "ppo.num_steps=16", "--set", "ppo.num_envs=3", "--compose"]  # fmt: skip
+    with serving(PickyServer()) as server:
+        agent = ["--reward", "agent", "--judge", server.url, "--judge-model", "judge"]
+        done = start([*arguments, *agent], ros_domain)
+        assert done.returncode == 0, done.stdout + done.stderr
+        asked = len(server.requests)
+        assert asked
+        summary = read_summary(run_dir)
+        assert (summary["reward"], summary["judge"]) == ("agent", f"judge at {server.url}")
+        assert f"reward agent (judge at {server.url})" in (run_dir / "report.html").read_text()
+        assert [line["step"] for line in read_metrics(run_dir, "ppo")] == [1, 2]
+        with Bag(Path(summary["bag"])) as bag:
+            assert bag.count("/wm/reward/verdict")
+        assert recorded_reward_name(Path(summary["bag"])) == "agent"
+        other = start(arguments, ros_domain)
+        assert other.returncode == 2 and "repeat its options or use a new folder" in " ".join(other.stdout.split())
+        again = start([*arguments, *agent], ros_domain)
+        assert again.returncode == 0 and "training is done already" in again.stdout, again.stdout + again.stderr
+        assert len(server.requests) == asked
 
 
 def test_a_wrong_setting_ends_with_one_clear_line(ros_domain: int, tmp_path: Path) -> None:

@@ -269,11 +269,12 @@ def test_a_policys_episodes_are_judged_at_their_end_and_a_judge_that_is_down_pau
     server: PickyServer, tmp_path: Path
 ) -> None:
     judge = {"judge.endpoints": [server.url], "judge.model": "judge", "judge.tries": 1}
-    config = load_config("smoke", {"ppo.num_steps": 14, **judge})
+    config = load_config("smoke", {"ppo.num_steps": 16, **judge})
     with own_domain() as domain:
         graph, probe = Graph(domain, tmp_path / "run", config), Probe(domain)
         try:
             rewards, verdicts = probe.listen("reward"), probe.listen("reward/verdict")
+            metrics = probe.listen("learner/metrics")
             graph.start("recorder", topics=[*GRAPH_TOPICS, VERDICT_TOPIC])
             transitions = probe.listen("env/transition")
             graph.start_environment()
@@ -293,6 +294,10 @@ def test_a_policys_episodes_are_judged_at_their_end_and_a_judge_that_is_down_pau
             }
             told = {(verdict.iteration, verdict.clip): verdict for verdict in verdicts}
             assert told.keys() == ended.keys() and ended
+            begun = {step.episode_id[env] for step in steps.values() for env in range(step.num_envs) if step.valid[env]}
+            cut = len(begun - set(ended.values()))
+            (update,) = wait_until("metrics", lambda: metrics[:])
+            assert dict(zip(update.names, update.values, strict=True))["cut_episodes"] == cut
             for message in rewards:
                 assert message.reward_name == "agent" and list(message.valid) == list(steps[message.step_id].valid)
                 for env, total in enumerate(message.total):

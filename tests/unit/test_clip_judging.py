@@ -12,15 +12,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from graph.video_loop import write_contexts
 from judge_server import PickyServer, serving
 from recording_samples import make_spec
+from rl_toys import toy_policy, toy_ppo, toy_rollout
 from scripted_judge import make_clip, make_task
 
 from wm_nodes.config.load import default_judge, judge_overrides, load_config
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.learning.clip_judging import ClipJob, ClipJudge
-from wm_nodes.learning.episode_reward import EpisodeReward, EpisodeStep, PendingReward
+from wm_nodes.learning.episode_reward import (
+    EpisodeReward,
+    EpisodeStep,
+    PendingReward,
+    check_horizon,
+    nothing_beyond_the_end,
+    unjudged,
+)
+from wm_nodes.learning.ppo import PpoLearner
 from wm_nodes.learning.video_config import dump_video_config, load_video_config
+from wm_nodes.main_job import main as main_job
 from wm_nodes.reward.agent import Status, Verdict
 from wm_nodes.reward.audit import read_record
 from wm_nodes.reward.judges.factory import check_judge
@@ -28,6 +40,7 @@ from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.graph import GraphError
 from wm_nodes.world_model_job import main
 
+JUDGE = ("--judge", "http://127.0.0.1:9/v1", "--judge-model", "judge")
 SPEC = make_spec(num_envs=2, height=8, width=8)
 
 
@@ -192,6 +205,46 @@ def test_an_episode_that_was_cut_short_leaves_nothing_to_the_next_one(server: Pi
         model.add(step(0), SPEC, 7)
         pending = model.add(step(0, ids=(3, 4), ended=(True, False)), SPEC, 7)
         assert wait_for(pending).verdicts()[0].clip_id == "episode 3 of session 7"
+        assert model.cut == 2 and list(pending.result().valid) == [True, True]
+        model.forget()
+        assert model.cut == 3 and judge.tally.verdicts == 1, "only the episode that ended is judged"
+
+
+def test_rollouts_in_which_no_episode_of_full_length_ends_are_refused_by_value_and_remedy() -> None:
+    check_horizon(16, 16)
+    with pytest.raises(ValueError, match=r"ppo\.num_steps is 15, .* 16 steps: .* at least that many"):
+        check_horizon(15, 16)
+
+
+def test_a_rollout_without_an_ended_episode_pauses_instead_of_looking_like_a_failure() -> None:
+    rollout = toy_rollout(toy_policy(), steps=3)
+    none = np.zeros_like(rollout.valid_TN)
+    cut = replace(rollout, terminated_TN=none, truncated_TN=none, valid_TN=~none)
+    assert "none of the episodes in a rollout of 3 lock-steps (ppo.num_steps) was seen to end" in unjudged(cut)
+    one = none.copy()
+    one[1, 0] = True
+    assert unjudged(replace(cut, truncated_TN=one)) == ""
+    assert "1 of 1 episodes" in unjudged(replace(cut, truncated_TN=one, valid_TN=~one))
+
+
+def test_a_cut_episode_is_worth_what_the_critic_says_and_an_ended_one_its_verdict(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Environment 0 is cut, 1 reaches its time limit with a verdict of 0.25, 2 terminates with one of 0.75."""
+    policy = toy_policy()
+    base = toy_rollout(policy, steps=2)
+    none = np.zeros_like(base.valid_TN)
+    truncated, terminated, rewards = none.copy(), none.copy(), np.zeros(none.shape, np.float32)
+    truncated[1, 1] = terminated[1, 2] = True
+    rewards[1, 1:3] = 0.25, 0.75
+    rollout = replace(base, rewards_TN=rewards, valid_TN=~none, terminated_TN=terminated, truncated_TN=truncated)
+    monkeypatch.setattr(policy, "value", lambda features, states: torch.full((len(features),), 0.6))
+    learner = PpoLearner(policy, toy_ppo(gamma=1.0, gae_lambda=1.0), seed=0)
+    returns = learner._samples(nothing_beyond_the_end(rollout)).returns.reshape(none.shape)
+    for column, worth in enumerate((0.6, 0.25, 0.75)):
+        assert returns[:, column].tolist() == pytest.approx([worth] * 2)
+    twice = learner._samples(rollout).returns.reshape(none.shape)
+    assert float(twice[1, 1]) == pytest.approx(0.85), "the failure would have beaten the success"
 
 
 def test_a_judge_that_is_down_leaves_the_last_step_without_a_reward_and_says_why(server: PickyServer) -> None:
@@ -239,11 +292,46 @@ def test_the_command_refuses_an_agent_without_a_judge_before_anything_is_made(
     assert "needs a judge" in capsys.readouterr().out and not (tmp_path / "run").exists()
 
 
+def test_the_command_refuses_an_embedded_judge_that_cannot_read_its_clips_before_a_model_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bags = [write_contexts(tmp_path / "contexts")]
+    monkeypatch.setattr("wm_nodes.world_model_job._data", lambda *given: (bags, bags))
+    embedded = ["--reward", "agent", "--set", "judge.kind=embedded", "--from-scratch"]
+    run_dir = tmp_path / "run"
+    assert main(["--preset", "smoke", *embedded, "--run-dir", str(run_dir)]) == 2
+    said = " ".join(capsys.readouterr().out.split())
+    assert "cannot judge clips of 3 frames, 64 x 128 px" in said and "Name a server" in said
+    assert not (run_dir / "video_model").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--reward", "agent"], "needs a judge"),
+        (["--judge-model", "judge"], "judge.model would change nothing without --reward agent"),
+        (["--reward", "agent", *JUDGE, "--set", "ppo.num_steps=15"], "ppo.num_steps is 15"),
+        (["--reward", "agent", *JUDGE, "--rubric", "nowhere"], "nowhere"),
+        (["--reward", "agent", "--set", "judge.kind=embedded"], "cannot judge clips of 17 frames, 64 x 128 px"),
+        (["--reward", "agent", "--set", "judge.kind=embedded"], "Name a server"),
+    ],
+    ids=["nobody", "judge_alone", "cut_off", "no_rubric", "size", "remedy"],
+)
+def test_the_main_job_refuses_an_agent_that_could_not_judge_before_anything_is_made(
+    options: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_dir = tmp_path / "run"
+    assert main_job(["--preset", "smoke", "--set", "ppo.num_steps=16", "--run-dir", str(run_dir), *options]) == 2
+    assert words in " ".join(capsys.readouterr().out.split()) and not run_dir.exists()
+
+
 def test_launch_arguments_bring_the_agent_into_both_loops(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text("{}")
+    preset = tmp_path / "whole_episodes.yaml"
+    preset.write_text("ppo: {num_steps: 16}")
     given = {"run_dir": str(tmp_path / "run"), "model_dir": str(tmp_path), "domain_id": "7"}
     judge = {"reward": "agent", "judge": "http://localhost:1/v1", "judge_model": "judge"}
-    policies = {**given, "preset": "smoke"}
+    policies = {**given, "preset": str(preset)}
     graph, values = launch_arguments.prepare("online_training", {**policies, **judge})
     assert graph.node("reward_evaluator").parameters["reward"] == "agent"
     assert graph.node("learner").parameters["join_timeout_s"] == 600
@@ -258,6 +346,7 @@ def test_launch_arguments_bring_the_agent_into_both_loops(tmp_path: Path) -> Non
         ("online_training", {**policies, "reward": "agent"}, "needs a judge"),
         ("online_training", {**policies, "judge": "http://localhost:1/v1"}, "would change nothing without"),
         ("online_training", {**given, **judge, "config_file": values["config_file"]}, "belong into it"),
+        ("online_training", {**policies, **judge, "preset": "smoke"}, r"ppo\.num_steps is 6"),
         ("world_model_rl", {**clips, "reward": "rule"}, "is of policies"),
         ("world_model_rl", {**clips, "reward": "agent"}, "needs a judge"),
     ]

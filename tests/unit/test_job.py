@@ -69,9 +69,10 @@ def test_the_table_of_rounds_says_what_became_of_the_refreshed_model() -> None:
 
 def test_a_run_goes_on_with_its_own_options_only(tmp_path: Path) -> None:
     text, other = dump_config(load_config("smoke")), dump_config(load_config("smoke", {"seed": 1}))
-    run_dir = open_run_dir(tmp_path / "run", "name", text, from_scratch=True)
-    assert open_run_dir(run_dir, "name", text, from_scratch=True) == run_dir
-    for changed, from_scratch in ((other, True), (text, False)):
+    options = ["--from-scratch", "--reward agent"]
+    run_dir = open_run_dir(tmp_path / "run", "name", text, begun_with=options)
+    assert open_run_dir(run_dir, "name", text, begun_with=options) == run_dir
+    for changed, begun_with in ((other, options), (text, []), (text, options[:1]), (text, options[1:])):
         with pytest.raises(ConfigError, match="repeat its options or use a new folder"):
-            open_run_dir(run_dir, "name", changed, from_scratch=from_scratch)
+            open_run_dir(run_dir, "name", changed, begun_with=begun_with)
     assert load_config(str(run_dir / "config.yaml")) == load_config("smoke")

@@ -114,10 +114,12 @@ def test_statistics_count_ended_episodes_only() -> None:
     assert (found.episodes, found.successes, found.success_rate) == (2, 1, 0.5)
     assert found.mean_return == pytest.approx((3 + 1.5) / 2)
     assert found.mean_length == pytest.approx((2 + 3) / 2)
+    assert found.cut == 1, "environment 0 had begun another episode; environment 1 had not"
 
 
 def test_statistics_without_an_ended_episode_are_missing_not_zero() -> None:
     base = toy_rollout(toy_policy(), steps=1)
     none = np.zeros((1, NUM_ENVS), bool)
     found = rollout_statistics(replace(base, terminated_TN=none, truncated_TN=none))
-    assert found.episodes == 0 and np.isnan([found.success_rate, found.mean_return, found.mean_length]).all()
+    assert (found.episodes, found.cut) == (0, NUM_ENVS)
+    assert np.isnan([found.success_rate, found.mean_return, found.mean_length]).all()

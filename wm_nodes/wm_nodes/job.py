@@ -4,12 +4,13 @@ Whatever took long is kept as a file with the identity of what it was measured o
 goes on where it stopped, and never takes a trained policy for the one it began with.
 """
 
+import argparse
 import hashlib
 import json
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 from rich.console import Console
 from tqdm import tqdm
 
-from wm_nodes.config.load import ConfigError, dump_config
+from wm_nodes.config.load import ConfigError, dump_config, judge_overrides
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.evaluation import evaluate
@@ -38,14 +39,16 @@ TRAINED = "trained.json"
 console = Console()
 
 
-def open_run_dir(given: Path | None, name: str, config_text: str, *, from_scratch: bool = False) -> Path:
-    """Make the run folder (default: runs/<time>-<name>) and keep its configuration there, and as a comment whether the
-    run trains its own models: the one must not go on as the other.
+def open_run_dir(given: Path | None, name: str, config_text: str, *, begun_with: Sequence[str] = ()) -> Path:
+    """Make the run folder (default: runs/<time>-<name>) and keep its configuration there.
+
+    Args:
+        begun_with: options that are no settings but without which the run must not go on; kept as comments.
 
     Raises:
-        ConfigError: the folder was begun with another configuration.
+        ConfigError: the folder was begun with another configuration or other such options.
     """
-    config_text += "# begun with --from-scratch\n" if from_scratch else ""
+    config_text += "".join(f"# begun with {option}\n" for option in begun_with)
     run_dir = (given or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}").expanduser().absolute()
     run_dir.mkdir(parents=True, exist_ok=True)
     saved = run_dir / "config.yaml"
@@ -55,6 +58,21 @@ def open_run_dir(given: Path | None, name: str, config_text: str, *, from_scratc
         )
     saved.write_text(config_text)
     return run_dir
+
+
+def add_judge_options(parser: argparse.ArgumentParser) -> None:
+    """Who judges where the reward is the agent's; judge_options reads them."""
+    parser.add_argument("--judge", default="", metavar="URL[,URL]", help="the judge's servers, e.g. http://host:8000/v1")
+    parser.add_argument("--judge-model", default="", metavar="NAME", help="its name on the server")
+    parser.add_argument("--judge-key-env", default="", metavar="VARIABLE", help="environment variable with its key")
+    parser.add_argument("--rubric", default="", help="rubric pack: a name, or a .yaml file")
+
+
+def judge_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The dotted settings that the options of add_judge_options stand for."""
+    return judge_overrides(
+        arguments.judge, arguments.judge_model, arguments.judge_key_env, arguments.rubric
+    )
 
 
 class Stages:
@@ -74,7 +92,7 @@ class Stages:
 
 @dataclass(frozen=True)
 class Job:
-    """What all trainings of a run share. starts: first frames to imagine from."""
+    """What all trainings of a run share. starts: first frames to imagine from. reward: as the launch argument."""
 
     config: RunConfig
     run_dir: Path
@@ -83,6 +101,7 @@ class Job:
     domain_id: str = ""
     compose: bool = False
     verbose: bool = False
+    reward: str = "endogenous"
 
 
 @dataclass(frozen=True)
@@ -125,11 +144,13 @@ class WaitingGraph:
 def start_graph(job: Job, start: Start) -> WaitingGraph:
     """Start the processes of one training; the caller stops the runner."""
     start.folder.mkdir(parents=True, exist_ok=True)
-    (start.folder / "config.yaml").write_text(dump_config(start.config))
+    config_file = start.folder / "config.yaml"
+    if not config_file.exists():  # the run folder's own says more, see open_run_dir
+        config_file.write_text(dump_config(start.config))
     name = "_".join(["training", *start.label.split(), time.strftime("%H%M%S")])
     bag = job.run_dir / "bags" / name
     graph, _ = launch_arguments.prepare("online_training", {
-        "config_file": str(start.folder / "config.yaml"), "run_dir": str(start.folder),
+        "config_file": str(config_file), "reward": job.reward, "run_dir": str(start.folder),
         "model_dir": str(start.model_dir), "starts_file": str(job.starts), "initial_policy": str(start.policy),
         "seed": str(start.config.seed), "bag_uri": str(bag), "domain_id": job.domain_id,
         "compose": "true" if job.compose else "false", "autostart": "false",

@@ -19,14 +19,27 @@ import torch
 from wm_nodes.config.load import ConfigError, dump_config, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.job import Job, Stages, console, is_trained, open_run_dir, rate, start_graph
+from wm_nodes.job import (
+    Job,
+    Stages,
+    add_judge_options,
+    console,
+    is_trained,
+    judge_options,
+    open_run_dir,
+    rate,
+    start_graph,
+)
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, collect_plan, gate_plan
+from wm_nodes.learning.episode_reward import check_agent
 from wm_nodes.learning.gate import judge_model
 from wm_nodes.learning.pictures import write_pictures
 from wm_nodes.learning.policies import load_policy
 from wm_nodes.learning.preparation import prepare_start, start_files
 from wm_nodes.learning.pretraining import load_arrays, make_model
+from wm_nodes.learning.video_config import AGENT
 from wm_nodes.reports import Summary, machine_facts, results_table, rounds_table, write_report, write_summary
+from wm_nodes.reward.judges.factory import judge_name
 from wm_nodes.ros.domain import DomainInUseError
 from wm_nodes.ros.graph import GraphError
 from wm_nodes.ros.operator import GoalFailed, PeerLost
@@ -41,6 +54,9 @@ EXPECTED = (
     ConfigError, GraphError, DomainInUseError, NodeDiedError, NotReadyError, GoalFailed, PeerLost, ValueError, OSError,
 )  # fmt: skip
 """Errors whose text says what to do; anything else is a fault of ours and shows its traceback."""
+
+
+ENDOGENOUS = "endogenous"
 
 
 class GateRefused(RuntimeError):
@@ -72,7 +88,9 @@ def run(arguments: argparse.Namespace) -> Summary:
     stage(f"run folder {run_dir}")
     model_dir = _model(arguments, config, run_dir, stage)
     starts, weak = start_files(run_dir)
-    job = Job(config, run_dir, starts, stage, arguments.domain_id, arguments.compose, arguments.verbose)
+    job = Job(
+        config, run_dir, starts, stage, arguments.domain_id, arguments.compose, arguments.verbose, arguments.reward
+    )
     with ExitStack() as stack:
         first, waiting = round_start(job, 1, model_dir, weak), None
         if not is_trained(first):
@@ -90,7 +108,8 @@ def run(arguments: argparse.Namespace) -> Summary:
         paired=asdict(paired_difference(found.real_before.tolist(), found.real_after.tolist())),
         imagined_paired=asdict(paired_difference(found.imagined_before.tolist(), found.imagined_after.tolist())),
         gate=json.loads((run_dir / "gate.json").read_text()), samples=found.samples, minutes=stage.minutes,
-        command=_command(), machine=machine_facts(), rounds=found.table,
+        command=_command(), machine=machine_facts(), rounds=found.table, reward=arguments.reward,
+        judge=judge_name(config.judge) if arguments.reward == AGENT else "",
     )  # fmt: skip
     write_summary(run_dir, summary)
     policy = load_policy(config, found.model_dir, found.policy)
@@ -128,6 +147,12 @@ def _parser() -> argparse.ArgumentParser:
         help="train, collect with the policy in the simulator, refresh the world model, N times; default: the preset's "
         "(1: never refresh). The policy updates are split over the rounds",
     )  # fmt: skip
+    parser.add_argument(
+        "--reward", choices=(ENDOGENOUS, AGENT), default=ENDOGENOUS,
+        help="what the policy is paid for in the world model. endogenous: the model's own signal; agent: a judge's "
+        "verdict on each whole episode; name the judge below, or in section judge of the settings. Default: endogenous",
+    )  # fmt: skip
+    add_judge_options(parser)
     parser.add_argument("--compose", action="store_true", help="all nodes in one process")
     parser.add_argument("--domain-id", default="", help="ROS domain 0 to 101; default: $ROS_DOMAIN_ID, else 0")
     parser.add_argument("--verbose", action="store_true", help="show the nodes' logs (they are in <run>/logs anyway)")
@@ -142,11 +167,15 @@ def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
         overrides["seed"] = arguments.seed
     if arguments.rounds is not None:
         overrides["rounds.num_rounds"] = arguments.rounds
-    config = load_config(arguments.preset, overrides)
-    run_dir = open_run_dir(
-        arguments.run_dir, config.task, dump_config(config), from_scratch=arguments.from_scratch
-    )
-    return config, run_dir
+    judge = judge_options(arguments)
+    if judge and arguments.reward != AGENT:
+        raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")
+    config = load_config(arguments.preset, {**overrides, **judge})
+    begun_with = ["--from-scratch"] if arguments.from_scratch else []
+    if arguments.reward == AGENT:
+        check_agent(config)
+        begun_with.append("--reward agent")
+    return config, open_run_dir(arguments.run_dir, config.task, dump_config(config), begun_with=begun_with)
 
 
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: Stages) -> Path:

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from wm_nodes.config.load import ConfigError, load_config, parse_override
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.job import READY_S, Stages, console, open_run_dir
+from wm_nodes.job import READY_S, Stages, add_judge_options, console, open_run_dir
 from wm_nodes.learning.clip_scores import load_probe
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
 from wm_nodes.learning.video_config import (
@@ -32,7 +32,7 @@ from wm_nodes.learning.video_data import load_clips
 from wm_nodes.learning.video_pretraining import make_video_model, shipped_video_model
 from wm_nodes.learning.video_run import progress
 from wm_nodes.reports import ClipSummary
-from wm_nodes.reward.judges.factory import check_judge
+from wm_nodes.reward.judges.factory import check_clips, check_judge
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.domain import DomainInUseError
 from wm_nodes.ros.graph import GraphError
@@ -80,6 +80,8 @@ def run(arguments: argparse.Namespace) -> ClipSummary:
     heldout = load_clips(heldout_bags, config.model.stride)
     stage("video model: " + ("the shipped one" if shipped else "flow matching"))
     clips = load_clips(bags, config.model.stride)
+    if config.rewards.get(AGENT):
+        check_clips(config.judge, clips.frames.shape[1:])
     make_video_model(config, clips, heldout, probe, run_dir, shipped=shipped, command=_command())
     version, done = progress(run_dir)
     if done < config.iterations:
@@ -140,8 +142,9 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
     if config.rewards.get(AGENT):
         check_judge(config.judge)
     run_dir = open_run_dir(
-        arguments.run_dir, "world_model_rl", dump_video_config(config), from_scratch=arguments.from_scratch
-    )
+        arguments.run_dir, "world_model_rl", dump_video_config(config),
+        begun_with=["--from-scratch"] if arguments.from_scratch else [],
+    )  # fmt: skip
     return config, run_dir
 
 
@@ -198,10 +201,7 @@ def _add_judge(parser: argparse.ArgumentParser) -> None:
         help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording. Default: what "
         "the preset or the run weighs",
     )  # fmt: skip
-    parser.add_argument("--judge", default="", metavar="URL[,URL]", help="the judge's servers, e.g. http://host:8000/v1")
-    parser.add_argument("--judge-model", default="", metavar="NAME", help="its name on the server")
-    parser.add_argument("--judge-key-env", default="", metavar="VARIABLE", help="environment variable with its key")
-    parser.add_argument("--rubric", default="", help="rubric pack: a name, or a .yaml file")
+    add_judge_options(parser)
 
 
 def _add_tensorboard(parser: argparse.ArgumentParser) -> None:

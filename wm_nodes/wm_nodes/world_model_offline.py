@@ -11,10 +11,10 @@ from rich.table import Table
 from torch import Tensor
 from tqdm import tqdm
 
-from wm_nodes.config.load import judge_overrides, parse_override
+from wm_nodes.config.load import parse_override
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.files import write_atomic
-from wm_nodes.job import Stages, console, open_run_dir
+from wm_nodes.job import Stages, console, judge_options, open_run_dir
 from wm_nodes.learning.clip_archive import (
     BufferJudge,
     RecordedClips,
@@ -122,13 +122,13 @@ def recorded_bags(run_dir: Path) -> list[Path]:
 
 def chosen_judge(arguments: argparse.Namespace) -> dict[str, Any]:
     """The settings that the options --reward, --judge, --judge-model, --judge-key-env and --rubric stand for."""
-    words = (arguments.judge, arguments.judge_model, arguments.judge_key_env, arguments.rubric)
-    return {**reward_overrides(arguments.reward), **judge_overrides(*words)}
+    return {**reward_overrides(arguments.reward), **judge_options(arguments)}
 
 
 @contextmanager
 def _judge(config: VideoRlConfig, run_dir: Path, fps: float) -> Iterator[BufferJudge | None]:
-    """The run's reward agent with the answers that it kept; None where it is not among the rewards."""
+    """The run's reward agent with the answers that it kept; a round is judged by the judge that did it, where the run
+    still has that one. None where the agent is not among the rewards."""
     if not config.rewards.get(AGENT):
         yield None
         return
@@ -137,7 +137,7 @@ def _judge(config: VideoRlConfig, run_dir: Path, fps: float) -> Iterator[BufferJ
         jobs = buffer_jobs(
             frames, references, recorded.sha256, fps=fps, task=config.task, robot=config.judge.robot
         )
-        return judge.judge(jobs)
+        return judge.judge(jobs, by=recorded.judge_id if recorded.judge_id in judge.judge_ids else "")
 
     with closing(ClipJudge(config.judge, seed=config.seed, reads=run_dir / READS)) as judge:
         yield verdicts

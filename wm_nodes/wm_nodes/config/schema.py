@@ -110,6 +110,16 @@ class RewardConfig(Section):
     """An imagined step above it pays no sparse reward and truncates the episode; 0: off."""
 
 
+class FallbackJudge(Section):
+    """Who judges a whole round where no judge before it answered; as in JudgeConfig, whose other values it shares."""
+
+    kind: Literal["openai", "embedded"] = "openai"
+    endpoints: list[str] = []
+    model: str = ""
+    api_key_env: str = ""
+    folder: str = ""
+
+
 class JudgeConfig(Section):
     """The reward agent: who judges, by which rubric, and how much it may take (reward/agent, reward/judges)."""
 
@@ -149,6 +159,10 @@ class JudgeConfig(Section):
     keep_reads: bool
     """Keep every answer in <run>/judge_reads, by content: the same clip is not asked about twice, and scoring a bag
     again gives the same verdicts."""
+    fallbacks: list[FallbackJudge]
+    """Loop 2: other judges, in the order in which they are tried, e.g. [{kind: openai, endpoints: [URL], model: NAME}].
+    A round that the judge could not judge is judged anew by the next one, as a whole; the round after begins with the
+    first again. Empty: an outage pauses training."""
 
 
 class PolicyConfig(Section):

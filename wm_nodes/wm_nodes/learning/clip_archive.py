@@ -33,7 +33,7 @@ class RecordedClips:
     """One ClipBatch with its ClipScores. contexts: rows of the context bags' clips, one per clip (N,). scores, total:
     float64 (N,), NaN where missing. valid: bool (N,). picture: uint8 (N H, F W, 3), or None where not asked for.
     weights: of the scores in the total. audit_ids: of the agent's verdicts (N,), "" where no answer came; () where it
-    was not asked.
+    was not asked. judge_id: of who gave them; "" where nobody did.
     """
 
     iteration: int
@@ -48,6 +48,7 @@ class RecordedClips:
     picture: UInt8Array | None
     weights: Mapping[str, float] = field(default_factory=dict)
     audit_ids: tuple[str, ...] = ()
+    judge_id: str = ""
 
     def frames(self, height: int, width: int) -> Tensor:
         """The clips, uint8 (N, F, H, W, 3), cut out of the picture.
@@ -110,7 +111,7 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
                 clips[message.sha256] = message
             elif (batch := clips.pop(message.buffer_sha256, None)) is not None:
                 picture = shown.pop(stamp_ns(batch.header.stamp), None)
-                yield _joined(batch, message, picture, _audit_ids(verdicts, message))
+                yield _joined(batch, message, picture, *_audit_ids(verdicts, message))
 
 
 def rescore(
@@ -198,32 +199,40 @@ def trained_clips(bags: Sequence[Path], iterations: int) -> list[RecordedClips]:
     return [found[iteration] for iteration in range(iterations)]
 
 
-def _verdicts(bag: Bag) -> dict[tuple[str, int], list[tuple[int, str]]]:
-    """(stamp in ns, audit id) of every verdict on a clip (sha256 of its buffer, row), in the order of their stamps; the
-    id is "" where no answer came."""
-    found = defaultdict[tuple[str, int], list[tuple[int, str]]](list)
+def _verdicts(bag: Bag) -> dict[tuple[str, int], list[tuple[int, str, str]]]:
+    """(stamp in ns, audit id, judge id) of every verdict on a clip (sha256 of its buffer, row), in the order of their
+    stamps; the audit id is "" where no answer came."""
+    found = defaultdict[tuple[str, int], list[tuple[int, str, str]]](list)
     name = topics.absolute(topics.DEFAULT_NAMESPACE, topics.VERDICT)
     for _, _, data in bag.messages([name]) if bag.count(name) else ():
         message = bag.decode(data, topics.VERDICT.msgtype)
         audit_id = "" if message.status == message.ERROR else str(message.audit_id)
-        found[message.buffer_sha256, int(message.clip)].append((stamp_ns(message.header.stamp), audit_id))
+        key = message.buffer_sha256, int(message.clip)
+        found[key].append((stamp_ns(message.header.stamp), audit_id, str(message.judge_id)))
     return {key: sorted(values) for key, values in found.items()}
 
 
-def _audit_ids(verdicts: Mapping[tuple[str, int], list[tuple[int, str]]], scores: Any) -> tuple[str, ...]:
-    """Of the verdicts behind a ClipScores: on each clip the newest one before it. Empty where one is missing."""
-    until, ids = stamp_ns(scores.header.stamp), list[str]()
+def _audit_ids(
+    verdicts: Mapping[tuple[str, int], list[tuple[int, str, str]]], scores: Any
+) -> tuple[tuple[str, ...], str]:
+    """Of the verdicts behind a ClipScores, on each clip the newest one before it, and their judge, who is one for all.
+    Empty where a verdict is missing."""
+    until, found = stamp_ns(scores.header.stamp), list[tuple[str, str]]()
     for clip in range(int(scores.num_clips)):
-        before = [audit_id for stamp, audit_id in verdicts.get((scores.buffer_sha256, clip), ()) if stamp <= until]
-        ids += before[-1:]
-    return tuple(ids) if len(ids) == int(scores.num_clips) else ()
+        before = [told for stamp, *told in verdicts.get((scores.buffer_sha256, clip), ()) if stamp <= until]
+        found += [(audit_id, judge_id) for audit_id, judge_id in before[-1:]]
+    if not found or len(found) != int(scores.num_clips):
+        return (), ""
+    return tuple(audit_id for audit_id, _ in found), found[0][1]
 
 
 def _weighed(weights: Mapping[str, float]) -> set[str]:
     return {name for name, weight in weights.items() if weight}
 
 
-def _joined(batch: Any, scores: Any, picture: UInt8Array | None, audit_ids: tuple[str, ...]) -> RecordedClips:
+def _joined(
+    batch: Any, scores: Any, picture: UInt8Array | None, audit_ids: tuple[str, ...], judge_id: str
+) -> RecordedClips:
     count = int(scores.num_clips)
     values = torch.from_numpy(np.array(scores.values, np.float64)).view(len(scores.names), count)
     valid = torch.from_numpy(np.array(scores.valid, np.uint8)).bool()
@@ -233,6 +242,7 @@ def _joined(batch: Any, scores: Any, picture: UInt8Array | None, audit_ids: tupl
         int(batch.iteration), int(batch.policy_version), contexts, int(batch.num_frames), batch.buffer_uri,
         batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), valid,
         picture, dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
+        judge_id,
     )  # fmt: skip
 
 

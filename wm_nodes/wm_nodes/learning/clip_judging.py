@@ -24,10 +24,11 @@ from wm_nodes.learning.video_config import AGENT
 from wm_nodes.learning.video_data import Clips
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.reward.agent import ClipRef, RewardAgent, Rubric, Status, TaskSpec, Verdict, clip_ref, load_rubric
+from wm_nodes.reward.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.reward.agent.scoring import skipped
 from wm_nodes.reward.agent.types import GATED, Cost, Health, Provenance, content_hash
 from wm_nodes.reward.audit import AuditedAgent, AuditLog, write_exchange
-from wm_nodes.reward.judges.factory import OpenedJudge, make_judge
+from wm_nodes.reward.judges.factory import OpenedJudge, check_judge, judges_of, make_judge
 
 READS = "judge_reads"
 """Folder of a run that keeps the judge's answers."""
@@ -75,8 +76,44 @@ class Tally:
         return self.cost.cached_tokens / self.cost.prompt_tokens if self.cost.prompt_tokens else 0.0
 
 
+@dataclass
+class _Seat:
+    """One of the judges. out: the last round that it was given was taken from it."""
+
+    opened: OpenedJudge
+    agent: RewardAgent | AuditedAgent
+    out: bool = False
+
+    @property
+    def judge_id(self) -> str:
+        return self.agent.judge.capabilities.judge_id
+
+
+class _Patience:
+    """With a judge that others could stand in for: over when more than MAX_INVALID_SHARE of a round's clips have no
+    answer, or the clip that was sent ahead has none. It lasts when the round's time is up: nobody else could judge it.
+
+    reason: of the newest clip without an answer.
+    """
+
+    def __init__(self, num_clips: int, deadline: float | None) -> None:
+        self._left, self._deadline = MAX_INVALID_SHARE * num_clips, deadline
+        self.over, self.reason = False, ""
+
+    def saw(self, verdict: Verdict, *, alone: bool) -> None:
+        if verdict.status is not Status.ERROR:
+            return
+        self._left -= 1
+        self.reason = verdict.reason
+        in_time = self._deadline is None or time.monotonic() < self._deadline
+        self.over = self.over or (in_time and (alone or self._left < 0))
+
+
 class ClipJudge:
     """A reward agent with its judge on an event loop in a thread of its own; at most `concurrency` clips at a time.
+
+    settings.fallbacks are further judges for whole rounds, see judge. fallen_back: why the last round did not stay with
+    the first judge, and to whom it went; "" where it stayed.
 
     Args:
         reads: folder that keeps the judge's answers; None: none are kept.
@@ -92,7 +129,8 @@ class ClipJudge:
         self.settings, self._seed, self._reads = settings, seed, reads
         self._log = None if audit is None else AuditLog(audit)
         self.pack, self.tally, self.health = settings.rubric, Tally(), Health(True, "not asked yet")
-        self._opened, self._agent = self._made(load_rubric(settings.rubric))
+        self._seats = self._made(load_rubric(settings.rubric))
+        self.fallen_back, self._used = "", self._seats[0]
         self._places = asyncio.Semaphore(settings.concurrency)
         self._asked_s = -math.inf
         self._asking: Future[None] | None = None
@@ -102,11 +140,17 @@ class ClipJudge:
 
     @property
     def rubric(self) -> Rubric:
-        return self._agent.rubric
+        return self._seats[0].agent.rubric
 
     @property
     def judge_id(self) -> str:
-        return self._agent.judge.capabilities.judge_id
+        """Of the judge of the last round; before one, of the first judge, of whom `health` is too."""
+        return self._used.judge_id
+
+    @property
+    def judge_ids(self) -> list[str]:
+        """Of all judges, in the order in which they are tried."""
+        return [seat.judge_id for seat in self._seats]
 
     def set_rubric(self, pack: str, base: Path) -> None:
         """Judge by another rubric from now on; call it while nothing is being judged.
@@ -120,49 +164,66 @@ class ClipJudge:
         """
         path = base / pack
         rubric = load_rubric(str(path) if path.is_file() else pack)
-        old, (self._opened, self._agent) = self._opened, self._made(rubric)
-        self.pack = pack
-        self._run(old.close())
+        old, self._seats = self._seats, self._made(rubric)
+        self.pack, self.fallen_back, self._used = pack, "", self._seats[0]
+        for seat in old:
+            self._run(seat.opened.close())
 
     def submit(self, job: ClipJob, deadline: float | None = None) -> "Future[Verdict]":
-        """Judge one clip as soon as there is a place. deadline: on the time.monotonic clock, s; see judge."""
-        return self._run(self._judged(self._agent, job, deadline))
+        """Have the first judge judge a clip as soon as there is a place. deadline: on the time.monotonic clock, s."""
+        return self._run(self._judged(self._seats[0].agent, job, deadline))
 
     def judge(
         self, jobs: Sequence[ClipJob], *, check: Callable[[], None] = lambda: None,
         done: Callable[[int, Verdict], None] = lambda index, verdict: None, within_s: float | None = None,
-        round_number: int = 0,
+        round_number: int = 0, by: str = "",
     ) -> list[Verdict]:  # fmt: skip
-        """Judge clips by one judge and one rubric; the verdicts are in the order of the jobs.
+        """Judge a round of clips by one judge and one rubric; the verdicts are in the order of the jobs.
+
+        A judge that leaves more than MAX_INVALID_SHARE of the clips without an answer (status ERROR) loses the round to
+        the next one, as long as there is one and time: all its verdicts are dropped, the answers it gave included.
 
         Args:
             check: called at least every POLL_S; what it raises ends the judging, and calls under way are dropped.
-            done: called in this thread with the index and verdict of every clip as it is judged.
+            done: called in this thread with the index and verdict of every clip: as it is judged by the last judge
+                there is, or when a round that could still be taken from its judge is over.
             within_s: clips without a verdict by then get one that says so, without a reward; None: no limit.
             round_number: what the audit log calls these clips' round.
+            by: the id of the only judge to ask; empty: all, in their order.
+
+        Raises:
+            ValueError: there is no judge of this id.
         """
-        if isinstance(self._agent, AuditedAgent):
-            self._agent.round_number = round_number
+        seats = [seat for seat in self._seats if by in ("", seat.judge_id)]
+        if not seats:
+            raise ValueError(f"there is no judge {by!r} to ask, only {', '.join(self.judge_ids)}")
         deadline = None if within_s is None else time.monotonic() + within_s
-        futures = {self.submit(job, deadline): index for index, job in enumerate(jobs)}
-        open_ = set(futures)
-        try:
-            while open_:
-                check()
-                finished, open_ = wait(open_, POLL_S, FIRST_COMPLETED)
-                for future in finished:
-                    done(futures[future], future.result())
-        finally:
-            for future in open_:
-                future.cancel()
-        return [future.result() for future in futures]
+        lost = list[str]()
+        for seat in seats:
+            if isinstance(seat.agent, AuditedAgent):
+                seat.agent.round_number = round_number
+            held = dict[int, Verdict]()
+            patience = _Patience(len(jobs), deadline) if seat is not seats[-1] else None
+            told = done if patience is None else held.__setitem__
+            ahead = 1 if seat.out and patience is not None else 0  # is it back? One clip, so that a breaker can close
+            verdicts = self._round(seat, jobs[:ahead], 0, deadline, check, told, patience)
+            verdicts += self._round(seat, jobs[ahead:], ahead, deadline, check, told, patience)
+            seat.out = patience is not None and patience.over
+            if patience is None or not patience.over:
+                break
+            lost.append(f"{seat.judge_id} did not answer: {patience.reason}")
+        for index, verdict in held.items():
+            done(index, verdict)
+        self._used = seat
+        self.fallen_back = f"{'; '.join(lost)}; the round went to {seat.judge_id}" if lost else ""
+        return verdicts
 
     def refresh_health(self) -> None:
         """Ask the judge how it is, at most every HEALTH_S and without waiting: `health` is the newest answer."""
         idle = self._asking is None or self._asking.done()
         if idle and not self._loop.is_closed() and time.monotonic() - self._asked_s >= HEALTH_S:
             self._asked_s = time.monotonic()
-            self._asking = self._run(self._ask_health())
+            self._asking = self._run(self._ask_health(self._seats[0]))
 
     def close(self) -> None:
         """Drop what is under way and end the thread."""
@@ -176,17 +237,45 @@ class ClipJudge:
 
     # internals
 
-    def _made(self, rubric: Rubric) -> tuple[OpenedJudge, RewardAgent | AuditedAgent]:
-        settings, log = self.settings, self._log
+    def _made(self, rubric: Rubric) -> list[_Seat]:
+        check_judge(self.settings)
+        return [self._seat(settings, rubric) for settings in judges_of(self.settings)]
+
+    def _seat(self, settings: JudgeConfig, rubric: Rubric) -> _Seat:
+        log = self._log
         limits: dict[str, Any] = {
             "mode": settings.mode, "seed": self._seed, "max_reads": settings.max_reads,
             "budget_s": settings.clip_budget_s, "call_plan": settings.call_plan,
         }  # fmt: skip
         if log is None:
             opened = make_judge(settings, rubric, self._reads)
-            return opened, RewardAgent(opened.judge, rubric, **limits)
+            return _Seat(opened, RewardAgent(opened.judge, rubric, **limits))
         opened = make_judge(settings, rubric, self._reads, partial(write_exchange, log))
-        return opened, AuditedAgent(opened.judge, rubric, log, **limits)
+        return _Seat(opened, AuditedAgent(opened.judge, rubric, log, **limits))
+
+    def _round(
+        self, seat: _Seat, jobs: Sequence[ClipJob], first: int, deadline: float | None, check: Callable[[], None],
+        done: Callable[[int, Verdict], None], patience: "_Patience | None",
+    ) -> list[Verdict]:  # fmt: skip
+        """The verdicts of one judge; fewer where patience with it is over. first: index of the first job."""
+        if patience is not None and patience.over:
+            return []
+        futures = {
+            self._run(self._judged(seat.agent, job, deadline)): first + index for index, job in enumerate(jobs)
+        }
+        open_ = set(futures)
+        try:
+            while open_ and not (patience is not None and patience.over):
+                check()
+                finished, open_ = wait(open_, POLL_S, FIRST_COMPLETED)
+                for future in finished:
+                    done(futures[future], future.result())
+                    if patience is not None:
+                        patience.saw(future.result(), alone=len(jobs) == 1)
+        finally:
+            for future in open_:
+                future.cancel()
+        return [future.result() for future in futures if future not in open_]
 
     def _run(self, work: Coroutine[Any, Any, T]) -> "Future[T]":
         return asyncio.run_coroutine_threadsafe(work, self._loop)
@@ -201,15 +290,16 @@ class ClipJudge:
         self.tally.add(verdict)
         return verdict
 
-    async def _ask_health(self) -> None:
-        self.health = await self._opened.judge.health()
+    async def _ask_health(self, seat: _Seat) -> None:
+        self.health = await seat.opened.judge.health()
 
     async def _end(self) -> None:
         others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
         for task in others:
             task.cancel()
         await asyncio.gather(*others, return_exceptions=True)
-        await self._opened.close()
+        for seat in self._seats:
+            await seat.opened.close()
 
 
 def _late(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict:

@@ -1,22 +1,28 @@
 """The reward agent as reward of a policy: an episode is judged as a clip at its end, and paid at its last step.
 
+Every rollout begins with a reset, so an episode that the rollout's end cuts short never goes on and is never judged.
+Its 0 at each step is exact, for what it is worth would come with its last step only; for the rest the critic stands,
+which learns from the episodes that ended: PPO bootstraps at the cut. One that ended has its verdict and nothing beyond.
+
 Shapes: N environments, T steps of an episode, H W 3 image, A action.
 """
 
 from collections.abc import Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.config.schema import JudgeConfig, RunConfig
 from wm_nodes.learning.clip_judging import ClipJob, ClipJudge
 from wm_nodes.learning.video_config import AGENT
 from wm_nodes.reward import SUCCESS_UNKNOWN, RewardResult
-from wm_nodes.reward.agent import TaskSpec, Verdict, clip_ref
+from wm_nodes.reward.agent import TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.reward.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.reward.base import version_of
-from wm_nodes.specs import EnvironmentSpec
+from wm_nodes.reward.judges.factory import check_clips, check_judge
+from wm_nodes.specs import EnvironmentSpec, simulation_spec
 from wm_nodes.types import BoolArray, FloatArray, Rollout, UInt8Array, UInt64Array
 
 
@@ -86,12 +92,72 @@ class PendingReward:
         )  # fmt: skip
 
 
+def check_agent(config: RunConfig, *, trains: bool = True) -> None:
+    """Refuse settings by which episodes of the configured scene could not be judged, before anything is made.
+
+    Args:
+        trains: rollouts of ppo.num_steps are trained on.
+
+    Raises:
+        ValueError, ConfigError: as check_judge, load_rubric, check_horizon and check_clips; fallbacks are named.
+    """
+    check_judge(config.judge)
+    _refuse_fallbacks(config.judge)
+    load_rubric(config.judge.rubric)
+    spec = simulation_spec(config.task, "", config.simulation, 1)
+    if trains:
+        check_horizon(config.ppo.num_steps, spec.max_episode_steps)
+    check_clips(config.judge, (spec.max_episode_steps + 1, spec.height, spec.width, spec.channels))
+
+
+def _refuse_fallbacks(settings: JudgeConfig) -> None:
+    if settings.fallbacks:
+        raise ValueError(
+            f"judge.fallbacks names {len(settings.fallbacks)}, but others stand in for whole rounds of loop 2 only; a "
+            "policy's episodes are judged one by one. Leave it empty: an outage pauses training, which then makes the "
+            "same rollout again"
+        )
+
+
+def check_horizon(num_steps: int, max_episode_steps: int) -> None:
+    """Refuse rollouts in which an episode of full length does not end.
+
+    None such would ever be judged: only episodes that end early would be paid, and no value beyond the cut be learned.
+
+    Args:
+        num_steps: lock-steps of a rollout, the first of them after a reset. max_episode_steps: of the environment.
+
+    Raises:
+        ValueError: num_steps is below max_episode_steps.
+    """
+    if num_steps < max_episode_steps:
+        raise ValueError(
+            f"ppo.num_steps is {num_steps}, but an episode may take {max_episode_steps} steps: the reward agent judges "
+            "it at its end, which such a rollout would cut off; set ppo.num_steps to at least that many"
+        )
+
+
+def nothing_beyond_the_end(rollout: Rollout) -> Rollout:
+    """The rollout as PPO must see it where an episode is paid once, at its last step: no value lies beyond that step.
+
+    A truncated episode got its verdict as a terminated one did. The critic's value on top of it would pay it twice, and
+    an episode that fails until its time is over could be worth more than one that succeeds.
+    """
+    ended = rollout.terminated_TN | rollout.truncated_TN
+    return replace(rollout, terminated_TN=ended, truncated_TN=np.zeros_like(ended))
+
+
 def unjudged(rollout: Rollout) -> str:
-    """Why training must pause before a rollout that the agent judged: more than MAX_INVALID_SHARE of its episodes ended
-    without a reward, so that nobody knows what their steps were worth; "" where it may go on.
+    """Why training must pause before a rollout that the agent judged: none of its episodes ended, or more than
+    MAX_INVALID_SHARE of them without a reward, so that nobody knows what their steps were worth; "" where it may go on.
     """
     ended = rollout.terminated_TN | rollout.truncated_TN
     without, count = int((ended & ~rollout.valid_TN).sum()), int(ended.sum())
+    if count == 0:
+        return (
+            f"training pauses: none of the episodes in a rollout of {len(ended)} lock-steps (ppo.num_steps) was seen "
+            "to end, so none was judged; nothing was trained on it. Raise ppo.num_steps, or mend what loses messages"
+        )
     if without <= MAX_INVALID_SHARE * count:
         return ""
     return (
@@ -102,12 +168,20 @@ def unjudged(rollout: Rollout) -> str:
 
 
 class EpisodeReward:
-    """Collects the lock-steps of one environment node into episodes and has each judged at its end."""
+    """Collects the lock-steps of one environment node into episodes and has each judged at its end.
+
+    cut: episodes that a reset ended before their last step, which are not judged.
+
+    Raises:
+        ValueError: the judge has fallbacks.
+    """
 
     name = AGENT
 
     def __init__(self, judge: ClipJudge) -> None:
+        _refuse_fallbacks(judge.settings)
         self._judge = judge
+        self.cut = 0
         self._open: dict[int, _Episode] = {}
 
     @property
@@ -117,6 +191,7 @@ class EpisodeReward:
 
     def forget(self) -> None:
         """The environment was (re)started: unfinished episodes belong to nobody."""
+        self.cut += len(self._open)
         self._open.clear()
 
     def add(self, step: EpisodeStep, spec: EnvironmentSpec, session: int) -> PendingReward:
@@ -133,6 +208,7 @@ class EpisodeReward:
         """The episode of environment n with this step."""
         episode, episode_id = self._open.get(n), int(step.episode_ids[n])
         if episode is None or episode.episode_id != episode_id:
+            self.cut += episode is not None
             episode = self._open[n] = _Episode(episode_id)
         made = len(episode.actions)
         if made != step.episode_steps[n]:

@@ -30,13 +30,15 @@ class Canceled(Exception):
 class RolloutStatistics:
     """Of the episodes that ended inside a rollout that began with a reset. NaN means without episodes.
 
-    successes: episodes that terminated (the environment's own done signal). mean_length: steps.
+    successes: episodes that terminated (the environment's own done signal). mean_length: steps. cut: further episodes,
+    which the rollout's end cut short: in none of the other numbers.
     """
 
     episodes: int
     successes: int
     mean_return: float
     mean_length: float
+    cut: int = 0
 
     @property
     def success_rate(self) -> float:
@@ -136,7 +138,7 @@ def rollout_statistics(rollout: Rollout) -> RolloutStatistics:
     """
     returns: list[float] = []
     lengths: list[int] = []
-    successes = 0
+    successes = cut = 0
     for n in range(rollout.valid_TN.shape[1]):
         total, length = 0.0, 0
         for t in range(rollout.valid_TN.shape[0]):
@@ -150,6 +152,7 @@ def rollout_statistics(rollout: Rollout) -> RolloutStatistics:
                 lengths.append(length)
                 successes += int(rollout.terminated_TN[t, n])
                 total, length = 0.0, 0
+        cut += length > 0
     if not returns:
-        return RolloutStatistics(0, 0, float("nan"), float("nan"))
-    return RolloutStatistics(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)))
+        return RolloutStatistics(0, 0, float("nan"), float("nan"), cut)
+    return RolloutStatistics(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)), cut)

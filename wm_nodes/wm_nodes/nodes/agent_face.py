@@ -61,7 +61,14 @@ class AgentFace:
         return message
 
     def pause(self, verdicts: Sequence[Verdict]) -> str:
-        """Why training must pause after these verdicts, told to the diagnostics too; "" where it may go on."""
+        """Why training must pause after a round's verdicts, told to the diagnostics too; "" where it may go on. A round
+        that another judge than the first had to judge is a warning there.
+        """
+        if fallen_back := self.judge.fallen_back:
+            self._node.get_logger().warning(fallen_back)
+            self._node.diagnostics.set_condition("judge_fallback", diagnostics.WARN, fallen_back)
+        else:
+            self._node.diagnostics.clear_condition("judge_fallback")
         reason = pause_reason(verdicts)
         if reason:
             self._node.get_logger().error(reason)
@@ -90,7 +97,7 @@ class AgentFace:
         if health.available:
             board.clear_condition("judge")
         else:
-            board.set_condition("judge", diagnostics.WARN, f"judge {judge.judge_id}: {health.reason}")
+            board.set_condition("judge", diagnostics.WARN, f"judge {judge.judge_ids[0]}: {health.reason}")
 
     def _on_set_rubric(self, request: SetRubric.Request, response: SetRubric.Response) -> SetRubric.Response:
         try:

@@ -23,6 +23,7 @@ from wm_nodes.nodes import agent_face
 from wm_nodes.nodes.agent_face import AgentFace
 from wm_nodes.reward.agent import Verdict, check_one_judge
 from wm_nodes.reward.agent.types import GATED
+from wm_nodes.reward.judges.factory import check_clips
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -53,7 +54,8 @@ class ClipEvaluatorNode(ManagedNode):
         self._config = load_video_config(str(self.param("config_file")))
         folder = load_video_folder(Path(str(self.param("video_model_dir"))))
         bags = [Path(text) for text in self.param("context_bags") if text]
-        self._generator = ClipGenerator(folder, load_clips(bags, folder.clip["stride"]), self._config)
+        contexts = load_clips(bags, folder.clip["stride"])
+        self._generator = ClipGenerator(folder, contexts, self._config)
         probe = load_model_folder(Path(str(self.param("model_dir")))).probe
         if probe is None:
             raise ValueError(f"{self.param('model_dir')} has no position probe; take the shipped world model")
@@ -61,6 +63,7 @@ class ClipEvaluatorNode(ManagedNode):
         self._fps = clip_fps(bags[0], folder.clip["stride"])
         self._agent = None
         if self._config.rewards.get(AGENT):
+            check_clips(self._config.judge, contexts.frames.shape[1:])
             self._agent = AgentFace(self, self._config.judge, self._config.seed, lambda: self._action.busy)
         self._scores = self.publish_on("clips/scores")
         self._action = WorkerAction(self, EvaluateClips, "clips/evaluate", self._evaluate, self._describe)

@@ -18,7 +18,7 @@ from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
 from wm_nodes.learning.clip_judging import TrainingPaused
 from wm_nodes.learning.distributed import Ranks, join
-from wm_nodes.learning.episode_reward import unjudged
+from wm_nodes.learning.episode_reward import check_horizon, unjudged
 from wm_nodes.learning.rollouts import Canceled
 from wm_nodes.learning.video_config import AGENT
 from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, load_weights
@@ -29,6 +29,7 @@ from wm_nodes.nodes.policy_holder import weights_uri
 from wm_nodes.nodes.replayed import ReplayJoiner
 from wm_nodes.nodes.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
 from wm_nodes.nodes.training import PolicyTraining, follow
+from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
@@ -86,7 +87,7 @@ class LearnerNode(ManagedNode):
         self._expected_spec = expected_spec(
             self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
         )
-        self._joiner, self._reward_name = RolloutJoiner(), ""
+        self._joiner, self._reward_name, self._max_episode_steps = RolloutJoiner(), "", 0
         self._replayed = ReplayJoiner(self._withhold)
         self._versions = self.publish_on("policy/version")
         self.listen("env/spec", self._on_spec, while_inactive=True)
@@ -181,9 +182,10 @@ class LearnerNode(ManagedNode):
 
     def _next(self, source: RolloutSource, *, live: bool) -> tuple[Rollout, Dropped] | None:
         """The next rollout to train on. One whose episodes the agent could not judge pauses live training, which then
-        repeats it; in a recording it is passed over. Raises as RolloutSource.next, and TrainingPaused.
+        repeats it; in a recording it is passed over. Raises as RolloutSource.next, check_horizon; TrainingPaused.
         """
         while (following := source.next()) is not None and self._reward_name == AGENT:
+            check_horizon(self._config.ppo.num_steps, self._max_episode_steps)
             if not (reason := unjudged(following[0])):
                 break
             if live:
@@ -201,6 +203,7 @@ class LearnerNode(ManagedNode):
         if goal.from_bags:
             paths = bag_paths(goal.bag_uris, self.run_dir)
             self._reward_name = recorded_reward_name(paths[0])
+            self._max_episode_steps = read_spec(paths[0]).max_episode_steps
             return BagRollouts(paths, progress, num_steps=num_steps, expected=self._expected_spec)
         if goal.from_replay:
             uris = [str(path) for path in bag_paths(goal.bag_uris, self.run_dir)] if goal.bag_uris else []
@@ -234,7 +237,9 @@ class LearnerNode(ManagedNode):
     def _update(self, work: Work, goal: Train.Goal, update: int, rollout: Rollout, dropped: Dropped) -> None:
         began = time.perf_counter()
         try:
-            metrics = self._training.update(rollout, dropped, lambda: work.stopped)
+            metrics = self._training.update(
+                rollout, dropped, lambda: work.stopped, paid_at_end=self._reward_name == AGENT
+            )
         except FloatingPointError as error:
             self._report.nonfinite(self._training.progress, error)
             raise
@@ -290,6 +295,7 @@ class LearnerNode(ManagedNode):
             self._spec = convert.spec_from_msg(message)
             if self._expected_spec is not None:
                 refuse_other(self._spec, self._expected_spec, "the learner's policy needs")
+            self._max_episode_steps = self._spec.max_episode_steps
             self._joiner.enter_session(message.session)
             self._replayed.enter_session(message.session)
         except WireError as error:

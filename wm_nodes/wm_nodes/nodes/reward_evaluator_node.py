@@ -57,8 +57,9 @@ class RewardEvaluatorNode(ManagedNode):
         self._undecided: deque[tuple[float, Transition, PendingReward]] = deque()
         self._model: RewardModel | EpisodeReward
         if kind == AGENT and not factory:
-            self._agent = AgentFace(self, config.judge, config.seed, lambda: bool(self._undecided))
-            self._model = EpisodeReward(self._agent.judge)
+            agent = AgentFace(self, config.judge, config.seed, lambda: bool(self._undecided))
+            self._model = EpisodeReward(agent.judge)
+            self._agent = agent
         else:
             self._model = make_reward(kind, config, str(self.param("model_dir")), factory)
         self._spec: EnvironmentSpec | None = None
@@ -90,6 +91,8 @@ class RewardEvaluatorNode(ManagedNode):
         if self._agent is not None:
             self._agent.update_diagnostics()
             self.diagnostics.gauge("undecided_steps", len(self._undecided))
+            if isinstance(self._model, EpisodeReward):
+                self.diagnostics.gauge("cut_episodes", self._model.cut)
 
     def on_gap(self, name: str, missing: int) -> None:
         self._window.invalid += missing if name == "env/transition" else 0

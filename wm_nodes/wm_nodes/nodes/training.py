@@ -17,6 +17,7 @@ import torch.distributed
 
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.distributed import Ranks, broadcast_rollout
+from wm_nodes.learning.episode_reward import nothing_beyond_the_end
 from wm_nodes.learning.rollouts import Canceled, rollout_statistics
 from wm_nodes.learning.weights import PackedWeights, load_weights, pack_weights
 from wm_nodes.nodes.joiner import Dropped
@@ -91,17 +92,21 @@ class PolicyTraining:
         return self.run_dir / CHECKPOINT
 
     def update(
-        self, rollout: Rollout, dropped: Dropped, should_stop: Callable[[], bool]
+        self, rollout: Rollout, dropped: Dropped, should_stop: Callable[[], bool], *, paid_at_end: bool = False
     ) -> dict[str, float]:
         """Make one update and one new version; return the metrics.
+
+        Args:
+            paid_at_end: an episode's only reward comes with its last step; see nothing_beyond_the_end.
 
         Raises:
             Canceled, FloatingPointError: nothing has changed. ValueError: the rollout cannot be trained on.
             OSError: the update was made, but its files were not written; ensure_saved() tries again.
         """
         began = time.perf_counter()
-        broadcast_rollout(rollout, self._ranks)
-        found = self.learner.update(rollout, should_stop=should_stop)
+        trained = nothing_beyond_the_end(rollout) if paid_at_end else rollout
+        broadcast_rollout(trained, self._ranks)
+        found = self.learner.update(trained, should_stop=should_stop)
         statistics = rollout_statistics(rollout)
         progress = self.progress
         progress.updates += 1
@@ -115,7 +120,7 @@ class PolicyTraining:
         self.ensure_saved()
         metrics = _numbers(found)
         metrics["update_s"] = time.perf_counter() - began
-        metrics["episodes"] = float(statistics.episodes)
+        metrics |= {"episodes": float(statistics.episodes), "cut_episodes": float(statistics.cut)}
         return metrics
 
     def ensure_saved(self) -> bool:

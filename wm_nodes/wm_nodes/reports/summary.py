@@ -39,6 +39,7 @@ class Summary:
         difference, low and high (and more); empty where not measured.
     gate: GateReport.to_dict(). samples: environment steps trained on. minutes: of the whole run.
     command: as typed. machine: facts by name.
+    reward: that the policy was trained for. judge: who gave it, where it is the agent's; else empty.
     rounds: of a run in online rounds, one mapping for each: number, updates, samples, imagined_before, imagined, real
         (successes, episodes, low, high, rate), verdict (accepted, reason, rows; empty after the last). The imagined
         rates of a round are those of the model it trained in, so imagined_before and _after above may be of two models.
@@ -61,6 +62,8 @@ class Summary:
     command: str = ""
     machine: Mapping[str, str] = field(default_factory=dict)
     rounds: Sequence[Mapping[str, Any]] = ()
+    reward: str = "endogenous"
+    judge: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; a number that is not finite becomes None."""

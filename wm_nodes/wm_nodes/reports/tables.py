@@ -55,7 +55,8 @@ def verdict(summary: Summary) -> str:
 
 def results_table(summary: Summary) -> Table:
     """The table for the terminal."""
-    table = Table(title=f"{summary.task}, preset {summary.preset}, seed {summary.seed}", caption=verdict(summary))
+    title = f"{summary.task}, preset {summary.preset}, seed {summary.seed}, reward {summary.reward}"
+    table = Table(title=title, caption=verdict(summary))
     for name in ("success", "real simulator", "imagined"):
         table.add_column(name, justify="left" if name == "success" else "right")
     for row in result_rows(summary):

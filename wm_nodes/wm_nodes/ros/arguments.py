@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.load import dump_config, judge_overrides, load_config
-from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.config.schema import JudgeConfig, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.ros.graph import Graph, GraphError, compose
 from wm_nodes.ros.scenarios import build_graph, parse_arguments
@@ -44,7 +44,7 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
         )
         values["config_file"] = str(run_dir / "config.yaml")
     if values.get("reward") == "agent":
-        _check_judge(config.judge)
+        _check_agent(config, values)
     if values.get("num_envs") == "0":
         values["num_envs"] = str(config.ppo.num_envs)
     if "model_dir" in values:
@@ -67,6 +67,18 @@ def _judge_settings(values: Mapping[str, str]) -> dict[str, Any]:
     if found and values["reward"] != "agent":
         raise GraphError(f"{', '.join(found)} would change nothing without reward:=agent")
     return found
+
+
+def _check_agent(config: RunConfig, values: Mapping[str, str]) -> None:
+    """Before a policy's episodes are judged. A backend of the user's may make images that the settings do not know."""
+    from wm_nodes.learning.episode_reward import check_agent
+
+    _check_judge(config.judge)
+    if values.get("backend") != "factory":
+        try:
+            check_agent(config, trains="learner_ranks" in values)
+        except ValueError as error:
+            raise GraphError(str(error)) from None
 
 
 def _check_judge(settings: JudgeConfig) -> None:

@@ -144,7 +144,7 @@ class EmbeddedJudge:
     def _measured(self, clip: ClipRef, task: TaskSpec) -> tuple[str, FloatArray]:
         """Why the clip cannot be judged, or "", and its evidence (1, F)."""
         head = self._head
-        if reason := _unfit(head, clip):
+        if reason := unfit(head, clip.frames.shape):
             return reason, np.zeros((1, len(head.names)), np.float32)
         row = head.row(self.evidence(clip, task))
         distance, limit = float(head.familiarity.distance(row)[0]), head.familiarity.limit
@@ -179,14 +179,14 @@ class EmbeddedJudge:
         return tuple(sorted((name for name in names if p_fail[name] >= 0.5), key=lambda name: -p_fail[name]))
 
 
-def _unfit(head: JudgeHead, clip: ClipRef) -> str:
-    """Why no number can be had from a clip of this shape, or ""."""
-    height, width = clip.frames.shape[1:3]
+def unfit(head: JudgeHead, shape: tuple[int, ...]) -> str:
+    """Why no number can be had from a clip of this shape (frames, height, width, 3), or ""."""
+    num_frames, height, width = shape[:3]
     if (height, width) != head.size:
         return f"{height} x {width} px, judged are {head.size[0]} x {head.size[1]} px; scale the clip"
     fewest, most = head.lengths
-    if not fewest <= len(clip.frames) <= most:
-        return f"{len(clip.frames)} frames, judged are {fewest} to {most}"
+    if not fewest <= num_frames <= most:
+        return f"{num_frames} frames, judged are {fewest} to {most}"
     return ""
 
 

@@ -12,7 +12,7 @@ from wm_nodes.reward.agent.types import Judge
 from wm_nodes.reward.evidence.head import load_head
 from wm_nodes.reward.judges.cache import VerdictCache
 from wm_nodes.reward.judges.calls import ChatOptions, Exchange
-from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head
+from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head, unfit
 from wm_nodes.reward.judges.openai_client import OpenAIJudge
 from wm_nodes.reward.judges.transport import ChatTransport, Endpoint, RetryPolicy
 
@@ -27,12 +27,34 @@ class OpenedJudge:
     close: Callable[[], Coroutine[Any, Any, None]]
 
 
+def judges_of(settings: JudgeConfig) -> list[JudgeConfig]:
+    """The judge and its fallbacks, in the order in which they are tried, none of them with fallbacks of its own."""
+    others = [fallback.model_dump() for fallback in settings.fallbacks]
+    return [settings.model_copy(update={**changes, "fallbacks": []}) for changes in ({}, *others)]
+
+
 def check_judge(settings: JudgeConfig) -> None:
     """Refuse settings that name no judge, before anything is made from them or written with them.
 
     Raises:
         ValueError: names the setting and the remedy; never repeats what may be a key.
     """
+    seen = set[tuple[str, str]]()
+    for number, judge in enumerate(judges_of(settings)):
+        try:
+            _check_one(judge)
+        except ValueError as error:
+            raise ValueError(f"judge.fallbacks[{number - 1}]: {error}" if number else str(error)) from None
+        identity = (judge.kind, judge.model if judge.kind == "openai" else str(_folder(judge)))
+        if identity in seen:
+            raise ValueError(
+                f"judge.fallbacks[{number - 1}] is {identity[1]!r} once more; further servers of one model belong into "
+                "the endpoints of its judge"
+            )
+        seen.add(identity)
+
+
+def _check_one(settings: JudgeConfig) -> None:
     if settings.kind == "embedded":
         if settings.folder and not Path(settings.folder).is_dir():
             raise ValueError(
@@ -52,6 +74,30 @@ def check_judge(settings: JudgeConfig) -> None:
         )
 
 
+def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
+    """Refuse a judge that would abstain on every clip of this shape, (frames, height, width, 3); likewise a fallback.
+    Servers take any.
+
+    Raises:
+        ValueError: names the shape and the remedy; or the folder holds no judge.
+    """
+    for judge in judges_of(settings):
+        if judge.kind != "embedded" or not (reason := unfit(load_head(_folder(judge)), shape)):
+            continue
+        raise ValueError(
+            f"the embedded judge {_folder(judge)} cannot judge clips of {shape[0]} frames, {shape[1]} x {shape[2]} "
+            f"px: {reason}. Name a server (judge.kind openai, judge.endpoints, judge.model), or in judge.folder a "
+            "judge that was trained on such clips (python -m wm_nodes.learning.train_judge)"
+        )
+
+
+def judge_name(settings: JudgeConfig) -> str:
+    """Who judges, in words for people."""
+    if settings.kind == "embedded":
+        return f"embedded judge {_folder(settings)}"
+    return f"{settings.model} at {', '.join(settings.endpoints)}"
+
+
 def make_judge(
     settings: JudgeConfig, rubric: Rubric, reads: Path | None = None,
     on_exchange: Callable[[Exchange], None] = lambda exchange: None,
@@ -68,8 +114,7 @@ def make_judge(
     """
     check_judge(settings)
     if settings.kind == "embedded":
-        folder = Path(settings.folder) if settings.folder else shipped_head()
-        return OpenedJudge(EmbeddedJudge(load_head(folder)), _nothing)
+        return OpenedJudge(EmbeddedJudge(load_head(_folder(settings))), _nothing)
     transport = ChatTransport(
         [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
         retry=RetryPolicy(settings.tries),
@@ -80,6 +125,10 @@ def make_judge(
     )  # fmt: skip
     cache = VerdictCache(reads) if reads is not None and settings.keep_reads else None
     return OpenedJudge(OpenAIJudge(transport, rubric, options, cache, on_exchange), transport.close)
+
+
+def _folder(settings: JudgeConfig) -> Path:
+    return Path(settings.folder) if settings.folder else shipped_head()
 
 
 async def _nothing() -> None:
