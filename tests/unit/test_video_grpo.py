@@ -358,6 +358,31 @@ def test_switching_off_an_adapter_that_a_model_does_not_have_is_an_error() -> No
         learner.train(buffer_of(learner))
 
 
+def test_training_the_condition_alone_moves_its_layers_and_no_other_weight_by_a_bit(tmp_path: Path) -> None:
+    learner = make(trains="condition", kl=KlSettings(anchor="dual"), weight_decay=0.1)
+    before = weights(learner.model)
+    train_rounds(learner, range(2))
+    after = weights(learner.model)
+    moved = {name.split(".")[0] if "film" not in name else "film" for name in after
+             if not torch.equal(after[name], before[name])}  # fmt: skip
+    assert moved == {"action", "time", "film"}, "a network without text has nothing to learn about it"
+    condition = ("action.", "text.", "time.", "blocks.0.film.")
+    assert set(learner._terms.anchor) == {name for name in before if name.startswith(condition)}
+    learner.save(tmp_path / "learner.safetensors", iteration=2)
+    resumed = make(trains="condition", kl=KlSettings(anchor="dual"), weight_decay=0.1)
+    assert resumed.load(tmp_path / "learner.safetensors") == 2
+    assert_equal(weights(resumed.model), after)
+    with pytest.raises(WeightsError, match=r"learner\.safetensors"):
+        make().load(tmp_path / "learner.safetensors")
+
+
+def test_a_model_that_does_not_say_which_weights_are_its_condition_is_refused_and_keeps_its_gradients() -> None:
+    model = Analytic(lambda x, t: x)
+    with pytest.raises(ValueError, match=r"embedded video model; Analytic takes grpo\.trains all"):
+        GrpoLearner(model, grpo(trains="condition"), toy_rollout_settings(), seed=0)
+    assert model.offset.requires_grad
+
+
 def test_a_larger_kl_weight_keeps_the_model_nearer_to_its_anchor() -> None:
     ends = [
         kl_by_version(6, kl=KlSettings("mean", beta, "frozen"), clip_low=0.2, clip_high=0.2)[-1]

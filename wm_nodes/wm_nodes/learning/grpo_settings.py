@@ -7,6 +7,7 @@ from wm_nodes.rl.group_advantages import StdScope
 from wm_nodes.rl.grpo import KlMode, LogprobWeight
 from wm_nodes.video_model.transitions import MaskSource
 
+Trains = Literal["all", "condition"]
 Anchor = Literal["buffer", "frozen", "lora_off", "moving", "dual"]
 
 
@@ -41,12 +42,14 @@ class KlSettings:
 class GrpoSettings:
     """Everything of the update; lengths and limits as in DynDiff-GRPO's Table 5 where it gives them.
 
+    trains: every parameter that asks for a gradient, or (condition) those of VideoNetwork.condition_parameters alone.
     updates_per_buffer: N_KL, optimizer steps on one buffer; passes: each on the whole buffer (full), or on its own
     part of the videos (parts). step_fraction, step_select, min_s: see step_window.select_steps. cfg: guidance of the
     training pass. ratio_norm: (15b). equalise: weigh steps by SAGE's equaliser. max_staleness: optimizer steps between
     sampling and training that are still accepted.
     """
 
+    trains: Trains = "all"
     advantage: AdvantageSettings = field(default_factory=AdvantageSettings)
     kl: KlSettings = field(default_factory=KlSettings)
     clip_low: float = 1e-4

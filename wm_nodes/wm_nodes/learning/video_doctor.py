@@ -117,7 +117,7 @@ def _first_update(
 ) -> tuple[Finding, Finding]:
     """Ratio and KL of one update that moves nothing; the anchor is the buffer's."""
     settings = replace(
-        grpo, updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0,
+        grpo, trains="all", updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0,
         kl=replace(grpo.kl, mode="mean", anchor="buffer", beta=1.0), ratio_norm=False,
         advantage=replace(grpo.advantage, best_of_n=0),
     )  # fmt: skip

@@ -71,7 +71,7 @@ class BufferReport:
 
 
 class GrpoLearner:
-    """Trains `model` in place.
+    """Trains `model` in place; with settings.trains condition its other parameters no longer ask for a gradient.
 
     Args:
         seed: of the step selection (stream `step_selection`).
@@ -93,6 +93,8 @@ class GrpoLearner:
             raise ValueError("an ODE rollout has no likelihood to train on; choose a stochastic arm and eta > 0")
         if settings.advantage.mix == "advantage" and settings.advantage.std_scope == "running":
             raise ValueError("advantage.std_scope running is of one reward; with advantage.mix advantage take group")
+        if settings.trains == "condition":
+            _train_condition(model)
         self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
         self.ranks, self.reward_weights = ranks or Ranks(), dict(reward_weights or {})
         self.version = 0
@@ -297,6 +299,18 @@ class GrpoLearner:
         self._running = RunningStd(header["sum_of_squares"], header["count"])
         self.version = header["version"]
         return int(header["iteration"])
+
+
+def _train_condition(model: nn.Module) -> None:
+    found: Any = getattr(model, "condition_parameters", None)
+    if found is None:
+        raise ValueError(
+            f"grpo.trains condition is of the embedded video model; {type(model).__name__} takes grpo.trains all, or a "
+            "LoRA adapter"
+        )
+    model.requires_grad_(False)
+    for parameter in found():
+        parameter.requires_grad_(True)
 
 
 def mixed_reward(buffer: RolloutBuffer) -> Tensor:

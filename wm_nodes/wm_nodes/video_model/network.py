@@ -87,6 +87,11 @@ class VideoNetwork(nn.Module):
         out = out[..., :H, :W].contiguous()
         return _around_last_given(out, x, t, condition, self.settings.change_std) if self.settings.change_std else out
 
+    def condition_parameters(self) -> list[nn.Parameter]:
+        """What says how time, actions and instruction act: their layers, and each block's scale and shift."""
+        inputs = ("action.", "text.", "time.")
+        return [p for name, p in self.named_parameters() if name.startswith(inputs) or ".film." in name]
+
     def _film(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None) -> Tensor:
         B, frames, K = x.shape[0], x.shape[2], condition.num_conditioning
         times_BF = t.to(device=x.device, dtype=x.dtype).view(B, 1).expand(B, frames).clone()
