@@ -44,7 +44,7 @@ def diversity_arms() -> list[Arm]:
 def learning_arms(learner: GrpoSettings) -> list[Arm]:
     """Claim B: every arm on one learner; `learner` holds what they share.
 
-    Mix-GRPO trains all four steps of its window, as many as the others do of their nine.
+    Mix-GRPO and the arms "window" train all four steps of a window that moves, as many as the others do of their nine.
     """
     cps, frozen = replace(learner, logprob_weight="cps"), KlSettings(beta=learner.kl.beta, anchor="frozen")
     plain = sampler_arm("CPS 0.6", SamplerSettings("cps", 0.6), cps)
@@ -57,12 +57,12 @@ def learning_arms(learner: GrpoSettings) -> list[Arm]:
         sampler_arm("DynDiff 0.2 sparse, rms, cps", dyndiff(0.2, "sparse", "rms"), cps),
     ]
     shared = (plain, matched, sparse, gated, *quiet)
-    mix = sampler_arm("Mix-GRPO 0.7", SamplerSettings("flow", 0.7), replace(learner, step_fraction=1.0))
+    mix = _in_window(sampler_arm("Flow-GRPO 0.7", SamplerSettings("flow", 0.7), learner))
     return [
         plain,
         sampler_arm("CPS 0.6, full", SamplerSettings("cps", 0.6), learner),
         sampler_arm("Flow-GRPO 0.7", SamplerSettings("flow", 0.7), learner),
-        replace(mix, window=WindowSettings("progressive", size=4, period=7), shared_noise=True),
+        replace(mix, name="Mix-GRPO 0.7"),
         sampler_arm("DanceGRPO 0.3", SamplerSettings("dance", 0.3), learner),
         sampler_arm("SAGE 0.5", SamplerSettings("sage", 0.5), learner),
         sampler_arm("DynDiff 0.6 gated", dyndiff(0.6), learner),
@@ -73,4 +73,10 @@ def learning_arms(learner: GrpoSettings) -> list[Arm]:
         gated,
         *(replace(arm, name=f"{arm.name}, frozen", grpo=replace(arm.grpo, kl=frozen)) for arm in (plain, matched)),
         *(replace(arm, name=f"{arm.name}, shared", shared_noise=True) for arm in shared),
+        *(replace(_in_window(arm), name=f"{arm.name}, window") for arm in (plain, gated)),
     ]
+
+
+def _in_window(arm: Arm) -> Arm:
+    grpo = replace(arm.grpo, step_fraction=1.0)
+    return replace(arm, grpo=grpo, window=WindowSettings("progressive", size=4, period=7), shared_noise=True)
