@@ -49,9 +49,9 @@ class GrpoSettings:
     sampling and training that are still accepted.
     """
 
-    trains: Trains = "all"
     advantage: AdvantageSettings = field(default_factory=AdvantageSettings)
     kl: KlSettings = field(default_factory=KlSettings)
+    trains: Trains = "all"
     clip_low: float = 1e-4
     clip_high: float = 1e-4
     logprob_weight: LogprobWeight = "full"
