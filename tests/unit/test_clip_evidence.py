@@ -12,7 +12,7 @@ from pushed_box import HALF_M, draw, push_clip, pushing_states, redrawn
 from wm_nodes.reward.adversarial import LabelledClip, SourceClip, apply, edit_states
 from wm_nodes.reward.evidence.definitions import EVIDENCE
 from wm_nodes.reward.evidence.motion import motion_evidence
-from wm_nodes.reward.evidence.objects import FAR, find_target, object_evidence
+from wm_nodes.reward.evidence.objects import FAR, find_target, object_evidence, scene_of
 from wm_nodes.reward.evidence.pixels import pixel_evidence
 from wm_nodes.reward.evidence.regions import region_evidence
 from wm_nodes.reward.evidence.registration import camera_moves
@@ -33,9 +33,9 @@ def numbers(clip: SourceClip) -> dict[str, float]:
     masks = np.concatenate([reference.masks[:1], clip.masks])
     return {
         **pixel_evidence(clip.frames, reference.frames[0]),
-        **object_evidence(masks, reference.frames[0], INSTRUCTION),
+        **object_evidence(scene_of(masks), reference.frames[0], INSTRUCTION),
         **region_evidence(clip.frames, reference.frames[0], masks, INSTRUCTION),
-        **motion_evidence(masks, np.concatenate([reference.frames[:1], clip.frames])),
+        **motion_evidence(scene_of(masks), np.concatenate([reference.frames[:1], clip.frames])),
     }
 
 
@@ -111,7 +111,7 @@ def test_the_colour_at_an_edge_tells_parts_of_a_pixel() -> None:
     masks = np.zeros((3, 96, 96), np.uint8)
     pictures[:, 40:50, 30:40], masks[:, 40:50, 30:40] = blue, OBJECT
     pictures[2, [39, 50], 30:40] = (grey + blue) // 2
-    found = motion_evidence(masks, pictures)
+    found = motion_evidence(scene_of(masks), pictures)
     assert found["outline_area_seen_last"] == pytest.approx(0, abs=1e-6), "the median of three is a sharp one"
     assert found["outline_area_step"] == pytest.approx(np.log(1.1), abs=0.02)
     assert found["outline_tall_step"] == pytest.approx(np.log(11 / 10), abs=0.02) and found["outline_wide_step"] < 1e-6
@@ -129,7 +129,7 @@ def test_a_late_jump_is_one_that_no_tool_hit_and_a_hit_is_none() -> None:
     masks[0, :, 20:58, 26:30] = ROBOT
     for t in range(9):
         masks[1, t, 20:58, 26 + 8 * (t > 5) : 30 + 8 * (t > 5)] = ROBOT
-    free, hit = (motion_evidence(one, pictures) for one in masks)
+    free, hit = (motion_evidence(scene_of(one), pictures) for one in masks)
     assert free["jump_sudden"] == hit["jump_sudden"] == pytest.approx(0.8, abs=0.01)
     assert free["jump_unhit"] == free["still_jump"] == pytest.approx(0.8, abs=0.01)
     assert hit["jump_unhit"] <= 0.05 and hit["still_jump"] == 0 and hit["jump_sudden_closing"] > 0.7
@@ -174,9 +174,9 @@ def test_every_number_is_finite_for_any_length_size_and_content(make: Callable[[
     for value in (0, 2):
         masks = np.full((len(frames) + 1, *frames.shape[1:3]), value, np.uint8)
         found = {
-            **pixel_evidence(frames, frames[0]), **object_evidence(masks, frames[0], INSTRUCTION),
+            **pixel_evidence(frames, frames[0]), **object_evidence(scene_of(masks), frames[0], INSTRUCTION),
             **region_evidence(frames, frames[0], masks, INSTRUCTION),
-            **motion_evidence(masks, np.concatenate([frames[:1], frames])),
+            **motion_evidence(scene_of(masks), np.concatenate([frames[:1], frames])),
         }  # fmt: skip
         assert {name: v for name, v in found.items() if not np.isfinite(v)} == {}
         assert set(found) == set(EVIDENCE)
@@ -213,17 +213,17 @@ def test_progress_towards_the_target_is_none_at_the_start_and_whole_at_its_edge(
     column = 36 + 300 * 0.2  # of the goal, pushed_box draws 300 px per m
     cv2.circle(reference, (round(column), 64 - 6), 24, (210, 40, 40), -1)
     masks = np.concatenate([clip.masks[:1], clip.masks])
-    found = object_evidence(masks, reference, INSTRUCTION)
+    found = object_evidence(scene_of(masks), reference, INSTRUCTION)
     assert found["asks_above"] == 0 and found["target_end"] < 1 < found["target_start"] < FAR
     assert found["target_progress"] > 0.9
-    idle = object_evidence(np.repeat(clip.masks[:1], 5, 0), reference, INSTRUCTION)
+    idle = object_evidence(scene_of(np.repeat(clip.masks[:1], 5, 0)), reference, INSTRUCTION)
     assert idle["target_progress"] == 0 and idle["target_end"] == idle["target_start"]
 
 
 def test_an_instruction_without_colours_asks_for_no_target_and_says_so() -> None:
     clip = clean().clip
     masks = np.concatenate([clip.masks[:1], clip.masks])
-    found = object_evidence(masks, clip.frames[0], "move the gripper above the blue cube")
+    found = object_evidence(scene_of(masks), clip.frames[0], "move the gripper above the blue cube")
     assert found["asks_above"] == 1 and found["target_end"] == FAR
     plain = replace(clip, instruction="do it")
     assert region_evidence(clip.frames, clip.frames[0], masks, plain.instruction)["named_hue_off"] == 0

@@ -3,7 +3,7 @@
 import numpy as np
 
 from wm_nodes.reward.evidence.motion import motion_evidence
-from wm_nodes.reward.evidence.objects import object_evidence
+from wm_nodes.reward.evidence.objects import object_evidence, scene_of
 from wm_nodes.reward.evidence.pixels import check_clip, pixel_evidence
 from wm_nodes.reward.evidence.regions import region_evidence
 from wm_nodes.reward.evidence.segmentation import Segmenter
@@ -25,9 +25,10 @@ def clip_evidence(
     check_clip(frames, reference)
     pictures = np.concatenate([reference[None], frames])
     masks = segmenter.masks(pictures)
+    scene = scene_of(masks)
     return {
         **pixel_evidence(frames, reference),
-        **object_evidence(masks, reference, instruction),
-        **motion_evidence(masks, pictures),
+        **object_evidence(scene, reference, instruction),
+        **motion_evidence(scene, pictures),
         **region_evidence(frames, reference, masks, instruction),
     }

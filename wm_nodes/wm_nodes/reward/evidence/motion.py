@@ -17,11 +17,9 @@ from wm_nodes.reward.evidence.objects import (
     TOUCH,
     Floats,
     Numbers,
+    Scene,
     Track,
     filled,
-    robot_gaps,
-    tool_points,
-    track,
 )
 from wm_nodes.reward.evidence.segmentation import OBJECT, ROBOT
 from wm_nodes.types import BoolArray, UInt8Array
@@ -56,20 +54,16 @@ class Outline:
     hollow: Floats
 
 
-def motion_evidence(masks: UInt8Array, pictures: UInt8Array) -> Numbers:
+def motion_evidence(scene: Scene, pictures: UInt8Array) -> Numbers:
     """Evidence of one clip.
 
     Args:
-        masks: uint8 (1 + T, H, W) of the classes of segmentation.py. pictures: uint8 (1 + T, H, W, 3); the reference
-            frame's first.
+        pictures: uint8 (1 + T, H, W, 3), the reference frame first.
     """
-    there, arm = masks == OBJECT, masks == ROBOT
-    thing = track(there)
-    size = float(np.sqrt(thing.area[0])) if thing.area[0] >= SMALLEST_PX else np.sqrt(masks[0].size) / 10
-    gap = np.minimum(robot_gaps(arm, there) / size, FAR)
-    outline = find_outline(masks, pictures, thing)
+    size, gap = scene.size, scene.gap
+    outline = find_outline(scene.masks, pictures, scene.thing)
     known = np.isfinite(outline.area)
-    place, hand = filled(outline.centre) / size, filled(tool_points(arm)) / size
+    place, hand = filled(outline.centre) / size, filled(scene.tool) / size
     found = {
         **_jumps(outline, place, hand, gap, known), **_passing(place, hand), **_contact(outline, gap),
         **_shapes(outline, place, gap, known),

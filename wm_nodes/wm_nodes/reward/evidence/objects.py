@@ -58,18 +58,35 @@ class Target:
         return np.asarray(np.sqrt(np.einsum("...i,ij,...j->...", away, self.inverse, away)))
 
 
-def object_evidence(masks: UInt8Array, reference: UInt8Array, instruction: str) -> Numbers:
+@dataclass(frozen=True)
+class Scene:
+    """A clip's masks and what several kinds of evidence read off them; the reference frame comes first.
+
+    masks: uint8 (1 + T, H, W) of the classes of segmentation.py. thing: the object's track. size: px, of the object in
+    the reference frame. gap: (1 + T,) from object to robot, sizes. tool: (1 + T, 2) the robot's lowest part, px.
+    """
+
+    masks: UInt8Array
+    thing: Track
+    size: float
+    gap: Floats
+    tool: Floats
+
+
+def scene_of(masks: UInt8Array) -> Scene:
+    thing, arm = track(masks == OBJECT), masks == ROBOT
+    size = float(np.sqrt(thing.area[0])) if thing.area[0] >= SMALLEST_PX else np.sqrt(masks[0].size) / 10
+    gap = np.minimum(robot_gaps(arm, masks == OBJECT) / size, FAR)
+    return Scene(masks, thing, size, gap, tool_points(arm))
+
+
+def object_evidence(scene: Scene, reference: UInt8Array, instruction: str) -> Numbers:
     """Evidence of one clip.
 
     Args:
-        masks: uint8 (1 + T, H, W) of the classes of segmentation.py, the reference frame's first.
         reference: uint8 (H, W, 3). instruction: names the object's colour first, then the target's.
     """
-    thing = track(masks == OBJECT)
-    arm = masks == ROBOT
-    size = float(np.sqrt(thing.area[0])) if thing.area[0] >= SMALLEST_PX else np.sqrt(masks[0].size) / 10
-    gap = np.minimum(robot_gaps(arm, masks == OBJECT) / size, FAR)
-    tool = tool_points(arm)
+    masks, thing, size, gap, tool = scene.masks, scene.thing, scene.size, scene.gap, scene.tool
     colours = [word for word in instruction.lower().replace(",", " ").split() if word in HUES_DEGREES]
     target = find_target(reference, masks[0], colours[1]) if len(colours) > 1 else None
     place, known = filled(thing.centre), np.isfinite(thing.area)
