@@ -22,6 +22,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.ros.links import LinkBook
 from wm_nodes.ros.qos import topic
 
 DOMAINS = range(20, 90)
@@ -81,6 +82,13 @@ class Probe:
         row = topic(name)
         self.node.create_subscription(row.type, at or name, self.messages[name].append, row.qos)
         return self.messages[name]
+
+    def links(self) -> LinkBook:
+        """A book of what the nodes say of their links from now on; a node restarted before it was reported as lost is
+        in use again only when the others have matched its new session."""
+        book, row = LinkBook(self.node.get_fully_qualified_name(), 0), topic("run/links")
+        self.node.create_subscription(row.type, row.name, book.note, row.reader_qos)
+        return book
 
     def publisher(self, name: str) -> Any:
         row = topic(name)

@@ -12,7 +12,7 @@ import pytest
 import torch
 from graph.harness import Graph, Probe, own_domain, wait_until
 from graph.test_robustness import full_disk
-from graph.video_loop import VideoLoop, settings
+from graph.video_loop import NAMES, VideoLoop, settings
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
@@ -244,13 +244,14 @@ def test_a_killed_recorder_disturbs_no_training_and_records_again_beside_what_it
     bags = loop.graph.folder / "bags"
     awaited = Parameter("await_nodes", value=["recorder"]).to_parameter_msg()
     loop.probe.call(SetParameters, "learner/set_parameters", SetParameters.Request(parameters=[awaited]))
+    book = loop.probe.links()
     for _ in range(2):
-        loop.probe.diagnostics.pop("/wm/recorder", None)
         loop.graph.start("recorder", bag_uri="bags/run", topics=topics, min_free_mib=16)
-        wait_until("a recorder", lambda: loop.probe.value("/wm/recorder", "state") == "active", 60)
+        wait_until("a recorder that all have matched", lambda: not book.missing(["/wm/recorder", *NAMES.values()]), 60)
         loop.assert_undisturbed(loop.train(1))
         time.sleep(2.0)  # a kill may cost the recorder's last second
         loop.graph.kill("/wm/recorder")
+        book.forget("/wm/recorder", lost=True)
     first, second = (list(read_clips(recover(bags / name).bag)) for name in ("run.partial", "run_1.partial"))
     assert [clips.iteration + 1 for clips in first] == [clips.iteration for clips in second]
 
