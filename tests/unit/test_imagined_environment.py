@@ -25,6 +25,7 @@ from wm_nodes.world_model import (
     load_starts,
     save_model_folder,
 )
+from wm_nodes.world_model.parts import PART
 
 NUM_ENVS, NUM_STARTS = 3, 5
 TASKS = ("push_cube", "reach")
@@ -65,10 +66,13 @@ def starts() -> tuple[np.ndarray, FloatArray]:
     return images, rng.uniform(0.5, 0.7, (NUM_STARTS, 3)).astype(np.float32)
 
 
-def make(models: WorldModels, seed: int = 0, **reward: float) -> ImaginedEnvironment:
+def make(
+    models: WorldModels, seed: int = 0, num_envs: int = NUM_ENVS, exact: bool = False, **reward: float
+) -> ImaginedEnvironment:
     return ImaginedEnvironment(
-        models, spec_of(), starts(), config_of(**reward).reward, num_envs=NUM_ENVS, seed=seed, with_goals=False
-    )
+        models, spec_of(), starts(), config_of(**reward).reward, num_envs=num_envs, seed=seed, with_goals=False,
+        exact=exact,
+    )  # fmt: skip
 
 
 def actions(step: int) -> FloatArray:
@@ -99,6 +103,22 @@ def test_one_environment_reset_later_lives_the_same_episode_bit_for_bit(models: 
     late.reset(mask=np.array([False, True, False]), seeds=seeds)
     for step in range(3):
         assert_same(early.step(actions(step)), late.step(actions(step)), slice(1, 2))
+
+
+def test_environments_in_different_parts_of_a_batch_live_the_episodes_of_one_part(models: WorldModels) -> None:
+    count = PART + NUM_ENVS
+    many, few = make(models, num_envs=count, exact=True), make(models, exact=True)
+    rows = np.arange(count) % NUM_ENVS
+    many.reset(seeds=rows.astype(np.uint64))
+    few.reset(seeds=np.arange(NUM_ENVS, dtype=np.uint64))
+    for step in range(4):
+        if step == 2:  # a reset of some environments of both parts
+            many.reset(mask=rows == 1, seeds=np.full(count, 7, np.uint64))
+            few.reset(mask=np.arange(NUM_ENVS) == 1, seeds=np.full(NUM_ENVS, 7, np.uint64))
+        together, alone = many.step(actions(step)[rows]), few.step(actions(step))
+        difference = together.observation.image.astype(int) - alone.observation.image[rows]
+        assert np.abs(difference).max() <= 2  # batches of other sizes may round otherwise
+        np.testing.assert_allclose(together.success_probability, alone.success_probability[rows], atol=1e-5)
 
 
 def test_a_reset_begins_at_a_real_frame_chosen_by_the_seed(models: WorldModels) -> None:

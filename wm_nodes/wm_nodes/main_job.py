@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 
+from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.config.load import ConfigError, dump_config, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
@@ -83,6 +84,7 @@ def main(argv: Sequence[str]) -> int:
 def run(arguments: argparse.Namespace) -> Summary:
     """The whole job; see main."""
     stage = Stages()
+    keep_freed_memory()
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     config, run_dir = _open_run(arguments)
     stage(f"run folder {run_dir}")

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.config.load import dump_config, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
@@ -44,6 +45,7 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(argv)
     folder = arguments.out.expanduser().absolute()
     folder.mkdir(parents=True, exist_ok=True)
+    keep_freed_memory()
     torch.set_num_threads(arguments.threads)
     for task in arguments.tasks:
         for seed in arguments.seeds:

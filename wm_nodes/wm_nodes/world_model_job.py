@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.config.load import ConfigError, load_config, parse_override
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
@@ -52,6 +53,7 @@ def main(argv: Sequence[str]) -> int:
     """Return the exit code: 0 done, 1 recorded scores differ, 2 a clear error, 130 interrupted (start again with
     --run-dir to go on)."""
     arguments = _parser().parse_args(argv)
+    keep_freed_memory()
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     try:
         if arguments.action == "rescore":

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from rich.table import Table
 
+from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.benchmark.graph import measure_graph
 from wm_nodes.benchmark.inputs import Effort, console, prepare_model
 from wm_nodes.benchmark.simulator import IMAGINED_ENVS, measure_simulator
@@ -46,6 +47,7 @@ def main(argv: Sequence[str]) -> int:
 
 def measure(config: RunConfig, effort: Effort, folder: Path, model_dir: Path | None = None) -> dict[str, Any]:
     """All four parts. Keys: graph_overhead, step_growth, imagined_over_simulator, imagined_steps_per_s, and details."""
+    keep_freed_memory()
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     model, starts, description = prepare_model(config, folder, model_dir)
     console.print(f"world model: {description}; {torch.get_num_threads()} torch threads", highlight=False)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.benchmark.inputs import Effort, actions_of, console, interleave, seeds_of
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.learning.policies import make_endogenous_reward, make_imagined_environment
@@ -92,6 +93,7 @@ def _serve_blocks(config: RunConfig, core: int, commands: Connection) -> None:
     """Rate every block that is asked for, until the other end closes."""
     os.sched_setaffinity(0, {core})
     torch.set_num_threads(1)
+    keep_freed_memory()
     from wm_nodes.simulation.environment import ManiSkillEnvironment
 
     env = ManiSkillEnvironment(

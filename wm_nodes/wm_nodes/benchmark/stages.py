@@ -18,7 +18,9 @@ from wm_nodes.seeding import numpy_stream
 from wm_nodes.types import UInt8Array
 from wm_nodes.world_model import load_starts
 from wm_nodes.world_model.dynamics import done_signal
+from wm_nodes.world_model.parts import in_parallel, parts_of
 from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.transformer import RingCache
 
 
 def measure_stages(config: RunConfig, effort: Effort, model: Path, starts: Path) -> dict[str, dict[str, float]]:
@@ -41,15 +43,20 @@ def measure_stages(config: RunConfig, effort: Effort, model: Path, starts: Path)
         return RewardInput(before, after, zeros, np.ones(IMAGINED_ENVS, bool), zeros, images)
 
     latents = tokenizer.encode(images)
-    caches = action.trunk.new_ring_caches(IMAGINED_ENVS, latents.device)
-    row = [torch.from_numpy(array).unsqueeze(1) for array in (actions, states, states)]
+    acted, before, after = (torch.from_numpy(array) for array in (actions, states, states))
+    parts = [
+        (rows, action.trunk.new_ring_caches(rows.stop - rows.start, latents.device))
+        for rows in parts_of(IMAGINED_ENVS, latents.device)
+    ]
 
-    @torch.inference_mode()
-    def transition() -> None:
+    def advance(part: tuple[slice, list[RingCache]]) -> None:
+        rows, caches = part
         with compute_context(latents.device):
-            prediction = action(latents.unsqueeze(1), *row, caches)
-        tokenizer.normalise(latents + prediction.change_BTSD[:, 0])
-        done_signal(prediction.done_logits_BTKJ[:, 0])
+            _, logits = action.advance(latents[rows], acted[rows], before[rows], after[rows], caches)
+        done_signal(logits)
+
+    def transition() -> None:
+        in_parallel(advance, parts)
 
     for _ in range(config.world_model.window):
         transition()  # a full history is the longest

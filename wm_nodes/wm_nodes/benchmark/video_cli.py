@@ -15,6 +15,7 @@ import torch
 from rich.console import Console
 from tqdm import tqdm
 
+from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.benchmark.clip_diversity import clip_comparisons, measure_clips
 from wm_nodes.benchmark.moving_disc import CHANNELS, NUM_ACTIONS, training_batch
 from wm_nodes.benchmark.video_arms import diversity_arms, learning_arms
@@ -69,6 +70,7 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(argv)
     if not console.is_terminal:
         console.width = LOG_COLUMNS
+    keep_freed_memory()
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     claims = {
         "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import torch
 
+from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reward.evidence.clip import clip_evidence
 from wm_nodes.reward.evidence.head import load_head
@@ -41,6 +42,7 @@ def moving_clip(seed: int) -> UInt8Array:
 
 def read_clips(folder: Path, count: int, seed: int) -> tuple[float, float]:
     """Processor and wall seconds per clip of evidence and every head, on one thread."""
+    keep_freed_memory()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     head, clip = load_head(folder), moving_clip(seed)

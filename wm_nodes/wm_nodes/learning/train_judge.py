@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 
+from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.judge_data import load_sets
 from wm_nodes.learning.judge_fitting import TARGETS, measured
@@ -37,6 +38,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--threads", type=int, default=1, help="cores; other numbers give other last bits")
     parser.add_argument("--measure", choices=("train", "validation", "test"), help="train nothing, measure this part")
     arguments = parser.parse_args(argv)
+    keep_freed_memory()
     torch.set_num_threads(arguments.threads)
     try:
         if arguments.measure:

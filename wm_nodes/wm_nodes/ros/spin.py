@@ -19,6 +19,7 @@ from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedEx
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.ros.environment import set_node_defaults
 
 EXECUTORS = ("events", "single", "multi")
@@ -106,6 +107,7 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
     executor. A start that fails gives exit code 1 after one line of error; an exception out of a callback gives it
     after its trace, and the nodes still stop in order.
     """
+    keep_freed_memory()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     set_node_defaults()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)

@@ -18,8 +18,10 @@ from wm_nodes.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.world_model.dynamics import done_signal
 from wm_nodes.world_model.folder import WorldModels
+from wm_nodes.world_model.parts import in_parallel, parts_of
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.text import imagine_goals
+from wm_nodes.world_model.transformer import RingCache
 
 GOAL_BATCH = 64
 
@@ -61,7 +63,10 @@ class ImaginedEnvironment:
         )
         self._goals = self._imagine_goals() if with_goals and models.text is not None else None
         self._seed, self._num_resets = seed, 0
-        self._caches = models.action.trunk.new_ring_caches(num_envs, tokenizer.device)
+        self._parts = parts_of(num_envs, tokenizer.device)
+        self._caches = [
+            models.action.trunk.new_ring_caches(rows.stop - rows.start, tokenizer.device) for rows in self._parts
+        ]
         self._latents = self._start_latents[:1].repeat(num_envs, 1, 1)
         self._starts = np.zeros(num_envs, np.int64)
         self._shown = np.repeat(self._images[:1], num_envs, 0)
@@ -82,8 +87,9 @@ class ImaginedEnvironment:
         self._shown[mask] = self._images[chosen]
         self._states[mask] = self._start_states[chosen]
         self._latents[torch.from_numpy(mask)] = self._start_latents[torch.from_numpy(chosen)]
-        for cache in self._caches:
-            cache.restart(torch.from_numpy(mask))
+        for rows, caches in zip(self._parts, self._caches, strict=True):
+            for cache in caches:
+                cache.restart(torch.from_numpy(mask[rows]))
         self._steps[mask] = 0
         self._ended[mask] = False
         return self.current()
@@ -93,12 +99,9 @@ class ImaginedEnvironment:
         check_actions(actions, self.spec)
         valid = ~self._ended
         moved = next_state(self._states, actions, self.spec)
-        latents, signal, spread = self._predict(actions, moved)
-        keep = torch.from_numpy(valid)
-        self._latents = torch.where(keep[:, None, None], latents, self._latents)
+        frames, signal, spread = self._predict(actions, moved, valid)
         self._states = np.where(valid[:, None], moved, self._states)
         self._steps += valid.astype(np.uint32)
-        frames = self._models.tokenizer.decode(self._latents).numpy()
         self._shown = np.where(valid[:, None, None, None], frames, self._shown)
         terminated = valid & (signal > self._reward.success_threshold)
         too_long = self._steps >= self.spec.max_episode_steps
@@ -129,21 +132,28 @@ class ImaginedEnvironment:
     def close(self) -> None:
         return None
 
-    def _predict(self, actions: FloatArray, moved: FloatArray) -> tuple[Tensor, FloatArray, FloatArray]:
-        """Next latents (N, S, D), done signal (N,) and disagreement (N,)."""
-        tokenizer = self._models.tokenizer
-        with compute_context(tokenizer.device, exact=self._exact):
-            latents, logits = self._models.action.advance(
-                self._latents,
-                torch.from_numpy(actions),
-                torch.from_numpy(self._states),
-                torch.from_numpy(moved),
-                self._caches,
-            )
-        signal, spread = done_signal(logits)
+    def _predict(
+        self, actions: FloatArray, moved: FloatArray, valid: BoolArray
+    ) -> tuple[UInt8Array, FloatArray, FloatArray]:
+        """Take the step where `valid`; return frames (N, H, W, 3), done signal (N,) and disagreement (N,)."""
+        tokenizer, model = self._models.tokenizer, self._models.action
+        acted, before, after = (torch.from_numpy(array) for array in (actions, self._states, moved))
+        keep = torch.from_numpy(valid)[:, None, None]
+
+        def part(item: tuple[slice, list[RingCache]]) -> tuple[Tensor, Tensor, Tensor]:
+            rows, caches = item
+            with compute_context(tokenizer.device, exact=self._exact):
+                latents, logits = model.advance(self._latents[rows], acted[rows], before[rows], after[rows], caches)
+            latents = torch.where(keep[rows], latents, self._latents[rows])
+            return latents, logits, tokenizer.decode(latents)
+
+        parts = in_parallel(part, list(zip(self._parts, self._caches, strict=True)))
+        latents, logits, frames = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
         if not torch.isfinite(latents).all():
             raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
-        return latents, signal[:, self._task].numpy(), spread[:, self._task].numpy()
+        self._latents = latents
+        signal, spread = done_signal(logits)
+        return frames.numpy(), signal[:, self._task].numpy(), spread[:, self._task].numpy()
 
     def _imagine_goals(self) -> tuple[UInt8Array, BoolArray]:
         """Goal frame and found flag of every start: one per (first frame, instruction), so computed once."""

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from wm_nodes.config.schema import TokenizerConfig
 from wm_nodes.types import UInt8Array
+from wm_nodes.world_model.parts import in_parts
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.quantizer import quantize
 
@@ -135,15 +136,21 @@ class Tokenizer(nn.Module):
             )
         return tensor.to(self.device).permute(0, 3, 1, 2).float() / 255
 
-    @torch.inference_mode()
     def encode(self, images: UInt8Array | Tensor) -> Tensor:
         """Latents (B, S, D) float32 of uint8 images (B, H, W, 3)."""
-        with compute_context(self.device):
-            return self.bottleneck(self.features(self.to_pixels(images)))
 
-    @torch.inference_mode()
+        def part(rows: slice) -> Tensor:
+            with compute_context(self.device):
+                return self.bottleneck(self.features(self.to_pixels(images[rows])))
+
+        return in_parts(part, len(images), self.device)
+
     def decode(self, latents_BSD: Tensor) -> Tensor:
         """Images uint8 (B, H, W, 3) of latents (B, S, D)."""
-        with compute_context(self.device):
-            pixels = self.decode_pixels(latents_BSD)
-        return pixels.clamp_(0, 1).mul_(255).round_().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+
+        def part(rows: slice) -> Tensor:
+            with compute_context(self.device):
+                pixels = self.decode_pixels(latents_BSD[rows])
+            return pixels.clamp_(0, 1).mul_(255).round_().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+
+        return in_parts(part, len(latents_BSD), self.device)
