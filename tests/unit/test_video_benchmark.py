@@ -1,8 +1,10 @@
 """The DynDiff benchmark: fair plans, honest intervals, an alarm that a hacked reward raises, and its command."""
 
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from wm_nodes.benchmark.moving_disc import draw_scenes
 from wm_nodes.benchmark.video_arms import dyndiff, learning_arms, sampler_arm
 from wm_nodes.benchmark.video_cli import LEARNER, load_base, main
 from wm_nodes.benchmark.video_comparison import compare_arms, paired_interval, value
+from wm_nodes.benchmark.video_cost import clocked, toy_rollout
 from wm_nodes.benchmark.video_learning import LearningPlan, alarms, evaluate, sample_groups, train_arm
 from wm_nodes.benchmark.video_plots import family_of
 from wm_nodes.benchmark.video_trials import ablation_trials, hacking_trials
@@ -149,6 +152,22 @@ def test_diversity_learning_and_hacking_draw_a_picture_beside_their_file(tmp_pat
         assert main([claim, *extra, "--json", str(path)]) == 0
         assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
         assert json.loads(path.read_text())["rows"]
+
+
+def test_a_clock_counts_the_time_inside_the_functions_it_names_and_leaves_them_as_they_were() -> None:
+    module = ModuleType("module")
+    module.slow = slow = lambda seconds: time.sleep(seconds)  # type: ignore[attr-defined]
+    with clocked(module, "slow") as spent:
+        module.slow(0.02)
+        module.slow(0.01)
+        time.sleep(0.2)
+    assert 0.03 <= spent[0] < 0.2 and module.slow is slow
+
+
+def test_a_rollout_reports_the_share_of_its_mask_and_of_its_caching() -> None:
+    found = toy_rollout(load_base(), repeats=1, seed=0)
+    assert 0.005 < found["mask_share"] < 0.3 and 0.001 < found["cache_share"] < 0.1
+    assert found["over_cps"] == pytest.approx(found["rollout_s"] / found["cps_s"])
 
 
 def test_an_unknown_arm_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:

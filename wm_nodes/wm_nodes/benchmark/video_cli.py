@@ -20,7 +20,7 @@ from wm_nodes.benchmark.clip_diversity import clip_comparisons, measure_clips
 from wm_nodes.benchmark.moving_disc import CHANNELS, NUM_ACTIONS, training_batch
 from wm_nodes.benchmark.video_arms import diversity_arms, learning_arms
 from wm_nodes.benchmark.video_comparison import Comparison, compare_arms
-from wm_nodes.benchmark.video_cost import measure_anchors, measure_rollout
+from wm_nodes.benchmark.video_cost import measure_anchors, pushcube_rollout, toy_rollout
 from wm_nodes.benchmark.video_diversity import DiversityPlan, compare, measure_arm
 from wm_nodes.benchmark.video_learning import LearningPlan, train_arm
 from wm_nodes.benchmark.video_plots import plot_diversity, plot_hacking, plot_learning
@@ -31,6 +31,7 @@ from wm_nodes.benchmark.video_tables import (
     cost_table,
     diversity_table,
     hacking_table,
+    rollout_table,
     training_table,
 )
 from wm_nodes.benchmark.video_trials import Trial, ablation_trials, hacking_trials
@@ -230,12 +231,12 @@ def _write_trainings(
 
 def _cost(arguments: argparse.Namespace) -> None:
     model = load_base(arguments.base)
-    rollout = measure_rollout(model, arguments.repeats, arguments.seed)
+    rollouts = [
+        toy_rollout(model, arguments.repeats, arguments.seed), pushcube_rollout(arguments.repeats, arguments.seed)
+    ]  # fmt: skip
     rows = measure_anchors(model, LEARNER, arguments.repeats, arguments.seed)
-    _write(arguments, {"seed": arguments.seed, "rollout": rollout, "rows": rows})
-    console.print(cost_table(rows, arguments.repeats))
-    shares = f"with the mask / without: {rollout['dyndiff_over_cps']:.3f}, the masks alone {rollout['mask_s']:.4f} s"
-    console.print(f"sampling {rollout['cps_s']:.3f} s; {shares}", highlight=False)
+    _write(arguments, {"seed": arguments.seed, "rollouts": rollouts, "rows": rows})
+    console.print(rollout_table(rollouts, arguments.repeats), cost_table(rows, arguments.repeats))
 
 
 def _named(known: dict[str, T], names: list[str] | None) -> list[T]:

@@ -1,21 +1,44 @@
-"""Claim C: what each KL anchor costs in seconds and bytes, side by side on the same buffers. Sections 1.6, 5.4."""
+"""Claim C: what each KL anchor costs in seconds and bytes, side by side on the same buffers, and what the mask and
+caching add to a rollout. Sections 1.6, 5.4.
+"""
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from statistics import median
+from types import ModuleType
 from typing import Any
 
-from wm_nodes.benchmark.moving_disc import draw_scenes
+import torch
+
+from wm_nodes.benchmark.moving_disc import CHANNELS, FRAMES, SIDE, draw_scenes
 from wm_nodes.benchmark.video_arms import dyndiff, sampler_arm
 from wm_nodes.benchmark.video_learning import sample_groups
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.learning.grpo_settings import Anchor, GrpoSettings
+from wm_nodes.learning.video_config import load_video_config
+from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.learning.video_grpo import GrpoLearner
-from wm_nodes.video_model import SamplerSettings, VideoNetwork
-from wm_nodes.video_model.mask import dynamic_mask
+from wm_nodes.seeding import torch_stream
+from wm_nodes.video_model import (
+    Condition,
+    RolloutSettings,
+    SamplerSettings,
+    VideoNetwork,
+    initial_noise,
+    kernels,
+    sample_videos,
+    sampling,
+)
 
 ANCHORS: tuple[Anchor, ...] = ("buffer", "frozen", "dual")
 PARTS = ("forward", "kl", "backward")
+CACHING = ("keep_state", "keep_transition")
 SCENES, GROUP = 4, 8
+CLIP_FRAMES = 9
+"""Of PushCube: every second of the 17 pictures of an episode."""
 
 
 def measure_anchors(model: VideoNetwork, learner: GrpoSettings, repeats: int, seed: int) -> list[dict[str, Any]]:
@@ -41,23 +64,80 @@ def measure_anchors(model: VideoNetwork, learner: GrpoSettings, repeats: int, se
     ]
 
 
-def measure_rollout(model: VideoNetwork, repeats: int, seed: int) -> dict[str, float]:
-    """Median seconds to sample the same videos by CPS and by DynDiff (mask included), alternating, and their ratio.
+def measure_rollout(
+    network: VideoNetwork, condition: Condition, shape: tuple[int, ...], rollout: RolloutSettings, repeats: int,
+    seed: int,
+) -> dict[str, float]:  # fmt: skip
+    """What the mask and caching add to sampling the videos of `condition`, latents of `shape` (C, F, H, W).
 
-    mask_s: of computing the masks of one such rollout, alone.
+    rollout_s: median seconds of a whole rollout with the DynDiff sampler of `rollout`. cps_s: with CPS at the same eta,
+    turn by turn. mask_share, cache_share: median share of a DynDiff rollout that went into its masks, and into keeping
+    states, masks and noise; measured inside that rollout, so the machine's noise moves them less than the ratio.
     """
-    arms = {"cps": sampler_arm("CPS", SamplerSettings("cps", 0.6)), "dyndiff": sampler_arm("DynDiff", dyndiff(0.6))}
-    times: dict[str, list[float]] = {name: [] for name in (*arms, "mask")}
-    scenes = draw_scenes(SCENES, seed, "cost")
-    for _ in range(repeats):
-        for name, arm in arms.items():
+    cps = replace(rollout, sampler=SamplerSettings("cps", rollout.sampler.eta))
+    seeds = torch.arange(len(condition.frames)) + seed
+    noise = initial_noise(shape, seeds)
+    found: dict[str, list[float]] = {"cps_s": [], "rollout_s": [], "mask_share": [], "cache_share": []}
+    network.eval()
+    for turn in range(repeats + 1):  # the first one warms up
+        for name, settings in (("cps_s", cps), ("rollout_s", rollout)):
+            with clocked(kernels, "rollout_mask") as mask, clocked(sampling, *CACHING) as caching:
+                start = time.perf_counter()
+                sample_videos(network, condition, noise, seeds, settings)
+                total = time.perf_counter() - start
+            if turn:
+                found[name].append(total)
+        if turn:
+            found["mask_share"].append(mask[0] / total)
+            found["cache_share"].append(caching[0] / total)
+    medians = {name: median(values) for name, values in found.items()}
+    return {**medians, "over_cps": medians["rollout_s"] / medians["cps_s"]}
+
+
+@contextmanager
+def clocked(module: ModuleType, *names: str) -> Iterator[list[float]]:
+    """Yield [seconds spent so far in functions of `module`], which are wrapped meanwhile."""
+    spent, originals = [0.0], {name: getattr(module, name) for name in names}
+
+    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
             start = time.perf_counter()
-            buffer, _ = sample_groups(model, arm, scenes, GROUP, seed, 0, 0)
-            times[name].append(time.perf_counter() - start)
-        latents, settings = buffer.rollout.latents, arms["dyndiff"].rollout.sampler.mask
-        start = time.perf_counter()
-        for _ in buffer.rollout.steps:
-            dynamic_mask(latents, buffer.condition.num_conditioning, settings)
-        times["mask"].append(time.perf_counter() - start)
-    found = {f"{name}_s": median(values) for name, values in times.items()}
-    return {**found, "dyndiff_over_cps": found["dyndiff_s"] / found["cps_s"]}
+            result = function(*arguments)
+            spent[0] += time.perf_counter() - start
+            return result
+
+        return call
+
+    for name, function in originals.items():
+        setattr(module, name, timed(function))
+    try:
+        yield spent
+    finally:
+        for name, function in originals.items():
+            setattr(module, name, function)
+
+
+def toy_rollout(model: VideoNetwork, repeats: int, seed: int) -> dict[str, Any]:
+    """measure_rollout of the moving disc: SCENES x GROUP videos, DynDiff 0.6 gated."""
+    condition = draw_scenes(SCENES, seed, "cost").condition().repeat_interleave(GROUP)
+    shape = (CHANNELS, FRAMES, SIDE, SIDE)
+    settings = sampler_arm("DynDiff", dyndiff(0.6)).rollout
+    return {"model": "moving disc", **measure_rollout(model, condition, shape, settings, repeats, seed)}
+
+
+def pushcube_rollout(repeats: int, seed: int) -> dict[str, Any]:
+    """measure_rollout of the shipped PushCube network by the recommended preset; given frames and actions are random,
+    because the time depends on sizes only.
+    """
+    config = load_video_config("recommended")
+    folder = load_video_folder(shipped_model(config.task) / "video_model")
+    settings, codec, videos, frames = folder.network.settings, folder.manifest["codec"], SCENES * GROUP, CLIP_FRAMES
+    H, W = (codec[side] // codec["config"]["patch_px"] for side in ("height", "width"))
+    draw = partial(torch.randn, generator=torch_stream(seed, "cost"))
+    condition = Condition(
+        draw(videos, settings.channels, folder.clip["num_conditioning"], H, W),
+        draw(videos, frames - 1, settings.action_dim), draw(videos, 4, settings.text_dim),
+    )  # fmt: skip
+    shape = (settings.channels, frames, H, W)
+    found = measure_rollout(folder.network, condition, shape, config.rollout, repeats, seed)
+    return {"model": "PushCube", **found}

@@ -121,6 +121,16 @@ def cost_table(rows: Sequence[dict[str, Any]], repeats: int) -> Table:
     return table
 
 
+def rollout_table(rows: Sequence[dict[str, Any]], repeats: int) -> Table:
+    numbers = ("by CPS, s", "by DynDiff, s", "ratio", "mask", "caching", "both")
+    table = _table(f"What a rollout of 32 videos spends on mask and caching, median of {repeats}", ("model",), numbers)
+    for row in rows:
+        shares = row["mask_share"], row["cache_share"], row["mask_share"] + row["cache_share"]
+        seconds = f"{row['cps_s']:.3f}", f"{row['rollout_s']:.3f}", f"{row['over_cps']:.3f}"
+        table.add_row(row["model"], *seconds, *(f"{share:.2%}" for share in shares))
+    return table
+
+
 def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
     return float(np.mean([row[name] for row in rows]))
 

@@ -107,33 +107,38 @@ def ode_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, s
 
 def cps_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerSettings) -> Step:
     """Coefficient-preserving sampling, (4) with the same sigma in every cell."""
-    return _preserving_step(x, v, t, s, _generated(x, context), settings)
+    return _preserving_step(*estimates(x, v, t), t, s, _generated(x, context), settings)
 
 
 def dyndiff_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerSettings) -> Step:
     """(4) with sigma(u) = sigma_base M(u), (5)."""
+    x0, eps = estimates(x, v, t)
     mask = context.mask
     if mask is None:
-        with torch.no_grad():
-            x0, _ = estimates(x, v, t)
-            mask = dynamic_mask(with_conditioning(x0, context.conditioning), context.num_conditioning, settings.mask)
-            late = (t <= settings.mask.time_limit).view(-1, 1, 1, 1, 1).to(mask.device)
-            mask = torch.where(late, mask, _generated(x, context).to(mask.dtype))
-            mask = mask.to(getattr(torch, settings.mask_dtype)).to(x.dtype)
+        mask = rollout_mask(x0, t, context, settings)
     elif mask.shape != (x.shape[0], 1, *x.shape[2:]):
         expected = (x.shape[0], 1, *x.shape[2:])
         raise ValueError(f"mask must be {expected} for latents {tuple(x.shape)}, got {tuple(mask.shape)}")
-    return _preserving_step(x, v, t, s, mask.to(x.dtype), settings)
+    return _preserving_step(x0, eps, t, s, mask.to(x.dtype), settings)
 
 
-def _preserving_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, mask: Tensor, settings: SamplerSettings) -> Step:
+@torch.no_grad()
+def rollout_mask(x0: Tensor, t: Tensor, context: StepContext, settings: SamplerSettings) -> Tensor:
+    """Return the mask of a step, (B, 1, F, H, W), from its clean estimate: (9) up to time_limit, 1 above; rounded."""
+    mask = dynamic_mask(with_conditioning(x0, context.conditioning), context.num_conditioning, settings.mask)
+    if settings.mask.time_limit < 1:
+        late = (t <= settings.mask.time_limit).view(-1, 1, 1, 1, 1).to(mask.device)
+        mask = torch.where(late, mask, _generated(x0, context).to(mask.dtype))
+    return mask.to(getattr(torch, settings.mask_dtype)).to(x0.dtype)
+
+
+def _preserving_step(x0: Tensor, eps: Tensor, t: Tensor, s: Tensor, mask: Tensor, settings: SamplerSettings) -> Step:
     """(10), (11): mean (1 - s) x0 + sqrt(s^2 - sigma^2) eps; the squared noise coefficients add up to s^2."""
-    x0, eps = estimates(x, v, t)
     with torch.no_grad():
-        base, sigma = _rows(_sigma_base(s, settings.eta, settings.sigma_map), x), masked_deviation(mask, s, settings)
-        kept = (_rows(s, x).square() - sigma.square()).clamp_min(0).sqrt()
-        slope = _rows(1 - t, x) * kept - _rows((1 - s) * t, x)
-    return Step(_rows(1 - s, x) * x0 + kept * eps, sigma, base.flatten(), mask, slope)
+        base, sigma = _rows(_sigma_base(s, settings.eta, settings.sigma_map), x0), masked_deviation(mask, s, settings)
+        kept = (_rows(s, x0).square() - sigma.square()).clamp_min(0).sqrt()
+        slope = _rows(1 - t, x0) * kept - _rows((1 - s) * t, x0)
+    return Step(_rows(1 - s, x0) * x0 + kept * eps, sigma, base.flatten(), mask, slope)
 
 
 def masked_deviation(mask: Tensor, s: Tensor, settings: SamplerSettings) -> Tensor:

@@ -4,7 +4,8 @@ Shapes: N videos, S stochastic steps, L kept latents, C channels, F latent frame
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -76,6 +77,11 @@ class VideoRollout:
         """Root mean square of noise_share over the stochastic steps; 0 by ODE."""
         return float(self.noise_share.square().mean().sqrt()) if len(self.noise_share) else 0.0
 
+    def rows(self, index: slice) -> "VideoRollout":
+        """Some of the videos, as views; noise_share is that of all."""
+        tensors = {name: getattr(self, name)[index] for name in ("latents", "states", "mask", "sigma_base", "seeds")}
+        return replace(self, **tensors, zeta=None if self.zeta is None else self.zeta[index])
+
     def state(self, k: int) -> Tensor:
         """x before step k, (N, C, F, H, W), storage dtype."""
         return self.states[:, self.state_steps.index(k)]
@@ -119,12 +125,14 @@ def sample_videos(
             f"{settings.num_steps - 2}, can"
         )
     chosen = [k for k in chosen if settings.trains_at(k)]
-    batches = (slice(i, i + settings.micro_batch) for i in range(0, len(noise), settings.micro_batch))
-    parts = list[VideoRollout]()
-    for rows in batches:
-        parts.append(_sample(model, condition.rows(rows), noise[rows], seeds[rows], settings, chosen))
+    rollout = _unsampled(noise, seeds, condition.num_conditioning, settings, chosen)
+    for i in range(0, len(noise), settings.micro_batch):
+        rows = slice(i, i + settings.micro_batch)
+        part = rollout.rows(rows)
+        squares = _sample(model, condition.rows(rows), noise[rows], settings, part)
+        rollout.noise_share.add_(squares, alpha=len(part.latents) / len(noise))
         on_progress(min(rows.stop, len(noise)), len(noise))
-    return concatenate_rollouts(parts)
+    return replace(rollout, noise_share=rollout.noise_share.sqrt())
 
 
 def concatenate_rollouts(parts: list[VideoRollout]) -> VideoRollout:
@@ -144,53 +152,70 @@ def concatenate_rollouts(parts: list[VideoRollout]) -> VideoRollout:
     )
 
 
-def _sample(
-    model: VelocityModel,
-    condition: Condition,
-    noise: Tensor,
-    seeds: Tensor,
-    settings: RolloutSettings,
-    stochastic: list[int],
+def _unsampled(
+    noise: Tensor, seeds: Tensor, num_conditioning: int, settings: RolloutSettings, stochastic: list[int]
 ) -> VideoRollout:
-    times, N, K = settings.times, len(noise), condition.num_conditioning
-    storage = getattr(torch, settings.storage_dtype)
-    context = StepContext(condition.frames.float(), first_time=float(times[1]))
-    state_steps = tuple(sorted({*stochastic, *(k + 1 for k in stochastic)}))
-    x = with_conditioning(noise.float(), context.conditioning)
-    states, masks, bases, zetas, shares = [], [], [], [], []
-    for k in range(settings.num_steps):
-        if k in state_steps:
-            x = with_conditioning(x.to(storage).float(), context.conditioning)
-            states.append(x.to(storage))
-        t, s = times[k].expand(N), times[k + 1].expand(N)
-        v = guided_velocity(model, x, t, condition, settings.cfg).float()
-        if k not in stochastic:
-            x = with_conditioning(ode_step(x, v, t, s, context, settings.sampler).mean, context.conditioning)
-            continue
-        law = step(x, v, t, s, context, settings.sampler)
-        z = step_noise(tuple(x.shape[1:]), seeds, k).to(x.device)
-        x = with_conditioning((law.mean + law.std * z).to(storage).float(), context.conditioning)
-        masks.append(law.mask)
-        bases.append(law.sigma_base)
-        spent = (law.std[:, :, K:] / float(times[k + 1])).square()
-        shares.append((spent.sum() / max(1, spent.numel())).sqrt())
-        if settings.noise_store == "zeta":
-            zetas.append(normalised_noise(x, law, K))
-    empty = x.new_zeros(N, 0)
+    """A rollout whose tensors are yet to be written, in place: kept once, without copies of its parts."""
+    N, C, frames, H, W = noise.shape
+    S, steps = len(stochastic), tuple(sorted({*stochastic, *(k + 1 for k in stochastic)}))
+    room = partial(torch.empty, dtype=torch.float32, device=noise.device)
     return VideoRollout(
-        latents=x,
+        latents=room(N, C, frames, H, W),
         steps=tuple(stochastic),
-        state_steps=state_steps,
-        states=torch.stack(states, 1) if states else empty,
-        mask=torch.stack(masks, 1) if masks else empty,
-        sigma_base=torch.stack(bases, 1) if bases else empty,
-        zeta=None if settings.noise_store == "seed" else torch.stack(zetas, 1) if zetas else empty,
+        state_steps=steps,
+        states=room(N, len(steps), C, frames, H, W, dtype=getattr(torch, settings.storage_dtype)),
+        mask=room(N, S, 1, frames, H, W),
+        sigma_base=room(N, S),
+        zeta=None if settings.noise_store == "seed" else room(N, S, C, frames - num_conditioning, H, W),
         seeds=seeds.clone(),
-        noise_share=torch.stack(shares) if shares else x.new_zeros(0),
+        noise_share=torch.zeros(S, device=noise.device),
     )
 
 
-def normalised_noise(x_s: Tensor, law: Step, num_conditioning: int) -> Tensor:
-    """Return zeta = (x_s - mean) / std on generated frames, (N, C, F - K, H, W)."""
+def _sample(
+    model: VelocityModel, condition: Condition, noise: Tensor, settings: RolloutSettings, rollout: VideoRollout
+) -> Tensor:
+    """Sample one micro-batch into its rows of `rollout`; return the squared noise_share of its steps, (S,)."""
+    times, N = settings.times, len(noise)
+    storage = getattr(torch, settings.storage_dtype)
+    context = StepContext(condition.frames.float(), first_time=float(times[1]))
+    x = with_conditioning(noise.float(), context.conditioning)
+    squares = torch.empty_like(rollout.noise_share)
+    for k in range(settings.num_steps):
+        if k in rollout.state_steps:
+            x = with_conditioning(x.to(storage).float(), context.conditioning)
+            keep_state(rollout, k, x)
+        t, s = times[k].expand(N), times[k + 1].expand(N)
+        v = guided_velocity(model, x, t, condition, settings.cfg).float()
+        if k not in rollout.steps:
+            x = with_conditioning(ode_step(x, v, t, s, context, settings.sampler).mean, context.conditioning)
+            continue
+        law = step(x, v, t, s, context, settings.sampler)
+        z = step_noise(tuple(x.shape[1:]), rollout.seeds, k).to(x.device)
+        x = with_conditioning((law.mean + law.std * z).to(storage).float(), context.conditioning)
+        keep_transition(rollout, k, x, law)
+        spent = (law.std[:, :, context.num_conditioning :] / float(times[k + 1])).square()
+        squares[rollout.steps.index(k)] = spent.sum() / max(1, spent.numel())
+    rollout.latents.copy_(x)
+    return squares
+
+
+def keep_state(rollout: VideoRollout, k: int, x: Tensor) -> None:
+    """Write x before step k, in the storage dtype."""
+    rollout.state(k).copy_(x)
+
+
+def keep_transition(rollout: VideoRollout, k: int, x_s: Tensor, law: Step) -> None:
+    """Write what training needs of step k beside its states: mask, sigma_base, normalised noise."""
+    i = rollout.steps.index(k)
+    rollout.mask[:, i] = law.mask
+    rollout.sigma_base[:, i] = law.sigma_base
+    if rollout.zeta is not None:
+        num_conditioning = x_s.shape[2] - rollout.zeta.shape[3]
+        normalised_noise(x_s, law, num_conditioning, out=rollout.zeta[:, i])
+
+
+def normalised_noise(x_s: Tensor, law: Step, num_conditioning: int, out: Tensor | None = None) -> Tensor:
+    """Return zeta = (x_s - mean) / std on generated frames, (N, C, F - K, H, W), in `out` where given."""
     K = num_conditioning
-    return (x_s[:, :, K:] - law.mean[:, :, K:]) / law.std[:, :, K:]
+    return torch.sub(x_s[:, :, K:], law.mean[:, :, K:], out=out).div_(law.std[:, :, K:])
