@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,10 +12,12 @@ from wm_nodes.reward.adversarial import LabelledClip, SourceClip, apply, edit_st
 from wm_nodes.reward.evidence.definitions import EVIDENCE
 from wm_nodes.reward.evidence.motion import motion_evidence
 from wm_nodes.reward.evidence.objects import FAR, find_target, object_evidence, scene_of
+from wm_nodes.reward.evidence.pictures import pictures_of
 from wm_nodes.reward.evidence.pixels import pixel_evidence
 from wm_nodes.reward.evidence.regions import region_evidence
 from wm_nodes.reward.evidence.registration import camera_moves
 from wm_nodes.reward.evidence.segmentation import OBJECT, ROBOT
+from wm_nodes.reward.evidence.tracks import second_areas, track
 from wm_nodes.types import FloatArray, UInt8Array
 
 INSTRUCTION = "push the blue cube into the red target"
@@ -30,13 +31,16 @@ def clean() -> LabelledClip:
 def numbers(clip: SourceClip) -> dict[str, float]:
     """All evidence, with the drawn masks in place of found ones; the clean clip's first frame is the reference."""
     reference = clean().clip
-    masks = np.concatenate([reference.masks[:1], clip.masks])
+    return evidence_of(clip.frames, reference.frames[0], np.concatenate([reference.masks[:1], clip.masks]))
+
+
+def evidence_of(frames: UInt8Array, reference: UInt8Array, masks: UInt8Array) -> dict[str, float]:
+    """What clip_evidence returns for given masks."""
+    pictures, scene = pictures_of(frames, reference), scene_of(masks)
     return {
-        **pixel_evidence(clip.frames, reference.frames[0]),
-        **object_evidence(scene_of(masks), reference.frames[0], INSTRUCTION),
-        **region_evidence(clip.frames, reference.frames[0], masks, INSTRUCTION),
-        **motion_evidence(scene_of(masks), np.concatenate([reference.frames[:1], clip.frames])),
-    }
+        **pixel_evidence(pictures), **object_evidence(scene, reference, INSTRUCTION),
+        **region_evidence(pictures, masks, INSTRUCTION), **motion_evidence(scene, pictures.colours),
+    }  # fmt: skip
 
 
 @functools.cache
@@ -173,11 +177,7 @@ def test_every_number_is_finite_for_any_length_size_and_content(make: Callable[[
     frames = make()
     for value in (0, 2):
         masks = np.full((len(frames) + 1, *frames.shape[1:3]), value, np.uint8)
-        found = {
-            **pixel_evidence(frames, frames[0]), **object_evidence(scene_of(masks), frames[0], INSTRUCTION),
-            **region_evidence(frames, frames[0], masks, INSTRUCTION),
-            **motion_evidence(scene_of(masks), np.concatenate([frames[:1], frames])),
-        }  # fmt: skip
+        found = evidence_of(frames, frames[0], masks)
         assert {name: v for name, v in found.items() if not np.isfinite(v)} == {}
         assert set(found) == set(EVIDENCE)
         low, high = (np.array([getattr(EVIDENCE[name], end) for name in found]) for end in ("low", "high"))
@@ -188,11 +188,29 @@ def test_every_number_is_finite_for_any_length_size_and_content(make: Callable[[
 def test_wrong_shapes_are_named() -> None:
     frames = noise(0, 4, 32, 32, 3)
     with pytest.raises(ValueError, match=r"T >= 2.*\(1, 32, 32, 3\)"):
-        pixel_evidence(frames[:1], frames[0])
+        pictures_of(frames[:1], frames[0])
     with pytest.raises(ValueError, match=r"reference frame must be uint8 \(32, 32, 3\), got uint8 \(16, 16, 3\)"):
-        pixel_evidence(frames, frames[0, :16, :16])
+        pictures_of(frames, frames[0, :16, :16])
     with pytest.raises(ValueError, match="float32"):
-        pixel_evidence(frames.astype(np.float32), frames[0])
+        pictures_of(frames.astype(np.float32), frames[0])
+
+
+def test_blobs_are_measured_alike_wherever_they_are_and_the_first_of_equals_counts() -> None:
+    """An ell of 12 px, a square of 9 and a dot, at every place of a window of 2 x 2 px and in a corner."""
+    ell = np.zeros((10, 14), bool)
+    ell[0, :6], ell[1:7, 0] = True, True
+    ell[4:7, 4:7], ell[9, 13] = True, True
+    for row, column in ((0, 0), (6, 7), (7, 6), (7, 7), (22, 18)):
+        mask = np.zeros((2, 32, 32), bool)
+        mask[0, row : row + 10, column : column + 14] = ell
+        found = track(mask)
+        assert found.area[0] == 12 and found.second[0] == second_areas(mask)[0] == 9
+        assert found.centre[0] == pytest.approx([row + 21 / 12, column + 15 / 12], rel=1e-15)
+        assert found.box[0].tolist() == [row, column, 7, 6]
+        assert np.isnan(found.area[1]) and found.second[1] == second_areas(mask)[1] == 0
+    twins = np.zeros((1, 16, 16), bool)
+    twins[0, 3:6, 9:12] = twins[0, 3:6, 3:6] = True
+    assert track(twins).box[0].tolist() == [3, 3, 3, 3]
 
 
 def test_the_target_is_where_it_was_drawn_and_distance_one_is_its_edge() -> None:
@@ -225,5 +243,4 @@ def test_an_instruction_without_colours_asks_for_no_target_and_says_so() -> None
     masks = np.concatenate([clip.masks[:1], clip.masks])
     found = object_evidence(scene_of(masks), clip.frames[0], "move the gripper above the blue cube")
     assert found["asks_above"] == 1 and found["target_end"] == FAR
-    plain = replace(clip, instruction="do it")
-    assert region_evidence(clip.frames, clip.frames[0], masks, plain.instruction)["named_hue_off"] == 0
+    assert region_evidence(pictures_of(clip.frames, clip.frames[0]), masks, "do it")["named_hue_off"] == 0

@@ -1,10 +1,9 @@
 """All evidence of a clip that the embedded judge reads. Specification: section 4.1. Shapes: T frames, H W 3 image."""
 
-import numpy as np
-
 from wm_nodes.reward.evidence.motion import motion_evidence
 from wm_nodes.reward.evidence.objects import object_evidence, scene_of
-from wm_nodes.reward.evidence.pixels import check_clip, pixel_evidence
+from wm_nodes.reward.evidence.pictures import pictures_of
+from wm_nodes.reward.evidence.pixels import pixel_evidence
 from wm_nodes.reward.evidence.regions import region_evidence
 from wm_nodes.reward.evidence.segmentation import Segmenter
 from wm_nodes.types import UInt8Array
@@ -22,13 +21,12 @@ def clip_evidence(
     Raises:
         ValueError: wrong shapes or types; names them.
     """
-    check_clip(frames, reference)
-    pictures = np.concatenate([reference[None], frames])
-    masks = segmenter.masks(pictures)
+    pictures = pictures_of(frames, reference)
+    masks = segmenter.masks(pictures.colours)
     scene = scene_of(masks)
     return {
-        **pixel_evidence(frames, reference),
+        **pixel_evidence(pictures),
         **object_evidence(scene, reference, instruction),
-        **motion_evidence(scene, pictures),
-        **region_evidence(frames, reference, masks, instruction),
+        **motion_evidence(scene, pictures.colours),
+        **region_evidence(pictures, masks, instruction),
     }

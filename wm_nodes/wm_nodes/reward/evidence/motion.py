@@ -5,23 +5,18 @@ its edge counts by how much of the object's colour it has, and every step is hel
 Shapes: T frames with the reference frame before them, H W image. Lengths are in object sizes, as in objects.py.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.reward.evidence.objects import (
-    FAR,
-    SMALLEST_PX,
-    TOUCH,
-    Floats,
-    Numbers,
-    Scene,
-    Track,
-    filled,
-)
+from wm_nodes.reward.evidence.objects import FAR, TOUCH, Floats, Numbers, Scene, filled
+from wm_nodes.reward.evidence.pictures import TURN
+from wm_nodes.reward.evidence.quantiles import median, quantile
 from wm_nodes.reward.evidence.segmentation import OBJECT, ROBOT
+from wm_nodes.reward.evidence.tracks import SMALLEST_PX, Track
 from wm_nodes.types import BoolArray, UInt8Array
 
 AROUND_PX = 3
@@ -34,6 +29,8 @@ NEAR, PLACE = 0.6, 0.35
 """A tool point this near goes through the object; an object this near to a place is there. Sizes."""
 CLEAR = 0.15
 """A robot further away covers nothing of the outline, sizes."""
+AROUND = np.ones((3, 3), np.uint8)
+"""A pixel and its neighbours."""
 SHAPES = ("tall", "wide", "area", "long")
 
 
@@ -68,7 +65,8 @@ def motion_evidence(scene: Scene, pictures: UInt8Array) -> Numbers:
         **_jumps(outline, place, hand, gap, known), **_passing(place, hand), **_contact(outline, gap),
         **_shapes(outline, place, gap, known),
     }  # fmt: skip
-    return {name: float(np.clip(np.nan_to_num(value), -FAR, FAR)) for name, value in found.items()}
+    values = np.clip(np.nan_to_num(np.array(list(found.values()), np.float64)), -FAR, FAR)
+    return dict(zip(found, values.tolist()))
 
 
 def find_outline(masks: UInt8Array, pictures: UInt8Array, thing: Track) -> Outline:
@@ -80,35 +78,38 @@ def find_outline(masks: UInt8Array, pictures: UInt8Array, thing: Track) -> Outli
         top, left, high, wide = (int(value) for value in thing.box[t])
         rows = slice(max(0, top - AROUND_PX), min(height, top + high + AROUND_PX))
         columns = slice(max(0, left - AROUND_PX), min(width, left + wide + AROUND_PX))
-        mask = masks[t, rows, columns] == OBJECT
+        shown = masks[t, rows, columns]
+        mask = shown == OBJECT
+        solid = mask.view(np.uint8)
         weights = _coloured(pictures[t, rows, columns], mask)
         area = float(weights.sum())
         if area < SMALLEST_PX / 2:
             continue
-        y, x = np.mgrid[rows, columns]
+        y, x = np.arange(rows.start, rows.stop)[:, None], np.arange(columns.start, columns.stop)
         row, column = (weights * y).sum() / area, (weights * x).sum() / area
         down, right = ((weights * away**2).sum() / area + 1 / 12 for away in (y - row, x - column))
         mixed = (weights * (y - row) * (x - column)).sum() / area
         middle, half = (down + right) / 2, np.hypot((down - right) / 2, mixed)
-        axes = np.sqrt(np.maximum([middle + half, middle - half], 1 / 12))
-        numbers[t] = (area, row, column, np.sqrt(down), np.sqrt(right), *axes)
-        edge = (cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~mask
-        ring[t] = (masks[t, rows, columns][edge] == ROBOT).mean() if edge.any() else 0.0
-        hull = cv2.convexHull(cv2.findNonZero(mask.astype(np.uint8)))
-        hollow[t] = 1 - mask.sum() / cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1).sum()
+        axes = [math.sqrt(max(value, 1 / 12)) for value in (middle + half, middle - half)]
+        numbers[t] = (area, row, column, math.sqrt(down), math.sqrt(right), *axes)
+        edge = cv2.dilate(solid, AROUND) != solid
+        ring[t] = np.count_nonzero(edge & (shown == ROBOT)) / max(np.count_nonzero(edge), 1)
+        hull = cv2.convexHull(cv2.findNonZero(solid))
+        filled_hull = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1)
+        hollow[t] = 1 - np.count_nonzero(mask) / np.count_nonzero(filled_hull)
     return Outline(numbers[:, 0], numbers[:, 1:3], numbers[:, 3:5], numbers[:, 5:], ring, hollow)
 
 
 def _coloured(picture: UInt8Array, mask: BoolArray) -> NDArray[np.float32]:
     """(H, W) in [0, 1], how much of the object's colour a pixel in or around its mask has."""
-    chroma = picture.astype(np.float32) @ np.exp(2j * np.pi / 3 * np.arange(3)).astype(np.complex64)
+    chroma = picture.astype(np.float32) @ TURN
     mean = chroma[mask].mean()
     if abs(mean) < GREY:
         return mask.astype(np.float32)
     turned = chroma * np.conj(mean / abs(mean))
     along, across = turned.real, np.abs(turned.imag)
-    weights = np.clip((along / max(float(np.median(along[mask])), 1.0) - 0.2) / 0.6, 0, 1)
-    near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2) > 0
+    weights = np.minimum(np.maximum((along / max(float(median(along[mask])), 1.0) - 0.2) / 0.6, 0), 1)
+    near = cv2.dilate(mask.view(np.uint8), AROUND, iterations=2) > 0
     return np.asarray(np.where(near & (across < 0.5 * np.maximum(along, 1)), weights, 0), np.float32)
 
 
@@ -186,7 +187,7 @@ def _shapes(outline: Outline, place: Floats, gap: Floats, known: BoolArray) -> N
             f"outline_{name}_clear_max": free.max(initial=-FAR) if len(free) else 0.0,
             f"outline_{name}_clear_min": free.min(initial=FAR) if len(free) else 0.0,
             f"outline_{name}_clear_last": _median(free[-3:]), f"outline_{name}_seen_last": _median(seen[-3:]),
-            f"outline_{name}_seen_most": float(np.quantile(seen, 0.85)) if len(seen) else 0.0,
+            f"outline_{name}_seen_most": quantile(seen, 0.85) if len(seen) else 0.0,
             f"outline_{name}_step": np.abs(np.diff(values))[steady].max(initial=0.0),
             f"outline_{name}_start": np.abs(values[start]).max(initial=0.0),
             f"outline_{name}_end": np.ptp(values[end]) if end.any() else 0.0,
@@ -199,4 +200,4 @@ def _mean(values: Floats) -> float:
 
 
 def _median(values: Floats) -> float:
-    return float(np.median(values)) if len(values) else 0.0
+    return float(median(values)) if len(values) else 0.0

@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.reward.evidence.pictures import TURN
 from wm_nodes.reward.evidence.segmentation import OBJECT, ROBOT
+from wm_nodes.reward.evidence.tracks import SMALLEST_PX, Track, track
 from wm_nodes.types import UInt8Array
 
 FAR = 20.0
@@ -22,27 +24,11 @@ MOVED = 0.12
 SEEN = 0.2
 """An object of which this share of its reference area is visible is seen."""
 RESHAPED_FRAMES = 3
-SMALLEST_PX = 6
 HUES_DEGREES = {"red": 0.0, "orange": 32.0, "yellow": 55.0, "green": 130.0, "blue": 225.0, "purple": 288.0}
 """Angle of r + g exp(2 pi i / 3) + b exp(4 pi i / 3) of the colours that instructions name."""
 
 Floats = NDArray[np.float64]
 Numbers = dict[str, float]
-
-
-@dataclass(frozen=True)
-class Track:
-    """The largest blob of a class in each of T frames; NaN where there is none.
-
-    area: (T,) px. centre: (T, 2) row and column. box: (T, 4) top, left, height, width. axes: (T, 2) longer and shorter
-    standard deviation, px. second: (T,) area of the next largest blob, px, 0 where there is none.
-    """
-
-    area: Floats
-    centre: Floats
-    box: Floats
-    axes: Floats
-    second: Floats
 
 
 @dataclass(frozen=True)
@@ -102,41 +88,19 @@ def object_evidence(scene: Scene, reference: UInt8Array, instruction: str) -> Nu
     }  # fmt: skip
 
 
-def track(found: NDArray[np.bool_]) -> Track:
-    """Follow the largest blob of bool (T, H, W)."""
-    count = len(found)
-    nan = np.full((count, 9), np.nan)
-    second = np.zeros(count)
-    for t, mask in enumerate(found):
-        number, labels, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
-        if number < 2:
-            continue
-        order = np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable") + 1
-        left, top, width, height, area = stats[order[0]]
-        m = cv2.moments((labels[top : top + height, left : left + width] == order[0]).astype(np.uint8), True)
-        middle, half = (m["mu20"] + m["mu02"]) / 2, np.hypot((m["mu20"] - m["mu02"]) / 2, m["mu11"])
-        axes = np.sqrt(np.maximum([middle + half, middle - half], 0) / area + 1 / 12)  # a pixel has an extent, too
-        nan[t] = (area, centres[order[0]][1], centres[order[0]][0], top, left, height, width, *axes)
-        second[t] = stats[order[1], cv2.CC_STAT_AREA] if number > 2 else 0
-    small = ~(nan[:, 0] >= SMALLEST_PX)
-    nan[small] = np.nan
-    return Track(nan[:, 0], nan[:, 1:3], nan[:, 3:7], nan[:, 7:], second)
-
-
 def tool_points(arm: NDArray[np.bool_]) -> Floats:
     """(T, 2) row and column of the robot's lowest part, the finger tips; NaN where no robot is."""
     points = np.full((len(arm), 2), np.nan)
-    for t, mask in enumerate(arm):
-        rows, columns = np.nonzero(mask)
-        if len(rows) >= SMALLEST_PX:
-            low = rows >= rows.max() - 2
-            points[t] = rows.max(), columns[low].mean()
+    reached = arm.any(2)
+    for t in np.flatnonzero(arm.sum((1, 2)) >= SMALLEST_PX):
+        low = int(np.flatnonzero(reached[t])[-1])
+        points[t] = low, np.nonzero(arm[t, max(0, low - 2) : low + 1])[1].mean()
     return points
 
 
 def find_target(reference: UInt8Array, mask: UInt8Array, colour: str) -> Target | None:
     """Fit an ellipse to the largest region of that colour outside of object and robot; None where there is none."""
-    chroma = reference.astype(np.float32) @ np.exp(2j * np.pi / 3 * np.arange(3)).astype(np.complex64)
+    chroma = reference.astype(np.float32) @ TURN
     turn = np.exp(-1j * np.radians(HUES_DEGREES[colour])).astype(np.complex64)
     near = (np.abs(np.angle(chroma * turn)) < np.radians(20)) & (np.abs(chroma) > 60)
     near &= (mask != OBJECT) & (mask != ROBOT)
@@ -159,7 +123,7 @@ def robot_gaps(arm: NDArray[np.bool_], thing: NDArray[np.bool_]) -> Floats:
     gaps = np.full(len(arm), np.inf)
     for t, (robot, mask) in enumerate(zip(arm, thing)):
         if robot.any() and mask.any():
-            away = cv2.distanceTransform((~robot).astype(np.uint8), cv2.DIST_L2, 3)
+            away = cv2.distanceTransform((~robot).view(np.uint8), cv2.DIST_L2, 3)
             gaps[t] = max(0.0, float(away[mask].min()) - 1)
     return gaps
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.reward.evidence.pictures import TURN, Pictures, shrunk
+from wm_nodes.reward.evidence.quantiles import median, quantile
 from wm_nodes.types import UInt8Array
 
-GRID = 48
-"""Frames are averaged to GRID x GRID cells for colour and motion, so that their size does not matter."""
 COARSE = 24
 TILES = 6
 STILL_LEVELS = 0.15
@@ -27,44 +27,17 @@ Floats = NDArray[np.float32]
 Numbers = dict[str, float]
 
 
-def pixel_evidence(frames: UInt8Array, reference: UInt8Array) -> Numbers:
-    """Evidence of one clip.
-
-    Args:
-        frames: uint8 (T, H, W, 3), T >= 2. reference: uint8 (H, W, 3), what the clip had to start from.
-
-    Raises:
-        ValueError: wrong shapes or types; names them.
-    """
-    check_clip(frames, reference)
-    together = np.concatenate([reference[None], frames])
-    greys = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in together])
-    cells = np.stack([_shrunk(frame, GRID) for frame in together])
-    coarse = np.stack([_shrunk(frame, COARSE) for frame in cells])
+def pixel_evidence(pictures: Pictures) -> Numbers:
+    """Evidence of one clip."""
+    coarse = np.stack([shrunk(cells, COARSE) for cells in pictures.cells[1:]])
     return {
-        **_sharpness(greys),
-        **_exposure(cells),
-        **_colour(cells),
-        **_agreement(cells),
-        **_motion(coarse[1:]),
-        **_order(coarse[1:]),
+        **_sharpness(pictures.greys),
+        **_exposure(pictures.planes),
+        **_colour(pictures.cells),
+        **_agreement(pictures.planes, pictures.away),
+        **_motion(coarse),
+        **_order(coarse),
     }
-
-
-def check_clip(frames: UInt8Array, reference: UInt8Array) -> None:
-    """Raise ValueError unless frames are uint8 (T >= 2, H, W, 3) and reference is one of that size."""
-    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or len(frames) < 2:
-        raise ValueError(f"frames must be uint8 (T >= 2, H, W, 3), got {frames.dtype} {frames.shape}")
-    if reference.dtype != np.uint8 or reference.shape != frames.shape[1:]:
-        raise ValueError(
-            f"the reference frame must be uint8 {frames.shape[1:]}, got {reference.dtype} {reference.shape}"
-        )
-
-
-def _shrunk(image: NDArray[np.generic], side: int) -> Floats:
-    """(side, side, C) float32; area means where the image is larger."""
-    shrunk: Floats = cv2.resize(image.astype(np.float32), (side, side), interpolation=cv2.INTER_AREA)
-    return shrunk
 
 
 def _sharpness(greys: UInt8Array) -> Numbers:
@@ -73,27 +46,27 @@ def _sharpness(greys: UInt8Array) -> Numbers:
     smoother = np.stack([cv2.blur(grey, (7, 7)) for grey in smooth])
     fine = np.stack([cv2.absdiff(a, b) for a, b in zip(greys, smooth)])
     coarse = np.stack([cv2.absdiff(a, b) for a, b in zip(smooth, smoother)])
-    detail = np.stack([_shrunk(image, TILES) for image in fine])  # (1 + T, S, S)
+    detail = np.stack([shrunk(image, TILES) for image in fine])  # (1 + T, S, S)
     share = fine.mean((1, 2)) / (coarse.mean((1, 2)) + 0.5)
     ratio = (detail[1:] + 0.3) / (detail[0] + 0.3)
     total = (detail[1:].mean((1, 2)) + 0.1) / (detail[0].mean() + 0.1)
     against = share[1:] / max(float(share[0]), 1e-3)
-    tiles = np.median(ratio, 0)
+    tiles = median(np.moveaxis(ratio, 0, -1))
     return {
         "sharpness_mean": float(against.mean()), "sharpness_min": float(against.min()),
         "sharpness_first": float(against[0]),
         "detail_mean": float(total.mean()), "detail_first": float(total[0]),
         "detail_spread": float(total.std()),
-        "tile_detail_low": float(np.quantile(tiles, 0.15)),
+        "tile_detail_low": quantile(tiles, 0.15),
         "tile_detail_lost": float((ratio < DEAD_DETAIL).mean()),
     }  # fmt: skip
 
 
-def _exposure(cells: Floats) -> Numbers:
+def _exposure(planes: Floats) -> Numbers:
     """Brightness against the reference frame: as a whole, in time (flicker), in places (patches, shadows)."""
-    light = cells.mean(3)
+    light = planes.mean(0)
     ratio = (light[1:] + 4) / (light[0] + 4)
-    gain = np.median(ratio, (1, 2))
+    gain = _over_cells(ratio)
     bend = np.abs(np.diff(gain, 2)) if len(gain) > 2 else np.zeros(1)
     dark = ratio < DARKENED * gain[:, None, None]
     return {
@@ -103,22 +76,19 @@ def _exposure(cells: Floats) -> Numbers:
         "light_contrast": float(light[1:].std((1, 2)).mean() / (light[0].std() + 1)),
         "black_more": float((light[1:] < 10).mean() - (light[0] < 10).mean()),
         "darkened_mean": float(dark.mean()),
-        "darkened_start": float(dark[0].mean()), "darkened_low": float(np.quantile(ratio, 0.02)),
+        "darkened_start": float(dark[0].mean()), "darkened_low": quantile(ratio, 0.02),
     }  # fmt: skip
 
 
 def _colour(cells: Floats) -> Numbers:
-    """Turn of all colours about the grey axis, saturation, cast.
-
-    Chroma is r + g exp(2 pi i / 3) + b exp(4 pi i / 3).
-    """
-    turn = np.exp(2j * np.pi / 3 * np.arange(3)).astype(np.complex64)
-    chroma = cells @ turn
+    """Turn of all colours about the grey axis, saturation, cast."""
+    chroma = cells @ TURN
     power = float((np.abs(chroma[0]) ** 2).sum()) + 1e-3 * chroma[0].size
     product = (np.conj(chroma[0]) * chroma[1:]).sum((1, 2))
     hue = np.degrees(np.angle(product))
-    cast = np.abs(np.median(chroma[1:].real - chroma[0].real, (1, 2)) + 1j * np.median(
-        chroma[1:].imag - chroma[0].imag, (1, 2)))  # fmt: skip
+    cast = np.abs(
+        _over_cells(chroma[1:].real - chroma[0].real) + 1j * _over_cells(chroma[1:].imag - chroma[0].imag)
+    )
     return {
         "hue_first": float(np.abs(hue[0])), "hue_last": float(np.abs(hue[-1])), "hue_max": float(np.abs(hue).max()),
         "hue_drift": float(np.abs(hue[-1] - hue[0])),
@@ -129,23 +99,27 @@ def _colour(cells: Floats) -> Numbers:
     }  # fmt: skip
 
 
-def _agreement(cells: Floats) -> Numbers:
+def _agreement(planes: Floats, away: Floats) -> Numbers:
     """Difference from the reference frame: how much of the picture, where, and whether it comes at once."""
-    away = np.abs(cells[1:] - cells[0]).mean(3)
     changed = away > CHANGED_LEVELS
-    median = np.median(away, (1, 2))
-    tiles = np.stack([_shrunk(frame, TILES) for frame in away])
-    steps = np.median(np.abs(np.diff(cells[1:], axis=0)).mean(3), (1, 2))
-    static = np.abs(cells[1:] - cells[1]).mean(3).max(0) < CHANGED_LEVELS
+    typical = _over_cells(away)
+    tiles = np.stack([shrunk(frame, TILES) for frame in away])
+    steps = _over_cells(np.abs(np.diff(planes[:, 1:], axis=1)).mean(0))
+    static = np.abs(planes[:, 1:] - planes[:, 1:2]).mean(0).max(0) < CHANGED_LEVELS
     kept = away[-1][static]
     return {
         "reference_first": float(away[0].mean()),
-        "reference_median": float(median.mean()),
-        "reference_median_first": float(median[0]), "changed_first": float(changed[0].mean()),
-        "tiles_changed_low": float(np.quantile(tiles[-1], 0.25)), "tile_changed_most": float(tiles.max()),
+        "reference_median": float(typical.mean()),
+        "reference_median_first": float(typical[0]), "changed_first": float(changed[0].mean()),
+        "tiles_changed_low": quantile(tiles[-1], 0.25), "tile_changed_most": float(tiles.max()),
         "picture_steps": float(steps.mean()), "static_share": float(static.mean()),
         "static_away": float(kept.mean()) if kept.size else 0.0,
     }  # fmt: skip
+
+
+def _over_cells(values: Floats) -> Floats:
+    """Medians (T,) of (T, G, G)."""
+    return median(values.reshape(len(values), -1))
 
 
 def _motion(coarse: Floats) -> Numbers:
@@ -155,7 +129,7 @@ def _motion(coarse: Floats) -> Numbers:
     total, where = float(energy.sum()), np.flatnonzero(moving)
     first, last = (int(where[0]), int(where[-1])) if len(where) else (0, len(energy) - 1)
     inside = moving[first : last + 1]
-    typical = float(np.median(energy[moving])) if len(where) else 0.0
+    typical = float(median(energy[moving])) if len(where) else 0.0
     times = (np.arange(len(energy)) + 0.5) / len(energy)
     net = float(np.abs(coarse[-1] - coarse[0]).mean())
     bend = float(np.abs(np.diff(coarse, 2, axis=0)).mean()) if len(coarse) > 2 else 0.0
@@ -176,21 +150,24 @@ def _motion(coarse: Floats) -> Numbers:
 def _order(coarse: Floats) -> Numbers:
     """Whether neighbours in time are neighbours in the picture: shuffled, repeated and dropped frames."""
     flat = coarse.reshape(len(coarse), -1)
-    distance = np.stack([np.abs(flat - frame).mean(1) for frame in flat])  # (T, T)
     count = len(flat)
+    distance = np.zeros((count, count), np.float32)
+    for t in range(1, count):
+        distance[t, :t] = distance[:t, t] = np.abs(flat[:t] - flat[t]).mean(1)
     step = np.diagonal(distance, 1)
     moving = step > STILL_LEVELS
     over = np.diagonal(distance, 2)
     wrong = (over < step[:-1]) & moving[:-1] & moving[1:] if count > 2 else np.zeros(1, bool)
     again, runs = np.zeros(count, bool), 0
+    furthest = np.maximum.accumulate(np.triu(distance), 1)  # (i, j): of frame i from any of i to j
     for lag in range(2, count):
-        left_between = np.array([distance[t - lag, t - lag : t].max() for t in range(lag, count)])
-        same = (np.diagonal(distance, -lag) < STILL_LEVELS) & (left_between > 2 * STILL_LEVELS)
+        left_between = np.diagonal(furthest, lag - 1)[:-1]
+        same = (np.diagonal(distance, lag) < STILL_LEVELS) & (left_between > 2 * STILL_LEVELS)
         again[lag:] |= same
         runs = max(runs, _longest_run(same & (step[lag - 1 :] > STILL_LEVELS)))
     nearest = np.where(np.eye(count, dtype=bool), np.inf, distance).min(1)
     jump = step / (0.2 + np.minimum(nearest[1:], nearest[:-1]))
-    typical = float(np.median(step[moving])) if moving.any() else np.inf
+    typical = float(median(step[moving])) if moving.any() else np.inf
     return {
         "order_wrong": float(wrong.sum() / max(1, int(moving.sum()))), "order_again": float(again.mean()),
         "order_again_run": runs / count, "order_gap": float(nearest.max() / (typical + 0.2)),
@@ -201,7 +178,7 @@ def _order(coarse: Floats) -> Numbers:
 
 def _longest_run(hits: NDArray[np.bool_]) -> int:
     longest = run = 0
-    for hit in hits:
+    for hit in hits.tolist():
         run = run + 1 if hit else 0
         longest = max(longest, run)
     return longest

@@ -8,40 +8,38 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.reward.evidence.objects import HUES_DEGREES, SMALLEST_PX, track
-from wm_nodes.reward.evidence.registration import SIDE as GRID
+from wm_nodes.reward.evidence.objects import HUES_DEGREES
+from wm_nodes.reward.evidence.pictures import GRID, TURN, Pictures, shrunk
+from wm_nodes.reward.evidence.quantiles import median, quantile
 from wm_nodes.reward.evidence.registration import registration_evidence
 from wm_nodes.reward.evidence.segmentation import CLUTTER, OBJECT, ROBOT, SCENE
-from wm_nodes.types import UInt8Array
+from wm_nodes.reward.evidence.tracks import SMALLEST_PX, second_areas
+from wm_nodes.types import BoolArray, UInt8Array
 
 TILES = 6
 CHANGED_LEVELS = 10.0
-TURN = np.exp(2j * np.pi / 3 * np.arange(3)).astype(np.complex64)
-"""Chroma is r + g exp(2 pi i / 3) + b exp(4 pi i / 3): its angle is the hue, its length the colourfulness."""
 
 Floats = NDArray[np.float32]
 Numbers = dict[str, float]
 
 
-def region_evidence(frames: UInt8Array, reference: UInt8Array, masks: UInt8Array, instruction: str) -> Numbers:
+def region_evidence(pictures: Pictures, masks: UInt8Array, instruction: str) -> Numbers:
     """Evidence of one clip.
 
     Args:
-        frames: uint8 (T, H, W, 3). reference: uint8 (H, W, 3). masks: uint8 (1 + T, H, W), the reference frame's first.
+        masks: uint8 (1 + T, H, W), the reference frame's first.
     """
-    pictures = np.concatenate([reference[None], frames])
-    means = {label: _means(pictures, masks == label) for label in (ROBOT, OBJECT)}
+    robot, thing = _means(pictures.colours, masks, (ROBOT, OBJECT))
     colours = [word for word in instruction.lower().split() if word in HUES_DEGREES]
-    greys = np.stack([cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in pictures])
-    scene = np.stack([_shrunk((mask == SCENE).astype(np.float32), GRID) > 0.99 for mask in masks])
+    scene = np.stack([shrunk(mask == SCENE, GRID) > 0.99 for mask in masks])
     return {
-        **_scene(pictures, greys, scene),
-        **registration_evidence(greys, scene),
+        **_scene(pictures, scene),
+        **registration_evidence(pictures.greys, scene),
         **_clutter(masks),
-        **_hue(means[OBJECT]),
-        **_paint(means[OBJECT], "object"),
-        **_paint(means[ROBOT], "robot"),
-        **_named(means[OBJECT], colours),
+        **_hue(thing),
+        **_paint(thing, "object"),
+        **_paint(robot, "robot"),
+        **_named(thing, colours),
         **_robot(masks == ROBOT),
         "share_unsure": float((masks[1:] != _smoothed(masks[1:])).mean()),
     }
@@ -52,41 +50,47 @@ def _smoothed(masks: UInt8Array) -> UInt8Array:
     return np.stack([cv2.medianBlur(mask, 3) for mask in masks])
 
 
-def _scene(pictures: UInt8Array, greys: UInt8Array, open_cells: NDArray[np.bool_]) -> Numbers:
+def _scene(pictures: Pictures, open_cells: BoolArray) -> Numbers:
     """The scene where it is in view, in the clip and in the reference frame: colour, texture, things that are gone."""
-    cells = np.stack([_shrunk(picture, GRID) for picture in pictures])
     both = open_cells[1:] & open_cells[0]
-    detail = np.stack([_shrunk(np.abs(cv2.Laplacian(grey, cv2.CV_16S)), GRID) for grey in greys])
-    away = np.abs(cells[1:] - cells[0]).mean(3) * both
+    detail = np.stack([shrunk(np.abs(cv2.Laplacian(grey, cv2.CV_16S)), GRID) for grey in pictures.greys])
+    away = pictures.away * both
     share = both.mean((1, 2)) + 1e-6
     mean = away.mean((1, 2)) / share
-    inside = [c[m] for c, m in zip(cells[1:], both)]
-    shifts = [np.median(c - cells[0][m], axis=0) if len(c) else np.zeros(3) for c, m in zip(inside, both)]
+    moved = (pictures.planes[:, 1:] - pictures.planes[:, :1]).swapaxes(0, 1)  # (T, 3, G, G)
+    shifts = [median(m[:, shown]) if shown.any() else np.zeros(3) for m, shown in zip(moved, both)]
     offset = np.linalg.norm(shifts, axis=1)
-    spread = np.array([c.std(0).mean() if len(c) else 0.0 for c in inside])
+    spread0, *spread = _spread(pictures.planes, np.concatenate([open_cells[:1], both]))
     changed = ((away > CHANGED_LEVELS) & both).mean((1, 2)) / share
     texture = ((detail[1:] * both).mean((1, 2)) / share + 0.2) / ((detail[0] * both).mean((1, 2)) / share + 0.2)
     part = _tiles(both)
     tiles, parts = _tiles(away) / (part + 0.05), part > 0.3
     kept = (_tiles(detail[1:] * both) + 0.1) / (_tiles(detail[0] * both) + 0.1)
-    first = cells[0][open_cells[0]]
     return {
         "scene_away_mean": float(mean.mean()), "scene_away_first": float(mean[0]), "scene_away_last": float(mean[-1]),
         "scene_away_step": float(np.diff(mean).max()),
-        "scene_tile_away_low": float(np.quantile(tiles[-1], 0.3)), "scene_changed": float(changed.mean()),
+        "scene_tile_away_low": quantile(tiles[-1], 0.3), "scene_changed": float(changed.mean()),
         "scene_changed_last": float(changed[-1]), "scene_changed_first": float(changed[0]),
         "scene_offset_last": float(offset[-1]), "scene_offset_max": float(offset.max()),
         "scene_offset_step": float(np.abs(np.diff(offset)).max()), "scene_texture": float(texture.mean()),
         "scene_texture_min": float(texture.min()),
         "scene_tile_texture": float(kept[parts].min()) if parts.any() else 1.0,
-        "scene_spread": float(spread.mean() / (first.std(0).mean() + 1 if len(first) else 1.0)),
+        "scene_spread": float(np.array(spread).mean() / (spread0 + 1)),
         "scene_share": float(share.mean()),
     }  # fmt: skip
 
 
-def _shrunk(image: NDArray[np.generic], side: int) -> Floats:
-    shrunk: Floats = cv2.resize(image.astype(np.float32), (side, side), interpolation=cv2.INTER_AREA)
-    return shrunk
+def _spread(planes: Floats, chosen: BoolArray) -> list[np.float32 | float]:
+    """Standard deviation of chosen cells (T, G, G) of planes (3, T, G, G), T > 1, mean over colours; 0 where none is.
+
+    Cells are added one after the other, those of all frames at once.
+    """
+    count = np.maximum(chosen.sum((1, 2)), 1).astype(np.float32)
+    weights = np.ascontiguousarray(chosen.reshape(len(chosen), -1).T).astype(np.float32)  # (G G, T)
+    values = np.ascontiguousarray(planes.reshape(3, len(chosen), -1).swapaxes(1, 2))
+    away = (values - (values * weights).sum(1, keepdims=True) / count) * weights
+    deviation = np.sqrt((away * away).sum(1) / count).T
+    return [row.mean() if shown.any() else 0.0 for row, shown in zip(deviation, chosen)]
 
 
 def _tiles(cells: NDArray[np.generic]) -> Floats:
@@ -110,11 +114,12 @@ def _clutter(masks: UInt8Array) -> Numbers:
     }  # fmt: skip
 
 
-def _means(pictures: UInt8Array, region: NDArray[np.bool_]) -> Floats:
-    """(1 + T, 3) mean colour; NaN where the region is too small."""
-    count = region.sum((1, 2)).astype(np.float32)
-    total = np.stack([picture[mask].sum(0, dtype=np.float32) for picture, mask in zip(pictures, region)])
-    return np.where(count[:, None] >= SMALLEST_PX, total / np.maximum(count, 1)[:, None], np.nan)
+def _means(colours: UInt8Array, masks: UInt8Array, labels: tuple[int, ...]) -> Floats:
+    """(L, 1 + T, 3) mean colours of L labels; NaN where a region is too small. Sums below 2^24 levels are exact."""
+    regions = np.stack([masks == label for label in labels], 1).reshape(len(masks), len(labels), -1)
+    count = regions.sum(2).astype(np.float32)[..., None]
+    total = regions.astype(np.float32) @ colours.reshape(len(masks), -1, 3).astype(np.float32)
+    return np.where(count >= SMALLEST_PX, total / np.maximum(count, 1), np.nan).swapaxes(0, 1)
 
 
 def _paint(means: Floats, name: str) -> Numbers:
@@ -149,10 +154,10 @@ def _named(means: Floats, colours: list[str]) -> Numbers:
     return {"named_hue_off": float(np.degrees(np.median(np.abs(off))))}
 
 
-def _robot(arm: NDArray[np.bool_]) -> Numbers:
+def _robot(arm: BoolArray) -> Numbers:
     """Whether the arm is whole: blobs and area. arm: bool (1 + T, H, W)."""
     area = arm.sum((1, 2)).astype(np.float64)
-    second = track(arm).second / (area + 20)
+    second = second_areas(arm) / (area + 20)
     return {
         "robot_second_max": float(second[1:].max()),
         "robot_first": float((area[1] + 20) / (area[0] + 20)),

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.reward.evidence.pictures import GRID
 from wm_nodes.types import UInt8Array
 
-SIDE = 48
 BLUR_PX = 1.2
-"""Of a picture of SIDE x SIDE."""
+"""Of a picture of GRID x GRID."""
 ROUNDS = 3
 SOFT_LEVELS = 3.0
 """A pixel that stays this far off, in grey levels, counts half."""
@@ -27,15 +27,15 @@ def registration_evidence(greys: UInt8Array, scene: NDArray[np.bool_]) -> dict[s
     """Camera evidence.
 
     Args:
-        greys: uint8 (1 + T, H, W), the reference frame first. scene: bool (1 + T, SIDE, SIDE), only scene is there.
+        greys: uint8 (1 + T, H, W), the reference frame first. scene: bool (1 + T, GRID, GRID), only scene is there.
     """
-    small = (cv2.resize(grey.astype(np.float32), (SIDE, SIDE), interpolation=cv2.INTER_AREA) for grey in greys)
+    small = (cv2.resize(grey.astype(np.float32), (GRID, GRID), interpolation=cv2.INTER_AREA) for grey in greys)
     images = np.stack([cv2.GaussianBlur(image, (0, 0), BLUR_PX) for image in small])
     around = np.ones((5, 5), np.uint8)  # the blur spreads what is no scene
     open_cells = np.stack([cv2.erode(mask.astype(np.uint8), around, borderValue=1) for mask in scene])
     moves, left = camera_moves(images, (open_cells[1:] * open_cells[:-1]).astype(np.float32))
     start, steps = moves[0], moves[1:]
-    scale = WIDTH_PX / SIDE
+    scale = WIDTH_PX / GRID
     path = np.cumsum(steps, 0)
     shift, total = np.hypot(steps[:, 0], steps[:, 1]) * scale, np.hypot(path[:, 0], path[:, 1]) * scale
     still = np.abs(images[1:] - images[0]).mean((1, 2))
@@ -63,8 +63,9 @@ def camera_moves(images: Floats, counted: Floats) -> tuple[Floats, Floats]:
     middle = (images[1:] + images[:-1]) / 2
     down, right = np.zeros_like(middle), np.zeros_like(middle)
     right[:, :, 1:-1], down[:, 1:-1] = (middle[:, :, 2:] - middle[:, :, :-2]) / 2, (middle[:, 2:] - middle[:, :-2]) / 2
-    slopes = np.stack([right, down, along * right - across * down, across * right + along * down], -1)
-    slopes = slopes.reshape(len(middle), -1, 4)
+    planes = np.stack([right, down, along * right - across * down, across * right + along * down])
+    planes = planes.reshape(4, len(middle), -1)
+    slopes = np.ascontiguousarray(planes.transpose(1, 2, 0))
     change = (images[1:] - images[:-1]).reshape(len(middle), -1)
     counts = counted.reshape(len(middle), -1)
     weight, moves = counts, np.zeros((len(middle), 4), np.float32)
@@ -73,7 +74,14 @@ def camera_moves(images: Floats, counted: Floats) -> tuple[Floats, Floats]:
     for _ in range(ROUNDS):
         weighted = slopes * weight[..., None]
         normal = weighted.transpose(0, 2, 1) @ slopes + ridge
-        moves = np.linalg.solve(normal, -(weighted * change[..., None]).sum(1)[..., None])[..., 0]
+        moves = np.linalg.solve(normal, -_total(planes * weight * change).T[..., None])[..., 0]
         left = change + (slopes @ moves[..., None])[..., 0]
         weight = counts / (1 + (left / SOFT_LEVELS) ** 2)
     return moves, (np.abs(left) * weight).sum(1) / (weight.sum(1) + 1)
+
+
+def _total(planes: Floats) -> Floats:
+    """(4, T), sums of (4, T, H W) pixel by pixel: sums of whole rows are quick, and those of four numbers are not."""
+    rows = np.ascontiguousarray(planes.reshape(-1, planes.shape[2]).T)
+    total: Floats = rows.sum(0).reshape(planes.shape[:2])
+    return total

@@ -53,7 +53,7 @@ class Trees:
     def log_odds(self, rows: FloatArray) -> FloatArray:
         """(N,) of rows (N, F)."""
         yes = rows[:, self.features] > self.thresholds
-        leaf = (yes << np.arange(self.features.shape[1])).sum(2)
+        leaf = yes @ (1 << np.arange(self.features.shape[1]))
         answers = self.leaves[np.arange(len(self.leaves)), leaf]
         odds: FloatArray = np.float32(self.bias) + answers.sum(1, dtype=np.float32)
         return odds
