@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pushed_box import FRAMES, push_clip, pushing_states, redrawn
+from pushed_box import FRAMES, draw, push_clip, pushing_states, redrawn
 
 from wm_nodes.reward.adversarial import (
     BACKGROUND,
@@ -23,11 +23,13 @@ from wm_nodes.reward.adversarial import (
     LabelledClip,
     Labels,
     NotApplicableError,
+    SceneStates,
     apply,
     children,
     edit_states,
     failed_physics,
     images,
+    recorded,
     tc_level,
 )
 from wm_nodes.reward.adversarial.clips import TC_PASS_LEVEL
@@ -339,6 +341,32 @@ def test_the_verifier_accepts_what_robots_do() -> None:
     around = replace(states, tool=states.thing.copy(), gripper_m=np.full(FRAMES, 0.08, np.float32))
     assert not failed_physics(around)  # an open gripper goes down around the box
     assert failed_physics(replace(around, gripper_m=np.zeros(FRAMES, np.float32))) == {"geometry"}
+
+
+def knocked(cube_m: float = 0.1149, tool_m: float = 0.0608) -> SceneStates:
+    """The hit in recording push_cube, seed 3195, as the simulator moved tool and cube. cube_m, tool_m: in its frame."""
+    ways_m = {4: (0.0542, 0.0187), 5: (tool_m, cube_m), 6: (0.0001, 0.0152)}
+    ways = np.array([ways_m.get(t, (0, 0)) for t in range(-1, FRAMES - 1)], np.float32).cumsum(0)
+    states = pushing_states("idle")
+    poses, tool = states.poses.copy(), states.tool.copy()
+    tool[:, 0] += ways[:, 0] - 0.05
+    poses[:, 0, 0] += ways[:, 1]
+    return replace(states, poses=poses, tool=tool, contact=np.isin(np.arange(FRAMES), (5, 6)))
+
+
+def test_what_is_hit_may_go_twice_as_far_as_the_tool() -> None:
+    assert not failed_physics(knocked())  # 54 mm further than the tool
+    assert not failed_physics(knocked(tool_m=0))  # hit at the end of the frame before
+    assert not failed_physics(knocked(2 * 0.0608 + 0.009))
+    assert failed_physics(knocked(2 * 0.0608 + 0.011)) == {"interaction"}
+    assert failed_physics(replace(knocked(), contact=np.zeros(FRAMES, bool))) == {"interaction"}
+
+
+def test_what_the_simulator_did_is_no_fault_of_a_recording_nor_of_an_edit() -> None:
+    root = recorded(draw(knocked(0.2), push_clip().clip.origin))  # more than the rule allows an edit
+    assert failed_physics(root.clip.states) == {"interaction"} and all(root.labels.components.values())
+    sunk = {kind: edited(root, "sunk", kind, 0, redrawn).labels for kind in ("mild", "fail")}
+    assert sunk["mild"] == root.labels and failures(sunk["fail"]) - failures(root.labels) == {"geometry"}
 
 
 def test_children_leave_out_what_does_not_apply_and_say_why() -> None:

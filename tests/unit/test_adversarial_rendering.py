@@ -28,6 +28,7 @@ from wm_nodes.reward.adversarial import (
     TASK_RULES,
     ManifestError,
     edit_states,
+    failed_physics,
     regenerate,
     tc_level,
 )
@@ -82,6 +83,15 @@ def test_an_expert_succeeds_and_a_clip_is_the_same_each_time(source: ClipSource)
     first = source.clip(seed)
     assert first.labels.overall and first.labels.tc_level == 4
     assert source.clip(seed).sha256 == first.sha256 != source.clip(seed + 1).sha256
+
+
+def test_a_cube_that_the_simulator_knocked_ahead_passes_and_only_its_edits_fail(source: ClipSource) -> None:
+    knocked = source.clip(1018)
+    states = knocked.clip.states
+    cube_m, tool_m = (np.linalg.norm(np.diff(way, axis=0), axis=1) for way in (states.thing, states.tool))
+    assert (cube_m - tool_m).max() > 0.04 and not failed_physics(states) and all(knocked.labels.components.values())
+    sunk = source.redraw(knocked, edit_states(knocked, "sunk", "fail", 0)).labels
+    assert [name for name, passed in sunk.components.items() if not passed] == ["geometry"]
 
 
 def test_a_long_set_outlives_the_sixteen_bits_of_the_segmentation(

@@ -8,13 +8,13 @@ import pytest
 from pushed_box import push_clip, redrawn
 
 from wm_nodes.learning.adversarial_set import MANIFEST, clip_path, to_file
-from wm_nodes.learning.judge_data import load_sets, set_clips
-from wm_nodes.learning.judge_fitting import Examples
+from wm_nodes.learning.judge_data import load_sets, rows_of, set_clips
 from wm_nodes.learning.judge_segmenter import masks_hold, overlaps, segmentation_data, train_segmenter
-from wm_nodes.learning.judge_training import without_doubt
+from wm_nodes.learning.judge_training import collect_evidence
 from wm_nodes.learning.train_judge import main
 from wm_nodes.reward.adversarial import Division, LabelledClip, children, manifest_of, to_bytes
 from wm_nodes.reward.evidence.definitions import EVIDENCE
+from wm_nodes.reward.evidence.segmentation import Segmenter
 
 SHORT = ["--segmenter-steps", "2", "--trees", "2"]
 
@@ -66,16 +66,19 @@ def test_what_cannot_be_trained_or_measured_is_named(
     assert "no clip has masks that show what is seen" in error(str(tmp_path / "out"), str(tests))
 
 
-def test_clips_of_a_recording_that_fails_by_its_own_label_train_nothing(toy_set: Path) -> None:
-    rows = load_sets([toy_set])[0][1].rows
-    first = next(row for row in rows if not row.edits)
-    wrong = replace(first.labels, components={**first.labels.components, "interaction": False})
-    changed = [replace(row, labels=wrong) if row is first else row for row in rows]
-    numbers = np.arange(len(rows), dtype=np.float32)[:, None]
-    kept = without_doubt(Examples(("number",), numbers, changed))
-    assert [row.sha256 for row in kept.rows] == [row.sha256 for row in rows if row.root != first.sha256]
-    assert [changed[int(value)] for value in kept.evidence[:, 0]] == list(kept.rows)
-    assert len(without_doubt(Examples(("number",), numbers, rows)).rows) == len(rows)
+def test_evidence_is_kept_when_labels_change_and_made_again_for_other_clips(toy_set: Path, tmp_path: Path) -> None:
+    (folder, manifest), model = load_sets([toy_set])[0], Segmenter().eval()
+    rows = rows_of(manifest, ["validation"])
+    assert len(collect_evidence(tmp_path, [(folder, manifest)], "validation", model, progress=False).rows) == len(rows)
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    worse = {row.sha256: replace(row, labels=replace(row.labels, tc_level=0)) for row in rows}
+    relabelled = replace(manifest, rows=tuple(worse.get(row.sha256, row) for row in manifest.rows))
+    again = collect_evidence(tmp_path, [(folder, relabelled)], "validation", model, progress=False)
+    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == kept
+    assert list(again.rows) == list(worse.values())
+    fewer = replace(manifest, rows=tuple(row for row in manifest.rows if row is not rows[0]))
+    assert len(collect_evidence(tmp_path, [(folder, fewer)], "validation", model, progress=False).rows) == len(rows) - 1
+    assert len(list(tmp_path.iterdir())) == len(kept) + 1
 
 
 def test_the_segmenter_learns_the_toy_and_leaves_out_masks_of_what_is_not_there(toy_set: Path) -> None:

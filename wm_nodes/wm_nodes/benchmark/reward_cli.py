@@ -62,7 +62,7 @@ from wm_nodes.files import write_atomic
 from wm_nodes.learning.adversarial_set import load_set
 from wm_nodes.learning.benchmark_clips import MIN_TEST_CLIPS, chosen_rows
 from wm_nodes.reports import machine_facts
-from wm_nodes.reward.adversarial import LabelledClip, Manifest, doubted
+from wm_nodes.reward.adversarial import LabelledClip, Manifest
 from wm_nodes.reward.adversarial.generator import SEVERITIES
 from wm_nodes.reward.adversarial.manifest import Row
 from wm_nodes.reward.agent import Judge, Rubric, TaskSpec, load_rubric
@@ -102,11 +102,6 @@ async def _table(arguments: argparse.Namespace) -> None:
     splits = by_split(rows, found, rubric)
     console.print(table2(agreements, caption), split_table(splits), confusion_table(agreements))
     console.print(pattern_table(patterns))
-    wrong = doubted(manifest.rows)
-    sure = [(row, outcome) for row, outcome in zip(rows, found) if row.sha256 not in wrong]
-    undoubted = agreement([row for row, _ in sure], [outcome for _, outcome in sure], rubric) if sure else []
-    note = f"{len(rows) - len(sure)} clips left out whose recording fails by its own label (manifest.doubted)"
-    console.print(table2(undoubted, note))
     cost = cost_row(found, arguments.price)
     console.print(cost_table({"agent, benchmark mode": cost}))
     _say_what_is_missing(arguments, len(rows), said, missed(agreements), worst(mistakes(rows, found, rubric)))
@@ -114,8 +109,7 @@ async def _table(arguments: argparse.Namespace) -> None:
         "claim": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "notice": said, "statuses": statuses(found), "cost": cost,
         "splits": {name: [asdict(row) for row in found] for name, found in splits.items()},
-        "rows": [asdict(row) for row in agreements], "doubted": len(rows) - len(sure),
-        "rows_without_doubted": [asdict(row) for row in undoubted], "patterns": [asdict(row) for row in patterns],
+        "rows": [asdict(row) for row in agreements], "patterns": [asdict(row) for row in patterns],
         "missed": missed(agreements), "mistakes": worst(mistakes(rows, found, rubric), 40),
     })  # fmt: skip
 

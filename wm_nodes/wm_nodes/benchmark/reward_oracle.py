@@ -4,6 +4,7 @@ It shows what the agent's machinery does with a judge of a given quality: what T
 exits cost and save, how votes mend independent errors.
 """
 
+import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -49,11 +50,12 @@ class OracleJudge:
         if not 0 <= error <= 1:
             raise ValueError(f"error must be a share in [0, 1], got {error}")
         self.clips, self._rubric, self._error, self._seed = dict(clips), rubric, error, seed
+        self._labels = hashlib.sha256(repr(sorted(clips.items())).encode()).hexdigest()[:8]
 
     @property
     def capabilities(self) -> Capabilities:
         names = frozenset({PLANNING, *self._rubric.component_names, *self._rubric.hack.patterns})
-        model = f"error {self._error:g}, seed {self._seed}"
+        model = f"labels {self._labels}, error {self._error:g}, seed {self._seed}"
         return Capabilities("simulator labels", "none", model, "1", names, reasons=False, deterministic=True)
 
     async def health(self) -> Health:

@@ -1,7 +1,7 @@
 """Make the embedded judge from adversarial sets: segmenter, evidence, heads, limits. Specification: section 4.3.
 
 Finished stages lie in the folder and are taken up again: segmenter.safetensors, and evidence-*.npz per set and part,
-named by everything they depend on.
+named by everything they depend on, which labels are not.
 """
 
 import hashlib
@@ -21,8 +21,8 @@ from wm_nodes.files import write_atomic
 from wm_nodes.learning.judge_data import load_sets, rows_of, set_clips
 from wm_nodes.learning.judge_fitting import TARGETS, Examples, fit_all, fit_familiarity, measured
 from wm_nodes.learning.judge_segmenter import overlaps, segmentation_data, train_segmenter
-from wm_nodes.reward.adversarial import Manifest, doubted
-from wm_nodes.reward.adversarial.manifest import Part, to_bytes
+from wm_nodes.reward.adversarial import Manifest
+from wm_nodes.reward.adversarial.manifest import Part, Row, to_bytes
 from wm_nodes.reward.evidence.clip import clip_evidence
 from wm_nodes.reward.evidence.head import JudgeHead
 from wm_nodes.reward.evidence.segmentation import Segmenter
@@ -51,8 +51,7 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     sets = load_sets(plan.sets)
     segmenter, segmenter_story = _segmenter(folder, sets, plan, progress)
     train, validation = (
-        without_doubt(collect_evidence(folder, sets, part, segmenter, progress=progress))
-        for part in ("train", "validation")
+        collect_evidence(folder, sets, part, segmenter, progress=progress) for part in ("train", "validation")
     )
     if not len(train.rows) or not len(validation.rows):
         raise ValueError(f"{len(train.rows)} training and {len(validation.rows)} validation clips; build larger sets")
@@ -84,8 +83,7 @@ def collect_evidence(
         chosen = rows_of(manifest, [part])
         if not chosen:
             continue
-        key = hashlib.sha256(to_bytes(manifest) + _state(segmenter) + _sources() + part.encode()).hexdigest()[:16]
-        kept = folder / f"evidence-{key}.npz"
+        kept = folder / f"evidence-{_key(chosen, segmenter)}.npz"
         if not kept.exists():
             name = f"evidence of {path.name} {part}"
             clips = tqdm(set_clips([(path, manifest)], [part]), name, len(chosen), disable=not progress)
@@ -101,11 +99,10 @@ def collect_evidence(
     return Examples(names, np.concatenate(found) if found else np.zeros((0, 0), np.float32), rows)
 
 
-def without_doubt(examples: Examples) -> Examples:
-    """Leave out clips whose label is in doubt, see manifest.doubted."""
-    wrong = doubted(examples.rows)
-    kept = [i for i, row in enumerate(examples.rows) if row.sha256 not in wrong]
-    return Examples(examples.names, examples.evidence[kept], [examples.rows[i] for i in kept])
+def _key(rows: Sequence[Row], segmenter: Segmenter) -> str:
+    """Of clips, their reference frames, what instructions are made of, weights and code."""
+    shown = "".join(f"{row.sha256} {row.root} {row.origin.task} {row.origin.object_id}\n" for row in rows)
+    return hashlib.sha256(shown.encode() + _state(segmenter) + _sources()).hexdigest()[:16]
 
 
 def _segmenter(
@@ -141,5 +138,6 @@ def _state(segmenter: Segmenter) -> bytes:
 def _sources() -> bytes:
     """Of the code that computes evidence: a changed number is another number."""
     folder = Path(str(wm_nodes.reward.evidence.__path__[0]))
-    names = ("pixels", "registration", "objects", "motion", "regions", "segmentation", "clip")
-    return hashlib.sha256(b"".join((folder / f"{name}.py").read_bytes() for name in names)).digest()
+    others = ("__init__", "definitions", "head", "trees")
+    files = (path for path in sorted(folder.glob("*.py")) if path.stem not in others)
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()

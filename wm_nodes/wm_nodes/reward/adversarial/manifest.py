@@ -122,22 +122,13 @@ def prevalence(rows: Sequence[Row]) -> Prevalence:
     return counts
 
 
-def doubted(rows: Sequence[Row]) -> frozenset[str]:
-    """Hashes of the clips whose recording fails a component by its own label.
-
-    A recording is what the simulator did, so that its physics holds; truth.py, which sees one state per frame, takes a
-    cube that was knocked ahead for one that moves by itself. All clips made of such a recording bear that label on.
-    """
-    roots = {row.sha256 for row in rows if not row.edits and not all(row.labels.components.values())}
-    return frozenset(row.sha256 for row in rows if row.root in roots)
-
-
 def check(manifest: Manifest) -> None:
     """Check what must hold between the rows.
 
     Raises:
         ManifestError: a clip twice or out of order, a part or split that the division does not give, an edited clip
-            whose recorded one is missing or lies in another part, other recipes than these.
+            whose recorded one is missing or lies in another part, a recording that fails a component although the
+            simulator made it, other recipes than these.
     """
     if manifest.recipes_sha != recipes_sha():
         raise ManifestError(
@@ -155,6 +146,8 @@ def check(manifest: Manifest) -> None:
             raise ManifestError(f"clip {row.sha256[:12]} lacks its recorded clip {row.root[:12]}; add that, unedited")
         if root.origin != row.origin:
             raise ManifestError(f"clip {row.sha256[:12]} has another origin than its recording; build the set again")
+        if not row.edits and not all(row.labels.components.values()):
+            raise ManifestError(f"recording {row.sha256[:12]} fails what the simulator made; build the set again")
 
 
 def to_bytes(manifest: Manifest) -> bytes:

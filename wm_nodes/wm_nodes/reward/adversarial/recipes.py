@@ -28,8 +28,8 @@ from wm_nodes.reward.adversarial.clips import (
 from wm_nodes.reward.adversarial.truth import failed_physics, task_rule, tc_level
 from wm_nodes.seeding import numpy_stream
 
-REVISION = 1
-"""Counted up whenever the code of a recipe changes what it draws; recipes_sha sees ranges and labels by itself."""
+REVISION = 2
+"""Counted up whenever code changes what a recipe draws or what truth.py says; recipes_sha sees ranges by itself."""
 SEEN_LEVELS = 8
 """A channel that changes by more, of 255, can be seen."""
 SEEN_SHARE = 0.0005
@@ -222,7 +222,7 @@ def _failed(parent: LabelledClip, clip: SourceClip, recipe: Recipe) -> Labels:
     if recipe.hides_motion:
         components = {name: passed for name, passed in components.items() if passed or name not in PHYSICS}
     components = {name: passed for name, passed in components.items() if not passed or name not in recipe.unknown}
-    broken = failed_physics(clip.states) if recipe.kind == "S" else frozenset[Component]()
+    broken = _newly_broken(parent, clip) if recipe.kind == "S" else frozenset[Component]()
     components |= dict.fromkeys((*recipe.fails, *broken), False)
     level = parent.labels.tc_level
     if recipe.kind != "P":  # other states at the end, or other frames
@@ -234,9 +234,14 @@ def _unchanged(parent: LabelledClip, clip: SourceClip) -> Labels:
     """The parent's labels, where the end of the clip is still worth the same and no physics broke."""
     if _truth_level(clip) != _truth_level(parent.clip):
         raise NotApplicableError("even a mild edit changes how far the task gets in this clip")
-    if not parent.edits and (fresh := failed_physics(clip.states) - failed_physics(parent.clip.states)):
+    if not parent.edits and (fresh := _newly_broken(parent, clip)):
         raise NotApplicableError(f"even a mild edit breaks {', '.join(sorted(fresh))} in this clip")
     return parent.labels
+
+
+def _newly_broken(parent: LabelledClip, clip: SourceClip) -> frozenset[Component]:
+    """What the parent's states show is in its labels, or it is what the simulator did."""
+    return failed_physics(clip.states) - failed_physics(parent.clip.states)
 
 
 def seen_share(before: SourceClip, after: SourceClip) -> float:
