@@ -6,10 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from wm_nodes.ros import readiness
 from wm_nodes.ros.domain import DomainInUseError
 from wm_nodes.ros.graph import Graph, NodeSpec
 from wm_nodes.ros.readiness import NotReadyError
@@ -102,6 +104,15 @@ def test_node_that_never_appears_is_named(ros_domain: int) -> None:
     with Runner(graph(silent), log=None) as runner:
         with pytest.raises((NotReadyError, NodeDiedError), match="absent"):
             runner.wait_ready(3)
+
+
+def test_node_that_never_becomes_active_is_named_with_its_last_words(
+    ros_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(readiness, "OBSERVER_S", 1.0)  # so that a second participant looks, too
+    with Runner(graph(replace(tiny("a", text="good morning"), lifecycle=True), tiny("b")), log=None) as runner:
+        with pytest.raises(NotReadyError, match=r"after 4 s: /wm/a \(seen\): tiny says 'good morning'"):
+            runner.wait_ready(4)
 
 
 def test_ctrl_c_ends_all_nodes_and_the_starter_with_code_0(ros_domain: int, tmp_path: Path) -> None:

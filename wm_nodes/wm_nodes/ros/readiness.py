@@ -10,18 +10,24 @@ from wm_nodes.ros.graph import NodeSpec
 POLL_S = 0.1
 ANSWER_S = 2.0
 """A lifecycle node that does not answer get_state within this time is asked again."""
+OBSERVER_S = 8.0
+"""After this long a new participant looks on. Once, one that had begun to look while a killed node's shared memory lay
+there heard nothing of that node's successor for 30 s; 114 further restarts did not show why."""
 
 
 class NotReadyError(TimeoutError):
-    """Nodes are missing or inactive after the deadline; the text names them and their states."""
+    """Nodes are missing or inactive after the deadline; the text names them and their states. nodes: full names."""
+
+    def __init__(self, text: str, nodes: Sequence[str]) -> None:
+        super().__init__(text)
+        self.nodes = tuple(nodes)
 
 
 class TransitionRefused(NotReadyError):
-    """A node could not configure or activate; its log says why. node: full name."""
+    """A node could not configure or activate; its log says why."""
 
     def __init__(self, node: str, transition: str) -> None:
-        super().__init__(f"{node} refused to {transition}")
-        self.node = node
+        super().__init__(f"{node} refused to {transition}", [node])
 
 
 def wait_ready(
@@ -38,20 +44,22 @@ def wait_ready(
     deadline = time.monotonic() + timeout_s
     waiting = {node.full_name: node for process in nodes for node in process.carried()}
     states = dict.fromkeys(waiting, "not seen")
-    with _observer(domain) as (observer, spin_once):
-        asked: dict[str, tuple[Any, Any, float]] = {}
-        while waiting:
-            check()
-            names = {f"{space.rstrip('/')}/{name}" for name, space in observer.get_node_names_and_namespaces()}
-            for full_name, node in list(waiting.items()):
-                if full_name in names:
-                    states[full_name] = _state(observer, node, asked)
-                if states[full_name] in _wanted(node):
-                    del waiting[full_name]
-            if waiting and time.monotonic() > deadline:
-                found = ", ".join(f"{name} ({states[name]})" for name in waiting)
-                raise NotReadyError(f"not ready after {timeout_s:g} s: {found}; their logs say why")
-            spin_once(POLL_S)
+    while waiting:
+        with _observer(domain) as (observer, spin_once):
+            asked: dict[str, tuple[Any, Any, float]] = {}
+            renewal = time.monotonic() + OBSERVER_S
+            while waiting and time.monotonic() < renewal:
+                check()
+                names = {f"{space.rstrip('/')}/{name}" for name, space in observer.get_node_names_and_namespaces()}
+                for full_name, node in list(waiting.items()):
+                    if full_name in names:
+                        states[full_name] = _state(observer, node, asked)
+                    if states[full_name] in _wanted(node):
+                        del waiting[full_name]
+                if waiting and time.monotonic() > deadline:
+                    found = ", ".join(f"{name} ({states[name]})" for name in waiting)
+                    raise NotReadyError(f"not ready after {timeout_s:g} s: {found}", list(waiting))
+                spin_once(POLL_S)
 
 
 def activate(
@@ -84,7 +92,8 @@ def activate(
                         asked[name] = client.call_async(request)
                 silent = [name for name in managed if name not in asked or not asked[name].done()]
                 if silent and time.monotonic() > deadline:
-                    raise NotReadyError(f"no answer to {transition} within {timeout_s:g} s: {', '.join(silent)}")
+                    text = f"no answer to {transition} within {timeout_s:g} s: {', '.join(silent)}"
+                    raise NotReadyError(text, silent)
                 spin_once(POLL_S)
             for name, future in asked.items():
                 if not future.result().success:

@@ -97,26 +97,33 @@ class Runner:
 
         Raises:
             NodeDiedError: a required node ended meanwhile.
-            NotReadyError: after timeout_s; names the nodes and their states.
+            NotReadyError: after timeout_s; names the nodes, their states and their last words.
         """
-        wait_ready(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
+        try:
+            wait_ready(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
+        except NotReadyError as error:
+            raise self._with_last_words(error) from None
 
     def activate(self, timeout_s: float = 60.0) -> None:
         """Configure and activate the nodes of a graph that was started with autostart false.
 
         Raises:
             NodeDiedError: a required node ended meanwhile.
-            NotReadyError: a node refused (with its last words), or did not answer within timeout_s.
+            NotReadyError: a node refused, or did not answer within timeout_s; with the nodes' last words.
         """
         try:
             activate(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
-        except TransitionRefused as refusal:
-            time.sleep(LAST_WORDS_S)
-            process = next(
-                process for process in self._processes.values()
-                if refusal.node in [node.full_name for node in process.spec.carried()]
-            )  # fmt: skip
-            raise NotReadyError(f"{refusal}: {process.last_words()}") from None
+        except NotReadyError as error:
+            if isinstance(error, TransitionRefused):
+                time.sleep(LAST_WORDS_S)
+            raise self._with_last_words(error) from None
+
+    def _with_last_words(self, error: NotReadyError) -> NotReadyError:
+        words = [
+            process.last_words() for process in self._processes.values()
+            if {node.full_name for node in process.spec.carried()} & {*error.nodes}
+        ]  # fmt: skip
+        return NotReadyError(f"{error}: {'; '.join(words)}", error.nodes)
 
     def check(self) -> None:
         """Raise NodeDiedError if a required node has ended without having been told to."""
