@@ -18,9 +18,9 @@ from wm_nodes.seeding import numpy_stream
 from wm_nodes.types import UInt8Array
 from wm_nodes.world_model import load_starts
 from wm_nodes.world_model.dynamics import done_signal
-from wm_nodes.world_model.parts import in_parallel, parts_of
+from wm_nodes.world_model.imagined_environment import CachedPart, cached_parts
+from wm_nodes.world_model.parts import in_parallel
 from wm_nodes.world_model.precision import compute_context
-from wm_nodes.world_model.transformer import RingCache
 
 
 def measure_stages(config: RunConfig, effort: Effort, model: Path, starts: Path) -> dict[str, dict[str, float]]:
@@ -44,12 +44,9 @@ def measure_stages(config: RunConfig, effort: Effort, model: Path, starts: Path)
 
     latents = tokenizer.encode(images)
     acted, before, after = (torch.from_numpy(array) for array in (actions, states, states))
-    parts = [
-        (rows, action.trunk.new_ring_caches(rows.stop - rows.start, latents.device))
-        for rows in parts_of(IMAGINED_ENVS, latents.device)
-    ]
+    parts = cached_parts(action.trunk, IMAGINED_ENVS, latents.device)
 
-    def advance(part: tuple[slice, list[RingCache]]) -> None:
+    def advance(part: CachedPart) -> None:
         rows, caches = part
         with compute_context(latents.device):
             _, logits = action.advance(latents[rows], acted[rows], before[rows], after[rows], caches)

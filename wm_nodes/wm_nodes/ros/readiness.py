@@ -23,13 +23,6 @@ class NotReadyError(TimeoutError):
         self.nodes = tuple(nodes)
 
 
-class TransitionRefused(NotReadyError):
-    """A node could not configure or activate; its log says why."""
-
-    def __init__(self, node: str, transition: str) -> None:
-        super().__init__(f"{node} refused to {transition}", [node])
-
-
 def wait_ready(
     nodes: Sequence[NodeSpec], *, domain: int, timeout_s: float, check: Callable[[], None] = lambda: None
 ) -> None:
@@ -68,8 +61,7 @@ def activate(
     """Be the lifecycle manager of nodes that were started with autostart false: configure all, then activate all.
 
     Raises:
-        TransitionRefused: a node could not configure or activate.
-        NotReadyError: a node did not answer within timeout_s.
+        NotReadyError: a node could not configure or activate, or did not answer within timeout_s.
         Whatever `check` raises.
     """
     from lifecycle_msgs.msg import Transition
@@ -97,7 +89,7 @@ def activate(
                 spin_once(POLL_S)
             for name, future in asked.items():
                 if not future.result().success:
-                    raise TransitionRefused(name, transition)
+                    raise NotReadyError(f"{name} refused to {transition}", [name])
 
 
 def _wanted(node: NodeSpec) -> tuple[str, ...]:

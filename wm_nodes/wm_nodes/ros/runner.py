@@ -21,7 +21,7 @@ from wm_nodes.ros.domain import DomainInUseError, DomainLock
 from wm_nodes.ros.environment import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES, graph_environment, interpreter
 from wm_nodes.ros.graph import Graph, GraphError
 from wm_nodes.ros.processes import NodeProcess
-from wm_nodes.ros.readiness import NotReadyError, TransitionRefused, activate, wait_ready
+from wm_nodes.ros.readiness import NotReadyError, activate, wait_ready
 from wm_nodes.ros.scenarios import describe_arguments
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
@@ -114,11 +114,10 @@ class Runner:
         try:
             activate(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
         except NotReadyError as error:
-            if isinstance(error, TransitionRefused):
-                time.sleep(LAST_WORDS_S)
             raise self._with_last_words(error) from None
 
     def _with_last_words(self, error: NotReadyError) -> NotReadyError:
+        time.sleep(LAST_WORDS_S)
         words = [
             process.last_words() for process in self._processes.values()
             if {node.full_name for node in process.spec.carried()} & {*error.nodes}

@@ -21,9 +21,17 @@ from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.parts import in_parallel, parts_of
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.text import imagine_goals
-from wm_nodes.world_model.transformer import RingCache
+from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer
 
 GOAL_BATCH = 64
+
+CachedPart = tuple[slice, list[RingCache]]
+"""The rows of a part of the batch, and the history of their environments."""
+
+
+def cached_parts(trunk: SpatioTemporalTransformer, batch: int, device: torch.device) -> list[CachedPart]:
+    """The parts of a batch, each with caches that start empty."""
+    return [(rows, trunk.new_ring_caches(rows.stop - rows.start, device)) for rows in parts_of(batch, device)]
 
 
 def load_starts(path: Path) -> tuple[UInt8Array, FloatArray]:
@@ -63,10 +71,7 @@ class ImaginedEnvironment:
         )
         self._goals = self._imagine_goals() if with_goals and models.text is not None else None
         self._seed, self._num_resets = seed, 0
-        self._parts = parts_of(num_envs, tokenizer.device)
-        self._caches = [
-            models.action.trunk.new_ring_caches(rows.stop - rows.start, tokenizer.device) for rows in self._parts
-        ]
+        self._parts = cached_parts(models.action.trunk, num_envs, tokenizer.device)
         self._latents = self._start_latents[:1].repeat(num_envs, 1, 1)
         self._starts = np.zeros(num_envs, np.int64)
         self._shown = np.repeat(self._images[:1], num_envs, 0)
@@ -87,7 +92,7 @@ class ImaginedEnvironment:
         self._shown[mask] = self._images[chosen]
         self._states[mask] = self._start_states[chosen]
         self._latents[torch.from_numpy(mask)] = self._start_latents[torch.from_numpy(chosen)]
-        for rows, caches in zip(self._parts, self._caches, strict=True):
+        for rows, caches in self._parts:
             for cache in caches:
                 cache.restart(torch.from_numpy(mask[rows]))
         self._steps[mask] = 0
@@ -140,14 +145,14 @@ class ImaginedEnvironment:
         acted, before, after = (torch.from_numpy(array) for array in (actions, self._states, moved))
         keep = torch.from_numpy(valid)[:, None, None]
 
-        def part(item: tuple[slice, list[RingCache]]) -> tuple[Tensor, Tensor, Tensor]:
+        def part(item: CachedPart) -> tuple[Tensor, Tensor, Tensor]:
             rows, caches = item
             with compute_context(tokenizer.device, exact=self._exact):
                 latents, logits = model.advance(self._latents[rows], acted[rows], before[rows], after[rows], caches)
             latents = torch.where(keep[rows], latents, self._latents[rows])
             return latents, logits, tokenizer.decode(latents)
 
-        parts = in_parallel(part, list(zip(self._parts, self._caches, strict=True)))
+        parts = in_parallel(part, self._parts)
         latents, logits, frames = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
         if not torch.isfinite(latents).all():
             raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")

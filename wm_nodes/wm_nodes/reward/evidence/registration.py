@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.reward.evidence.pictures import GRID
+from wm_nodes.reward.evidence.pictures import GRID, shrunk
 from wm_nodes.types import UInt8Array
 
 BLUR_PX = 1.2
@@ -29,8 +29,7 @@ def registration_evidence(greys: UInt8Array, scene: NDArray[np.bool_]) -> dict[s
     Args:
         greys: uint8 (1 + T, H, W), the reference frame first. scene: bool (1 + T, GRID, GRID), only scene is there.
     """
-    small = (cv2.resize(grey.astype(np.float32), (GRID, GRID), interpolation=cv2.INTER_AREA) for grey in greys)
-    images = np.stack([cv2.GaussianBlur(image, (0, 0), BLUR_PX) for image in small])
+    images = np.stack([cv2.GaussianBlur(shrunk(grey, GRID), (0, 0), BLUR_PX) for grey in greys])
     around = np.ones((5, 5), np.uint8)  # the blur spreads what is no scene
     open_cells = np.stack([cv2.erode(mask.astype(np.uint8), around, borderValue=1) for mask in scene])
     moves, left = camera_moves(images, (open_cells[1:] * open_cells[:-1]).astype(np.float32))
