@@ -1,6 +1,6 @@
 """DynDiff-GRPO against its rivals on a toy world: diversity, learning, cost of the KL; every arm on one learner.
 
-python3 launch_scripts/benchmark_dyndiff.py diversity|learning|ablations|hacking|cost|base [--json FILE]
+python3 launch_scripts/benchmark_dyndiff.py diversity|learning|ablations|hacking|cost|clips|base [--json FILE]
 """
 
 import sys

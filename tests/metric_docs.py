@@ -17,6 +17,8 @@ def documented(section: str) -> set[str]:
 
 
 def written(line: dict[str, object], scores: set[str]) -> set[str]:
-    """The names in a line of metrics.jsonl as the document has them: <k> for an update, <score> for an alarm."""
+    """The names in a line of metrics.jsonl as the document has them: <k> of an update or step, <score> of a score."""
     names = {re.sub(r"_\d+$", "_<k>", name) for name in line if name not in ("section", "step")}
-    return {"hacked_<score>" if name.removeprefix("hacked_") in scores else name for name in names}
+    for kind in ("hacked", "reward"):
+        names = {f"{kind}_<score>" if name.removeprefix(f"{kind}_") in scores - {name} else name for name in names}
+    return names

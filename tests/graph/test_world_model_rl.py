@@ -245,6 +245,36 @@ def test_training_again_names_a_buffer_that_is_gone_or_another_one(
         shutil.move(tmp_path / "checkpoint", run_dir / CHECKPOINT)
 
 
+@pytest.mark.slow
+def test_recordings_that_are_named_stand_in_for_new_episodes(run_dir: Path, tmp_path: Path, ros_domain: int) -> None:
+    """Those of a run, from a folder of their own, make that run's weights again."""
+    kept = {name: shutil.copytree(run_dir / "data" / name, tmp_path / name) for name in ("train", "heldout")}
+    named = [f"--bags={kept['train'] / 'shard_00000000'}", f"--heldout-bags={kept['heldout'] / 'shard_00500000'}"]
+    done = start([*ARGUMENTS, *named, "--run-dir", str(tmp_path / "run")], ros_domain)
+    assert done.returncode == 0 and "recordings" in done.stdout, done.stdout + done.stderr
+    assert (tmp_path / "run" / version_uri(4)).read_bytes() == (run_dir / version_uri(4)).read_bytes()
+    assert main(["rescore", str(tmp_path / "run")]) == 0
+    other = start([*ARGUMENTS, "--run-dir", str(tmp_path / "run")], ros_domain)
+    assert other.returncode == 2 and "begun with another configuration" in " ".join(other.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--bags", "a"], "--bags and --heldout-bags go together"),
+        (["--heldout-bags", "a"], "--bags and --heldout-bags go together"),
+        (["--bags", "a", "b", "--heldout-bags", "./b"], "b cannot be trained on and held out"),
+        (["--bags", "nowhere", "--heldout-bags", "neither"], "nowhere is no recording; name bags"),
+    ],
+)
+def test_recordings_that_cannot_be_used_end_with_one_clear_line(
+    options: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["--preset", "smoke", *options, "--run-dir", str(tmp_path / "run")]) == 2
+    assert words in " ".join(capsys.readouterr().out.split())
+
+
 def test_no_kept_buffer_is_refused_before_anything_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

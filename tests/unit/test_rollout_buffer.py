@@ -36,6 +36,7 @@ from wm_nodes.video_model import (
     step_noise,
     transition,
 )
+from wm_nodes.video_model.sampling import normalised_noise
 
 WIDE = (8, 5, 16, 16)
 """D = 8192 with one given frame."""
@@ -94,13 +95,28 @@ def test_the_stored_noise_or_its_seed_gives_the_mean_of_every_step_back(arm: str
 
 @pytest.mark.parametrize("t", [0.9, 0.5, 0.2])
 def test_noise_kept_in_bfloat16_costs_a_kl_below_3e_6_and_a_mean_kept_so_more_than_ten_times_that(t: float) -> None:
-    """T22."""
-    zeta = randn(1, 8192, seed=1)
-    assert float(mean_kl(zeta, zeta.bfloat16().float())) < 3e-6
-    x, v = randn(1, 8, 4, 16, 16, seed=2), randn(1, 8, 4, 16, 16, seed=3)
+    """T22. The noise is that of a step whose end was rounded to bfloat16 first."""
+    x, v, z = (randn(1, 8, 4, 16, 16, seed=seed) for seed in (2, 3, 1))
     law = step(x, v, times(t), times(0.8 * t), StepContext(x[:, :, :0], 0.9), SamplerSettings())
+    zeta = normalised_noise((law.mean + law.std * z).bfloat16().float(), law, 0).flatten(1)
+    assert float((zeta - z.flatten(1)).abs().max()) > 1e-4, "rounding the state has changed its noise"
+    assert float(mean_kl(zeta, zeta.bfloat16().float())) < 3e-6
     off = (law.mean - law.mean.bfloat16().float()) / law.std
     assert float(off.square().mean() / 2) > 3e-5
+
+
+def test_a_rollout_keeps_its_noise_in_bfloat16_where_asked_and_nothing_else_of_it_changes() -> None:
+    """T22; the default for large models."""
+    model = Analytic(swirl)
+    exact, rounded = (
+        toy_buffer(model, toy_rollout_settings(storage_dtype="bfloat16", noise_store=store), groups=1, size=2)
+        for store in ("zeta", "zeta_bfloat16")
+    )
+    assert exact.rollout.zeta is not None and rounded.rollout.zeta is not None
+    assert torch.equal(rounded.rollout.zeta, exact.rollout.zeta.bfloat16())
+    assert 2 * rounded.rollout.zeta.nbytes == exact.rollout.zeta.nbytes
+    assert torch.equal(rounded.rollout.states, exact.rollout.states)
+    assert_same(RolloutBuffer.from_bytes(rounded.to_bytes()), rounded)
 
 
 def test_a_mask_and_seeds_take_less_than_a_tenth_of_a_mask_and_the_noise_at_16_channels() -> None:
@@ -172,6 +188,7 @@ def test_a_buffer_survives_its_bytes_bit_for_bit(storage: str, given: int) -> No
     assert list(again.rewards) == sorted(again.rewards), "in one order on every rank"
     assert again.valid.tolist() == [True] * 5 + [False] + [True] * 2
     assert (again.policy_version, again.iteration, again.rollout.steps) == (3, 2, (0, 1, 2, 3, 4))
+    assert torch.equal(again.rollout.times, settings.times), "readable without the settings of its run"
 
 
 @pytest.mark.parametrize("changes", [{"noise_store": "seed"}, {"arm": "ode"}, {"num_steps": 1}, {"arm": "cps"}])
@@ -243,6 +260,7 @@ def test_how_a_rollout_is_batched_or_its_noise_is_kept_does_not_make_it_another_
     assert (
         config_hash(toy_rollout_settings(micro_batch=3))
         == config_hash(toy_rollout_settings(noise_store="seed"))
+        == config_hash(toy_rollout_settings(noise_store="zeta_bfloat16"))
         == plain
     )
 

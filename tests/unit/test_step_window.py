@@ -1,7 +1,5 @@
 """Which steps are stochastic and which of them train: windows of Mix-GRPO and Flow-GRPO-Fast, step fractions."""
 
-from itertools import pairwise
-
 import pytest
 import torch
 from torch import Tensor
@@ -33,7 +31,7 @@ def test_a_progressive_window_moves_on_by_one_each_period_and_rolls_back_to_its_
     assert window("progressive", 24) == [0, 1, 2, 3] and window("progressive", 25) == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("strategy", ["progressive", "random", "decay", "fast"])
+@pytest.mark.parametrize("strategy", ["progressive", "random", "decay", "exp_decay", "fast"])
 def test_a_window_is_never_shorter_than_its_size_and_never_holds_the_last_step(strategy: str) -> None:
     """Mix-GRPO's own state machine gives lengths 4, 3, 2, 1, 0 near the end."""
     for num_steps in (6, 10, 25, 50):
@@ -42,7 +40,7 @@ def test_a_window_is_never_shorter_than_its_size_and_never_holds_the_last_step(s
             assert len(steps) == 4 and steps == list(range(steps[0], steps[0] + 4)) and steps[-1] < num_steps - 1
 
 
-@pytest.mark.parametrize("strategy", ["progressive", "random", "decay", "fast"])
+@pytest.mark.parametrize("strategy", ["progressive", "random", "decay", "exp_decay", "fast"])
 def test_a_window_as_long_as_all_stochastic_steps_is_all_of_them(strategy: str) -> None:
     assert window(strategy, 77, num_steps=5) == [0, 1, 2, 3]
     assert window(strategy, 77, num_steps=3) == [0, 1]
@@ -61,14 +59,23 @@ def test_the_fast_window_stays_in_the_first_half() -> None:
     assert found == {(k, k + 1) for k in range(4)}
 
 
-def test_the_decaying_window_stays_shorter_from_step_13_on() -> None:
-    """25 steps, window of 4, period 20: starts 0 to 13 last 20 iterations, 14 lasts 18, 20 lasts 20 e^-0.7 = 10."""
-    starts = [window("decay", i, num_steps=25, period=20)[0] for i in range(2000)]
-    assert starts[: 14 * 20] == [i // 20 for i in range(14 * 20)]
-    first = starts[: starts.index(0, 20)]
-    lengths = [first.count(start) for start in range(21)]
-    assert lengths[14] == 18 and lengths[20] == 10 and len(first) == sum(lengths)
-    assert all(a >= b for a, b in pairwise(lengths)) and starts[len(first)] == 0
+def stays(strategy: str, *, num_steps: int, period: int) -> list[int]:
+    """Iterations at each start, 0 first, until the window is back at its start."""
+    starts = [window(strategy, i, num_steps=num_steps, period=period)[0] for i in range(2000)]
+    first = starts[: starts.index(0, period)]
+    assert first == sorted(first) and starts[len(first)] == 0
+    return [first.count(start) for start in range(num_steps - 4)]
+
+
+def test_an_exponentially_decaying_window_stays_shorter_from_step_13_on() -> None:
+    """25 steps, window of 4, period 20: 20 e^(-k / 10) iterations, rounded up, at the k-th start after the 13th."""
+    assert stays("exp_decay", num_steps=25, period=20) == [20] * 14 + [19, 17, 15, 14, 13, 11, 10]
+
+
+def test_a_decaying_window_stays_linearly_shorter_towards_a_quarter_of_its_period() -> None:
+    """12 steps, window of 4, period 20: 20 (1 - l / 10) + 5 l / 10 at start l, rounded down."""
+    assert stays("decay", num_steps=12, period=20) == [20, 18, 17, 15, 14, 12, 11, 9]
+    assert stays("decay", num_steps=6, period=1) == [1, 1]
 
 
 @pytest.mark.parametrize("bad", [{"size": 0}, {"period": 0}])
@@ -121,5 +128,5 @@ def test_a_selection_counts_positions_among_the_stochastic_steps() -> None:
 
 @pytest.mark.parametrize(("steps", "min_s"), [([], 0.0), ([0, 1], 0.9)])
 def test_no_step_that_could_train_is_an_error_that_says_what_to_do(steps: list[int], min_s: float) -> None:
-    with pytest.raises(ValueError, match=r"no step can train: .*take more sampler steps, or lower train.min_s"):
+    with pytest.raises(ValueError, match=r"no step can train: .*take more sampler steps, or lower grpo.min_s"):
         select_steps(times(1, 0.5, 0.2, 0), steps, 2, fraction=1.0, select="random", min_s=min_s, seed=0, iteration=0)

@@ -6,6 +6,7 @@ Parity is against diffusers' own pipelines run from noise to latents, never agai
 import copy
 import json
 import logging
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -612,6 +613,24 @@ class TestFolder:
             assert doctor(["--public", str(folder), *small, *more]) == 0, capsys.readouterr().out
         assert doctor(["--public", str(tmp_path), *small]) == 2
         assert str(tmp_path) in capsys.readouterr().out.replace("\n", "")
+
+    def test_the_documented_training_runs_as_written_and_its_adapter_loads(self, folder: Path, tmp_path: Path) -> None:
+        page = (Path(__file__).parents[2] / "wm_nodes" / "docs" / "dyndiff.md").read_text()
+        (block,) = re.findall(r"## Training a public model.*?```python\n(.*?)```", page, re.DOTALL)
+        small = {"rollout.num_steps": 4, "groups.group_size": 4, "grpo.advantage.best_of_n": 2}
+        scope: dict[str, Any] = {
+            "folder": folder, "dtype": "bfloat16", "device": "cpu", "frames": picture(), "prompt": "push the cube",
+            "settings": {**small, "grpo.learning_rate": 1e-3}, "latent_frames": FRAMES, "iterations": 2,
+            "out": tmp_path, "reward": lambda clips: clips.double().mean((1, 2, 3, 4)),
+        }  # fmt: skip
+        exec(block, scope)
+        assert scope["report"].kept == 2 and scope["learner"].version == 4
+        trained = dict(scope["public"].velocity.named_parameters())
+        other = load_public_model(folder, LoadSettings(dtype="bfloat16", text=False)).velocity
+        load_lora(other, tmp_path)
+        adapter = {name: p for name, p in other.named_parameters() if "lora_B" in name}
+        assert adapter and all(torch.equal(p, trained[name]) for name, p in adapter.items())
+        assert any(float(p.detach().abs().max()) > 0 for p in adapter.values()), "it starts as zeros"
 
     def test_bfloat16_checkpointing_and_no_text_encoder(self, folder: Path) -> None:
         both = load_public_model(folder, LoadSettings(dtype="bfloat16", max_tokens=12))

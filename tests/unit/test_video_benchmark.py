@@ -1,6 +1,8 @@
 """The DynDiff benchmark: fair plans, honest intervals, an alarm that a hacked reward raises, and its command."""
 
+import hashlib
 import json
+import shlex
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -9,15 +11,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from wm_nodes.benchmark import video_cost
 from wm_nodes.benchmark.moving_disc import draw_scenes
 from wm_nodes.benchmark.video_arms import dyndiff, learning_arms, sampler_arm
-from wm_nodes.benchmark.video_cli import LEARNER, load_base, main
+from wm_nodes.benchmark.video_cli import BASE, LEARNER, load_base, main
 from wm_nodes.benchmark.video_comparison import compare_arms, paired_interval, value
-from wm_nodes.benchmark.video_cost import clocked, toy_rollout
-from wm_nodes.benchmark.video_learning import LearningPlan, alarms, evaluate, sample_groups, train_arm
+from wm_nodes.benchmark.video_cost import ANCHORS, clocked, toy_rollout
+from wm_nodes.benchmark.video_learning import LearningPlan, alarms, evaluate, group_spread, sample_groups, train_arm
 from wm_nodes.benchmark.video_plots import family_of
 from wm_nodes.benchmark.video_trials import ablation_trials, hacking_trials
+from wm_nodes.config.shipped import PRETRAINED
 
 SHORT = LearningPlan(iterations=2, scenes=1, eval_scenes=4, eval_every=1)
 
@@ -140,18 +145,54 @@ def test_ablations_go_on_where_their_file_stops_and_refuse_another_plan(
     assert "take another file" in capsys.readouterr().out.replace("\n", " ")
 
 
-def test_diversity_learning_and_hacking_draw_a_picture_beside_their_file(tmp_path: Path) -> None:
-    short = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--seeds", "0", "1"]
-    calls = {
-        "diversity": ["--contexts", "2", "--group-size", "2", "--arms", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"],
-        "learning": [*short, "--arms", "CPS 0.6", "DynDiff 0.6 gated"],
-        "hacking": [*short, "--arms", "honest reward"],
-    }
-    for claim, extra in calls.items():
-        path = tmp_path / f"{claim}.json"
-        assert main([claim, *extra, "--json", str(path)]) == 0
-        assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
-        assert json.loads(path.read_text())["rows"]
+SHORT_CALL = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--seeds", "0", "1"]
+CALLS = {
+    "diversity": ["--contexts", "2", "--group-size", "2", "--arms", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"],
+    "learning": [*SHORT_CALL, "--arms", "CPS 0.6", "DynDiff 0.6 gated"],
+    "ablations": [*SHORT_CALL, "--arms", "base", "no KL"],
+    "hacking": [*SHORT_CALL, "--arms", "honest reward"],
+    "cost": ["--repeats", "1"],
+}
+
+
+@pytest.mark.parametrize("claim", CALLS)
+def test_every_file_says_how_it_was_made_and_lies_beside_its_picture(
+    claim: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(video_cost, "SCENES", 1)
+    monkeypatch.setattr(video_cost, "GROUP", 4)
+    path = tmp_path / f"{claim}.json"
+    assert main([claim, *CALLS[claim], "--json", str(path)]) == 0
+    assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads(path.read_text())
+    assert found["command"] == shlex.join(["benchmark_dyndiff.py", claim, *CALLS[claim], "--json", str(path)])
+    assert found["sha256"]["base"] == hashlib.sha256(BASE.read_bytes()).hexdigest()
+    if claim == "cost":
+        assert {(row["model"], row["anchor"]) for row in found["rows"]} == {
+            (model, anchor) for model in ("moving disc", "PushCube") for anchor in ANCHORS
+        }
+        assert found["learner"]["kl"]["beta"] == LEARNER.kl.beta
+        kl = {(row["model"], row["anchor"]): row["kl_s"] / row["forward_s"] for row in found["rows"]}
+        assert all(kl[model, "buffer"] < 0.1 < kl[model, "frozen"] for model in ("moving disc", "PushCube"))
+    else:
+        assert {arm["name"] for arm in found["arms"]} == {row["arm"] for row in found["rows"]}
+        assert all(arm["rollout"]["num_steps"] == 10 and arm["grpo"]["kl"] for arm in found["arms"])
+
+
+def test_a_training_keeps_the_spread_of_its_rollouts_and_the_noise_of_steps_that_a_window_leaves() -> None:
+    arm = {arm.name: arm for arm in learning_arms(LEARNER)}["CPS 0.6, window"]
+    moving = replace(arm, window=replace(arm.window, period=1))
+    found = train_arm(load_base(), moving, SHORT, seed=0)["buffers"]
+    assert found["noise_share_step_0"][0] == pytest.approx(0.809, abs=1e-3) and found["noise_share_step_0"][1] is None
+    assert found["noise_share_step_4"][0] is None and found["noise_share_step_4"][1] == pytest.approx(0.809, abs=1e-3)
+    assert all(0 < value < 2 for value in found["rollout_diversity"])
+    buffer, _ = sample_groups(load_base(), moving, draw_scenes(2, 0, "test"), 3, 0, 0, 0)
+    rewards = torch.tensor([1.0, 2, 3, 5, 5, 5], dtype=torch.float64)
+    spread = group_spread(buffer.with_rewards({"total": rewards}), 3)
+    assert spread["rollout_reward_std"] == pytest.approx((2 / 3) ** 0.5 / 2) and spread["rollout_diversity"] > 0.01
+    alike = replace(buffer.rollout, latents=buffer.rollout.latents[::3].repeat_interleave(3, 0))
+    equal = replace(buffer, rollout=alike).with_rewards({"total": rewards})
+    assert group_spread(equal, 3)["rollout_diversity"] == pytest.approx(0, abs=1e-6)
 
 
 def test_a_clock_counts_the_time_inside_the_functions_it_names_and_leaves_them_as_they_were() -> None:
@@ -173,3 +214,12 @@ def test_a_rollout_reports_the_share_of_its_mask_and_of_its_caching() -> None:
 def test_an_unknown_arm_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["learning", "--arms", "CPS 7"]) == 2
     assert "unknown arms CPS 7" in capsys.readouterr().out
+
+
+def test_a_base_of_another_architecture_and_a_count_of_zero_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    other = PRETRAINED / "table_top_cube" / "video_model" / "network.safetensors"
+    assert main(["diversity", "--base", str(other)]) == 2
+    assert "of another architecture" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(SystemExit):
+        main(["diversity", "--contexts", "0"])
+    assert "'0' is no whole number from 1 on" in capsys.readouterr().err

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 import torch.multiprocessing as mp
+from safetensors.torch import save
 from torch import Tensor
 from torch.testing import assert_close
 from video_toys import (
@@ -108,6 +109,16 @@ def test_from_seeds_alone_the_ratio_is_one_to_five_digits() -> None:
     assert buffer.rollout.zeta is None
     first, second = learner.train(buffer).updates
     assert first.clip_low_share == first.clip_high_share == 0.0 and first.kl < 1e-11 < second.kl
+
+
+def test_from_noise_kept_in_bfloat16_no_ratio_leaves_the_clip_range_and_the_kl_is_below_3e_6() -> None:
+    """T22, D = 8192; a clip range of 1e-6 would be left."""
+    settings = toy_rollout_settings(micro_batch=8, storage_dtype="bfloat16", noise_store="zeta_bfloat16")
+    for clip, left in ((1e-4, False), (1e-6, True)):
+        learner = make(settings, network=tiny_network(8), clip_low=clip, clip_high=clip)
+        first, second = learner.train(buffer_of(learner, shape=(8, 5, 16, 16))).updates
+        assert (first.clip_low_share + first.clip_high_share > 0) == left
+        assert 0 < first.kl < 3e-6 < second.kl
 
 
 @pytest.mark.parametrize("cfg", [1.0, 2.5])
@@ -287,7 +298,7 @@ def kl_by_version(rounds: int = 4, **changes: Any) -> list[float]:
     return found
 
 
-@pytest.mark.parametrize("mode", ["mean", "velocity"])
+@pytest.mark.parametrize("mode", MODES)
 def test_each_anchor_is_where_it_says(mode: str) -> None:
     """Versions 0 to 7, two to a buffer. The first KL after an anchor moved to the weights is 0."""
     zero = {
@@ -383,6 +394,38 @@ def test_a_model_that_does_not_say_which_weights_are_its_condition_is_refused_an
     assert model.offset.requires_grad
 
 
+@pytest.mark.parametrize("mode", ["logk2", "logk3"])
+def test_a_log_space_kl_measures_against_its_own_anchor(mode: str) -> None:
+    """From (12): log r of the weights now to those of the anchor, at the stored x_s; not to those that sampled."""
+    learner = make(kl=KlSettings(mode, 0.5, "frozen"))  # type: ignore[arg-type]
+    anchor = tiny_network()
+    with torch.no_grad():
+        for parameter in learner.parameters:
+            parameter.add_(0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3)))
+    buffer = buffer_of(learner)  # sampled by the weights now: against the buffer the KL is 0
+    found = learner.gradients(buffer, all_rows(buffer), SIGNAL)["kl"] / 40
+    logs = torch.tensor([
+        float(_logprob(learner.model, learner, buffer, i) - _logprob(anchor, learner, buffer, i)) for i in range(40)
+    ], dtype=torch.float64)  # fmt: skip
+    wanted = logs.square() / 2 if mode == "logk2" else (-logs).exp() - 1 + logs
+    assert found == pytest.approx(float(wanted.mean()), rel=1e-2) and found > 1e-9
+
+
+def _logprob(model: torch.nn.Module, learner: GrpoLearner, buffer: RolloutBuffer, row: int) -> Tensor:
+    """(14) of one stored transition under `model`, float64."""
+    rows, times = all_rows(buffer), learner.rollout.times
+    video, position = int(rows.videos[row]), int(rows.positions[row])
+    k, one = buffer.rollout.steps[position], slice(video, video + 1)
+    condition = buffer.condition.rows(one)
+    x_t, x_s = buffer.rollout.state(k)[one], buffer.rollout.state(k + 1)[one]
+    context = StepContext(condition.frames, float(times[1]), buffer.rollout.mask[one, position])
+    t, s = times[k].expand(1), times[k + 1].expand(1)
+    with torch.no_grad():
+        law = step(x_t, model(x_t, t, condition), t, s, context, learner.rollout.sampler)
+    x, mean, std = (value.expand_as(x_t)[:, :, 1:].flatten(1).double() for value in (x_s, law.mean, law.std))
+    return gaussian_logprob(x, mean, std)
+
+
 def test_a_larger_kl_weight_keeps_the_model_nearer_to_its_anchor() -> None:
     ends = [
         kl_by_version(6, kl=KlSettings("mean", beta, "frozen"), clip_low=0.2, clip_high=0.2)[-1]
@@ -411,6 +454,48 @@ def test_mixed_advantages_do_not_depend_on_a_reward_s_unit_and_mixed_rewards_do(
     for mix, (first, second) in trained.items():
         same = all(torch.equal(value, second[name]) for name, value in first.items())
         assert same == (mix == "advantage")
+
+
+def test_win_rates_train_by_rank_alone_whatever_the_scale_of_the_reward() -> None:
+    """Pref-GRPO: rewards and their cubes have one order, so they train alike; the rewards themselves do not."""
+    trained: dict[str, list[dict[str, Tensor]]] = {"win_rate": [], "reward": []}
+    rewards = torch.tensor([0.0, 1, 2, 5, 3, 7, -1, 4], dtype=torch.float64)
+    for source, found in trained.items():
+        for values in (rewards, rewards**3):
+            learner = make(advantage=AdvantageSettings(source=source))  # type: ignore[arg-type]
+            report = learner.train(buffer_of(learner).with_rewards({"total": values}))
+            assert report.reward_mean == pytest.approx(float(values.mean())), "the log has the reward, not the rank"
+            found.append(weights(learner.model))
+    for source, (first, second) in trained.items():
+        same = all(torch.equal(value, second[name]) for name, value in first.items())
+        assert same == (source == "win_rate")
+
+
+def test_win_rates_are_of_each_reward_where_advantages_are_mixed_and_leave_invalid_videos_out() -> None:
+    learner = GrpoLearner(
+        tiny_network(), grpo(advantage=AdvantageSettings(mix="advantage", source="win_rate")),
+        toy_rollout_settings(micro_batch=8), seed=0, reward_weights={"a": 1.0, "b": 1.0},
+    )  # fmt: skip
+    a = torch.tensor([0.0, 1, 2, math.nan, 0, 0, 0, 0], dtype=torch.float64)
+    b = torch.tensor([0.0, 100, 1, 3, 0, 0, 0, 0], dtype=torch.float64)
+    buffer = buffer_of(learner).with_rewards({"a": a, "b": b, "total": a + b})
+    found = learner._advantages(a + b, buffer, torch.tensor([1, 1, 1, 0, 1, 1, 1, 1]).bool())
+    ranks = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
+    normal = (ranks - 0.5) / ranks.std(correction=0)
+    assert_close(found.advantages_N[:3], (normal + normal[torch.tensor([0, 2, 1])]) / 2)
+    assert not found.advantages_N[3:].any() and found.kept_N.tolist() == [True] * 3 + [False] * 5
+
+
+def test_the_floor_of_a_group_s_spread_is_a_setting() -> None:
+    rewards = torch.tensor([0.0, 0.01, 0.0, 0.01, 0.0, 1.0, 0.0, 1.0])
+    for floor, flat in ((1e-6, 0.0), (0.1, 0.5)):
+        learner = make(advantage=AdvantageSettings(floor=floor))
+        assert learner.train(buffer_of(learner).with_rewards({"total": rewards})).zero_std_ratio == flat
+
+
+def test_a_recomputed_mask_warns_that_it_is_an_ablation() -> None:
+    with pytest.warns(UserWarning, match="recompute is an ablation.*Otherwise take cached"):
+        make(mask_source="recompute")
 
 
 def test_one_running_deviation_for_several_advantages_is_refused() -> None:
@@ -583,6 +668,30 @@ def test_a_checkpoint_of_another_seed_or_architecture_is_refused(tmp_path: Path)
     with pytest.raises(WeightsError, match="another architecture"):
         wider.load(tmp_path / "state")
     assert_equal(before, weights(wider.model))
+
+
+@pytest.mark.parametrize(
+    ("changes", "knob"), [({"kl": KlSettings(anchor="frozen")}, "kl.anchor"), ({"ema_decay": 0.9}, "ema_decay")]
+)
+def test_a_checkpoint_without_the_anchor_or_average_that_a_run_has_is_refused(
+    tmp_path: Path, changes: dict[str, Any], knob: str
+) -> None:
+    """An anchor that is missing would be the current weights: a KL of 0 for ever."""
+    make().save(tmp_path / "plain", iteration=0)
+    make(**changes).save(tmp_path / "other", iteration=0)
+    with pytest.raises(ValueError, match=f"another grpo.{knob}"):
+        make(**changes).load(tmp_path / "plain")
+    with pytest.raises(ValueError, match=f"another grpo.{knob}"):
+        make().load(tmp_path / "other")
+
+
+def test_a_damaged_checkpoint_and_other_tensors_are_refused(tmp_path: Path) -> None:
+    make().save(tmp_path / "state", iteration=0)
+    whole = (tmp_path / "state").read_bytes()
+    for name, data in (("cut", whole[: len(whole) // 2]), ("short", whole[:4]), ("other", save({"a": torch.ones(1)}))):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(WeightsError, match="no complete checkpoint of GRPO"):
+            make().load(tmp_path / name)
 
 
 @pytest.mark.parametrize("changes", STATEFUL)

@@ -34,7 +34,9 @@ def train(run: VideoRun, totals: list[float]) -> None:
     for total in totals:
         buffer = toy_buffer(run.network, run.config.rollout, version=run.version, iteration=run.iterations)
         spread = torch.tensor([-1.0, 1.0, -1.0, 1.0]).repeat(2)
-        run.train(buffer.with_rewards({"total": total + spread}))
+        scored = buffer.with_rewards({"total": total + spread})
+        raw = {"tracking": spread, "psnr_db": torch.full((8,), math.nan)}
+        run.train(replace(scored, rewards={**scored.rewards, **raw}))
 
 
 def lines(rewards: list[float | None], **scores: list[float]) -> list[dict[str, object]]:
@@ -114,6 +116,21 @@ def test_held_out_scores_are_written_every_so_many_buffers_and_the_alarm_with_th
     assert last["hacked_tracking"] == pytest.approx(-0.1) and "hacked_psnr_db" not in last
     assert written(last, SCORES) <= documented("section `heldout`")
     assert written(read_metrics(tmp_path, "grpo")[0], SCORES) == documented("section `grpo`")
+
+
+def test_raw_rewards_and_the_noise_of_each_step_are_in_the_log(tmp_path: Path, network: VideoNetwork) -> None:
+    run = VideoRun(network, config(every=0), tmp_path)
+    buffer = toy_buffer(network, run.config.rollout)
+    raw = {"total": torch.arange(8.0), "tracking": torch.arange(8.0), "object_cm": 10 * torch.arange(8.0)}
+    raw["object_cm"][7] = math.nan
+    scored = replace(buffer.with_rewards({"total": raw["total"]}), rewards=raw)
+    run.train(scored)
+    run.close()
+    (line,) = read_metrics(tmp_path, "grpo")
+    assert (line["reward_mean"], line["reward_tracking"], line["reward_object_cm"]) == (3.5, 3.5, 30.0)
+    shares = [float(str(line[f"noise_share_step_{k}"])) for k in range(5)]
+    assert shares == pytest.approx(buffer.rollout.noise_share.tolist()) and len(set(shares)) > 1
+    assert line["noise_share"] == pytest.approx(math.sqrt(sum(share**2 for share in shares) / 5))
 
 
 def test_without_an_evaluation_setting_nothing_is_asked(tmp_path: Path, network: VideoNetwork) -> None:

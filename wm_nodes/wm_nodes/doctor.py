@@ -34,8 +34,9 @@ def main(argv: Sequence[str]) -> int:
     try:
         config = load_video_config(arguments.preset, dict(parse_override(text) for text in arguments.set))
         model, condition, shape, config = _patient(arguments, config)
-        findings = examine(model, condition, shape, config.rollout, config.grpo, seed=config.seed)
-    except (ValueError, OSError, ImportError) as error:
+        videos = config.groups.contexts * config.groups.group_size
+        findings = examine(model, condition, shape, config.rollout, config.grpo, seed=config.seed, buffer_videos=videos)
+    except (ValueError, OSError, ImportError, FloatingPointError) as error:
         console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
         return 2
     table = Table(title=f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)")

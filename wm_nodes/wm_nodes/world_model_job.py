@@ -78,7 +78,12 @@ def run(arguments: argparse.Namespace) -> ClipSummary:
     scene = load_config("cpu", {"task": config.task, "seed": config.seed})
     probe = load_probe(shipped_model(config.task))
     shipped = None if arguments.from_scratch else shipped_video_model(config)
-    bags, heldout_bags = _data(scene, config.context_episodes if shipped else config.data_episodes, run_dir, stage)
+    if arguments.bags:
+        stage(f"{len(arguments.bags)} + {len(arguments.heldout_bags)} held-out recordings")
+        bags = linked(arguments.bags, run_dir / "data" / "train")
+        heldout_bags = linked(arguments.heldout_bags, run_dir / "data" / "heldout")
+    else:
+        bags, heldout_bags = _data(scene, config.context_episodes if shipped else config.data_episodes, run_dir, stage)
     heldout = load_clips(heldout_bags, config.model.stride)
     stage("video model: " + ("the shipped one" if shipped else "flow matching"))
     clips = load_clips(bags, config.model.stride)
@@ -95,6 +100,24 @@ def run(arguments: argparse.Namespace) -> ClipSummary:
             str(recorded_bags(run_dir)[-1]), _command(), stage.minutes,
         )
     )  # fmt: skip
+
+
+def linked(bags: Sequence[Path], folder: Path) -> list[Path]:
+    """Links to recordings of the simulator, named like the shards of episodes that a run collects itself.
+
+    Raises:
+        ValueError: a recording is missing, or the folder links to another one.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    links = [folder / f"shard_{index:08d}" for index in range(len(bags))]
+    for link, bag in zip(links, bags, strict=True):
+        if not bag.is_dir():
+            raise ValueError(f"{bag} is no recording; name bags of simulator episodes, e.g. RUN/data/train/shard_*")
+        if not link.is_symlink():
+            link.symlink_to(bag.resolve(), target_is_directory=True)
+        if link.resolve() != bag.resolve():
+            raise ValueError(f"{link} is of {link.resolve()}, not {bag}; use a new run folder")
+    return links
 
 
 def _data(scene: RunConfig, episodes: int, run_dir: Path, stage: Stages) -> tuple[list[Path], list[Path]]:
@@ -137,6 +160,10 @@ def _post_train(
 def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
     if arguments.keep_buffers < 1:
         raise ValueError(f"--keep-buffers must be at least 1, got {arguments.keep_buffers}")
+    if bool(arguments.bags) != bool(arguments.heldout_bags):
+        raise ValueError("--bags and --heldout-bags go together: what is trained on, and what is held out")
+    if twice := {bag.resolve() for bag in arguments.bags} & {bag.resolve() for bag in arguments.heldout_bags}:
+        raise ValueError(f"{min(twice)} cannot be trained on and held out; name other --heldout-bags")
     overrides: dict[str, Any] = dict(parse_override(text) for text in arguments.set)
     if arguments.seed is not None:
         overrides["seed"] = arguments.seed
@@ -145,7 +172,11 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
         check_judge(config.judge)
     run_dir = open_run_dir(
         arguments.run_dir, "world_model_rl", dump_video_config(config),
-        begun_with=["--from-scratch"] if arguments.from_scratch else [],
+        begun_with=[
+            *(["--from-scratch"] if arguments.from_scratch else []),
+            *(f"--bags {bag.resolve()}" for bag in arguments.bags),
+            *(f"--heldout-bags {bag.resolve()}" for bag in arguments.heldout_bags),
+        ],
     )  # fmt: skip
     return config, run_dir
 
@@ -168,6 +199,12 @@ def _parser() -> argparse.ArgumentParser:
         "--from-scratch", action="store_true",
         help="train a video model of your own even where one with these settings is shipped (half an hour on one core)",
     )  # fmt: skip
+    parser.add_argument(
+        "--bags", type=Path, nargs="+", default=[], metavar="BAG",
+        help="recorded simulator episodes to train on and to draw contexts from in place of new ones, e.g. those of a "
+        "run of online_rl.py: RUN/bags/heldout/shard_*",
+    )  # fmt: skip
+    parser.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and those held out")
     parser.add_argument(
         "--keep-buffers", type=int, default=4, metavar="N",
         help="rollout buffers kept on disk; as many as iterations if `retrain` shall be possible. Default: 4",

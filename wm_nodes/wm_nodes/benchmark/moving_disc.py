@@ -138,6 +138,12 @@ def score(videos: Tensor, scenes: Scenes) -> Scores:
     )
 
 
+def centred_pixels(videos: Tensor) -> Tensor:
+    """Features of generated frames, (n, F - 1, C H W): pixels less their frame's mean, so that motion shows."""
+    frames = videos[:, :, 1:].transpose(1, 2)
+    return (frames - frames.mean((3, 4), keepdim=True)).flatten(2)
+
+
 def opacity_at(centres: Tensor, radius: float = RADIUS, side: int = SIDE) -> Tensor:
     """A Gaussian disc at each centre (B, F, 2): (B, F, side, side), 1 in its middle."""
     rows = torch.arange(side, dtype=torch.float32)

@@ -1,12 +1,18 @@
 """DynDiff-GRPO against its rivals on the moving disc: claims A (diversity), B (learning) and C (cost of the KL), the
-choices of the paper's section 5.4, and a reward that can be hacked. A picture is drawn beside every --json file.
+choices of the paper's section 5.4, and a reward that can be hacked; claims A and B on clips of recorded episodes.
+
+Every --json file holds the command, the settings of each arm, and the sha256 of the weights that were measured; a
+picture is drawn beside it (of ablations from two seeds on).
 """
 
 import argparse
+import hashlib
 import json
+import math
 import os
+import shlex
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,16 +23,25 @@ from tqdm import tqdm
 
 from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.benchmark.clip_diversity import clip_comparisons, measure_clips
+from wm_nodes.benchmark.clip_learning import MEASURES as CLIP_MEASURES
+from wm_nodes.benchmark.clip_learning import TASK, ClipPlan, clip_learning_arms, train_on_clips
 from wm_nodes.benchmark.moving_disc import CHANNELS, NUM_ACTIONS, training_batch
-from wm_nodes.benchmark.video_arms import diversity_arms, learning_arms
-from wm_nodes.benchmark.video_comparison import Comparison, compare_arms
-from wm_nodes.benchmark.video_cost import measure_anchors, pushcube_rollout, toy_rollout
-from wm_nodes.benchmark.video_diversity import DiversityPlan, compare, measure_arm
+from wm_nodes.benchmark.video_arms import Arm, diversity_arms, learning_arms
+from wm_nodes.benchmark.video_comparison import MEASURES, Comparison, compare_arms
+from wm_nodes.benchmark.video_cost import (
+    measure_anchors,
+    pushcube_buffer,
+    pushcube_rollout,
+    toy_buffer,
+    toy_rollout,
+)
+from wm_nodes.benchmark.video_diversity import FEATURES, DiversityPlan, compare, measure_arm
 from wm_nodes.benchmark.video_learning import LearningPlan, train_arm
-from wm_nodes.benchmark.video_plots import plot_diversity, plot_hacking, plot_learning
+from wm_nodes.benchmark.video_plots import plot_comparisons, plot_cost, plot_diversity, plot_hacking, plot_learning
 from wm_nodes.benchmark.video_tables import (
     clip_comparison_table,
     clip_table,
+    clip_training_table,
     comparison_table,
     cost_table,
     diversity_table,
@@ -34,10 +49,12 @@ from wm_nodes.benchmark.video_tables import (
     rollout_table,
     training_table,
 )
-from wm_nodes.benchmark.video_trials import Trial, ablation_trials, hacking_trials
+from wm_nodes.benchmark.video_trials import Plan, Trial, ablation_trials, hacking_trials
+from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import PRETRAINED, shipped_model
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.clip_scores import load_probe
+from wm_nodes.learning.collecting import HELDOUT_SEEDS, collect_plan, scripted_plan
 from wm_nodes.learning.frame_features import (
     CentredPixels,
     FrameFeatures,
@@ -50,14 +67,18 @@ from wm_nodes.learning.video_config import load_video_config
 from wm_nodes.learning.video_data import load_clips
 from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.learning.video_training import FlowMatchingSettings, train_video_model
-from wm_nodes.learning.weights import pack_weights, unpack_weights
+from wm_nodes.learning.weights import check_same_layout, pack_weights, unpack_weights
 from wm_nodes.reports import machine_facts
 from wm_nodes.seeding import numpy_stream
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.world_model import load_model_folder
 
 BASE_ITERATIONS, BASE_BATCH = 4000, 16
+BASE = PRETRAINED / "moving_disc" / "video_model.safetensors"
 NETWORK = NetworkSettings(channels=CHANNELS, action_dim=NUM_ACTIONS, width=32, depth=5)
+EPISODES = Path("runs/clip_contexts")
+NEW_SEEDS = 250_000
+"""First reset seed of contexts to train on that the shipped video model has not seen."""
 LEARNER = GrpoSettings(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
 LOG_COLUMNS = 180
@@ -69,13 +90,14 @@ console = Console()
 def main(argv: Sequence[str]) -> int:
     """Return the exit code: 0 done, 2 a clear error, 130 interrupted (finished rows are kept)."""
     arguments = _parser().parse_args(argv)
+    arguments.command = shlex.join(["benchmark_dyndiff.py", *argv])
     if not console.is_terminal:
         console.width = LOG_COLUMNS
     keep_freed_memory()
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     claims = {
         "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,
-        "cost": _cost, "clips": _clips,
+        "cost": _cost, "clips": _clips, "clip-learning": _clip_learning,
     }  # fmt: skip
     try:
         claims[arguments.claim](arguments)
@@ -89,9 +111,9 @@ def main(argv: Sequence[str]) -> int:
 
 def load_base(path: Path | None = None) -> VideoNetwork:
     """The base model: the one at `path`, or the shipped one."""
-    data = (path or PRETRAINED / "moving_disc" / "video_model.safetensors").read_bytes()
     model = VideoNetwork(NETWORK)
-    tensors, _ = unpack_weights(data)
+    tensors, _ = unpack_weights((path or BASE).read_bytes())
+    check_same_layout(model.state_dict(), tensors, what=str(path or BASE))
     model.load_state_dict(tensors)
     return model.eval()
 
@@ -125,16 +147,18 @@ def _diversity(arguments: argparse.Namespace) -> None:
                 compare(row, regime[base], arguments.seed)
                 for name, row in regime.items() if name.startswith("DynDiff") for base in bases
             ]  # fmt: skip
-    _write(arguments, {"plan": asdict(plan), "seed": arguments.seed, "rows": rows, "comparisons": comparisons})
+    of = {"plan": asdict(plan), "seed": arguments.seed, "features": FEATURES, **_settings(arms), **_base_of(arguments)}
+    _write(arguments, {**of, "rows": rows, "comparisons": comparisons})
     if arguments.json is not None:
         plot_diversity(rows, arguments.json.with_suffix(".png"), arguments.seed)
     console.print(diversity_table(rows, arguments.seed))
 
 
 def _clips(arguments: argparse.Namespace) -> None:
-    config = load_video_config(arguments.preset)
+    config = load_video_config(arguments.preset, {"seed": arguments.seed})
     folder, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(config.task))
-    clips = load_clips(arguments.context_bags, folder.clip["stride"])
+    bags = arguments.context_bags or _episodes(arguments.contexts, HELDOUT_SEEDS, config.task)
+    clips = load_clips(bags, folder.clip["stride"])
     drawn = numpy_stream(arguments.seed, "clip_diversity").permutation(len(clips))[: arguments.contexts]
     contexts, features = clips.select(torch.from_numpy(drawn)), _features(arguments.features, config.task)
     arms = _named({arm.name: arm for arm in diversity_arms()}, arguments.arms)
@@ -151,8 +175,18 @@ def _clips(arguments: argparse.Namespace) -> None:
                 )
     compared = clip_comparisons(rows, arguments.seed)
     size = {"contexts": len(contexts), "group_size": arguments.group_size, "features": features.name}
-    _write(arguments, {**size, "seed": arguments.seed, "rows": rows, "comparisons": compared})
+    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(arms)}
+    _write(arguments, {**size, "seed": arguments.seed, **of, "rows": rows, "comparisons": compared})
+    if arguments.json is not None:
+        plot_diversity(rows, arguments.json.with_suffix(".png"), arguments.seed)
     console.print(clip_table(rows, arguments.seed), clip_comparison_table(compared))
+
+
+def _episodes(clips: int, first_seed: int, task: str) -> list[Path]:
+    """Bags of scripted episodes, a tenth more than the clips that are wanted: one that ends early gives none."""
+    scene = load_config("cpu", {"task": task})
+    plan = scripted_plan(scene, math.ceil(1.1 * clips), first_seed)
+    return collect_plan(plan, scene, EPISODES / f"{task}_{first_seed}_{plan.num_episodes}")
 
 
 def _features(name: str, task: str) -> FrameFeatures:
@@ -166,14 +200,35 @@ def _features(name: str, task: str) -> FrameFeatures:
     return load_backbone(Path(name))
 
 
+def _clip_learning(arguments: argparse.Namespace) -> None:
+    clip, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(TASK))
+    given = (arguments.context_bags, arguments.heldout_bags)
+    wanted = ((arguments.contexts, NEW_SEEDS), (arguments.eval_contexts, HELDOUT_SEEDS))
+    contexts, heldout = (
+        load_clips(bags or _episodes(*what, TASK), clip.clip["stride"])
+        for bags, what in zip(given, wanted, strict=True)
+    )
+    plan = ClipPlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
+    trials, of = [Trial(arm, plan) for arm in clip_learning_arms()], {"sha256": clip.manifest["sha256"]}
+
+    def train(trial: Trial[ClipPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
+        folder = load_video_folder(arguments.video_model)
+        return train_on_clips(folder, contexts, heldout, probe, trial.arm, trial.plan, seed, on_iteration)
+
+    rows = _train(arguments, trials, train, of)
+    comparisons = _compared(rows, _against_cps(rows), CLIP_MEASURES)
+    _write_trainings(arguments, trials, rows, comparisons, of)
+    if arguments.json is not None and comparisons:
+        plot_comparisons(comparisons, arguments.json.with_suffix(".png"))
+    console.print(clip_training_table(rows), comparison_table(comparisons))
+
+
 def _learning(arguments: argparse.Namespace) -> None:
     plan = _plan(arguments, eval_every=5)
     trials = [Trial(arm, plan) for arm in learning_arms(LEARNER)]
-    rows = _train(arguments, trials)
-    names = sorted({row["arm"] for row in rows})
-    bases = [name for name in names if name.startswith("CPS")]
-    comparisons = _compared(rows, [(name, base) for name in names for base in bases if name != base])
-    _write_trainings(arguments, trials, rows, comparisons)
+    rows = _train_discs(arguments, trials)
+    comparisons = _compared(rows, _against_cps(rows))
+    _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
     if arguments.json is not None:
         plot_learning(rows, arguments.json.with_suffix(".png"))
     console.print(training_table(rows), comparison_table(comparisons))
@@ -181,14 +236,16 @@ def _learning(arguments: argparse.Namespace) -> None:
 
 def _ablations(arguments: argparse.Namespace) -> None:
     trials, pairs = ablation_trials(LEARNER, _plan(arguments, eval_every=4))
-    rows = _train(arguments, trials)
+    rows = _train_discs(arguments, trials)
     comparisons = _compared(rows, pairs)
-    _write_trainings(arguments, trials, rows, comparisons)
+    _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
+    if arguments.json is not None and comparisons:
+        plot_comparisons(comparisons, arguments.json.with_suffix(".png"))
     console.print(training_table(rows), comparison_table(comparisons))
 
 
 def _hacking(arguments: argparse.Namespace) -> None:
-    rows = _train(arguments, hacking_trials(LEARNER, _plan(arguments, eval_every=3)))
+    rows = _train_discs(arguments, hacking_trials(LEARNER, _plan(arguments, eval_every=3)))
     if arguments.json is not None:
         plot_hacking(rows, arguments.json.with_suffix(".png"))
     console.print(hacking_table(rows))
@@ -201,8 +258,21 @@ def _plan(arguments: argparse.Namespace, eval_every: int) -> LearningPlan:
     )  # fmt: skip
 
 
-def _train(arguments: argparse.Namespace, trials: list[Trial]) -> list[dict[str, Any]]:
-    """The trials named by --arms, at every seed, but what --json holds already; it is written after each training."""
+def _train_discs(arguments: argparse.Namespace, trials: list[Trial[LearningPlan]]) -> list[dict[str, Any]]:
+    def train(trial: Trial[LearningPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
+        return train_arm(load_base(arguments.base), trial.arm, trial.plan, seed, on_iteration)
+
+    return _train(arguments, trials, train, _base_of(arguments))
+
+
+def _train(
+    arguments: argparse.Namespace, trials: list[Trial[Plan]],
+    train: Callable[[Trial[Plan], int, Callable[[], object]], dict[str, Any]], of: dict[str, Any],
+) -> list[dict[str, Any]]:  # fmt: skip
+    """The trials named by --arms, at every seed, but what --json holds already; it is written after each training.
+
+    train: returns the row of a trial at a seed. of: what the file says beside the rows.
+    """
     rows = _finished(arguments.json, trials)
     done = {(row["arm"], row["seed"]) for row in rows}
     wanted = _named({trial.arm.name: trial for trial in trials}, arguments.arms)
@@ -210,23 +280,41 @@ def _train(arguments: argparse.Namespace, trials: list[Trial]) -> list[dict[str,
     with tqdm(total=sum(trial.plan.iterations for trial, _ in todo), desc=arguments.claim, unit="buffer") as bar:
         for trial, seed in todo:
             bar.set_postfix_str(f"{trial.arm.name}, seed {seed}")
-            rows.append(train_arm(load_base(arguments.base), trial.arm, trial.plan, seed, on_iteration=bar.update))
-            _write_trainings(arguments, trials, rows, [])
+            rows.append(train(trial, seed, bar.update))
+            _write_trainings(arguments, trials, rows, [], of)
     return rows
 
 
-def _compared(rows: list[dict[str, Any]], pairs: list[tuple[str, str]]) -> list[Comparison]:
-    found = (compare_arms(rows, arm, base) for arm, base in pairs)
+def _against_cps(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Every arm with every CPS arm."""
+    names = sorted({row["arm"] for row in rows})
+    return [(name, base) for name in names for base in names if base.startswith("CPS") and name != base]
+
+
+def _compared(
+    rows: list[dict[str, Any]], pairs: list[tuple[str, str]], measures: Sequence[str] = MEASURES
+) -> list[Comparison]:
+    found = (compare_arms(rows, arm, base, measures) for arm, base in pairs)
     return [comparison for comparison in found if comparison is not None]
 
 
 def _write_trainings(
-    arguments: argparse.Namespace, trials: list[Trial], rows: list[dict[str, Any]], comparisons: list[Comparison]
-) -> None:
+    arguments: argparse.Namespace, trials: Sequence[Trial[Any]], rows: list[dict[str, Any]],
+    comparisons: list[Comparison], of: dict[str, Any],
+) -> None:  # fmt: skip
     """The rows, the resolved settings of their arms, and the comparisons."""
     names = {row["arm"] for row in rows}
-    arms = [asdict(trial.arm) for trial in trials if trial.arm.name in names]
-    _write(arguments, {"arms": arms, "comparisons": [asdict(one) for one in comparisons], "rows": rows})
+    arms = _settings([trial.arm for trial in trials if trial.arm.name in names])
+    _write(arguments, {**of, **arms, "comparisons": [asdict(one) for one in comparisons], "rows": rows})
+
+
+def _settings(arms: list[Arm]) -> dict[str, Any]:
+    return {"arms": [asdict(arm) for arm in arms]}
+
+
+def _base_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Which base model was measured."""
+    return {"sha256": {"base": hashlib.sha256((arguments.base or BASE).read_bytes()).hexdigest()}}
 
 
 def _cost(arguments: argparse.Namespace) -> None:
@@ -234,8 +322,14 @@ def _cost(arguments: argparse.Namespace) -> None:
     rollouts = [
         toy_rollout(model, arguments.repeats, arguments.seed), pushcube_rollout(arguments.repeats, arguments.seed)
     ]  # fmt: skip
-    rows = measure_anchors(model, LEARNER, arguments.repeats, arguments.seed)
-    _write(arguments, {"seed": arguments.seed, "rollouts": rollouts, "rows": rows})
+    rows = [
+        *measure_anchors("moving disc", model, toy_buffer(model, arguments.seed), LEARNER, arguments.repeats),
+        *measure_anchors("PushCube", *pushcube_buffer(arguments.seed), LEARNER, arguments.repeats),
+    ]
+    of = {"seed": arguments.seed, "learner": asdict(LEARNER), **_base_of(arguments)}
+    _write(arguments, {**of, "rollouts": rollouts, "rows": rows})
+    if arguments.json is not None:
+        plot_cost(rows, arguments.json.with_suffix(".png"))
     console.print(rollout_table(rollouts, arguments.repeats), cost_table(rows, arguments.repeats))
 
 
@@ -246,7 +340,7 @@ def _named(known: dict[str, T], names: list[str] | None) -> list[T]:
     return [known[name] for name in names or known]
 
 
-def _finished(path: Path | None, trials: list[Trial]) -> list[dict[str, Any]]:
+def _finished(path: Path | None, trials: Sequence[Trial[Any]]) -> list[dict[str, Any]]:
     """The rows of an earlier call; a trial of this one that it ran by another plan is refused."""
     if path is None or not path.is_file():
         return []
@@ -263,35 +357,51 @@ def _finished(path: Path | None, trials: list[Trial]) -> list[dict[str, Any]]:
 def _write(arguments: argparse.Namespace, found: dict[str, Any]) -> None:
     if arguments.json is None:
         return
-    facts = {"machine": machine_facts(), "date": time.strftime("%Y-%m-%d")}
+    facts = {"command": arguments.command, "machine": machine_facts(), "date": time.strftime("%Y-%m-%d")}
     rounded = json.loads(json.dumps({**found, **facts}), parse_float=lambda digits: float(f"{float(digits):.5g}"))
     write_atomic(arguments.json, (json.dumps(rounded) + "\n").encode())
+
+
+def _positive(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 1 on")
+    return int(text)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="benchmark_dyndiff.py", description=__doc__)
     claims = parser.add_subparsers(dest="claim", required=True)
     base = claims.add_parser("base", help="train the base model (minutes on one core)")
-    base.add_argument("--iterations", type=int, default=BASE_ITERATIONS)
+    base.add_argument("--iterations", type=_positive, default=BASE_ITERATIONS)
     base.add_argument("--out", type=Path, default=Path("runs/moving_disc"))
     diversity = claims.add_parser("diversity", help="claim A: diversity at equal quality and noise budget")
-    diversity.add_argument("--contexts", type=int, default=100)
-    diversity.add_argument("--group-size", type=int, default=8)
+    diversity.add_argument("--contexts", type=_positive, default=100)
+    diversity.add_argument("--group-size", type=_positive, default=8)
     learning = claims.add_parser("learning", help="claim B: reward against model calls, every arm on one learner")
     ablations = claims.add_parser("ablations", help="section 5.4: KL, advantage clip, guidance, resolution, in pairs")
     hacking = claims.add_parser("hacking", help="a reward that can be hacked, and the detector of (2) on both")
     for claim, iterations in ((learning, 40), (ablations, 12), (hacking, 25)):
         claim.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-        claim.add_argument("--iterations", type=int, default=iterations)
-        claim.add_argument("--scenes", type=int, default=6, help="contexts per iteration, 8 videos each")
-        claim.add_argument("--eval-scenes", type=int, default=100, help="held-out scenes per evaluation")
+        claim.add_argument("--iterations", type=_positive, default=iterations)
+        claim.add_argument("--scenes", type=_positive, default=6, help="contexts per iteration, 8 videos each")
+        claim.add_argument("--eval-scenes", type=_positive, default=100, help="held-out scenes per evaluation")
     cost = claims.add_parser("cost", help="claim C: seconds and bytes of the KL anchors, and of the mask")
-    cost.add_argument("--repeats", type=int, default=7)
+    cost.add_argument("--repeats", type=_positive, default=7)
     clips = claims.add_parser("clips", help="claim A on a video model of recorded episodes")
-    clips.add_argument("--video-model", type=Path, default=shipped_model("push_cube") / "video_model")
-    clips.add_argument("--context-bags", type=Path, nargs="+", required=True, help="episodes to take contexts from")
-    clips.add_argument("--contexts", type=int, default=100)
-    clips.add_argument("--group-size", type=int, default=8)
+    training = claims.add_parser("clip-learning", help="claim B on a video model of recorded episodes")
+    training.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    training.add_argument("--iterations", type=_positive, default=ClipPlan.iterations)
+    training.add_argument("--contexts", type=_positive, default=400, help="recorded episodes to draw contexts from")
+    training.add_argument("--eval-contexts", type=_positive, default=ClipPlan.eval_contexts)
+    training.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and held-out ones")
+    for claim in (clips, training):
+        claim.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model")
+        claim.add_argument(
+            "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
+            help=f"episodes to take contexts from (default: new ones in {EPISODES}, of seeds that no model has seen)",
+        )  # fmt: skip
+    clips.add_argument("--contexts", type=_positive, default=100)
+    clips.add_argument("--group-size", type=_positive, default=8)
     clips.add_argument(
         "--features", default="tokenizer",
         help="tokenizer, pixels, random, or the folder of a vision backbone, e.g. DINOv3 (default: tokenizer)",
@@ -299,10 +409,10 @@ def _parser() -> argparse.ArgumentParser:
     clips.add_argument("--preset", default="recommended", help="settings of loop 2, for the rewards")
     for claim in (base, diversity, cost, clips):
         claim.add_argument("--seed", type=int, default=0)
-    for claim in (diversity, learning, ablations, hacking, clips):
+    for claim in (diversity, learning, ablations, hacking, clips, training):
         claim.add_argument("--arms", nargs="+", metavar="NAME")
     for claim in (diversity, learning, ablations, hacking, cost):
         claim.add_argument("--base", type=Path, help="weights of another base model than the shipped one")
-    for claim in (diversity, learning, ablations, hacking, cost, clips):
+    for claim in (diversity, learning, ablations, hacking, cost, clips, training):
         claim.add_argument("--json", type=Path, help="write every row here; trainings go on where the file stops")
     return parser

@@ -9,9 +9,9 @@ import numpy as np
 
 from wm_nodes.rl.hacking import T_975
 
+PATH = "_path"
+"""Ending of a measure that is a mean over the evaluations of a training, its area per model call, and not the last."""
 MEASURES = ("reward_path", "reward", "obeyed", "background")
-"""reward_path: mean held-out reward over the evaluations of a training, its area per model call; the others: at its
-end."""
 
 
 @dataclass(frozen=True)
@@ -37,24 +37,28 @@ class Comparison:
     differences: dict[str, Difference]
 
 
-def compare_arms(rows: Sequence[dict[str, Any]], arm: str, base: str) -> Comparison | None:
-    """Compare the rows of train_arm; None where the two have fewer than two seeds in common."""
+def compare_arms(
+    rows: Sequence[dict[str, Any]], arm: str, base: str, measures: Sequence[str] = MEASURES
+) -> Comparison | None:
+    """Compare trainings, whose rows hold `arm`, `seed` and `evaluations`, the first one of before; None where the two
+    have fewer than two seeds in common.
+    """
     of = {name: {row["seed"]: row for row in rows if row["arm"] == name} for name in (arm, base)}
     seeds = sorted(of[arm].keys() & of[base].keys())
     if len(seeds) < 2:
         return None
     differences = {
         measure: paired_interval([value(of[arm][seed], measure) - value(of[base][seed], measure) for seed in seeds])
-        for measure in MEASURES
+        for measure in measures
     }
     return Comparison(arm, base, tuple(seeds), differences)
 
 
 def value(row: dict[str, Any], measure: str) -> float:
-    """One number of one training, see MEASURES."""
-    evaluations = row["evaluations"]
-    if measure == "reward_path":
-        return float(np.mean([evaluation["reward"] for evaluation in evaluations[1:]]))
+    """One number of one training, e.g. `reward`, or `reward_path`; see PATH."""
+    evaluations, name = row["evaluations"], measure.removesuffix(PATH)
+    if name != measure:
+        return float(np.mean([evaluation[name] for evaluation in evaluations[1:]]))
     return float(evaluations[-1][measure])
 
 

@@ -24,9 +24,11 @@ from wm_nodes.learning.video_grpo import GrpoLearner
 from wm_nodes.seeding import torch_stream
 from wm_nodes.video_model import (
     Condition,
+    RolloutBuffer,
     RolloutSettings,
     SamplerSettings,
     VideoNetwork,
+    config_hash,
     initial_noise,
     kernels,
     sample_videos,
@@ -41,16 +43,19 @@ CLIP_FRAMES = 9
 """Of PushCube: every second of the 17 pictures of an episode."""
 
 
-def measure_anchors(model: VideoNetwork, learner: GrpoSettings, repeats: int, seed: int) -> list[dict[str, Any]]:
-    """One row per anchor: median seconds of each part of training on one buffer, turn by turn, and the bytes kept."""
-    arm = sampler_arm("DynDiff", dyndiff(0.4, "sparse", "rms"), learner)
-    buffer, scores = sample_groups(model, arm, draw_scenes(SCENES, seed, "cost"), GROUP, seed, 0, 0)
-    buffer = buffer.with_rewards({"total": scores.reward})
+def measure_anchors(
+    name: str, model: VideoNetwork, sampled: tuple[RolloutBuffer, RolloutSettings], learner: GrpoSettings, repeats: int
+) -> list[dict[str, Any]]:
+    """One row per anchor: median seconds of each part of training on one buffer, turn by turn, and the bytes kept.
+
+    sampled: the buffer and how it was sampled.
+    """
+    buffer, rollout = sampled
     times: dict[str, dict[str, list[float]]] = {anchor: {part: [] for part in PARTS} for anchor in ANCHORS}
     for _ in range(repeats):
         for anchor in ANCHORS:
             kl = replace(learner.kl, anchor=anchor, dual_every=1)
-            grpo = GrpoLearner(model, replace(learner, kl=kl, learning_rate=0.0), arm.rollout, seed=seed)
+            grpo = GrpoLearner(model, replace(learner, kl=kl, learning_rate=0.0), rollout, seed=0)
             updates = grpo.train(buffer).updates
             for part in PARTS:
                 times[anchor][part].append(sum(getattr(update, f"{part}_seconds") for update in updates))
@@ -59,9 +64,12 @@ def measure_anchors(model: VideoNetwork, learner: GrpoSettings, repeats: int, se
     kept = {"buffer": zeta + buffer.rollout.mask.nbytes, "frozen": weights}
     kept["dual"] = kept["buffer"] + weights
     return [
-        {"anchor": anchor, **{f"{part}_s": median(times[anchor][part]) for part in PARTS}, "bytes": kept[anchor]}
+        {
+            "model": name, "anchor": anchor, "bytes": kept[anchor],
+            **{f"{part}_s": median(times[anchor][part]) for part in PARTS},
+        }
         for anchor in ANCHORS
-    ]
+    ]  # fmt: skip
 
 
 def measure_rollout(
@@ -125,9 +133,35 @@ def toy_rollout(model: VideoNetwork, repeats: int, seed: int) -> dict[str, Any]:
     return {"model": "moving disc", **measure_rollout(model, condition, shape, settings, repeats, seed)}
 
 
+def toy_buffer(model: VideoNetwork, seed: int) -> tuple[RolloutBuffer, RolloutSettings]:
+    """SCENES x GROUP scored videos of the moving disc, DynDiff 0.4 sparse at an rms budget."""
+    arm = sampler_arm("DynDiff", dyndiff(0.4, "sparse", "rms"))
+    buffer, scores = sample_groups(model, arm, draw_scenes(SCENES, seed, "cost"), GROUP, seed, 0, 0)
+    return buffer.with_rewards({"total": scores.reward}), arm.rollout
+
+
 def pushcube_rollout(repeats: int, seed: int) -> dict[str, Any]:
-    """measure_rollout of the shipped PushCube network by the recommended preset; given frames and actions are random,
-    because the time depends on sizes only.
+    """measure_rollout of the shipped PushCube network by the recommended preset."""
+    network, condition, shape, rollout = _pushcube(seed)
+    return {"model": "PushCube", **measure_rollout(network, condition, shape, rollout, repeats, seed)}
+
+
+def pushcube_buffer(seed: int) -> tuple[VideoNetwork, tuple[RolloutBuffer, RolloutSettings]]:
+    """The shipped PushCube network and SCENES x GROUP of its videos with random rewards, by the recommended preset."""
+    network, condition, shape, rollout = _pushcube(seed)
+    index = torch.arange(SCENES * GROUP)
+    videos = sample_videos(network, condition, initial_noise(shape, index + seed), index + seed, rollout)
+    rewards = torch.rand(len(index), generator=torch_stream(seed, "cost_rewards"), dtype=torch.float64)
+    buffer = RolloutBuffer(
+        videos, condition, index // GROUP, index % GROUP, {}, torch.ones(len(index), dtype=torch.bool), 0, 0,
+        config_hash(rollout),
+    )  # fmt: skip
+    return network, (buffer.with_rewards({"total": rewards}), rollout)
+
+
+def _pushcube(seed: int) -> tuple[VideoNetwork, Condition, tuple[int, ...], RolloutSettings]:
+    """The shipped network, what it is asked for, the shape of its latents, and how it samples; given frames and actions
+    are random, because times depend on sizes only.
     """
     config = load_video_config("recommended")
     folder = load_video_folder(shipped_model(config.task) / "video_model")
@@ -139,5 +173,4 @@ def pushcube_rollout(repeats: int, seed: int) -> dict[str, Any]:
         draw(videos, frames - 1, settings.action_dim), draw(videos, 4, settings.text_dim),
     )  # fmt: skip
     shape = (settings.channels, frames, H, W)
-    found = measure_rollout(folder.network, condition, shape, config.rollout, repeats, seed)
-    return {"model": "PushCube", **found}
+    return folder.network.eval(), condition, shape, config.rollout

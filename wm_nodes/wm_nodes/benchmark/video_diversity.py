@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from wm_nodes.benchmark.moving_disc import draw_scenes, opacity_at
+from wm_nodes.benchmark.moving_disc import centred_pixels, draw_scenes, opacity_at
 from wm_nodes.benchmark.video_arms import Arm
 from wm_nodes.benchmark.video_learning import sample_groups
 from wm_nodes.rl.diversity import rollout_diversity
@@ -66,12 +66,6 @@ def compare(arm: dict[str, Any], base: dict[str, Any], seed: int) -> dict[str, A
         "high": high, "background_change": background, "mass_change": mass, "equal_quality": equal,
         "noise_share": (arm["noise_share"], base["noise_share"]), "more_diverse": equal and low > 0,
     }  # fmt: skip
-
-
-def centred_pixels(videos: Tensor) -> Tensor:
-    """Features of generated frames, (n, F - 1, C H W): pixels less their frame's mean, so that motion shows."""
-    frames = videos[:, :, 1:].transpose(1, 2)
-    return (frames - frames.mean((3, 4), keepdim=True)).flatten(2)
 
 
 def _moving(start: Tensor) -> Tensor:

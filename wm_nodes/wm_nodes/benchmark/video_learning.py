@@ -12,9 +12,11 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from wm_nodes.benchmark.moving_disc import CHANNELS, FRAMES, SIDE, Scenes, Scores, draw_scenes, score
+from wm_nodes.benchmark.moving_disc import CHANNELS, FRAMES, SIDE, Scenes, Scores, centred_pixels, draw_scenes, score
 from wm_nodes.benchmark.video_arms import Arm
-from wm_nodes.learning.video_grpo import BufferReport, GrpoLearner
+from wm_nodes.learning.video_grpo import GrpoLearner
+from wm_nodes.learning.video_run import flat_metrics
+from wm_nodes.rl.diversity import rollout_diversity
 from wm_nodes.rl.group_advantages import group_advantages
 from wm_nodes.rl.hacking import hacked_metrics
 from wm_nodes.seeding import stream_seed
@@ -67,13 +69,15 @@ def train_arm(
         report = learner.train(buffer)
         seconds["rollout"] += middle - start
         seconds["train"] += time.perf_counter() - middle
-        buffers.append({**_flat(report), "advantage_max": _largest_advantage(buffer), **_means(scores, "rollout_")})
+        spread = group_spread(buffer, plan.group_size) | {"advantage_max": _largest_advantage(buffer)}
+        buffers.append({**flat_metrics(report), **spread, **_means(scores, "rollout_")})
         if (iteration + 1) % plan.eval_every == 0 or iteration + 1 == plan.iterations:
             evaluations.append({"iteration": iteration + 1, **evaluate(model, arm, plan, seed)})
         on_iteration()
+    names = dict.fromkeys(name for row in buffers for name in row)  # a window's steps are not those of every buffer
     return {
         "arm": arm.name, "shared_noise": arm.shared_noise, "seed": seed, "plan": asdict(plan),
-        "evaluations": evaluations, "buffers": {name: [row[name] for row in buffers] for name in buffers[0]},
+        "evaluations": evaluations, "buffers": {name: [row.get(name) for row in buffers] for name in names},
         "seconds": seconds, "hacked": hacked(evaluations, plan.proxy),
     }  # fmt: skip
 
@@ -143,14 +147,19 @@ def _means(scores: Scores, prefix: str = "") -> dict[str, float]:
     return {prefix + name: float(getattr(scores, name).mean()) for name in names}
 
 
+def group_spread(buffer: RolloutBuffer, group_size: int) -> dict[str, float]:
+    """How far the videos of a scene spread while an arm trains, mean over the buffer's scenes.
+
+    rollout_diversity: (19) of centred pixels. rollout_reward_std: of the training reward.
+    """
+    latents = buffer.rollout.latents
+    groups = latents.view(-1, group_size, *latents.shape[1:])
+    stds = buffer.rewards["total"].view(-1, group_size).std(1, correction=0)
+    diversity = sum(rollout_diversity(centred_pixels(videos)) for videos in groups) / len(groups)
+    return {"rollout_diversity": diversity, "rollout_reward_std": float(stds.mean())}
+
+
 def _largest_advantage(buffer: RolloutBuffer) -> float:
     """The largest |A| of (13) before it is clipped."""
     unclipped = group_advantages(buffer.rewards["total"], buffer.group_ids, buffer.valid, clip=math.inf)
     return float(unclipped.advantages_N.abs().max())
-
-
-def _flat(report: BufferReport) -> dict[str, float]:
-    """One number per name; those of update 1, 2, ... of the buffer end in _1, _2, ..."""
-    numbers = asdict(report)
-    updates = numbers.pop("updates")
-    return numbers | {f"{name}_{u}": value for u, update in enumerate(updates, 1) for name, value in update.items()}

@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from wm_nodes.benchmark.video_comparison import MEASURES, Comparison, Difference
+from wm_nodes.benchmark.video_comparison import Comparison, Difference
 from wm_nodes.benchmark.video_learning import alarms
 from wm_nodes.statistics import bootstrap_mean
 
-LAST_UPDATE = ("noise_share", "clip_low_share_2", "clip_high_share_2", "kl_2")
+COURSE = ("noise_share", "rollout_diversity")
+SCORES = ("tracking", "object_cm", "tool_cm", "psnr_db")
+LAST_UPDATE = ("clip_low_share_2", "clip_high_share_2", "kl_2")
 
 
 def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
@@ -65,10 +67,12 @@ def _average(row: dict[str, Any], name: str) -> float:
 
 
 def training_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per arm, means over its seeds: held-out scenes before and after; the last buffer's second update."""
+    """One line per arm, means over its seeds: held-out scenes before and after; noise and diversity of its rollouts,
+    means over the buffers; the last buffer's second update.
+    """
     table = _table(
         "held-out scenes, ODE, before and after; mean over seeds", ("arm",),
-        ("seeds", "reward", "obeyed", "bg", "mass", "noise", "clip low/high @2", "KL @2", "seconds"),
+        ("seeds", "reward", "obeyed", "bg", "mass", "noise", "diversity", "clip low/high @2", "KL @2", "seconds"),
     )  # fmt: skip
     for arm in dict.fromkeys(row["arm"] for row in rows):
         mine = [row for row in rows if row["arm"] == arm]
@@ -77,20 +81,44 @@ def training_table(rows: Sequence[dict[str, Any]]) -> Table:
         course = (f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed"))
         table.add_row(
             arm, str(len(mine)), *course,
-            f"{_mean(last, 'background'):.4f}", f"{_mean(last, 'mass'):.3f}", f"{update['noise_share']:.3f}",
+            f"{_mean(last, 'background'):.4f}", f"{_mean(last, 'mass'):.3f}",
+            *(_over_buffers(mine, name) for name in COURSE),
             f"{update['clip_low_share_2']:.2f}/{update['clip_high_share_2']:.2f}", f"{update['kl_2']:.1e}",
             f"{np.mean([sum(row['seconds'].values()) for row in mine]):.0f}",
         )  # fmt: skip
     return table
 
 
-def comparison_table(comparisons: Sequence[Comparison]) -> Table:
+def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """One line per training: held-out contexts after - before, paired over them."""
     table = _table(
-        "arm - base on the same seeds: mean, 95 % t interval, * if beside 0; reward_path is the mean over a training",
-        ("arm", "base"), ("seeds", *MEASURES),
+        "held-out contexts by ODE, after - before, 95 % bootstrap interval over the contexts", ("arm",),
+        ("seed", "noise rms/s", "tracking before", *SCORES, "seconds"),
+    )  # fmt: skip
+    for row in rows:
+        changes = (np.subtract(row["after"][name], row["before"][name]) for name in SCORES)
+        intervals = ("{:+.3f} ({:+.3f} to {:+.3f})".format(*bootstrap_mean(one, seed=row["seed"])) for one in changes)
+        table.add_row(
+            row["arm"], str(row["seed"]), _over_buffers([row], "noise_share"),
+            f"{_average(row['before'], 'tracking'):.3f}", *intervals, f"{sum(row['seconds'].values()):.0f}",
+        )  # fmt: skip
+    return table
+
+
+def _over_buffers(rows: Sequence[dict[str, Any]], name: str) -> str:
+    """Mean over seeds and buffers; nothing where a file of an earlier version lacks it."""
+    found = [np.mean(row["buffers"][name]) for row in rows if name in row["buffers"]]
+    return f"{np.mean(found):.3f}" if len(found) == len(rows) else ""
+
+
+def comparison_table(comparisons: Sequence[Comparison]) -> Table:
+    measures = tuple(comparisons[0].differences) if comparisons else ()
+    table = _table(
+        "arm - base on the same seeds: mean, 95 % t interval, * if beside 0; _path: mean over a training",
+        ("arm", "base"), ("seeds", *measures),
     )  # fmt: skip
     for row in comparisons:
-        table.add_row(row.arm, row.base, str(len(row.seeds)), *(_shown(row.differences[name]) for name in MEASURES))
+        table.add_row(row.arm, row.base, str(len(row.seeds)), *(_shown(row.differences[name]) for name in measures))
     return table
 
 
@@ -114,10 +142,10 @@ def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 def cost_table(rows: Sequence[dict[str, Any]], repeats: int) -> Table:
     numbers = ("forward, s", "KL, s", "backward, s", "kept beside the weights, MiB")
-    table = _table(f"KL anchors, median of {repeats} turns on one buffer", ("anchor",), numbers)
+    table = _table(f"KL anchors, median of {repeats} turns on one buffer", ("model", "anchor"), numbers)
     for row in rows:
         seconds = (f"{row[name]:.3f}" for name in ("forward_s", "kl_s", "backward_s"))
-        table.add_row(row["anchor"], *seconds, f"{row['bytes'] / 2**20:.2f}")
+        table.add_row(row["model"], row["anchor"], *seconds, f"{row['bytes'] / 2**20:.2f}")
     return table
 
 

@@ -4,7 +4,9 @@ Each ablation is a pair on one learner and one arm, with equal model calls.
 """
 
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
+from wm_nodes.benchmark.clip_learning import ClipPlan
 from wm_nodes.benchmark.video_arms import Arm, dyndiff, sampler_arm
 from wm_nodes.benchmark.video_learning import LearningPlan
 from wm_nodes.learning.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
@@ -18,15 +20,20 @@ PAPER_GROUP = 16
 """Videos per context of Table 5: a clip of 2.5 can act from groups of 8 on, one of 5 only from 27 on."""
 
 
+Plan = TypeVar("Plan", bound=LearningPlan | ClipPlan)
+
+
 @dataclass(frozen=True)
-class Trial:
+class Trial(Generic[Plan]):
     """One arm trained by one plan; the arm's name is the trial's."""
 
     arm: Arm
-    plan: LearningPlan
+    plan: Plan
 
 
-def ablation_trials(learner: GrpoSettings, plan: LearningPlan) -> tuple[list[Trial], list[tuple[str, str]]]:
+def ablation_trials(
+    learner: GrpoSettings, plan: LearningPlan
+) -> tuple[list[Trial[LearningPlan]], list[tuple[str, str]]]:
     """Return the trainings, and which is compared with which: (name, name of its base)."""
     cps = replace(learner, logprob_weight="cps", learning_rate=SHORT_RATE)
     base = replace(sampler_arm("base", dyndiff(0.6, "gated", "rms"), cps), shared_noise=True)
@@ -51,7 +58,7 @@ def ablation_trials(learner: GrpoSettings, plan: LearningPlan) -> tuple[list[Tri
     return trials, pairs
 
 
-def hacking_trials(learner: GrpoSettings, plan: LearningPlan) -> list[Trial]:
+def hacking_trials(learner: GrpoSettings, plan: LearningPlan) -> list[Trial[LearningPlan]]:
     """The honest reward; temporal consistency alone, which a picture that stands still, or has no disc, satisfies best;
     the same with a frozen anchor, which holds it back.
     """

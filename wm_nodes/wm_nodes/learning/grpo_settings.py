@@ -15,6 +15,8 @@ Anchor = Literal["buffer", "frozen", "lora_off", "moving", "dual"]
 class AdvantageSettings:
     """(13). clip: of the normalised advantage. mix: several rewards are added before they are normalised (reward), or
     each is normalised and then weighed (advantage). best_of_n: videos of a group that train, best and worst; 0: all.
+    floor: a group with std < floor max(1, |mean|) has no spread. source: what is normalised, the reward, or (win_rate)
+    Pref-GRPO's share of wins against the others of the group.
     """
 
     clip: float = 2.5
@@ -22,6 +24,8 @@ class AdvantageSettings:
     std_scope: StdScope = "group"
     ddof: int = 0
     best_of_n: int = 0
+    floor: float = 1e-6
+    source: Literal["reward", "win_rate"] = "reward"
 
 
 @dataclass(frozen=True)

@@ -76,20 +76,14 @@ class GrpoTerms:
 
     def kl(self, found: Pass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
         """(17) or (20) per transition, (M,). version: optimizer steps made, which tell when a dual anchor is due."""
-        settings, new = self.settings.kl, found.new
+        settings, kl = self.settings.kl, torch.zeros_like(found.log_ratio)
         if settings.mode == "none" or settings.beta == 0:
-            return torch.zeros_like(found.log_ratio)
-        if settings.mode in ("logk2", "logk3"):
-            return log_space_kl(found.log_ratio, settings.mode)
-        kl = torch.zeros_like(found.log_ratio)
-        if self.settings.mask_source == "recompute":  # the anchor's deviation is the rollout's: measure in it
-            old_std = self._old_std(new, buffer, rows)
-            new = new._replace(zeta=new.zeta * (new.std / old_std), std=old_std)
+            return kl
         if settings.anchor in ("buffer", "dual"):
-            kl = kl + self._distance(new, found.old_zeta)
+            kl = kl + self._distance(found.new, found.old_zeta, buffer, rows)
         due = settings.anchor in ("frozen", "moving", "lora_off") or version % settings.dual_every == 0
         if settings.anchor != "buffer" and due:
-            kl = kl + self._distance(new, self._anchor_zeta(buffer, rows))
+            kl = kl + self._distance(found.new, self._anchor_zeta(buffer, rows), buffer, rows)
         return kl
 
     @torch.no_grad()
@@ -148,10 +142,15 @@ class GrpoTerms:
         generated = std[:, :, buffer.condition.num_conditioning :]
         return generated.expand(-1, buffer.rollout.latents.shape[1], -1, -1, -1).flatten(1)
 
-    def _distance(self, new: Transition, target_zeta: Tensor) -> Tensor:
-        if self.settings.kl.mode == "velocity":
-            return velocity_kl(new.zeta, target_zeta, new.std, new.slope)
-        return mean_kl(new.zeta, target_zeta)
+    def _distance(self, new: Transition, target_zeta: Tensor, buffer: RolloutBuffer, rows: Rows) -> Tensor:
+        mode = self.settings.kl.mode
+        if mode == "logk2" or mode == "logk3":
+            return log_space_kl(self._log_ratio(new, target_zeta, buffer, rows), mode)
+        zeta, std = new.zeta, new.std
+        if self.settings.mask_source == "recompute":  # the anchor's deviation is the rollout's: measure in it
+            std = self._old_std(new, buffer, rows)
+            zeta = zeta * (new.std / std)
+        return velocity_kl(zeta, target_zeta, std, new.slope) if mode == "velocity" else mean_kl(zeta, target_zeta)
 
     @torch.no_grad()
     def _anchor_zeta(self, buffer: RolloutBuffer, rows: Rows) -> Tensor:
@@ -161,7 +160,8 @@ class GrpoTerms:
         disable: Any = getattr(self.model, "disable_adapter", None)
         if disable is None:
             raise ValueError(
-                "kl.anchor lora_off needs a model with a LoRA adapter; set lora.rank, or take kl.anchor frozen"
+                "kl.anchor lora_off needs a model with a LoRA adapter; add one (video_model.adapters.add_lora), or "
+                "take kl.anchor frozen"
             )
         with disable():
             return self._transition(self.model, buffer, rows, mask).zeta

@@ -9,6 +9,7 @@ by their number, so that micro-batches and ranks do not change it. On the first 
 import copy
 import json
 import time
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, fields
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
@@ -25,9 +27,16 @@ from wm_nodes.learning.checkpoint_tensors import metadata_of, optimizer_tensors,
 from wm_nodes.learning.distributed import Ranks
 from wm_nodes.learning.grpo_settings import GrpoSettings
 from wm_nodes.learning.grpo_terms import GrpoTerms, Rows
-from wm_nodes.learning.weights import check_same_layout
+from wm_nodes.learning.weights import WeightsError, check_same_layout
 from wm_nodes.reward.agent.contract import trainable
-from wm_nodes.rl.group_advantages import GroupAdvantages, RunningStd, best_of_n, group_advantages, mixed_advantages
+from wm_nodes.rl.group_advantages import (
+    GroupAdvantages,
+    RunningStd,
+    best_of_n,
+    group_advantages,
+    mixed_advantages,
+    win_rates,
+)
 from wm_nodes.rl.grpo import clip_tails, clipped_objective
 from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_model.sampling import RolloutSettings
@@ -56,7 +65,9 @@ class UpdateReport:
 @dataclass(frozen=True)
 class BufferReport:
     """What one buffer gave. updates: one report per optimizer step, in order (index 0 is on-policy). dropped_groups:
-    those with fewer valid videos than contract.trainable asks for; they are in zero_std_ratio too.
+    those with fewer valid videos than contract.trainable asks for; they are in zero_std_ratio too. raw_rewards: mean of
+    each score beside the total over the videos that have it, NaN where none has. step_noise: noise_share of each
+    stochastic sampler step.
     """
 
     updates: tuple[UpdateReport, ...]
@@ -68,6 +79,8 @@ class BufferReport:
     kept: int
     group_size: float
     noise_share: float
+    raw_rewards: Mapping[str, float]
+    step_noise: Mapping[int, float]
 
 
 class GrpoLearner:
@@ -93,6 +106,12 @@ class GrpoLearner:
             raise ValueError("an ODE rollout has no likelihood to train on; choose a stochastic arm and eta > 0")
         if settings.advantage.mix == "advantage" and settings.advantage.std_scope == "running":
             raise ValueError("advantage.std_scope running is of one reward; with advantage.mix advantage take group")
+        if settings.mask_source == "recompute":
+            warnings.warn(
+                "grpo.mask_source recompute is an ablation: mask cells that flip throw the ratio out of its clip "
+                "range. Otherwise take cached",
+                stacklevel=2,
+            )
         if settings.trains == "condition":
             _train_condition(model)
         self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
@@ -151,7 +170,12 @@ class GrpoLearner:
             kept=int(kept.sum()),
             group_size=len(buffer) / advantages.num_groups,
             noise_share=buffer.rollout.spent_noise,
-        )
+            raw_rewards={
+                name: float(values[torch.isfinite(values)].mean())
+                for name, values in buffer.rewards.items() if name != "total"
+            },
+            step_noise=dict(zip(buffer.rollout.steps, buffer.rollout.noise_share.tolist(), strict=True)),
+        )  # fmt: skip
 
     def gradients(self, buffer: RolloutBuffer, rows: "Rows", advantages: GroupAdvantages) -> dict[str, float]:
         """Accumulate the gradient of L = -J + beta KL over the rows into .grad; return the sums for a report."""
@@ -194,14 +218,20 @@ class GrpoLearner:
     def _advantages(self, rewards: Tensor, buffer: RolloutBuffer, trains: Tensor) -> GroupAdvantages:
         """trains: bool (N,), the videos that may be compared; see reward.agent.contract."""
         settings = self.settings.advantage
+
+        def signal(values: Tensor) -> Tensor:
+            return win_rates(values, buffer.group_ids, trains) if settings.source == "win_rate" else values
+
         if settings.mix == "advantage":
             return mixed_advantages(
-                buffer.rewards, self.reward_weights, buffer.group_ids, trains, clip=settings.clip,
-                std_scope=settings.std_scope, ddof=settings.ddof,
+                {name: signal(values) for name, values in buffer.rewards.items()}, self.reward_weights,
+                buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope, ddof=settings.ddof,
+                floor=settings.floor,
             )  # fmt: skip
         return group_advantages(
-            rewards, buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope,
-            ddof=settings.ddof, running=self._running if settings.std_scope == "running" else None,
+            signal(rewards), buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope,
+            ddof=settings.ddof, floor=settings.floor,
+            running=self._running if settings.std_scope == "running" else None,
         )  # fmt: skip
 
     def _passes(self, buffer: RolloutBuffer, kept: Tensor) -> Iterator[Rows]:
@@ -280,17 +310,23 @@ class GrpoLearner:
         """Continue exactly from save(); return its iteration.
 
         Raises:
-            ValueError: the file is of another architecture or seed.
+            ValueError: the file is damaged, or of another architecture, seed, KL anchor or EMA.
         """
         data = path.read_bytes()
-        tensors = load(data)
-        header = json.loads(metadata_of(data)["grpo"])
+        try:
+            tensors, header = load(data), json.loads(metadata_of(data)["grpo"])
+        except (SafetensorError, KeyError, ValueError) as error:
+            raise WeightsError(f"{path} is no complete checkpoint of GRPO ({error}); use a new run folder") from error
         if header["seed"] != self.seed:
             raise ValueError(
                 f"{path} was made with seed {header['seed']}, this run has {self.seed}; use a new run folder"
             )
         weights = section(tensors, "model.")
         check_same_layout(dict(_trained(self.model)), weights, what=str(path))
+        own = {"averaged.": (self.averaged, "ema_decay"), "anchor.": (self._terms.anchor, "kl.anchor")}
+        for prefix, (kept, knob) in own.items():
+            if bool(kept) != bool(section(tensors, prefix)):
+                raise ValueError(f"{path} was made with another grpo.{knob}; resume with its settings")
         _set_trained(self.model, weights)
         device = next(self.model.parameters()).device
         self.averaged = {name: value.to(device) for name, value in section(tensors, "averaged.").items()}

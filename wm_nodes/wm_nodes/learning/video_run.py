@@ -188,8 +188,10 @@ def _averaged_uri(version: int) -> str:
 def flat_metrics(report: BufferReport) -> dict[str, float]:
     """One number per name; those of the k-th optimizer step on a buffer end in _<k>, from 1."""
     values = asdict(report)
-    updates = values.pop("updates")
+    updates, rewards, noise = (values.pop(name) for name in ("updates", "raw_rewards", "step_noise"))
     found = {name: float(value) for name, value in values.items()}
+    found |= {f"reward_{name}": value for name, value in rewards.items()}
+    found |= {f"noise_share_step_{k}": value for k, value in noise.items()}
     for index, update in enumerate(updates, 1):
         found |= {f"{name}_{index}": float(value) for name, value in update.items()}
     return found

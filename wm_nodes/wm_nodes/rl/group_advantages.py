@@ -109,6 +109,7 @@ def mixed_advantages(
     clip: float,
     std_scope: StdScope = "group",
     ddof: int = 0,
+    floor: float = 1e-6,
 ) -> GroupAdvantages:
     """Return clip(sum_r w_r A_r / sum_r |w_r|) of rewards normalised one by one, whatever their units and spreads.
 
@@ -121,7 +122,7 @@ def mixed_advantages(
     unknown = sorted(set(weights) - set(rewards))
     if unknown or not weights:
         raise ValueError(f"no advantages of unknown rewards {unknown}; weigh some of {', '.join(sorted(rewards))}")
-    one = partial(group_advantages, clip=math.inf, std_scope=std_scope, ddof=ddof)
+    one = partial(group_advantages, clip=math.inf, std_scope=std_scope, ddof=ddof, floor=floor)
     parts = {name: one(rewards[name], group_ids_N, valid_N) for name in weights}
     total = sum(abs(weight) for weight in weights.values())
     mixed = torch.stack([weight * parts[name].advantages_N for name, weight in weights.items()]).sum(0) / total

@@ -18,7 +18,7 @@ from wm_nodes.video_model.conditions import Condition, concatenate
 from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout, concatenate_rollouts
 
 _METADATA_KEY = "rollout_buffer"
-_ROLLOUT_TENSORS = ("latents", "states", "mask", "sigma_base", "zeta", "seeds", "noise_share")
+_ROLLOUT_TENSORS = ("latents", "states", "mask", "sigma_base", "zeta", "seeds", "noise_share", "times")
 
 
 class RolloutBufferError(ValueError):

@@ -23,8 +23,9 @@ class RolloutSettings:
     """How videos are sampled.
 
     cfg: guidance g of v_u + g (v_c - v_u); 1 is off. storage_dtype: of the kept latents; x_s is rounded to it before
-    its log-probability is taken. noise_store: keep the normalised noise of each step (exact, as large as the latents),
-    or only the seed it was drawn from (no memory; needs float32 latents). micro_batch: videos per network call.
+    its log-probability is taken. noise_store: keep the normalised noise of each step (zeta: exact, as large as the
+    latents; zeta_bfloat16: half as large, with a KL of 1e-6 at its own anchor), or only the seed it was drawn from
+    (seed: no memory; needs float32 latents). micro_batch: videos per network call.
     """
 
     num_steps: int = 10
@@ -32,7 +33,7 @@ class RolloutSettings:
     cfg: float = 1.0
     sampler: SamplerSettings = field(default_factory=SamplerSettings)
     storage_dtype: Literal["float32", "bfloat16"] = "float32"
-    noise_store: Literal["zeta", "seed"] = "zeta"
+    noise_store: Literal["zeta", "zeta_bfloat16", "seed"] = "zeta"
     micro_batch: int = 16
 
     def __post_init__(self) -> None:
@@ -58,8 +59,10 @@ class VideoRollout:
 
     latents: the clean result (N, C, F, H, W), float32. steps: the stochastic steps k, ascending. states: x at the steps
     of state_steps (N, L, C, F, H, W); transition k leads from state k to state k + 1. mask: (N, S, 1, F, H, W).
-    sigma_base: (N, S). zeta: (N, S, C, F - K, H, W), or None where only seeds are kept. seeds: int64 (N,).
-    noise_share: rms of std / s over generated elements, (S,), the noise budget that was spent.
+    sigma_base: (N, S). zeta: (N, S, C, F - K, H, W), float32 or bfloat16, or None where only seeds are kept. seeds:
+    int64 (N,).
+    noise_share: rms of std / s over generated elements, (S,), the noise budget that was spent. times: of the sampler,
+    float64 (T + 1,); step k leads from times[k] to times[k + 1].
     """
 
     latents: Tensor
@@ -71,6 +74,7 @@ class VideoRollout:
     zeta: Tensor | None
     seeds: Tensor
     noise_share: Tensor
+    times: Tensor
 
     @property
     def spent_noise(self) -> float:
@@ -149,6 +153,7 @@ def concatenate_rollouts(parts: list[VideoRollout]) -> VideoRollout:
         zeta=None if parts[0].zeta is None else torch.cat([part.zeta for part in parts if part.zeta is not None]),
         seeds=torch.cat([part.seeds for part in parts]),
         noise_share=squares.sum(0).sqrt(),
+        times=parts[0].times,
     )
 
 
@@ -158,6 +163,7 @@ def _unsampled(
     """A rollout whose tensors are yet to be written, in place: kept once, without copies of its parts."""
     N, C, frames, H, W = noise.shape
     S, steps = len(stochastic), tuple(sorted({*stochastic, *(k + 1 for k in stochastic)}))
+    kept = torch.bfloat16 if settings.noise_store == "zeta_bfloat16" else torch.float32
     room = partial(torch.empty, dtype=torch.float32, device=noise.device)
     return VideoRollout(
         latents=room(N, C, frames, H, W),
@@ -166,9 +172,10 @@ def _unsampled(
         states=room(N, len(steps), C, frames, H, W, dtype=getattr(torch, settings.storage_dtype)),
         mask=room(N, S, 1, frames, H, W),
         sigma_base=room(N, S),
-        zeta=None if settings.noise_store == "seed" else room(N, S, C, frames - num_conditioning, H, W),
+        zeta=None if settings.noise_store == "seed" else room(N, S, C, frames - num_conditioning, H, W, dtype=kept),
         seeds=seeds.clone(),
         noise_share=torch.zeros(S, device=noise.device),
+        times=settings.times,
     )
 
 
@@ -212,7 +219,10 @@ def keep_transition(rollout: VideoRollout, k: int, x_s: Tensor, law: Step) -> No
     rollout.sigma_base[:, i] = law.sigma_base
     if rollout.zeta is not None:
         num_conditioning = x_s.shape[2] - rollout.zeta.shape[3]
-        normalised_noise(x_s, law, num_conditioning, out=rollout.zeta[:, i])
+        if rollout.zeta.dtype == torch.float32:
+            normalised_noise(x_s, law, num_conditioning, out=rollout.zeta[:, i])
+        else:
+            rollout.zeta[:, i] = normalised_noise(x_s, law, num_conditioning)
 
 
 def normalised_noise(x_s: Tensor, law: Step, num_conditioning: int, out: Tensor | None = None) -> Tensor:

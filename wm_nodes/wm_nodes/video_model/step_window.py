@@ -14,16 +14,19 @@ from wm_nodes.seeding import numpy_stream, torch_stream
 
 DECAY_FROM = 13
 DECAY_RATE = 0.1
+LEAST_STAY = 4
+"""With strategy decay the stay of a window falls towards this part of the period."""
 
 
 @dataclass(frozen=True)
 class WindowSettings:
     """strategy: all steps stochastic; a window of `size` steps that moves on by one every `period` iterations
-    (progressive), is drawn anew each iteration (random), moves on after exponentially fewer iterations from step 13 on
-    (decay), or is drawn in the first half (fast, Flow-GRPO-Fast).
+    (progressive), is drawn anew each iteration (random), moves on after fewer iterations the further it is, down to a
+    quarter of the period (decay) or exponentially from step 13 on (exp_decay), or is drawn in the first half (fast,
+    Flow-GRPO-Fast).
     """
 
-    strategy: Literal["all", "progressive", "random", "decay", "fast"] = "all"
+    strategy: Literal["all", "progressive", "random", "decay", "exp_decay", "fast"] = "all"
     size: int = 4
     period: int = 25
 
@@ -47,7 +50,7 @@ def stochastic_steps(num_steps: int, settings: WindowSettings, iteration: int, s
     elif settings.strategy == "progressive":
         start = (iteration // settings.period) % (last_start + 1)
     else:
-        start = _decayed_start(iteration, settings.period, last_start)
+        start = _decayed_start(iteration, settings, last_start, num_steps)
     return list(range(start, start + settings.size))
 
 
@@ -71,7 +74,7 @@ def select_steps(
     if not stochastic or not bool(usable.any()):
         raise ValueError(
             f"no step can train: {len(stochastic)} stochastic steps, none of which ends at or above s = {min_s}; "
-            f"take more sampler steps, or lower train.min_s"
+            f"take more sampler steps, or lower grpo.min_s"
         )
     S, candidates = len(stochastic), torch.nonzero(usable).flatten()
     chosen = torch.zeros(num_samples, S, dtype=torch.bool)
@@ -91,12 +94,20 @@ def select_steps(
     return chosen
 
 
-def _decayed_start(iteration: int, period: int, last_start: int) -> int:
-    decays = (math.exp(-DECAY_RATE * max(0, start - DECAY_FROM)) for start in range(last_start + 1))
-    stays = [max(1, round(period * decay)) for decay in decays]
+def _decayed_start(iteration: int, settings: WindowSettings, last_start: int, num_steps: int) -> int:
+    """Where a window stands that stays ever shorter, by Mix-GRPO's formulas; it starts anew after its last place."""
+    period, least = settings.period, max(1, settings.period // LEAST_STAY)
+
+    def stay(start: int) -> int:
+        if settings.strategy == "exp_decay":
+            return math.ceil(period * math.exp(-DECAY_RATE * max(0, start - DECAY_FROM)))
+        share = start / (num_steps - 2)
+        return max(least, int(period * (1 - share) + least * share))
+
+    stays = [stay(start) for start in range(last_start + 1)]
     left = iteration % sum(stays)
-    for start, stay in enumerate(stays):
-        if left < stay:
+    for start, iterations in enumerate(stays):
+        if left < iterations:
             return start
-        left -= stay
+        left -= iterations
     raise AssertionError("unreachable: left < sum(stays)")

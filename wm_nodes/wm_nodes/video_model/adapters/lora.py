@@ -1,8 +1,10 @@
 """Low-rank adapters on a public model's attention, through peft. Adapter off is the base model: kl.anchor lora_off."""
 
 from pathlib import Path
+from typing import Any
 
 import torch
+from safetensors.torch import load_file
 
 from wm_nodes.video_model.adapters.packages import package
 from wm_nodes.video_model.adapters.velocity import PublicVelocity, tuner_layers
@@ -60,10 +62,21 @@ def load_lora(model: PublicVelocity, folder: Path) -> None:
             str(folder / name), prefix=None, adapter_name="default", use_safetensors=True, local_files_only=True
         )
     _train_adapter_alone(model)
+    for name, transformer in zip(_names(model), model.transformers()):
+        _copy_exactly(transformer, folder / name)
 
 
 def _names(model: PublicVelocity) -> list[str]:
     return [f"lora_{index}" for index in range(len(model.transformers()))]
+
+
+@torch.no_grad()
+def _copy_exactly(transformer: Any, folder: Path) -> None:
+    """Write the file's float32 values again: diffusers loads them in the dtype of the base weights."""
+    parameters = {name.replace(".default.", "."): p for name, p in transformer.named_parameters() if "lora_" in name}
+    for path in sorted(folder.glob("*.safetensors")):
+        for name, tensor in load_file(path).items():
+            parameters[name].copy_(tensor)
 
 
 def _train_adapter_alone(model: PublicVelocity) -> None:

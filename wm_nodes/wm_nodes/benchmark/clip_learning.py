@@ -1,0 +1,105 @@
+"""Claim B on clips of recorded contexts: what each sampler makes of the same number of model calls. Section 5.3.
+
+The setting is the one of docs/dyndiff.md in which the shipped video model was seen to learn: contexts it has not been
+trained on, clips of few steps, only the weights that carry the condition, no KL.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from wm_nodes.benchmark.video_arms import SHIFT, Arm, dyndiff
+from wm_nodes.learning.clip_generation import ClipGenerator
+from wm_nodes.learning.clip_scores import mixed, score_clips
+from wm_nodes.learning.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
+from wm_nodes.learning.heldout import context_scores
+from wm_nodes.learning.video_config import EvaluationSettings, GroupSettings, VideoRlConfig
+from wm_nodes.learning.video_data import Clips
+from wm_nodes.learning.video_folder import VideoFolder
+from wm_nodes.learning.video_grpo import GrpoLearner
+from wm_nodes.learning.video_run import flat_metrics, rewarded
+from wm_nodes.video_model import RolloutSettings, SamplerSettings
+from wm_nodes.world_model.position_probe import PositionProbe
+
+MEASURES = ("tracking_path", "tracking", "object_cm", "tool_cm", "psnr_db")
+TASK = "push_cube"
+NUM_STEPS = 4
+REWARDS = {"tracking": 1.0, "object_cm": -0.1}
+LEARNER = GrpoSettings(
+    AdvantageSettings(std_scope="global", best_of_n=4), KlSettings("none"), trains="condition", logprob_weight="cps",
+    updates_per_buffer=1, step_fraction=1.0, learning_rate=2e-4, weight_decay=0.0,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ClipPlan:
+    """iterations: buffers of contexts x group_size clips. eval_contexts: held out, one ODE clip each, before, every
+    eval_every buffers, and at the end.
+    """
+
+    iterations: int = 8
+    contexts: int = 16
+    group_size: int = 8
+    eval_contexts: int = 100
+    eval_every: int = 2
+
+
+def clip_learning_arms() -> list[Arm]:
+    """CPS and DynDiff at one eta, CPS at the noise that DynDiff spends on these clips, and DynDiff as written."""
+    samplers = {
+        "CPS 0.6": SamplerSettings("cps", 0.6),
+        "CPS 0.4": SamplerSettings("cps", 0.4),
+        "DynDiff 0.6 gated, rms": dyndiff(0.6, "gated", "rms"),
+        "DynDiff 0.6 gated": dyndiff(0.6),
+    }
+    return [
+        Arm(name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler), LEARNER, shared_noise=True)
+        for name, sampler in samplers.items()
+    ]
+
+
+def train_on_clips(
+    folder: VideoFolder, contexts: Clips, heldout: Clips, probe: PositionProbe, arm: Arm, plan: ClipPlan, seed: int,
+    on_iteration: Callable[[], object] = lambda: None,
+) -> dict[str, Any]:  # fmt: skip
+    """Post-train folder.network in place; return evaluations, a list per quantity of the buffers, the held-out scores
+    of every context before and after, and seconds.
+    """
+    config = VideoRlConfig(
+        seed, TASK, rewards=REWARDS, groups=GroupSettings(plan.contexts, plan.group_size, arm.shared_noise),
+        window=arm.window, rollout=arm.rollout, grpo=arm.grpo,
+        evaluation=EvaluationSettings(plan.eval_contexts, NUM_STEPS),
+    )  # fmt: skip
+    generator = ClipGenerator(folder, contexts, config)
+    learner = GrpoLearner(folder.network, arm.grpo, arm.rollout, seed=seed)
+    K, seconds = folder.clip["num_conditioning"], {"rollout": 0.0, "train": 0.0}
+
+    def evaluate(iteration: int) -> dict[str, Any]:
+        scores = context_scores(folder, heldout, probe, config)
+        return {"iteration": iteration, **{name: values.tolist() for name, values in scores.items()}}
+
+    evaluations, buffers = [evaluate(0)], list[dict[str, float]]()
+    for iteration in range(plan.iterations):
+        start = time.perf_counter()
+        request = generator.request(iteration, learner.version)
+        buffer = generator.sample(request)
+        frames = folder.codec.decode(buffer.rollout.latents)
+        scores = score_clips(frames, generator.references(request), probe, K).named()
+        middle = time.perf_counter()
+        report = learner.train(rewarded(buffer, scores, mixed(scores, REWARDS)))
+        seconds["rollout"] += middle - start
+        seconds["train"] += time.perf_counter() - middle
+        buffers.append(flat_metrics(report))
+        if (iteration + 1) % plan.eval_every == 0 or iteration + 1 == plan.iterations:
+            evaluations.append(evaluate(iteration + 1))
+        on_iteration()
+    return {
+        "arm": arm.name, "shared_noise": arm.shared_noise, "seed": seed, "plan": asdict(plan),
+        "before": evaluations[0], "after": evaluations[-1], "evaluations": [_means(found) for found in evaluations],
+        "buffers": {name: [row[name] for row in buffers] for name in buffers[0]}, "seconds": seconds,
+    }  # fmt: skip
+
+
+def _means(found: dict[str, Any]) -> dict[str, Any]:
+    return {name: sum(v) / len(v) if isinstance(v, Sequence) else v for name, v in found.items()}
