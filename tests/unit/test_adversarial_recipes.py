@@ -281,6 +281,19 @@ def test_an_idle_clip_has_no_motion_to_freeze_and_no_path_for_a_ghost() -> None:
         edit_states(idle, "ghost_motion", "fail", 0)
 
 
+def test_an_object_that_the_robot_hides_to_the_end_is_not_copied() -> None:
+    seen = push_clip().clip
+    masks = seen.masks.copy()
+    masks[1:][masks[1:] == OBJECT] = ROBOT
+    hidden = recorded(replace(seen, masks=masks))
+    reasons = set()
+    for seed in range(9):
+        with pytest.raises(NotApplicableError) as caught:
+            apply(hidden, "object_copy", "fail", seed)
+        reasons.add(str(caught.value))
+    assert "the object is hidden to the end: nothing to copy" in reasons
+
+
 def test_what_a_time_edit_may_have_cut_away_is_unknown() -> None:
     defect = parent("occlude_patch", "fail")
     assert {"interaction", "geometry"} <= failures(defect.labels)

@@ -5,13 +5,17 @@ written last: a folder without one is unfinished. Equal arguments give equal byt
 
     python3 launch_scripts/make_adversarial_set.py FOLDER --tasks push_cube --episodes 8
     python3 launch_scripts/make_adversarial_set.py FOLDER --benchmark
+    python3 launch_scripts/make_adversarial_set.py FOLDER --diverse --episodes 40 --edits 26 --seed 20000
 
 --benchmark is the set that judges are compared on: three tasks, shapes that no judge was trained on, and seeds of its
 own; its test split is fixed by the manifest (benchmark_clips.chosen_rows) and has 400 clips or more.
+--development leaves out the episodes of the test part, which training does not read; --diverse does so too, and draws
+cameras, colours, light and push directions from ranges that keep away from what is held out (diverse_looks.py).
 """
 
 import argparse
 import io
+import itertools
 import sys
 import zipfile
 import zlib
@@ -26,7 +30,9 @@ from tqdm import tqdm
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.files import write_atomic
+from wm_nodes.learning.diverse_looks import Variation, drawn_variation
 from wm_nodes.reward.adversarial import (
+    RECIPES,
     Division,
     LabelledClip,
     Manifest,
@@ -42,6 +48,7 @@ from wm_nodes.reward.adversarial import (
     rendered,
     to_bytes,
 )
+from wm_nodes.reward.adversarial.manifest import Part
 from wm_nodes.reward.agent.types import media_sha
 from wm_nodes.seeding import numpy_stream
 from wm_nodes.simulation.clip_scenes import (
@@ -49,6 +56,7 @@ from wm_nodes.simulation.clip_scenes import (
     ClipStage,
     EpisodeStates,
     Look,
+    View,
     cube_half_sizes,
     record_states,
 )
@@ -80,6 +88,8 @@ class SetPlan:
     """tasks: in turn. num_episodes: recorded ones, each seen by one camera. edits_per_clip: (recipe, severity) pairs
     that are tried on each, None for all. seed: episode i is reset with seed + i; look and recipes follow from it.
     shapes: besides the cube; rare, and test clips only. Not in "reach", whose end state depends on the height.
+    development: episodes that no test part has, num_episodes of them. diverse: scenes of diverse_looks.py. recipes: of
+    the edits.
     """
 
     tasks: tuple[str, ...] = ("push_cube",)
@@ -88,8 +98,15 @@ class SetPlan:
     seed: int = 0
     division: Division = HELD_OUT
     shapes: tuple[str, ...] = ()
+    development: bool = False
+    diverse: bool = False
+    recipes: tuple[str, ...] = tuple(RECIPES)
 
     def __post_init__(self) -> None:
+        if self.diverse and (self.shapes or not self.development):
+            raise ValueError("a diverse set is of the development parts, and of the cube alone; leave out shapes")
+        if self.development and (kept := sorted({*self.tasks} & {*self.division.tasks})):
+            raise ValueError(f"{', '.join(kept)} is held out, a development set has none of it; take another task")
         if self.num_episodes < 1 or (self.edits_per_clip is not None and self.edits_per_clip < 0):
             raise ValueError(f"need at least 1 episode and 0 edits, got {self.num_episodes} and {self.edits_per_clip}")
         if foreign := sorted(set(self.shapes) - set(SHAPES)):
@@ -101,33 +118,49 @@ class SetPlan:
         objects = (f"{shape}/{colour}" for shape in self.shapes if shape != "cube" for colour in OBJECT_COLOURS)
         return replace(self.division, objects=(*self.division.objects, *objects))
 
+    def seeds(self, task: str) -> list[int]:
+        """Of the recorded episodes."""
+        found = itertools.count(self.seed)
+        kept = (seed for seed in found if not self.development or self.part(task, seed) != "test")
+        return list(itertools.islice(kept, self.num_episodes))
+
+    def part(self, task: str, seed: int) -> Part:
+        return _drawn_part(task, seed) if self.diverse else self.held_out.part(drawn_origin(task, seed, self.shapes))
+
 
 BENCHMARK = SetPlan(("push_cube", "reach", "pull_cube"), 20, 26, 9000, shapes=("post", "slab"))
 """The set that judges are compared on. Train on other seeds."""
 
 
 class ClipSource:
-    """Recorded clips and redrawn edits of one task. Building it starts the simulator: seconds.
+    """Recorded clips and redrawn edits of one task; shapes, diverse: see SetPlan. Building it starts the simulator:
+    seconds.
 
     Raises:
         NoRendererError: Vulkan finds no device.
     """
 
-    def __init__(self, task: str, config: SimulationConfig, shapes: Collection[str] = ()) -> None:
+    def __init__(
+        self, task: str, config: SimulationConfig, shapes: Collection[str] = (), *, diverse: bool = False
+    ) -> None:
         self._task = task
         self._shapes = shapes
+        self._diverse = diverse
         self._config = config
         self._env = ManiSkillEnvironment(task, config.model_copy(update={"image_size": 16}), end_on_success=False)
         self.stage = ClipStage(task, config.model_copy(update={"image_size": SIDE_PX}))
 
     def origin(self, seed: int) -> Origin:
-        return drawn_origin(self._task, seed, self._shapes)
+        drawn = drawn_origin(self._task, seed, self._shapes)
+        return self._variation(seed).origin(self._task, seed, drawn.behaviour) if self._diverse else drawn
 
     def clip(self, seed: int) -> LabelledClip:
         """Record one episode and draw it."""
-        origin = self.origin(seed)
+        origin, behaviour = self.origin(seed), drawn_origin(self._task, seed, self._shapes).behaviour
         height = SHAPES[origin.object_id.split("/")[0]]
-        return recorded(self._drawn(scene_states(record_states(self._env, origin.behaviour, seed), height), origin))
+        layout = self._variation(seed).look.layout if self._diverse else None
+        states = scene_states(record_states(self._env, behaviour, seed, layout), height)
+        return recorded(self._drawn(states, origin))
 
     def redraw(self, parent: LabelledClip, edit: StateEdit) -> LabelledClip:
         return rendered(parent, edit, self._drawn(edit.states, parent.clip.origin))
@@ -136,17 +169,30 @@ class ClipSource:
         self._env.close()
         self.stage.close()
 
+    def _variation(self, seed: int) -> Variation:
+        return drawn_variation(self._task, seed, _drawn_part(self._task, seed))
+
     def _drawn(self, states: SceneStates, origin: Origin) -> SourceClip:
-        colour = origin.object_id.split("/")[1]
-        look = Look(OBJECT_COLOURS[colour], TABLES[origin.scene], seed=origin.seed)
+        camera, look = self._scenery(origin)
         drawing = self.stage.draw(
-            states.robot_q, states.poses, states.half_sizes_m * states.scales, states.tool, states.goal, origin.camera,
-            look,
-        )  # fmt: skip
+            states.robot_q, states.poses, states.half_sizes_m * states.scales, states.tool, states.goal, camera, look
+        )
         return SourceClip(
             drawing.frames, drawing.masks, drawing.tracks, states, origin,
             instruction_of(origin), self._config.control_hz,
         )  # fmt: skip
+
+    def _scenery(self, origin: Origin) -> tuple[str | View, Look]:
+        if self._diverse:
+            variation = self._variation(origin.seed)
+            return variation.view, variation.look
+        colour = origin.object_id.split("/")[1]
+        return origin.camera, Look(OBJECT_COLOURS[colour], TABLES[origin.scene], seed=origin.seed)
+
+
+def _drawn_part(task: str, seed: int) -> Part:
+    """Of an episode that has nothing of what is held out."""
+    return HELD_OUT.part(Origin(task, "drawn", "cube/drawn", "drawn", seed))
 
 
 def drawn_origin(task: str, seed: int, shapes: Collection[str] = ()) -> Origin:
@@ -170,9 +216,11 @@ def _pick(rng: np.random.Generator, values: Sequence[str], rare: Sequence[str]) 
 
 
 def instruction_of(origin: Origin) -> str:
-    """The task's instruction with the object's colour in place of blue, and its shape in place of the cube."""
+    """The task's instruction with the object's colour in place of blue, and its shape in place of the cube. What
+    follows the colour's name, as numbers do that were drawn, is not said.
+    """
     shape, _, colour = origin.object_id.partition("/")
-    return get_task(origin.task).instruction.replace("blue", colour).replace("cube", shape)
+    return get_task(origin.task).instruction.replace("blue", colour.split()[0]).replace("cube", shape)
 
 
 def scene_states(states: EpisodeStates, height: float = 1.0) -> SceneStates:
@@ -202,11 +250,12 @@ def build(
 
     def kept() -> Iterator[LabelledClip]:
         for task in plan.tasks:
-            source = ClipSource(task, config, plan.shapes)
+            source = ClipSource(task, config, plan.shapes, diverse=plan.diverse)
             try:
-                for seed in tqdm(range(plan.seed, plan.seed + plan.num_episodes), desc=task, disable=not progress):
+                for seed in tqdm(plan.seeds(task), desc=task, disable=not progress):
                     parent = source.clip(seed)
-                    made = children(parent, seed, source.redraw, count=plan.edits_per_clip, skipped=skipped)
+                    made = children(parent, seed, source.redraw, names=plan.recipes, count=plan.edits_per_clip,
+                                    skipped=skipped)  # fmt: skip
                     for clip in (parent, *made):
                         write_atomic(clip_path(folder, clip.sha256), to_file(clip))
                         yield clip
@@ -276,6 +325,9 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--edits", type=int, help="edits tried on each; all by default")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--shapes", nargs="+", choices=sorted(SHAPES), default=[], help="besides the cube, held out")
+    parser.add_argument("--recipes", nargs="+", choices=sorted(RECIPES), default=tuple(RECIPES), help="all by default")
+    parser.add_argument("--development", action="store_true", help="only episodes of the training and validation parts")
+    parser.add_argument("--diverse", action="store_true", help="the same, with cameras, colours, light, ways at random")
     parser.add_argument("--benchmark", action="store_true", help="the set that judges are compared on; nothing else")
     parser.add_argument("--check", action="store_true", help="build nothing, verify the set that is there")
     arguments = parser.parse_args(argv)
@@ -285,7 +337,9 @@ def main(argv: Sequence[str]) -> int:
         else:
             shapes = tuple(arguments.shapes)
             plan = SetPlan(
-                tuple(arguments.tasks), arguments.episodes, arguments.edits, arguments.seed, shapes=shapes
+                tuple(arguments.tasks), arguments.episodes, arguments.edits, arguments.seed, shapes=shapes,
+                development=arguments.development or arguments.diverse, diverse=arguments.diverse,
+                recipes=tuple(arguments.recipes),
             )  # fmt: skip
             plan = BENCHMARK if arguments.benchmark else plan
             manifest, skipped = build(arguments.folder, plan, load_config("cpu").simulation)

@@ -65,7 +65,7 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
         "fitted": {"train": len(train.rows), "validation": len(validation.rows)},
         "segmenter": segmenter_story, "trees": vars(plan.trees),
         "tasks": sorted({row.origin.task for row in train.rows}),
-        "cameras": sorted({row.origin.camera for row in train.rows}),
+        "cameras": sorted({row.origin.camera.split()[0] for row in train.rows}),
         "validation": {target: measured(questions, target, validation) for target in TARGETS},
     }  # fmt: skip
     known = fit_familiarity(train, validation)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wm_nodes.simulation.tasks import CUBE, CUBE_HALF_SIZE_M, GOAL, reach_target
+from wm_nodes.simulation.tasks import CUBE, CUBE_HALF_SIZE_M, GOAL, TOOL, reach_target
 from wm_nodes.types import FloatArray
 
 ROBOT_BASE = np.array([-0.615, 0.0, 0.0], np.float32)
@@ -79,6 +79,34 @@ def script(
         if largest > style.speed:
             step = step * (style.speed / largest)
         return np.clip(step + rng.normal(0, style.noise, 3), -1, 1).astype(np.float32)
+
+    return act
+
+
+def turned(
+    behaviour: str, truth: FloatArray, rng: np.random.Generator, max_action_m: float, heading_rad: float
+) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """script() for a goal that lies `heading_rad` from +x: it acts in a world turned back about the first cube."""
+    centre = truth[CUBE][:2].copy()
+    cos, sin = np.cos(heading_rad), np.sin(heading_rad)
+    out = np.array([[cos, -sin], [sin, cos]], np.float32)
+
+    def back(places: FloatArray) -> FloatArray:
+        """x y m turned back about the centre; what follows them is kept."""
+        return np.concatenate([centre + (places[:2] - centre) @ out, places[2:]])
+
+    def seen(truth_now: FloatArray) -> FloatArray:
+        found = truth_now.copy()
+        for places in (CUBE, TOOL, GOAL):
+            found[places] = back(truth_now[places])
+        return found
+
+    scripted = script(behaviour, seen(truth), rng, max_action_m)
+
+    def act(truth_now: FloatArray, state: FloatArray) -> FloatArray:
+        action = scripted(seen(truth_now), back(state + ROBOT_BASE) - ROBOT_BASE)
+        turned_action: FloatArray = np.clip(np.concatenate([out @ action[:2], action[2:]]), -1, 1).astype(np.float32)
+        return turned_action
 
     return act
 

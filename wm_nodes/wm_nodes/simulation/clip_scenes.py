@@ -20,22 +20,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.seeding import numpy_stream
-from wm_nodes.simulation.behaviours import script
+from wm_nodes.simulation.behaviours import script, turned
 from wm_nodes.simulation.environment import ManiSkillEnvironment
 from wm_nodes.simulation.episodes import record_episode
 from wm_nodes.simulation.scenes import WmPullCube, WmPushCube, make_scene
 from wm_nodes.simulation.tasks import CUBE_HALF_SIZE_M, get_task
 from wm_nodes.types import BoolArray, FloatArray, Observation, UInt8Array
 
+View = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Eye and target of a camera, m, world frame."""
 CLIP_FOV_RAD = 0.72
 """With this a 4 cm cube is at least 9 px wide in 96 px (section 3.2)."""
-CAMERAS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+CAMERAS: Mapping[str, View] = {
     "near_side": ((0.22, 0.46, 0.34), (0.06, 0.0, 0.02)),
     "near_left": ((0.26, -0.42, 0.36), (0.06, 0.0, 0.02)),
     "near_right": ((0.40, 0.34, 0.38), (0.05, 0.0, 0.02)),
     "near_high": ((0.26, 0.30, 0.50), (0.06, 0.0, 0.0)),
 }
-"""Eye and target, m, world frame."""
+MOVED_CAMERA = "moved"
+"""The sensor that draws a View which is none of CAMERAS."""
 HIDDEN = sapien.Pose(p=[0.0, 0.0, -9.0])
 TILE_M, TILES = 0.06, 14
 TILE_TOP_M, GOAL_Z_M = 0.0009, 0.0014
@@ -65,13 +68,29 @@ class EpisodeStates:
 
 
 @dataclass(frozen=True)
+class Layout:
+    """Where the cube starts, x y m, and which way its goal lies, rad from +x to +y; the cube faces that way."""
+
+    cube_m: tuple[float, float]
+    heading_rad: float
+
+
+@dataclass(frozen=True)
 class Look:
-    """How a scene is drawn. Colours are RGB in [0, 1]. seed: of the tiles' shades and the clutter's places."""
+    """How a scene is drawn. Colours are RGB in [0, 1]. seed: of the tiles' shades and the clutter's places. shades:
+    range of a tile's brightness over the table's. ambient: light from everywhere. lamp: direction and strength of a
+    light besides the scene's own two, whose strength is 1 each. layout: of the episode; clutter lies beside its way,
+    without one beside y = 0.
+    """
 
     thing: tuple[float, float, float] = (0.05, 0.16, 0.63)
     table: tuple[float, float, float] = (0.78, 0.74, 0.66)
     num_clutter: int = 3
     seed: int = 0
+    shades: tuple[float, float] = (0.75, 1.15)
+    ambient: float = 0.3
+    lamp: tuple[tuple[float, float, float], float] | None = None
+    layout: Layout | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +104,13 @@ class Drawing:
     tracks: dict[str, FloatArray]
 
 
-def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int) -> EpisodeStates:
-    """Act one scripted episode in slot 0 and keep its states. Everything follows from `behaviour` and `seed`.
+def record_states(
+    env: ManiSkillEnvironment, behaviour: str, seed: int, layout: Layout | None = None
+) -> EpisodeStates:
+    """Act one scripted episode in slot 0 and keep its states. Everything follows from the arguments.
 
-    The scene is built anew: what PhysX keeps of earlier episodes changes the last bits of the next contact.
+    layout: in place of the task's own. The scene is built anew: what PhysX keeps of earlier episodes changes the last
+    bits of the next contact.
     """
     scene, frames = env.scene, list[dict[str, Any]]()
     touched = [False]
@@ -112,7 +134,12 @@ def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int) -> Episo
     scene.image_size = env.spec.height  # its own: another scene of this process may have set the class's
     scene.reset(seed=0, options={"reconfigure": True})
     env.reset(seeds=np.array([seed], np.uint64))
-    scripted = script(behaviour, env.ground_truth[0], numpy_stream(seed, "behaviour"), env.spec.action_scale[0])
+    rng, scale = numpy_stream(seed, "behaviour"), env.spec.action_scale[0]
+    if layout is None:
+        scripted = script(behaviour, env.ground_truth[0], rng, scale)
+    else:
+        env.lay_out(layout.cube_m, layout.heading_rad)
+        scripted = turned(behaviour, env.ground_truth[0], rng, scale, layout.heading_rad)
 
     def act(observation: Observation, truth: FloatArray) -> FloatArray:
         keep()
@@ -129,14 +156,14 @@ def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int) -> Episo
 
 
 class _ClipScene(BaseEnv):  # type: ignore[misc]
-    """Mixin: the cameras of CAMERAS and no other."""
+    """Mixin: the cameras of CAMERAS, one that is put anywhere, and no other."""
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
         size = {"width": self.image_size, "height": self.image_size, "near": 0.01, "far": 10.0, "fov": CLIP_FOV_RAD}
         return [
             CameraConfig(name, pose=sapien_utils.look_at(eye=list(eye), target=list(target)), **size)
-            for name, (eye, target) in CAMERAS.items()
+            for name, (eye, target) in {**CAMERAS, MOVED_CAMERA: CAMERAS["near_side"]}.items()
         ]
 
 
@@ -166,7 +193,7 @@ class ClipStage:
 
     def draw(
         self, robot_q: FloatArray, poses: FloatArray, half_sizes_m: FloatArray, tool: FloatArray, goal: FloatArray,
-        camera: str, look: Look,
+        camera: str | View, look: Look,
     ) -> Drawing:  # fmt: skip
         """Draw T frames.
 
@@ -176,10 +203,13 @@ class ClipStage:
         Raises:
             ValueError: no such camera.
         """
-        if camera not in CAMERAS:
+        if isinstance(camera, str) and camera not in CAMERAS:
             raise ValueError(f"unknown camera {camera!r}; choose one of {', '.join(CAMERAS)}")
         labels = self._dress(look)
-        sensor = self._env._sensors[camera]
+        sensor = self._env._sensors[camera if isinstance(camera, str) else MOVED_CAMERA]
+        if not isinstance(camera, str):
+            pose = sapien_utils.look_at(eye=list(camera[0]), target=list(camera[1])).sp
+            sensor.camera._render_cameras[0].set_local_pose(pose)
         frames, masks = [], []
         for t in range(len(poses)):
             self._env.agent.robot.set_qpos(torch.from_numpy(robot_q[t])[None])
@@ -227,14 +257,19 @@ class ClipStage:
         for i in range(TILES):
             for j in range(TILES):
                 place = [TILE_M * (i - TILES / 2) + 0.05, TILE_M * (j - TILES / 2), TILE_TOP_M / 2]
-                shade = np.clip(table * rng.uniform(0.75, 1.15), 0, 1)
+                shade = np.clip(table * rng.uniform(*look.shades), 0, 1)
                 self._drawn.append(self._box([half, half, TILE_TOP_M / 2], shade, [*place, 1, 0, 0, 0]))
         clutter = []
         for _ in range(look.num_clutter):
             size, side = rng.uniform(0.008, 0.016, 3), rng.choice([-1.0, 1.0])
             place = [rng.uniform(-0.08, 0.2), side * rng.uniform(0.1, 0.16), size[2], 1, 0, 0, 0]
+            if look.layout is not None:
+                place[:2] = _beside(look.layout, place[0], place[1])
             clutter.append(self._box(size, rng.uniform(0.1, 0.9, 3), place))
         self._drawn += clutter
+        self._scene.render_system.ambient_light = [look.ambient] * 3
+        if look.lamp is not None:
+            self._drawn.append(self._lamp(*look.lamp))
         robot = {link._objs[0].entity.per_scene_id: ROBOT for link in self._env.agent.robot.links}
         self._look, self._labels = look, robot | {entity.per_scene_id: CLUTTER for entity in clutter}
         return self._labels
@@ -250,6 +285,22 @@ class ClipStage:
         self._scene.add_entity(entity)
         self._last_id = int(entity.per_scene_id)
         return entity
+
+    def _lamp(self, direction: tuple[float, float, float], strength: float) -> sapien.Entity:
+        light = sapien.render.RenderDirectionalLightComponent()
+        light.color = [strength] * 3
+        entity = sapien.Entity()
+        entity.add_component(light)
+        entity.set_pose(sapien.Pose(q=sapien.math.shortest_rotation([1, 0, 0], direction)))
+        self._scene.add_entity(entity)
+        return entity
+
+
+def _beside(layout: Layout, ahead_m: float, left_m: float) -> tuple[float, float]:
+    """x y m of a place so far along a layout's way and to its left, from where its cube starts."""
+    cos, sin = np.cos(layout.heading_rad), np.sin(layout.heading_rad)
+    x, y = layout.cube_m
+    return x + cos * ahead_m - sin * left_m, y + sin * ahead_m + cos * left_m
 
 
 def cube_half_sizes(num_frames: int, num_things: int = 1) -> FloatArray:

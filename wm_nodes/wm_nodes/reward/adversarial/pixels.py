@@ -62,6 +62,8 @@ def copy_object(clip: SourceClip, opacity: float, rng: np.random.Generator) -> S
     """A second object beside the first one, from a frame in the first half on."""
     start, mask = int(rng.integers(0, max(1, len(clip) // 2))), _seen(clip, OBJECT)
     rows, columns = np.nonzero(mask[start:].any(0))
+    if not len(rows):
+        raise NotApplicableError("the object is hidden to the end: nothing to copy")
     extent = max(np.ptp(rows), np.ptp(columns)) + 4
     away = extent if columns.mean() < clip.frames.shape[2] / 2 else -extent
     frames, copied = _floats(clip), np.roll(mask, away, axis=2)
