@@ -1,6 +1,7 @@
-"""DynDiff-GRPO against its rivals on a toy world: diversity, learning, cost of the KL; every arm on one learner.
+"""DynDiff-GRPO against its rivals, every arm on one learner: diversity and learning on a toy world and on PushCube
+clips, cost of the KL.
 
-python3 launch_scripts/benchmark_dyndiff.py diversity|learning|ablations|hacking|cost|clips|base [--json FILE]
+python3 launch_scripts/benchmark_dyndiff.py CLAIM [--json FILE]      # the claims: --help
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Clips, codec, scores, settings, folder and doctor of the video model."""
+"""Clips, codec, scores, settings and folder of the video model."""
 
 from pathlib import Path
 
@@ -6,21 +6,17 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from video_toys import toy_condition
 
-from wm_nodes.benchmark.moving_disc import draw_scenes
-from wm_nodes.benchmark.video_cli import load_base
 from wm_nodes.config.load import ConfigError
 from wm_nodes.learning.clip_scores import mixed, score_clips
 from wm_nodes.learning.episode_arrays import EpisodeArrays
 from wm_nodes.learning.video_config import dump_video_config, load_video_config, video_preset_names
 from wm_nodes.learning.video_data import Clips, cut_clips
-from wm_nodes.learning.video_doctor import examine
 from wm_nodes.learning.video_folder import load_video_folder, save_video_folder
 from wm_nodes.learning.weights import WeightsError
 from wm_nodes.seeding import torch_stream
 from wm_nodes.simulation.tasks import GROUND_TRUTH_NAMES
-from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
+from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
@@ -183,30 +179,3 @@ def test_a_folder_comes_back_equal_and_a_changed_file_is_refused(tmp_path: Path)
     (tmp_path / "model" / "network.safetensors").write_bytes(data)
     with pytest.raises(WeightsError):
         load_video_folder(tmp_path / "model")
-
-
-def test_the_doctor_passes_the_shipped_toy_model_and_leaves_it_as_it_was() -> None:
-    model, config = load_base(), load_video_config("recommended")
-    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-    findings = examine(model, draw_scenes(4, 0, "doctor").condition(), (2, 6, 16, 16), config.rollout, config.grpo)
-    assert [finding.name for finding in findings if not finding.passed] == []
-    assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
-
-
-def test_the_doctor_names_a_flat_mask_and_a_ratio_that_is_not_1() -> None:
-    class Restless(torch.nn.Module):
-        """Other noise on every call, as dropout left on would give."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.scale = torch.nn.Parameter(torch.ones(()))
-
-        def forward(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None = None) -> Tensor:
-            return self.scale * (x + 0.3 * torch.randn_like(x))
-
-    config = load_video_config("recommended")
-    condition = toy_condition(3, (2, 5, 8, 8))
-    findings = {f.name: f for f in examine(Restless(), condition, (2, 5, 8, 8), config.rollout, config.grpo)}
-    assert not findings["ratio is 1 on the first update"].passed
-    assert "dropout" in findings["ratio is 1 on the first update"].remedy
-    assert not findings["eta = 0 is the Euler ODE step"].passed

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from video_toys import Analytic, toy_condition
 
 from wm_nodes.benchmark.moving_disc import draw_scenes
 from wm_nodes.benchmark.video_cli import load_base
@@ -68,15 +68,7 @@ def test_an_image_is_explored_everywhere_and_passes() -> None:
 
 
 def test_a_model_whose_output_is_not_finite_is_the_only_finding() -> None:
-    class Overflowing(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.scale = torch.nn.Parameter(torch.ones(()))
-
-        def forward(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None = None) -> Tensor:
-            return self.scale * x / 0
-
-    ((name, finding),) = findings(model=Overflowing()).items()
+    ((name, finding),) = findings(model=Analytic(lambda x, t: x / 0)).items()
     assert name == "sampled videos are finite" and not finding.passed and finding.value == "4 of 4 are not"
 
 
@@ -116,3 +108,21 @@ def test_settings_that_cannot_train_are_one_clear_error(
 ) -> None:
     assert main(["--set", setting]) == 2
     assert words in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_doctor_passes_the_shipped_toy_model_and_leaves_it_as_it_was() -> None:
+    model, config = load_base(), load_video_config("recommended")
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    findings = examine(model, draw_scenes(4, 0, "doctor").condition(), (2, 6, 16, 16), config.rollout, config.grpo)
+    assert [finding.name for finding in findings if not finding.passed] == []
+    assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
+
+
+def test_the_doctor_names_a_flat_mask_and_a_ratio_that_is_not_1() -> None:
+    config = load_video_config("recommended")
+    condition = toy_condition(3, (2, 5, 8, 8))
+    restless = Analytic(lambda x, t: x + 0.3 * torch.randn_like(x))  # other noise on every call, as dropout would give
+    findings = {f.name: f for f in examine(restless, condition, (2, 5, 8, 8), config.rollout, config.grpo)}
+    assert not findings["ratio is 1 on the first update"].passed
+    assert "dropout" in findings["ratio is 1 on the first update"].remedy
+    assert not findings["eta = 0 is the Euler ODE step"].passed

@@ -4,12 +4,12 @@ The setting is the one of docs/dyndiff.md in which the shipped video model was s
 trained on, clips of few steps, only the weights that carry the condition, no KL.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from wm_nodes.benchmark.video_arms import SHIFT, Arm, dyndiff
+from wm_nodes.benchmark.video_learning import follow_training
 from wm_nodes.learning.clip_generation import ClipGenerator
 from wm_nodes.learning.clip_scores import mixed, score_clips
 from wm_nodes.learning.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
@@ -18,8 +18,8 @@ from wm_nodes.learning.video_config import EvaluationSettings, GroupSettings, Vi
 from wm_nodes.learning.video_data import Clips
 from wm_nodes.learning.video_folder import VideoFolder
 from wm_nodes.learning.video_grpo import GrpoLearner
-from wm_nodes.learning.video_run import flat_metrics, rewarded
-from wm_nodes.video_model import RolloutSettings, SamplerSettings
+from wm_nodes.learning.video_run import rewarded
+from wm_nodes.video_model import RolloutBuffer, RolloutSettings, SamplerSettings
 from wm_nodes.world_model.position_probe import PositionProbe
 
 MEASURES = ("tracking_path", "tracking", "object_cm", "tool_cm", "psnr_db")
@@ -63,8 +63,8 @@ def train_on_clips(
     folder: VideoFolder, contexts: Clips, heldout: Clips, probe: PositionProbe, arm: Arm, plan: ClipPlan, seed: int,
     on_iteration: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Post-train folder.network in place; return evaluations, a list per quantity of the buffers, the held-out scores
-    of every context before and after, and seconds.
+    """Post-train folder.network in place; return follow_training's row, and the held-out scores of every context
+    before and after.
     """
     config = VideoRlConfig(
         seed, TASK, rewards=REWARDS, groups=GroupSettings(plan.contexts, plan.group_size, arm.shared_noise),
@@ -73,31 +73,22 @@ def train_on_clips(
     )  # fmt: skip
     generator = ClipGenerator(folder, contexts, config)
     learner = GrpoLearner(folder.network, arm.grpo, arm.rollout, seed=seed)
-    K, seconds = folder.clip["num_conditioning"], {"rollout": 0.0, "train": 0.0}
 
-    def evaluate(iteration: int) -> dict[str, Any]:
-        scores = context_scores(folder, heldout, probe, config)
-        return {"iteration": iteration, **{name: values.tolist() for name, values in scores.items()}}
+    def evaluate() -> dict[str, Any]:
+        return {name: values.tolist() for name, values in context_scores(folder, heldout, probe, config).items()}
 
-    evaluations, buffers = [evaluate(0)], list[dict[str, float]]()
-    for iteration in range(plan.iterations):
-        start = time.perf_counter()
-        request = generator.request(iteration, learner.version)
+    def sample(iteration: int, version: int) -> tuple[RolloutBuffer, Callable[[], dict[str, float]]]:
+        request = generator.request(iteration, version)
         buffer = generator.sample(request)
         frames = folder.codec.decode(buffer.rollout.latents)
-        scores = score_clips(frames, generator.references(request), probe, K).named()
-        middle = time.perf_counter()
-        report = learner.train(rewarded(buffer, scores, mixed(scores, REWARDS)))
-        seconds["rollout"] += middle - start
-        seconds["train"] += time.perf_counter() - middle
-        buffers.append(flat_metrics(report))
-        if (iteration + 1) % plan.eval_every == 0 or iteration + 1 == plan.iterations:
-            evaluations.append(evaluate(iteration + 1))
-        on_iteration()
+        scores = score_clips(frames, generator.references(request), probe, folder.clip["num_conditioning"]).named()
+        return rewarded(buffer, scores, mixed(scores, REWARDS)), dict
+
+    row = follow_training(learner, plan.iterations, plan.eval_every, sample, evaluate, on_iteration)
+    found = row["evaluations"]
     return {
         "arm": arm.name, "shared_noise": arm.shared_noise, "seed": seed, "plan": asdict(plan),
-        "before": evaluations[0], "after": evaluations[-1], "evaluations": [_means(found) for found in evaluations],
-        "buffers": {name: [row[name] for row in buffers] for name in buffers[0]}, "seconds": seconds,
+        **row, "before": found[0], "after": found[-1], "evaluations": [_means(one) for one in found],
     }  # fmt: skip
 
 

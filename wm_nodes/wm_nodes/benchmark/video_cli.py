@@ -149,8 +149,7 @@ def _diversity(arguments: argparse.Namespace) -> None:
             ]  # fmt: skip
     of = {"plan": asdict(plan), "seed": arguments.seed, "features": FEATURES, **_settings(arms), **_base_of(arguments)}
     _write(arguments, {**of, "rows": rows, "comparisons": comparisons})
-    if arguments.json is not None:
-        plot_diversity(rows, arguments.json.with_suffix(".png"), arguments.seed)
+    _draw(arguments, plot_diversity, rows, arguments.seed)
     console.print(diversity_table(rows, arguments.seed))
 
 
@@ -177,8 +176,7 @@ def _clips(arguments: argparse.Namespace) -> None:
     size = {"contexts": len(contexts), "group_size": arguments.group_size, "features": features.name}
     of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(arms)}
     _write(arguments, {**size, "seed": arguments.seed, **of, "rows": rows, "comparisons": compared})
-    if arguments.json is not None:
-        plot_diversity(rows, arguments.json.with_suffix(".png"), arguments.seed)
+    _draw(arguments, plot_diversity, rows, arguments.seed)
     console.print(clip_table(rows, arguments.seed), clip_comparison_table(compared))
 
 
@@ -201,15 +199,15 @@ def _features(name: str, task: str) -> FrameFeatures:
 
 
 def _clip_learning(arguments: argparse.Namespace) -> None:
-    clip, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(TASK))
+    base, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(TASK))
     given = (arguments.context_bags, arguments.heldout_bags)
     wanted = ((arguments.contexts, NEW_SEEDS), (arguments.eval_contexts, HELDOUT_SEEDS))
     contexts, heldout = (
-        load_clips(bags or _episodes(*what, TASK), clip.clip["stride"])
+        load_clips(bags or _episodes(*what, TASK), base.clip["stride"])
         for bags, what in zip(given, wanted, strict=True)
     )
     plan = ClipPlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
-    trials, of = [Trial(arm, plan) for arm in clip_learning_arms()], {"sha256": clip.manifest["sha256"]}
+    trials, of = [Trial(arm, plan) for arm in clip_learning_arms()], {"sha256": base.manifest["sha256"]}
 
     def train(trial: Trial[ClipPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
         folder = load_video_folder(arguments.video_model)
@@ -218,8 +216,8 @@ def _clip_learning(arguments: argparse.Namespace) -> None:
     rows = _train(arguments, trials, train, of)
     comparisons = _compared(rows, _against_cps(rows), CLIP_MEASURES)
     _write_trainings(arguments, trials, rows, comparisons, of)
-    if arguments.json is not None and comparisons:
-        plot_comparisons(comparisons, arguments.json.with_suffix(".png"))
+    if comparisons:
+        _draw(arguments, plot_comparisons, comparisons)
     console.print(clip_training_table(rows), comparison_table(comparisons))
 
 
@@ -229,8 +227,7 @@ def _learning(arguments: argparse.Namespace) -> None:
     rows = _train_discs(arguments, trials)
     comparisons = _compared(rows, _against_cps(rows))
     _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
-    if arguments.json is not None:
-        plot_learning(rows, arguments.json.with_suffix(".png"))
+    _draw(arguments, plot_learning, rows)
     console.print(training_table(rows), comparison_table(comparisons))
 
 
@@ -239,15 +236,14 @@ def _ablations(arguments: argparse.Namespace) -> None:
     rows = _train_discs(arguments, trials)
     comparisons = _compared(rows, pairs)
     _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
-    if arguments.json is not None and comparisons:
-        plot_comparisons(comparisons, arguments.json.with_suffix(".png"))
+    if comparisons:
+        _draw(arguments, plot_comparisons, comparisons)
     console.print(training_table(rows), comparison_table(comparisons))
 
 
 def _hacking(arguments: argparse.Namespace) -> None:
     rows = _train_discs(arguments, hacking_trials(LEARNER, _plan(arguments, eval_every=3)))
-    if arguments.json is not None:
-        plot_hacking(rows, arguments.json.with_suffix(".png"))
+    _draw(arguments, plot_hacking, rows)
     console.print(hacking_table(rows))
 
 
@@ -328,8 +324,7 @@ def _cost(arguments: argparse.Namespace) -> None:
     ]
     of = {"seed": arguments.seed, "learner": asdict(LEARNER), **_base_of(arguments)}
     _write(arguments, {**of, "rollouts": rollouts, "rows": rows})
-    if arguments.json is not None:
-        plot_cost(rows, arguments.json.with_suffix(".png"))
+    _draw(arguments, plot_cost, rows)
     console.print(rollout_table(rollouts, arguments.repeats), cost_table(rows, arguments.repeats))
 
 
@@ -360,6 +355,12 @@ def _write(arguments: argparse.Namespace, found: dict[str, Any]) -> None:
     facts = {"command": arguments.command, "machine": machine_facts(), "date": time.strftime("%Y-%m-%d")}
     rounded = json.loads(json.dumps({**found, **facts}), parse_float=lambda digits: float(f"{float(digits):.5g}"))
     write_atomic(arguments.json, (json.dumps(rounded) + "\n").encode())
+
+
+def _draw(arguments: argparse.Namespace, plot: Callable[..., None], what: Sequence[Any], *more: Any) -> None:
+    """The picture beside the --json file, where there is one."""
+    if arguments.json is not None:
+        plot(what, arguments.json.with_suffix(".png"), *more)
 
 
 def _positive(text: str) -> int:

@@ -52,34 +52,56 @@ class LearningPlan:
     eval_side: int = SIDE
 
 
+Sample = Callable[[int, int], tuple[RolloutBuffer, Callable[[], dict[str, float]]]]
+"""(iteration, policy version) -> a buffer with rewards, and what is measured of it outside the clock."""
+
+
 def train_arm(
     model: VideoNetwork, arm: Arm, plan: LearningPlan, seed: int,
     on_iteration: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Post-train `model` in place; return the arm's curve: evaluations, a list per quantity of the buffers, seconds."""
-    learner = GrpoLearner(model, arm.grpo, arm.rollout, seed=seed)
-    evaluations = [{"iteration": 0, **evaluate(model, arm, plan, seed)}]
-    buffers, seconds = list[dict[str, float]](), {"rollout": 0.0, "train": 0.0}
-    for iteration in range(plan.iterations):
-        start = time.perf_counter()
+    """Post-train `model` in place; return follow_training's row, and what equation (2) names."""
+
+    def sample(iteration: int, version: int) -> tuple[RolloutBuffer, Callable[[], dict[str, float]]]:
         scenes = draw_scenes(plan.scenes, seed, "rollouts", iteration, plan.side)
-        buffer, scores = sample_groups(model, arm, scenes, plan.group_size, seed, iteration, learner.version)
+        buffer, scores = sample_groups(model, arm, scenes, plan.group_size, seed, iteration, version)
         buffer = buffer.with_rewards({"total": getattr(scores, plan.proxy)})
+        return buffer, lambda: {
+            **group_spread(buffer, plan.group_size), "advantage_max": _largest_advantage(buffer),
+            **_means(scores, "rollout_"),
+        }  # fmt: skip
+
+    learner = GrpoLearner(model, arm.grpo, arm.rollout, seed=seed)
+    row = follow_training(
+        learner, plan.iterations, plan.eval_every, sample, lambda: evaluate(model, arm, plan, seed), on_iteration
+    )
+    named = {"arm": arm.name, "shared_noise": arm.shared_noise, "seed": seed, "plan": asdict(plan)}
+    return {**named, **row, "hacked": hacked(row["evaluations"], plan.proxy)}
+
+
+def follow_training(
+    learner: GrpoLearner, iterations: int, eval_every: int, sample: Sample, evaluate: Callable[[], dict[str, Any]],
+    on_iteration: Callable[[], object],
+) -> dict[str, Any]:  # fmt: skip
+    """Train on so many buffers; return what one training gave: evaluations (before, every eval_every buffers, and
+    after), a list per quantity of the buffers, and seconds.
+    """
+    evaluations = [{"iteration": 0, **evaluate()}]
+    buffers, seconds = list[dict[str, float]](), {"rollout": 0.0, "train": 0.0}
+    for iteration in range(iterations):
+        start = time.perf_counter()
+        buffer, measured = sample(iteration, learner.version)
         middle = time.perf_counter()
         report = learner.train(buffer)
         seconds["rollout"] += middle - start
         seconds["train"] += time.perf_counter() - middle
-        spread = group_spread(buffer, plan.group_size) | {"advantage_max": _largest_advantage(buffer)}
-        buffers.append({**flat_metrics(report), **spread, **_means(scores, "rollout_")})
-        if (iteration + 1) % plan.eval_every == 0 or iteration + 1 == plan.iterations:
-            evaluations.append({"iteration": iteration + 1, **evaluate(model, arm, plan, seed)})
+        buffers.append({**flat_metrics(report), **measured()})
+        if (iteration + 1) % eval_every == 0 or iteration + 1 == iterations:
+            evaluations.append({"iteration": iteration + 1, **evaluate()})
         on_iteration()
     names = dict.fromkeys(name for row in buffers for name in row)  # a window's steps are not those of every buffer
-    return {
-        "arm": arm.name, "shared_noise": arm.shared_noise, "seed": seed, "plan": asdict(plan),
-        "evaluations": evaluations, "buffers": {name: [row.get(name) for row in buffers] for name in names},
-        "seconds": seconds, "hacked": hacked(evaluations, plan.proxy),
-    }  # fmt: skip
+    courses = {name: [row.get(name) for row in buffers] for name in names}
+    return {"evaluations": evaluations, "buffers": courses, "seconds": seconds}
 
 
 def hacked(evaluations: list[dict[str, float]], proxy: str) -> list[str]:
