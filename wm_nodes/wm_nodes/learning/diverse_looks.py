@@ -21,7 +21,7 @@ from wm_nodes.simulation.clip_scenes import CAMERAS, Layout, Look, View
 T = TypeVar("T")
 Triple = tuple[float, float, float]
 
-HELD_OUT_CAMERA, HELD_OUT_COLOUR, HELD_OUT_TABLE = "near_high", "purple", "moss"
+HELD_OUT_CAMERA = "near_high"
 PULL_DEGREES = 180.0
 """The heading of pull_cube, whose goal lies towards the robot."""
 CAMERA_GAP_M, HUE_GAP_DEGREES, TABLE_GAP, HEADING_GAP_DEGREES = 0.15, 30.0, 0.12, 60.0
