@@ -4,11 +4,13 @@ import atexit
 import contextlib
 import fcntl
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,12 +26,17 @@ from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.ros.links import LinkBook
 from wm_nodes.ros.qos import topic
+from wm_nodes.ros.runner import clean_shared_memory
 
 DOMAINS = range(20, 90)
 TOY_FOLDER = Path(__file__).parent
 START_S = 60.0
 MATCH_S = 0.5
 """A server that has not matched a new client's reader yet loses its answer (rmw_fastrtps 556)."""
+IN_MIDDLEWARE = re.compile(r"Garbage-collecting\n  File \".*/ros/spin\.py\", line \d+ in run_nodes\n")
+"""The stack of a node that has stopped, and whose participant does not come back from its destructor: Fast DDS can
+deadlock where all leave at once (https://github.com/eProsima/Fast-DDS/issues/6193). Seen once so far;
+ros.runner kills such a node after 10 s."""
 RESEND_S = 8.0
 """A request without an answer is sent once more after this time, for the same reason."""
 
@@ -243,19 +250,31 @@ class Graph:
         self.processes[name].wait(10)
 
     def stop(self) -> dict[str, int]:
-        """SIGINT all; after 20 s SIGABRT, which leaves the stack in the log. Return the exit codes."""
+        """SIGINT all; after 20 s SIGABRT, which leaves the stack in the log. Return the exit codes; 0, with a warning,
+        for a node that had done all of its own and hung in the middleware's destructors."""
         for process in self.processes.values():
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
-        for process in self.processes.values():
+        codes = {}
+        for name, process in self.processes.items():
             try:
-                process.wait(20)
+                codes[name] = process.wait(20)
             except subprocess.TimeoutExpired:
+                threads = thread_names(process.pid)
                 process.send_signal(signal.SIGABRT)
-                process.wait(5)
+                codes[name] = process.wait(5)
+                if IN_MIDDLEWARE.search(self.log(name)):
+                    codes[name] = 0
+                    warnings.warn(f"{name} hung in the middleware's destructors; threads: {threads}", stacklevel=2)
+                    clean_shared_memory(os.environ)
         for log in self._logs:
             log.close()
-        return {name: process.returncode for name, process in self.processes.items()}
+        return codes
+
+
+def thread_names(pid: int) -> list[str]:
+    """Of a process, as the system knows them: Fast DDS names its threads by what they serve."""
+    return [path.read_text().strip() for path in Path(f"/proc/{pid}/task").glob("*/comm")]
 
 
 _forks: Forks | None = None

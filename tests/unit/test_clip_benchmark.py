@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from recording_samples import make_episode, make_spec
 
+from wm_nodes.benchmark.clip_resolution import CODEC, COPY, ENLARGED, MODEL
 from wm_nodes.benchmark.video_cli import main
 from wm_nodes.recording import EpisodeBagWriter
 
@@ -89,3 +90,20 @@ def test_trainings_in_the_file_are_not_made_again_and_another_plan_is_refused(
     assert json.loads(path.read_text())["rows"] == rows, "their seconds would differ"
     assert main([*call, "--iterations", "2"]) == 2
     assert "take another file" in " ".join(capsys.readouterr().out.split())
+
+
+def test_sizes_are_shown_beside_the_own_one_enlarged_and_the_own_one_is_the_same_there(tmp_path: Path) -> None:
+    paths = []
+    for side in (64, 96):
+        paths.append(tmp_path / f"side_{side}")
+        spec = make_spec(height=side, width=2 * side)
+        with EpisodeBagWriter(paths[-1], spec, run_id="sizes", start_ns=1) as bag:
+            episode = make_episode(spec, 0, STEPS)
+            bag.write(replace(episode, ground_truth=np.full_like(episode.ground_truth, 0.1)))
+    path = tmp_path / "found.json"
+    assert main(["resolution", "--context-bags", *map(str, paths), "--contexts", "1", "--json", str(path)]) == 0
+    rows = {(row["side_px"], row["shown"]): row for row in json.loads(path.read_text())["rows"]}
+    assert set(rows) == {(side, shown) for side in (64, 96) for shown in (MODEL, ENLARGED, CODEC, COPY)}
+    assert rows[64, MODEL]["psnr_db"] == rows[64, ENLARGED]["psnr_db"]
+    assert rows[96, MODEL]["psnr_db"] != rows[96, ENLARGED]["psnr_db"]
+    assert rows[96, COPY]["psnr_db"] != rows[96, CODEC]["psnr_db"]

@@ -39,6 +39,9 @@ def test_episodes_without_ground_truth_are_refused() -> None:
         train_position_probe(unknown, load_config("base", {}), 0, None, progress=False)
 
 
-def test_images_of_another_size_are_refused_with_both_sizes() -> None:
-    with pytest.raises(ValueError, match=r"32, 32, 3\), got \(1, 64, 32, 3\)"):
-        PositionProbe(32, 32).read(np.zeros((1, 64, 32, 3), np.uint8))
+def test_enlarged_images_are_read_as_they_are_and_another_shape_is_refused() -> None:
+    probe, image = PositionProbe(16, 32), arrays(1).images[:, 0, :16]
+    enlarged = image.repeat(3, axis=1).repeat(3, axis=2)
+    np.testing.assert_allclose(probe.read(enlarged), probe.read(image), atol=1e-4)
+    with pytest.raises(ValueError, match=r"16, 32, 3\) or enlarged, got \(1, 64, 64, 3\)"):
+        probe.read(np.zeros((1, 64, 64, 3), np.uint8))

@@ -7,6 +7,7 @@ import pytest
 import torch
 from model_folders import make_model_folder
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from wm_nodes.config.load import load_config
 from wm_nodes.learning.tokenizer_codec import TokenizerCodec, codec_of_world_model
@@ -82,10 +83,29 @@ def test_the_shipped_video_model_serves_the_recommended_settings_and_no_others()
     assert shipped_video_model(load_video_config("recommended", {"task": "pull_cube"})) is None
 
 
-def test_pictures_and_latents_of_another_size_and_discrete_tokens_are_refused(world_model: Path) -> None:
+@pytest.mark.parametrize("size", [(64, 128), (96, 192), (128, 256)])
+def test_a_picture_of_any_size_comes_back(size: tuple[int, int]) -> None:
+    shipped = shipped_video_model(load_video_config("recommended"))
+    assert shipped is not None and isinstance(shipped.codec, TokenizerCodec)
+    codec = shipped.codec
+    scene = interpolate(codec.tokenizer.background[None], size, mode="bilinear", antialias=True)
+    frames = (scene * 255).round().to(torch.uint8).permute(0, 2, 3, 1).view(1, 1, *size, 3)
+    frames[..., 16:48, 16:48, :] = torch.tensor([200, 40, 40], dtype=torch.uint8)
+    weights = {name: value.clone() for name, value in codec.state_dict().items()}
+    latents = codec.encode(frames)
+    assert latents.shape == (1, codec.channels, 1, size[0] // codec.patch, size[1] // codec.patch)
+    error = (codec.decode(latents).float() - frames.float()).abs().mean()
+    missed = (codec.decode(codec.encode(frames.flip(3))).float() - frames.float()).abs().mean()
+    assert error < 12 and error < 0.5 * missed
+    assert all(torch.equal(value, weights[name]) for name, value in codec.state_dict().items())
+
+
+def test_an_indivisible_picture_wrong_channels_and_discrete_tokens_are_refused(world_model: Path) -> None:
     codec = codec_of_world_model(world_model)
+    with pytest.raises(ValueError, match="image 40x128 px is not a multiple"):
+        codec.encode(clips(height=40))
     with pytest.raises(ValueError, match="images must be uint8"):
-        codec.encode(clips(height=32))
+        codec.encode(clips().float())
     with pytest.raises(ValueError, match="this codec has"):
         codec.decode(torch.zeros(1, codec.channels + 1, 3, *codec.tokenizer.grid))
     discrete = load_config("smoke", {"tokenizer.kind": "lfq"}).tokenizer

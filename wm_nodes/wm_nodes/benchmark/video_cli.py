@@ -1,5 +1,6 @@
 """DynDiff-GRPO against its rivals on the moving disc: claims A (diversity), B (learning) and C (cost of the KL), the
-choices of the paper's section 5.4, and a reward that can be hacked; claims A and B on clips of recorded episodes.
+choices of the paper's section 5.4, and a reward that can be hacked; claims A and B on clips of recorded episodes, and
+their picture's size.
 
 Every --json file holds the command, the settings of each arm, and the sha256 of the weights that were measured; a
 picture is drawn beside it (of ablations from two seeds on).
@@ -12,7 +13,7 @@ import math
 import os
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,6 +26,7 @@ from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.benchmark.clip_diversity import clip_comparisons, measure_clips
 from wm_nodes.benchmark.clip_learning import MEASURES as CLIP_MEASURES
 from wm_nodes.benchmark.clip_learning import TASK, ClipPlan, clip_learning_arms, train_on_clips
+from wm_nodes.benchmark.clip_resolution import sample_clips, size_rows
 from wm_nodes.benchmark.moving_disc import CHANNELS, NUM_ACTIONS, training_batch
 from wm_nodes.benchmark.video_arms import Arm, diversity_arms, learning_arms
 from wm_nodes.benchmark.video_comparison import MEASURES, Comparison, compare_arms
@@ -46,6 +48,7 @@ from wm_nodes.benchmark.video_tables import (
     cost_table,
     diversity_table,
     hacking_table,
+    resolution_table,
     rollout_table,
     training_table,
 )
@@ -97,7 +100,7 @@ def main(argv: Sequence[str]) -> int:
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     claims = {
         "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,
-        "cost": _cost, "clips": _clips, "clip-learning": _clip_learning,
+        "cost": _cost, "clips": _clips, "clip-learning": _clip_learning, "resolution": _resolution,
     }  # fmt: skip
     try:
         claims[arguments.claim](arguments)
@@ -180,11 +183,31 @@ def _clips(arguments: argparse.Namespace) -> None:
     console.print(clip_table(rows, arguments.seed), clip_comparison_table(compared))
 
 
-def _episodes(clips: int, first_seed: int, task: str) -> list[Path]:
+def _resolution(arguments: argparse.Namespace) -> None:
+    config = load_video_config(arguments.preset, {"seed": arguments.seed})
+    folder, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(config.task))
+    if arguments.context_bags:
+        found = [[bag] for bag in arguments.context_bags]
+    else:
+        sides = [{"simulation.image_size": side} for side in (probe.height, *arguments.sizes)]
+        found = [_episodes(arguments.contexts, HELDOUT_SEEDS, config.task, side) for side in sides]
+    rows, own = list[dict[str, Any]](), None
+    for bags in tqdm(found, desc="resolution", unit="size"):
+        clips = load_clips(bags, folder.clip["stride"])
+        clips = clips.select(torch.arange(min(arguments.contexts, len(clips))))
+        if own is None:
+            own = sample_clips(folder, clips, config)
+        rows += size_rows(folder, clips, own, config, probe)
+    _write(arguments, {"seed": arguments.seed, "sha256": folder.manifest["sha256"], "rows": rows})
+    console.print(resolution_table(rows))
+
+
+def _episodes(clips: int, first_seed: int, task: str, settings: Mapping[str, Any] | None = None) -> list[Path]:
     """Bags of scripted episodes, a tenth more than the clips that are wanted: one that ends early gives none."""
-    scene = load_config("cpu", {"task": task})
+    scene = load_config("cpu", {"task": task, **(settings or {})})
     plan = scripted_plan(scene, math.ceil(1.1 * clips), first_seed)
-    return collect_plan(plan, scene, EPISODES / f"{task}_{first_seed}_{plan.num_episodes}")
+    of = "".join(f"_{value}" for value in (settings or {}).values())
+    return collect_plan(plan, scene, EPISODES / f"{task}_{first_seed}_{plan.num_episodes}{of}")
 
 
 def _features(name: str, task: str) -> FrameFeatures:
@@ -401,19 +424,27 @@ def _parser() -> argparse.ArgumentParser:
             "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
             help=f"episodes to take contexts from (default: new ones in {EPISODES}, of seeds that no model has seen)",
         )  # fmt: skip
-    clips.add_argument("--contexts", type=_positive, default=100)
+    resolution = claims.add_parser("resolution", help="the same video model on larger pictures than it was trained on")
+    resolution.add_argument("--sizes", type=_positive, nargs="+", default=[80, 96, 128], help="sides of a picture, px")
+    resolution.add_argument(
+        "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
+        help="the same episodes in several sizes, a bag of each, the model's own size first (default: new ones)",
+    )  # fmt: skip
+    resolution.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model")
+    for claim in (clips, resolution):
+        claim.add_argument("--contexts", type=_positive, default=100)
+        claim.add_argument("--preset", default="recommended", help="settings of loop 2: rewards, sampler steps, task")
     clips.add_argument("--group-size", type=_positive, default=8)
     clips.add_argument(
         "--features", default="tokenizer",
         help="tokenizer, pixels, random, or the folder of a vision backbone, e.g. DINOv3 (default: tokenizer)",
     )  # fmt: skip
-    clips.add_argument("--preset", default="recommended", help="settings of loop 2, for the rewards")
-    for claim in (base, diversity, cost, clips):
+    for claim in (base, diversity, cost, clips, resolution):
         claim.add_argument("--seed", type=int, default=0)
     for claim in (diversity, learning, ablations, hacking, clips, training):
         claim.add_argument("--arms", nargs="+", metavar="NAME")
     for claim in (diversity, learning, ablations, hacking, cost):
         claim.add_argument("--base", type=Path, help="weights of another base model than the shipped one")
-    for claim in (diversity, learning, ablations, hacking, cost, clips, training):
+    for claim in (diversity, learning, ablations, hacking, cost, clips, training, resolution):
         claim.add_argument("--json", type=Path, help="write every row here; trainings go on where the file stops")
     return parser

@@ -127,6 +127,14 @@ def _shown(difference: Difference) -> str:
     return f"{difference.mean:+.4f} ({difference.low:+.4f}, {difference.high:+.4f}){star}"
 
 
+def resolution_table(rows: Sequence[dict[str, Any]]) -> Table:
+    measures = ("tracking", "object_cm", "tool_cm", "psnr_db")
+    table = _table("clips at other picture sizes, means over contexts", ("side, px", "shown"), measures)
+    for row in rows:
+        table.add_row(str(row["side_px"]), row["shown"], *(f"{_average(row, name):.3f}" for name in measures))
+    return table
+
+
 def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
     """Per training: the reward that trained it and the truths, before and after, and what the detector (2) names."""
     table = _table(

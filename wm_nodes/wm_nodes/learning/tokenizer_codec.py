@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import interpolate
 
 from wm_nodes.config.schema import TokenizerConfig
 from wm_nodes.video_model.codec import PatchCodec
@@ -17,7 +18,10 @@ BATCH = 256
 
 
 class TokenizerCodec(nn.Module):
-    """uint8 frames (B, F, H, W, 3) <-> latents float32 (B, C, F, h, w), of about unit variance. One size of picture.
+    """uint8 frames (B, F, H, W, 3) <-> latents float32 (B, C, F, h, w), of about unit variance.
+
+    Pictures of another size than the tokenizer was trained on, of the same cameras, go through the same convolutions
+    with the background stretched to them; what that costs is in docs/dyndiff.md.
 
     Raises:
         ValueError: a tokenizer of discrete tokens, which flow matching cannot move through.
@@ -40,29 +44,40 @@ class TokenizerCodec(nn.Module):
         """Return latents (B, C, F, h, w) of uint8 frames (B, F, H, W, 3).
 
         Raises:
-            ValueError: not uint8, or another size than the tokenizer's.
+            ValueError: not uint8, or a size that the patch does not divide.
         """
-        B, count = frames.shape[:2]
+        B, count, H, W = frames.shape[:4]
+        tokenizer = self._at(H, W)
         parts = torch.split(frames.flatten(0, 1), BATCH)  # type: ignore[no-untyped-call]
-        tokens = torch.cat([self.tokenizer.encode(part) for part in parts])
-        grid = tokens.view(B, count, *self.tokenizer.grid, self.channels)
+        tokens = torch.cat([tokenizer.encode(part) for part in parts])
+        grid = tokens.view(B, count, *tokenizer.grid, self.channels)
         return grid.permute(0, 4, 1, 2, 3).clone(memory_format=torch.contiguous_format)  # out of inference mode
 
     def decode(self, latents: Tensor) -> Tensor:
         """Return uint8 frames (B, F, H, W, 3) of latents (B, C, F, h, w).
 
         Raises:
-            ValueError: another number of channels, or another grid.
+            ValueError: another number of channels.
         """
         B, channels, count, h, w = latents.shape
-        if channels != self.channels or (h, w) != self.tokenizer.grid:
-            raise ValueError(
-                f"this codec has {self.channels} channels on a {self.tokenizer.grid} grid, got {channels} on ({h}, {w})"
-            )
-        tokens = self.tokenizer.normalise(latents.float().permute(0, 2, 3, 4, 1).reshape(B * count, h * w, channels))
+        if channels != self.channels:
+            raise ValueError(f"this codec has {self.channels} channels, got latents of {channels}")
+        tokenizer = self._at(h * self.patch, w * self.patch)
+        tokens = tokenizer.normalise(latents.float().permute(0, 2, 3, 4, 1).reshape(B * count, h * w, channels))
         parts = torch.split(tokens, BATCH)  # type: ignore[no-untyped-call]
-        frames = torch.cat([self.tokenizer.decode(part) for part in parts])
+        frames = torch.cat([tokenizer.decode(part) for part in parts])
         return frames.view(B, count, *frames.shape[1:]).clone()
+
+    def _at(self, height: int, width: int) -> Tokenizer:
+        """The tokenizer for pictures of this size; of another than its own, one that shares the convolutions."""
+        own = self.tokenizer
+        if (height, width) == (own.height, own.width):
+            return own
+        with torch.device("meta"):
+            other = Tokenizer(self.config, height, width)
+        other.encoder, other.decoder = own.encoder, own.decoder
+        other.background = interpolate(own.background[None], (height, width), mode="bilinear", antialias=True)[0]
+        return other
 
 
 def codec_of_world_model(folder: Path) -> TokenizerCodec:

@@ -21,10 +21,9 @@ AGENT = "agent"
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """The embedded model. codec: principal components of patches (any size of picture; patch: its side, channels: how
-    many), or the frozen tokenizer of the task's shipped world model (its own sizes). stride: recorded steps between
-    frames. num_conditioning: given frames. text_dim: values per hashed word. width, depth: of the network. batch_size:
-    clips per training step.
+    """The embedded model. codec: principal components of patches (patch: its side, channels: how many), or the frozen
+    tokenizer of the task's shipped world model. stride: recorded steps between frames. num_conditioning: given frames.
+    text_dim: values per hashed word. width, depth: of the network. batch_size: clips per training step.
     """
 
     codec: Literal["patch", "tokenizer"] = "tokenizer"

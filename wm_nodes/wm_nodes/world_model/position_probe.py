@@ -7,6 +7,7 @@ loss ever passes through it. A world model cannot learn to please it.
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import interpolate
 
 from wm_nodes.types import FloatArray, UInt8Array
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
@@ -44,21 +45,28 @@ class PositionProbe(nn.Module):
 
     @torch.inference_mode()
     def read(self, images: UInt8Array | Tensor) -> FloatArray:
-        """Positions (..., P), m, of uint8 images (..., H, W, 3).
+        """Positions (..., P), m, of uint8 images (..., H, W, 3) of the cameras that it was trained on, of any size.
 
         Raises:
-            ValueError: images of another size.
+            ValueError: images of another shape.
         """
         tensor = torch.as_tensor(images)
-        if tuple(tensor.shape[-3:]) != (self.height, self.width, 3):
+        H, W, channels = tensor.shape[-3:]
+        if channels != 3 or H * self.width != W * self.height:
             raise ValueError(
-                f"images must be (..., {self.height}, {self.width}, 3), got {tuple(tensor.shape)}; the probe was "
-                "trained for another camera set-up, see the model folder's manifest.json"
+                f"images must be (..., {self.height}, {self.width}, 3) or enlarged, got {tuple(tensor.shape)}; the "
+                "probe was trained for another camera set-up, see the model folder's manifest.json"
             )
-        flat = tensor.reshape(-1, *tensor.shape[-3:])
+        flat = tensor.reshape(-1, H, W, 3)
         parts = [
-            self(flat[i : i + BATCH].permute(0, 3, 1, 2).to(self.mean.device).float() / 255) * self.std + self.mean
-            for i in range(0, len(flat), BATCH)
+            self(self._pixels(flat[i : i + BATCH])) * self.std + self.mean for i in range(0, len(flat), BATCH)
         ]
         positions: FloatArray = torch.cat(parts).cpu().numpy().reshape(*tensor.shape[:-3], -1).astype(np.float32)
         return positions
+
+    def _pixels(self, images: Tensor) -> Tensor:
+        """Float (B, 3, height, width) in [0, 1]."""
+        pixels = images.permute(0, 3, 1, 2).to(self.mean.device).float() / 255
+        if tuple(pixels.shape[2:]) == (self.height, self.width):
+            return pixels
+        return interpolate(pixels, (self.height, self.width), mode="bilinear", antialias=True)
