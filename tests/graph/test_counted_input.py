@@ -9,9 +9,11 @@ import pytest
 from graph.harness import Graph, Probe, wait_until
 from graph.test_environment import Client
 from graph.test_training import train
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 
 from wm_msgs.action import Train
-from wm_msgs.msg import ErrorCode, RewardBatch, TransitionBatch
+from wm_msgs.msg import ErrorCode, PolicyVersion, RewardBatch, TransitionBatch
 from wm_msgs.srv import EvaluateReward, InferAction, LoadPolicy
 from wm_nodes.nodes.policy_holder import weights_uri
 from wm_nodes.ros import convert
@@ -120,3 +122,41 @@ def test_a_bad_request_is_answered_and_counted_a_good_one_served_and_training_go
         status = probe.diagnostics[node]
         assert all(text in status.message for text in texts), status.message
         assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
+
+
+BAD_CHANGES: list[tuple[str, Any, str]] = [
+    ("peer_timeout_s", 0.1, "peer_timeout_s must be at least 1 s; got 0.1"),
+    ("max_action_age_s", float("nan"), "max_action_age_s must be a number; got nan"),
+    ("service_introspection", "all", "service_introspection must be one of off, metadata, contents; got 'all'"),
+    ("num_envs", 8, "num_envs stays 4 while the node runs; start it again with num_envs:=8"),
+    ("peer_timeout", 2.0, "unknown parameter 'peer_timeout'; did you mean 'peer_timeout_s'?"),
+]
+
+
+def test_a_version_of_another_architecture_is_refused_and_the_old_weights_go_on_acting(
+    graph: Graph, probe: Probe
+) -> None:
+    graph.start_policy()
+    publisher = probe.publisher("policy/version")
+    wait_until("the policy", lambda: probe.value(POLICY, "state") == "active", 30)
+    wait_until("matching", publisher.get_subscription_count)
+    publisher.publish(PolicyVersion(version=7, sha256="0" * 64, arch_hash="ab" * 32))
+    wait_until("the count", lambda: probe.value(POLICY, "refused_versions") == "1")
+    assert "policy version 7 has architecture abababababab" in probe.diagnostics[POLICY].message
+    assert "start both with the same config_file and model_dir" in probe.diagnostics[POLICY].message
+    assert probe.value(POLICY, "policy_version") == "0"
+
+
+def test_a_refused_parameter_change_names_value_and_remedy_and_is_counted(graph: Graph, probe: Probe) -> None:
+    graph.start_environment()
+
+    def change(name: str, value: Any) -> Any:
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        return probe.call(SetParameters, "environment/set_parameters", request).results[0]
+
+    for name, value, words in BAD_CHANGES:
+        refused = change(name, value)
+        assert (refused.successful, refused.reason) == (False, words)
+    assert change("peer_timeout_s", 4.0).successful
+    wait_until("the count", lambda: probe.value("/wm/environment", "refused_parameters") == str(len(BAD_CHANGES)))
+    assert BAD_CHANGES[-1][2] in probe.diagnostics["/wm/environment"].message

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,28 @@ def test_evaluation_over_dds_equals_evaluation_in_one_process(graph: Graph, prob
     missing = probe.finish(probe.send(client, Evaluate.Goal(policy_uri="gone.safetensors", episodes=1)))
     assert missing.termination_reason == Evaluate.Result.FAILED
     assert "gone.safetensors" in missing.message
+
+
+@pytest.mark.alone
+def test_cancel_ends_an_evaluation_and_a_rollout_within_a_second(graph: Graph, probe: Probe) -> None:
+    save_weights(toy.make_policy(graph.config), graph.folder / "start.safetensors")
+    graph.start_environment("toy:make_long_environment", namespace="/wm/sim", num_envs=3)
+    graph.start("evaluation", policy_factory="toy:make_policy")
+    graph.start_environment("toy:make_long_environment")
+    graph.start_policy()
+    goals = {
+        "evaluate": (Evaluate, Evaluate.Goal(policy_uri="start.safetensors", episodes=100_000, deterministic=True)),
+        "rollout": (Rollout, Rollout.Goal(steps=100_000, reset=True)),
+    }
+    for name, (kind, goal) in goals.items():
+        transitions = probe.listen("env/transition", at="sim/env/transition" if name == "evaluate" else None)
+        transitions.clear()
+        handle = probe.send(probe.action(kind, name), goal)
+        wait_until(f"steps of {name}", lambda: len(transitions) > 5, 30)  # noqa: B023
+        began = time.monotonic()
+        probe.run(handle.cancel_goal_async, 5, "cancel")
+        assert probe.finish(handle, 5).termination_reason == kind.Result.CANCELED
+        assert time.monotonic() - began < 1.0, name
 
 
 def test_a_composed_process_steps_by_direct_call_and_trains_to_the_same_weights(graph: Graph, probe: Probe) -> None:

@@ -7,10 +7,12 @@ import time
 from typing import Any
 
 import pytest
+import torch
 from graph.harness import Graph, Probe, shm_files, wait_until
 
 from wm_msgs.action import Train
 from wm_msgs.msg import Credit, TransitionBatch
+from wm_nodes.learning.weights import save_weights
 from wm_nodes.ros.wire import WireError
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
@@ -157,6 +159,30 @@ def test_a_wrong_setting_ends_the_node_with_one_line_that_names_it(
     assert graph.start("environment", **params).wait(60) == 1
     log = graph.log("/wm/environment")
     assert words in log
+    assert "Traceback" not in log
+
+
+@pytest.mark.kills
+@pytest.mark.parametrize("node", ["policy", "learner"])
+def test_weights_of_another_architecture_end_the_node_with_one_line_that_names_the_file(
+    graph: Graph, node: str
+) -> None:
+    file = graph.folder / "other.safetensors"
+    save_weights(torch.nn.Linear(2, 2), file)
+    assert graph.start(node, policy_factory="toy:make_policy", initial_policy=file).wait(60) == 1
+    log = graph.log(f"/wm/{node}")
+    assert f"initial_policy {file}: " in log and "weights of another architecture: " in log
+    assert "use the configuration it was made by" in log and "Traceback" not in log
+
+
+@pytest.mark.kills
+def test_a_cut_checkpoint_ends_the_learner_with_one_line_that_names_it(graph: Graph) -> None:
+    file = graph.folder / "checkpoints" / "learner.json"
+    file.parent.mkdir()
+    file.write_text('{"progress": {')
+    assert graph.start_learner().wait(60) == 1
+    log = graph.log("/wm/learner")
+    assert f"checkpoint {file} does not fit: " in log and "begin anew in another run_dir" in log
     assert "Traceback" not in log
 
 

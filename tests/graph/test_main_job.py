@@ -14,6 +14,7 @@ from model_folders import make_model_folder
 from safetensors.numpy import save_file
 
 from wm_nodes.learning.metrics import read_metrics
+from wm_nodes.learning.rescoring import main as rescore
 from wm_nodes.recording import Bag, read_episodes
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports import read_summary
@@ -30,9 +31,18 @@ def start(arguments: list[str], domain: int) -> subprocess.CompletedProcess[str]
 
 
 @pytest.mark.slow
-def test_the_main_job_runs_end_to_end_and_leaves_summary_report_and_bag(ros_domain: int, tmp_path: Path) -> None:
+def test_the_main_job_stops_at_the_gate_and_when_forced_leaves_summary_report_and_bag(
+    ros_domain: int, tmp_path: Path
+) -> None:
     run_dir = tmp_path / "run"
-    done = start(["--preset", "smoke", "--force", "--run-dir", str(run_dir)], ros_domain)
+    arguments = ["--preset", "smoke", "--set", "gate.tool_error_ratio=0.001", "--run-dir", str(run_dir)]
+    refused = start(arguments, ros_domain)
+    assert refused.returncode == 3, refused.stdout + refused.stderr
+    said = " ".join(refused.stdout.split())
+    assert "tool error / copying" in said and "or go on with --force" in said
+    policies = sorted(path.name for path in (run_dir / "policies").iterdir())
+    assert policies == ["policy_000001.safetensors", "weak.safetensors"], "trained in a model that failed"
+    done = start([*arguments, "--force"], ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = read_summary(run_dir)
     assert (summary["task"], summary["preset"], summary["seed"]) == ("push_cube", "smoke", 0)
@@ -40,10 +50,12 @@ def test_the_main_job_runs_end_to_end_and_leaves_summary_report_and_bag(ros_doma
     assert summary["real_before"]["episodes"] == summary["real_after"]["episodes"] == 4
     assert summary["imagined_steps_per_s"] > 0
     assert list(Path(summary["bag"]).glob("*.mcap"))
-    played = [episode.behaviour for episode in read_episodes(Path(summary["bag"]), namespace="/wm/sim")]
+    bags = sorted((run_dir / "bags").glob("training_*"))  # the refused run's and the forced one's
+    played = [episode.behaviour for bag in bags for episode in read_episodes(bag, namespace="/wm/sim")]
     assert played.count("before") >= 4 and played.count("after") >= 4
     assert "data:image/png;base64" in (run_dir / "report.html").read_text()
     assert json.loads((run_dir / "gate.json").read_text())["criteria"]
+    assert rescore([summary["bag"]]) == 0, "the recorded rewards, evaluated again, are others"
 
 
 def write_some_starts(path: Path) -> None:

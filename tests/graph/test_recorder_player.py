@@ -6,12 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from graph.harness import MATCH_S
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
@@ -23,7 +25,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from wm_msgs.action import Replay
-from wm_msgs.msg import Credit, ErrorCode
+from wm_msgs.msg import Credit, ErrorCode, TransitionBatch
 from wm_msgs.srv import PlayNext, Seek, SetRate, StartRecording, StopRecording
 from wm_nodes.nodes.bag_qos import message_class
 from wm_nodes.recording import Bag, read_episodes, read_rollouts, recover, topics
@@ -73,6 +75,16 @@ class Peer:
         until = time.monotonic() + MATCH_S
         while time.monotonic() < until:
             self.executor.spin_once(timeout_sec=0.05)
+
+    def counts(self) -> dict[str, str]:
+        """What the node's /diagnostics say from now on; the dictionary grows while this process spins."""
+        found: dict[str, str] = {}
+
+        def note(message: DiagnosticArray) -> None:
+            found.update((value.key, value.value) for status in message.status for value in status.values)
+
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", note, 10)
+        return found
 
     def end(self, how: int = signal.SIGTERM) -> int:
         self.process.send_signal(how)
@@ -200,6 +212,38 @@ def test_the_recorder_reports_exactly_the_gaps_there_were(domain: int, tmp_path:
     assert drops == {"/wm/env/transition": {"lost": 3, "gaps": [[7, 3, 2], [7, 7, 1]]}}
 
 
+def test_what_a_flood_lost_is_what_the_recorder_reports(domain: int, tmp_path: Path, peer: Start) -> None:
+    recorder = peer(domain, "recorder_node", tmp_path, bag_uri="bag", min_free_mib=16)
+    publish(recorder, Graph(make_spec(num_envs=NUM_ENVS)))
+    overwritten = QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=1, reliability=table.topic("env/transition").qos.reliability
+    )
+    flood = recorder.node.create_publisher(TransitionBatch, "env/transition", overwritten)
+    recorder.wait(flood.get_subscription_count, "subscription")
+    recorder.match()
+    newest = [-1]
+
+    def note(credit: Credit) -> None:
+        if credit.stream_session == 9:
+            newest.append(credit.received_seq)
+
+    recorder.node.create_subscription(Credit, "flow/credit", note, 10)
+    message, num_sent = TransitionBatch(session=9, action=array("f", bytes(80_000))), 2000
+    flood.publish(message)
+    recorder.wait(lambda: newest[-1] == 0, "first message: whatever is missing after it is a gap")
+    for seq in range(1, num_sent):
+        if seq == num_sent // 2:  # a reader that is busy: the writer's one place is overwritten for sure
+            recorder.process.send_signal(signal.SIGSTOP)
+        message.seq = seq
+        flood.publish(message)
+    recorder.process.send_signal(signal.SIGCONT)
+    recorder.wait(lambda: newest[-1] == num_sent - 1, "last message")
+    stopped = recorder.call(StopRecording, "recorder/stop")
+    received = len(recorded(tmp_path / "bag")["env/transition"])
+    assert 0 < received < num_sent
+    assert stopped.gaps == num_sent - received
+
+
 def test_a_stopped_recorder_first_takes_what_was_sent_to_it(domain: int, tmp_path: Path, peer: Start) -> None:
     recorder = peer(domain, "recorder_node", tmp_path, bag_uri="bag", min_free_mib=16)
     graph = live_graph(8)
@@ -231,9 +275,11 @@ def test_a_killed_recorder_loses_at_most_the_last_second(domain: int, tmp_path: 
 
 def test_a_full_disk_refuses_the_recording_with_one_clear_error(domain: int, tmp_path: Path, peer: Start) -> None:
     recorder = peer(domain, "recorder_node", tmp_path, record_at_start=False, min_free_mib=10**9)
+    counts = recorder.counts()
     answer = recorder.call(StartRecording, "recorder/start")
     assert answer.error_code == ErrorCode.IO_ERROR
     assert "free some space" in answer.message
+    recorder.wait(lambda: counts.get("refused_starts") == "1", "count")
     assert not (tmp_path / "bags").exists()
 
 
@@ -314,8 +360,10 @@ def test_the_player_pauses_steps_seeks_and_is_cancelled(domain: int, tmp_path: P
     player.wait(lambda: feedback, "feedback")
     assert player.call(PlayNext, "player/play_next", num_messages=7).played == 7
     player.wait(lambda: len(listener.order) == 7, "seven messages")
+    counts = player.counts()
     assert player.call(SetRate, "player/set_rate", rate=-1.0).error_code == ErrorCode.OUT_OF_RANGE
     assert "lasts" in player.call(Seek, "player/seek", position=1e6).message
+    player.wait(lambda: counts.get("refused_requests") == "2", "count")
     assert player.call(SetRate, "player/set_rate", rate=100.0).error_code == ErrorCode.OK
     assert player.call(Seek, "player/seek", position=0.0).error_code == ErrorCode.OK
     assert player.call(PlayNext, "player/play_next", num_messages=1).played == 1
@@ -330,7 +378,7 @@ def test_the_player_pauses_steps_seeks_and_is_cancelled(domain: int, tmp_path: P
     player.wait(cancelled.done, "cancel answer")
     player.wait(done.done, "cancelled result")
     assert done.result().result.termination_reason == Replay.Result.CANCELED
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 1
 
 
 def test_a_bag_that_cannot_be_played_is_a_failed_goal_with_the_reason(domain: int, tmp_path: Path, peer: Start) -> None:
@@ -338,6 +386,7 @@ def test_a_bag_that_cannot_be_played_is_a_failed_goal_with_the_reason(domain: in
     file = path / "bag_0.mcap"
     file.write_bytes(file.read_bytes()[:-100])
     player = peer(domain, "player_node", tmp_path)
+    counts = player.counts()
     for goal, text in (
         ({"bag_uri": "bag"}, "damaged"),
         ({"bag_uri": "nothing"}, "no bag at"),
@@ -347,3 +396,4 @@ def test_a_bag_that_cannot_be_played_is_a_failed_goal_with_the_reason(domain: in
         player.wait(done.done, "result")
         assert done.result().result.termination_reason == Replay.Result.FAILED
         assert text in done.result().result.message
+    player.wait(lambda: counts.get("failed_goals") == "3", "count")

@@ -38,6 +38,10 @@ def evaluate(probe: Probe, episodes: int, timeout_s: float = 60.0) -> Any:
     return probe.finish(probe.send(probe.action(Evaluate, "evaluate"), goal), timeout_s)
 
 
+def _reported(probe: Probe, reporter: str, lost: str) -> bool:
+    return any(f"{lost} is lost" in text for text in probe.seen_errors[reporter])
+
+
 @pytest.mark.kills
 def test_a_killed_recorder_records_again_beside_what_it_left(graph: Graph, probe: Probe) -> None:
     start_recorder(graph)
@@ -46,7 +50,7 @@ def test_a_killed_recorder_records_again_beside_what_it_left(graph: Graph, probe
     assert probe.finish(probe.send(client, Train.Goal(updates=1))).termination_reason == Train.Result.FINISHED
     time.sleep(2.0)  # a kill may cost the recorder's last second
     graph.kill("/wm/recorder")
-    wait_until("the report", lambda: any("/wm/recorder is lost" in t for t in probe.seen_errors["/wm/learner"]), 5.0)
+    wait_until("the report", lambda: _reported(probe, "/wm/learner", "/wm/recorder"), 5.0)
     probe.diagnostics.pop("/wm/recorder", None)
     start_recorder(graph)
     active(probe, "/wm/recorder")
@@ -70,14 +74,22 @@ def test_evaluation_episodes_are_recorded_and_a_killed_simulator_or_evaluation_n
     for start in nodes.values():
         start()
     active(probe, "/wm/recorder", *nodes)
+    steps = probe.listen("env/transition", at="sim/env/transition")
     first = evaluate(probe, 7)
     assert first.termination_reason == Evaluate.Result.FINISHED, first.message
     assert first.mean_return == pytest.approx(graph.config.reward.sparse_weight * first.success_rate)
     for name, start in nodes.items():
+        goal = Evaluate.Goal(policy_uri="start.safetensors", episodes=1_000_000, seed=1000, deterministic=True)
+        running, count = probe.send(probe.action(Evaluate, "evaluate"), goal), len(steps)
+        wait_until("its steps", lambda c=count: len(steps) > c + 5)
         graph.kill(name)
         if name == "/wm/sim/environment":
+            lost = probe.finish(running, 5.0)  # its step_timeout_s says when: nobody in /wm hears /wm/sim's heartbeats
+            assert lost.termination_reason == Evaluate.Result.PEER_LOST and "environment" in lost.message
             lost = evaluate(probe, 1)
             assert lost.termination_reason == Evaluate.Result.PEER_LOST and "environment" in lost.message
+        else:
+            wait_until("the report", lambda: _reported(probe, "/wm/recorder", "/wm/evaluation"), 5.0)
         probe.diagnostics.pop(name, None)
         start()
         active(probe, name)
@@ -85,7 +97,7 @@ def test_evaluation_episodes_are_recorded_and_a_killed_simulator_or_evaluation_n
         assert again.termination_reason == Evaluate.Result.FINISHED, again.message
         assert list(again.success) == list(first.success) and list(again.length) == list(first.length)
     assert graph.stop()["/wm/recorder"] == 0
-    found = list(read_episodes(graph.folder / "bags" / "run", namespace="/wm/sim"))
+    found = list(read_episodes(graph.folder / "bags" / "run", namespace="/wm/sim", report=BagReport()))
     assert len(found) >= 7
     assert [episode.seed for episode in sorted(found[:7], key=lambda e: e.seed)] == list(range(1000, 1007))
     assert {len(e.actions) for e in found[:7]} == set(map(int, first.length))
@@ -96,10 +108,14 @@ def test_a_killed_player_plays_again(graph: Graph, probe: Probe) -> None:
     recorded = Recorded(make_spec(num_envs=NUM_ENVS))
     recorded.rollout(1, 20)
     write(graph.folder / "bag", recorded)
+    graph.start_environment()
     graph.start("player")
     client = probe.action(Replay, "replay")
+    active(probe, "/wm/player", "/wm/environment")
+    time.sleep(1.0)  # two heartbeats
     probe.send(client, Replay.Goal(bag_uri="bag", rate=0.01))
     graph.kill("/wm/player")
+    wait_until("the report", lambda: _reported(probe, "/wm/environment", "/wm/player"), 5.0)
     graph.start("player")
     probe.diagnostics.pop("/wm/player", None)
     active(probe, "/wm/player")

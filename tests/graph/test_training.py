@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from graph import toy
 from graph.harness import Graph, Probe, own_domain, wait_until
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 
 from wm_msgs.action import Replay, Train
 from wm_msgs.msg import ErrorCode
@@ -62,6 +64,7 @@ def test_a_late_joiner_gets_the_newest_version_inline_and_in_chunks(graph: Graph
     refused = probe.call(GetWeights, "learner/get_weights", GetWeights.Request(version=99, max_bytes=10))
     assert refused.error_code == ErrorCode.NOT_FOUND
     assert "ask for 0" in refused.message
+    wait_until("the count", lambda: probe.value("/wm/learner", "refused_weights") == "1")
     saved = probe.call(SaveCheckpoint, "learner/save", SaveCheckpoint.Request(uri="mine/best.json"))
     assert saved.error_code == ErrorCode.OK
     assert (graph.folder / "mine" / "best.json").is_file()
@@ -204,6 +207,16 @@ def test_cancel_ends_training_within_a_second_and_the_next_goal_works(graph: Gra
     assert result.termination_reason == Train.Result.CANCELED
     assert time.monotonic() - began < 1.0
     assert train(probe, updates=1).termination_reason == Train.Result.FINISHED
+
+
+def test_a_deactivated_learner_ends_its_goal_with_that_reason(graph: Graph, probe: Probe) -> None:
+    graph.start_training_nodes()
+    updates: list[Any] = []
+    handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
+    wait_until("the first update", lambda: updates, 30)
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    assert probe.call(ChangeState, "learner/change_state", request).success
+    assert probe.finish(handle, 10).termination_reason == Train.Result.DEACTIVATED
 
 
 def test_limits_and_a_second_goal(graph: Graph, probe: Probe) -> None:

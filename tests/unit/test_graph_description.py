@@ -16,6 +16,7 @@ from wm_nodes.ros.environment import PROFILE, graph_environment
 from wm_nodes.ros.graph import Graph, GraphError, NodeSpec
 from wm_nodes.ros.runner import Runner, main
 from wm_nodes.ros.scenarios import ARGUMENTS, SCENARIOS, build_graph, describe_arguments, parse_arguments  # fmt: skip
+from wm_nodes.world_model import load_starts
 
 
 @pytest.fixture
@@ -161,6 +162,13 @@ def test_several_ranks_start_under_torchrun() -> None:
     program = NodeSpec("wm_nodes.nodes.learner_node", "learner", ranks=2).program()
     assert program[:3] == ["-m", "torch.distributed.run", "--standalone"]
     assert program[-3:] == ["--nproc-per-node=2", "-m", "wm_nodes.nodes.learner_node"]
+
+
+def test_the_shipped_model_brings_the_first_frames_that_a_launch_file_imagines_from(tmp_path: Path) -> None:
+    for task in ("push_cube", "reach"):
+        values = launch_arguments.resolve("online_training", {"task": task, "run_dir": str(tmp_path / task)})
+        images, states = load_starts(Path(values["starts_file"]))
+        assert len(images) >= 32 and images.shape[1:] == (64, 128, 3) and states.shape == (len(images), 3)
 
 
 def test_every_argument_is_used_and_described() -> None:

@@ -11,6 +11,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.control import check_actions, next_state
 from wm_nodes.learning.collecting import collect_plan, demonstration_plan
 from wm_nodes.recording import read_episodes
+from wm_nodes.simulation import backend
 from wm_nodes.simulation.backend import NoRendererError, render_backend
 from wm_nodes.simulation.behaviours import sample_style
 from wm_nodes.simulation.environment import ManiSkillEnvironment
@@ -83,6 +84,24 @@ def test_bad_actions_are_refused_by_value(actions: np.ndarray, text: str) -> Non
 def test_a_device_that_cannot_render_names_the_remedy() -> None:
     with pytest.raises(NoRendererError, match=r"cuda:77.*lavapipe"):
         render_backend("cuda:77")
+
+
+@pytest.mark.parametrize(("able", "chosen", "patches"), [("cuda", "cuda", 0), ("pci:0", "pci:0", 1)])
+def test_only_the_software_device_needs_maniskill_patched(
+    monkeypatch: pytest.MonkeyPatch, able: str, chosen: str, patches: int
+) -> None:
+    class Device:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def can_render(self) -> bool:
+            return self.name == able
+
+    patched: list[str] = []
+    monkeypatch.setattr(backend.sapien, "Device", Device)
+    monkeypatch.setattr(backend, "keep_pci_names_whole", lambda: patched.append(able))
+    assert render_backend("auto") == chosen
+    assert len(patched) == patches
 
 
 def test_one_seed_shows_one_picture_and_steps_move_the_commanded_tool_exactly(env: ManiSkillEnvironment) -> None:

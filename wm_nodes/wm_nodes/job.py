@@ -25,6 +25,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.evaluation import evaluate
 from wm_nodes.learning.policies import load_policy, make_imagined_environment, models_of
+from wm_nodes.learning.preparation import num_starts
 from wm_nodes.reports import Rate
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.operator import Operator
@@ -32,7 +33,6 @@ from wm_nodes.ros.runner import Runner
 from wm_nodes.statistics import wilson_interval
 from wm_nodes.types import BoolArray
 
-IMAGINED_EPISODES = 256
 READY_S = 120.0
 TRAINED = "trained.json"
 
@@ -62,7 +62,8 @@ def open_run_dir(given: Path | None, name: str, config_text: str, *, begun_with:
 
 def add_judge_options(parser: argparse.ArgumentParser) -> None:
     """Who judges where the reward is the agent's; judge_options reads them."""
-    parser.add_argument("--judge", default="", metavar="URL[,URL]", help="the judge's servers, e.g. http://host:8000/v1")
+    parser.add_argument("--judge", default="", metavar="URL[,URL]|embedded|FOLDER",
+                        help="the judge's servers, e.g. http://host:8000/v1; or a judge without one")  # fmt: skip
     parser.add_argument("--judge-model", default="", metavar="NAME", help="its name on the server")
     parser.add_argument("--judge-key-env", default="", metavar="VARIABLE", help="environment variable with its key")
     parser.add_argument("--rubric", default="", help="rubric pack: a name, or a .yaml file")
@@ -207,8 +208,8 @@ def read_success(folder: Path, name: str) -> BoolArray:
 
 
 def imagined_success(job: Job, folder: Path, label: str, model_dir: Path, policy: Path) -> BoolArray:
-    """Success in the world model, without action noise, on IMAGINED_EPISODES starts, (E,)."""
-    episodes = min(IMAGINED_EPISODES, 8 * job.config.evaluation.episodes)
+    """Success in the world model, without action noise, on num_starts() episodes, (E,)."""
+    episodes = num_starts(job.config)
 
     def measure() -> BoolArray:
         env = make_imagined_environment(job.config, model_dir, job.starts, num_envs=64, seed=job.config.seed)

@@ -31,7 +31,7 @@ from wm_nodes.learning.pretraining import load_arrays
 from wm_nodes.learning.rollouts import collect_rollout, rollout_statistics
 from wm_nodes.learning.weights import save_weights
 from wm_nodes.policy import ImagePolicy
-from wm_nodes.reports import machine_facts
+from wm_nodes.reports import machine_facts, mean_gain
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.statistics import paired_difference, wilson_interval
 from wm_nodes.types import Environment
@@ -54,7 +54,10 @@ def main(argv: Sequence[str]) -> int:
             for arm in arguments.arms:
                 if not _done(folder, task, seed, arm):
                     _run(config, arm, arguments.model_dir or shipped_model(task), folder)
-    Console().print(table(read_results(folder)))
+    rows = read_results(folder)
+    Console().print(table(rows))
+    if (gain := gain_over_simulator(rows)) is not None:
+        print(f"RL in the world model less RL in the simulator, mean over the tasks: {gain:+.1f} points")
     return 0
 
 
@@ -85,6 +88,21 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
             f"{100 * pooled.difference:+.1f} ({100 * pooled.low:+.1f} to {100 * pooled.high:+.1f})", "", "",
         )  # fmt: skip
     return found
+
+
+def gain_over_simulator(rows: Sequence[dict[str, Any]]) -> float | None:
+    """By how many points RL in the world model ends above RL in the simulator: mean over tasks, each on the seeds that
+    both arms have; None where no task has both."""
+    after = {(row["task"], row["seed"], row["arm"]): row["real_after"] for row in rows}
+    rates: dict[tuple[str, str, str], float] = {}
+    for task in {task for task, _, _ in after}:
+        tried = [{seed for other, seed, done in after if (other, done) == (task, arm)} for arm in ARMS]
+        seeds = set.intersection(*tried)
+        for arm in ARMS if seeds else ():
+            found = [after[task, seed, arm] for seed in seeds]
+            successes, episodes = (sum(rate[name] for rate in found) for name in ("successes", "episodes"))
+            rates["image policy", arm, task] = 100 * successes / episodes
+    return mean_gain(rates, *ARMS) if rates else None
 
 
 def _parser() -> argparse.ArgumentParser:

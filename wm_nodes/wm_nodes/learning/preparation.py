@@ -17,20 +17,27 @@ from wm_nodes.policy import ImagePolicy
 from wm_nodes.recording import read_episodes
 from wm_nodes.types import Episode
 
-MAX_STARTS = 512
+STARTS = "starts.safetensors"
+MAX_STARTS, MODEL_STARTS = 512, 64
+"""First frames kept for a run, and beside a model, from which a launch file imagines unless it is told otherwise."""
 NUM_STARTS = 256
 DEMONSTRATION_SEEDS, START_SEEDS = 600_000, 700_000
 SEEDS_PER_RUN = 1000
 
 
-def write_starts(bags: Iterable[Path], path: Path) -> int:
-    """Write the first frame and state of up to MAX_STARTS recorded episodes; returns how many."""
+def num_starts(config: RunConfig) -> int:
+    """First frames of a run, which are also the episodes that imagined success is measured on."""
+    return min(NUM_STARTS, 8 * config.evaluation.episodes)
+
+
+def write_starts(bags: Iterable[Path], path: Path, limit: int = MAX_STARTS) -> int:
+    """Write the first frame and state of up to `limit` recorded episodes; returns how many."""
     episodes: list[Episode] = []
     for bag in bags:
         episodes += list(read_episodes(bag))
-        if len(episodes) >= MAX_STARTS:
+        if len(episodes) >= limit:
             break
-    chosen = episodes[:MAX_STARTS]
+    chosen = episodes[:limit]
     tensors = {
         "images": torch.from_numpy(np.stack([episode.images[0] for episode in chosen])),
         "states": torch.from_numpy(np.stack([episode.states[0] for episode in chosen])),
@@ -54,7 +61,7 @@ def train_weak_policy(config: RunConfig, model_dir: Path, demo_bags: Iterable[Pa
 
 def start_files(run_dir: Path) -> tuple[Path, Path]:
     """Where prepare_start puts a run's first frames and its weak policy."""
-    return run_dir / "starts.safetensors", run_dir / "policies" / "weak.safetensors"
+    return run_dir / STARTS, run_dir / "policies" / "weak.safetensors"
 
 
 def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Path, Path]:
@@ -69,7 +76,7 @@ def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Pa
     demos = collect_plan(plan, config, run_dir / "bags" / "demos")
     starts, weak = start_files(run_dir)
     if not starts.exists():
-        first_frames = first_frames_plan(config, NUM_STARTS, START_SEEDS)
+        first_frames = first_frames_plan(config, num_starts(config), START_SEEDS)
         write_starts(collect_plan(first_frames, config, run_dir / "bags" / "starts"), starts)
     if not weak.exists():
         train_weak_policy(config, model_dir, demos, weak)

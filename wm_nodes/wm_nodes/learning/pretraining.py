@@ -21,7 +21,7 @@ from wm_nodes.learning.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.learning.gate import model_metrics
 from wm_nodes.learning.policies import ACTION_DIM, STATE_DIM, policy_actor
 from wm_nodes.learning.position_probe_training import train_position_probe
-from wm_nodes.learning.preparation import train_weak_policy
+from wm_nodes.learning.preparation import MODEL_STARTS, STARTS, train_weak_policy, write_starts
 from wm_nodes.learning.text_model_training import DEMONSTRATORS, train_text_model
 from wm_nodes.learning.token_model_training import train_token_model
 from wm_nodes.learning.tokenizer_training import train_tokenizer
@@ -103,6 +103,7 @@ def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, comma
     }  # fmt: skip
     models = WorldModels(tokenizer, action, text, MODEL_TASKS[config.task], config.simulation, {}, probe)
     story["heldout"] = model_metrics(models, load_arrays(heldout_bags, config), config)
+    write_starts(bags, folder / STARTS, MODEL_STARTS)
     save_model_folder(folder, tokenizer, action, text, story=story, probe=probe, **arguments)
     load_model_folder(folder)
     return folder

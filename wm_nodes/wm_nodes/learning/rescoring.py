@@ -1,14 +1,20 @@
 """Score a recorded run again with a reward model, and say whether the rewards are the recorded ones, bit by bit."""
 
+import argparse
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.config.load import load_config
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.learning.policies import make_endogenous_reward
 from wm_nodes.recording import Bag, BagError
 from wm_nodes.recording.lockstep import LockSteps, RecordedReward, RecordedStep
-from wm_nodes.reward import RewardInput, RewardModel, RewardResult
+from wm_nodes.recording.rollouts import recorded_reward_name
+from wm_nodes.reward import RewardInput, RewardModel, RewardResult, RuleReward
 
 
 @dataclass
@@ -27,6 +33,12 @@ class RescoreReport:
     def equal(self) -> bool:
         """True when something was compared and nothing differed."""
         return self.compared > 0 and not self.different
+
+    def text(self) -> str:
+        return (
+            f"{self.compared} lock-steps evaluated again, {len(self.different)} differ; not compared: "
+            f"{self.unrewarded} without reward, {self.without_images} without images"
+        )
 
 
 def rescore_bag(path: Path, model: RewardModel, *, namespace: str | None = None) -> RescoreReport:
@@ -84,3 +96,34 @@ def _differences(recorded: RecordedReward, result: RewardResult) -> list[str]:
 
 def _bit_equal(theirs: NDArray[np.generic], ours: NDArray[np.generic]) -> bool:
     return theirs.dtype == ours.dtype and theirs.tobytes() == ours.tobytes()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Return 0 where every reward is bit-equal, 1 where one differs, 2 after a clear error."""
+    parser = argparse.ArgumentParser(
+        prog="bag_rescore", description="Evaluate the rewards of a recorded training again and compare them bit by bit."
+    )
+    parser.add_argument("bag", type=Path, help="a bag of a run folder, e.g. runs/x/bags/training_120000")
+    parser.add_argument("--config", type=Path, help="the run's configuration; default: config.yaml two folders above")
+    parser.add_argument("--model-dir", type=Path, help="its world model; default: <run>/model, else the shipped one")
+    options = parser.parse_args(arguments)
+    try:
+        report = rescore_bag(options.bag, _recorded_model(options.bag, options.config, options.model_dir))
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print("\n".join([*report.different[:10], report.text()]))
+    return int(not report.equal)
+
+
+def _recorded_model(bag: Path, config_file: Path | None, model_dir: Path | None) -> RewardModel:
+    """The reward model of the run that a bag belongs to. Raises BagError for rewards that are a judge's."""
+    name = recorded_reward_name(bag)
+    run_dir = bag.absolute().parent.parent
+    config = load_config(str(config_file or run_dir / "config.yaml"))
+    if name == "rule":
+        return RuleReward(config.reward.sparse_weight)
+    if name != "endogenous":
+        raise BagError(f"{bag} holds rewards of {name or 'nobody'}; endogenous and rule ones can be evaluated again")
+    own = run_dir / "model"
+    return make_endogenous_reward(config, model_dir or (own if own.is_dir() else shipped_model(config.task)))

@@ -21,7 +21,7 @@ from wm_nodes.learning.distributed import Ranks, join
 from wm_nodes.learning.episode_reward import check_horizon, unjudged
 from wm_nodes.learning.rollouts import Canceled
 from wm_nodes.learning.video_config import AGENT
-from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, load_weights
+from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, WeightsError, load_weights
 from wm_nodes.nodes.backends import existing, expected_spec, make_learner, make_policy, refuse_other
 from wm_nodes.nodes.joiner import Dropped, RolloutJoiner
 from wm_nodes.nodes.learner_report import LearnerReport
@@ -74,7 +74,11 @@ class LearnerNode(ManagedNode):
         self._config = self.run_config()
         policy = make_policy(self._config, str(self.param("model_dir")), str(self.param("policy_factory")))
         if self.param("initial_policy"):
-            load_weights(policy, existing(str(self.param("initial_policy")), "initial_policy").read_bytes())
+            path = existing(str(self.param("initial_policy")), "initial_policy")
+            try:
+                load_weights(policy, path.read_bytes())
+            except WeightsError as error:
+                raise ValueError(f"initial_policy {path}: {error}") from None
         learner = make_learner(policy, self._config, str(self.param("learner_factory")), self._ranks)
         self._training = PolicyTraining(
             policy, learner, self.run_dir, resume=bool(self.param("resume")),
@@ -355,13 +359,14 @@ class LearnerNode(ManagedNode):
             version, data = self._training.weights_of(request.version)
             if request.offset >= len(data):
                 raise WireError(
-                    ErrorCode.OUT_OF_RANGE, f"offset {request.offset} lies behind the end of {len(data)} bytes"
+                    ErrorCode.OUT_OF_RANGE,
+                    f"offset {request.offset} lies behind the end of {len(data)} bytes; begin again at 0",
                 )
-        except WireError as error:
-            return convert.fill_error(response, error)
-        except OSError:
+        except (WireError, OSError) as error:
             text = f"policy version {request.version} is not in {self.run_dir / 'policies'}; ask for 0, the newest"
-            return convert.fill_error(response, WireError(ErrorCode.NOT_FOUND, text))
+            refused = error if isinstance(error, WireError) else WireError(ErrorCode.NOT_FOUND, text)
+            self.diagnostics.count("refused_weights", text=f"learner/get_weights refused: {refused}")
+            return convert.fill_error(response, refused)
         chunk = data[request.offset : request.offset + request.max_bytes]
         response.version, response.total, response.crc32 = version, len(data), zlib.crc32(chunk)
         response.data = convert.bytes_field(chunk)

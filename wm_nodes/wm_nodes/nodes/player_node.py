@@ -193,6 +193,7 @@ class PlayerNode(ManagedNode):
             self._play(playback, work.request, work)
         except (BagError, ValueError) as error:
             self.get_logger().error(f"replay failed: {error}")
+            self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=f"replay failed: {error}")
             return _describe(Replay.Result.FAILED, str(error))
         if not self.active:
             raise Cancelled("deactivated")
@@ -253,6 +254,7 @@ class PlayerNode(ManagedNode):
             act(playback)
         except BagError as error:
             response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
+            self.diagnostics.count("refused_requests", text=f"player request refused: {error}")
         return response
 
 

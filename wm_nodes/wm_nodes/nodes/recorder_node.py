@@ -229,6 +229,7 @@ class RecorderNode(ManagedNode):
         text = f"recording stopped: {error}; {state}"
         self.get_logger().error(text)
         self.diagnostics.set_condition("recording", diagnostics.ERROR, text)
+        self.diagnostics.count("failed_recordings", level=diagnostics.ERROR, text=text)
 
     # Services.
 
@@ -242,6 +243,8 @@ class RecorderNode(ManagedNode):
             response.error_code, response.message = ErrorCode.BUSY, str(error)
         except (RecordingError, ValueError) as error:
             response.error_code, response.message = ErrorCode.IO_ERROR, str(error)
+        if response.message:
+            self.diagnostics.count("refused_starts", text=f"not recording: {response.message}")
         return response
 
     def _on_stop(self, request: StopRecording.Request, response: StopRecording.Response) -> Any:

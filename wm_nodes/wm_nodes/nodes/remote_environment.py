@@ -53,6 +53,7 @@ class RemoteEnvironment:
     def step(self, actions: FloatArray) -> StepResult:
         if self._last is None:
             raise ValueError("reset() must come before step()")
+        self._check()  # a client that is answered at once never asks it
         reply = self._client.step(
             StepCommand(
                 session=self._last.session, step_id=self._last.step_id + 1, spec_hash=self.spec.spec_hash,

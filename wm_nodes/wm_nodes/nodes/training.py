@@ -176,11 +176,21 @@ class PolicyTraining:
 
 
 def restore(policy: ImagePolicy, learner: Learner, checkpoint: Path) -> Progress:
-    """Load a checkpoint into policy and learner; return its counts."""
-    content = json.loads(checkpoint.read_text())
-    load_weights(policy, (checkpoint.parent / content["weights"]).read_bytes(), sha256=content["sha256"])
-    learner.load(checkpoint.parent / content["learner"])
-    return Progress(**content["progress"])
+    """Load a checkpoint into policy and learner; return its counts.
+
+    Raises:
+        ValueError: a damaged file, or one of another architecture, algorithm or seed; names it.
+    """
+    try:
+        content = json.loads(checkpoint.read_text())
+        load_weights(policy, (checkpoint.parent / content["weights"]).read_bytes(), sha256=content["sha256"])
+        learner.load(checkpoint.parent / content["learner"])
+        return Progress(**content["progress"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"checkpoint {checkpoint} does not fit: {error}; go on with the configuration it was made by, or begin "
+            "anew in another run_dir"
+        ) from None
 
 
 def follow(policy: ImagePolicy, learner: Learner, run_dir: Path, ranks: Ranks) -> None:

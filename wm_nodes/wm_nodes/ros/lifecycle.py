@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -24,7 +25,7 @@ from wm_nodes.ros.credit import CreditGrantor
 from wm_nodes.ros.diagnostics import Diagnostics
 from wm_nodes.ros.introspection import introspect
 from wm_nodes.ros.links import Links
-from wm_nodes.ros.params import COMMON, Param, declare
+from wm_nodes.ros.params import COMMON, Param, declare, refusal
 from wm_nodes.ros.peers import HEARTBEAT_S, PeerWatch
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
@@ -54,6 +55,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._trackers: dict[str, GapTracker] = {}
         self._introspected: list[Any] = []
         declare(self, (*COMMON, *params))
+        self._params = {param.name: param for param in (*COMMON, *params)}
         self.add_post_set_parameters_callback(self._after_set)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         run_dir = self.run_dir if self.param("run_dir") else None
@@ -115,6 +117,14 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         if not Path(path).is_file():
             raise ValueError(f"{self.get_name()}: config_file {path!r} does not exist")
         return load_config(path)
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """What rclpy calls for `ros2 param set`. A refused change names value and remedy, and is counted."""
+        reason = refusal(self, self._params, parameter_list)
+        result = SetParametersResult(reason=reason) if reason else super().set_parameters_atomically(parameter_list)
+        if not result.successful:
+            self.diagnostics.count("refused_parameters", text=f"parameter refused: {result.reason}")
+        return result
 
     def publish_on(self, name: str, qos: QoSProfile | None = None) -> StampedPublisher:
         """A numbering publisher for a row of the QoS table (or another profile), destroyed at cleanup."""

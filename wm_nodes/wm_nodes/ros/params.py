@@ -1,12 +1,13 @@
 """Described parameters: text, unit, range, choices; unknown names and bad values are refused with a reason."""
 
 import difflib
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import (
     InvalidParameterTypeException,
     InvalidParameterValueException,
@@ -56,6 +57,8 @@ class Param:
 
     def problem(self, value: Any) -> str:
         """Return why a value is refused, or ''."""
+        if isinstance(value, float) and math.isnan(value):
+            return f"{self.name} must be a number; got nan"
         if self.choices and value not in self.choices:
             return f"{self.name} must be one of {', '.join(self.choices)}; got {value!r}"
         for limit, wrong in ((self.minimum, "at least"), (self.maximum, "at most")):
@@ -81,12 +84,11 @@ COMMON = (
 
 
 def declare(node: Node, params: Sequence[Param]) -> None:
-    """Declare all parameters and guard later changes.
+    """Declare all parameters.
 
     Raises:
         ParameterError: for a value outside its range or choices, or an override that no parameter has the name of.
     """
-    by_name = {param.name: param for param in params}
     for param in params:
         try:
             node.declare_parameter(param.name, param.default, param.descriptor())
@@ -102,14 +104,21 @@ def declare(node: Node, params: Sequence[Param]) -> None:
             raise ParameterError(f"{node.get_name()}: {problem}")
     _refuse_unknown(node)
 
-    def check(changes: list[Parameter]) -> SetParametersResult:
-        for change in changes:
-            param = by_name.get(change.name)
-            if param is not None and (problem := param.problem(change.value)):
-                return SetParametersResult(successful=False, reason=problem)
-        return SetParametersResult(successful=True)
 
-    node.add_on_set_parameters_callback(check)
+def refusal(node: Node, params: Mapping[str, Param], changes: Sequence[Parameter]) -> str:
+    """Why a change at run time is refused, or ''. params: those of declare(), by name."""
+    for change in changes:
+        if not node.has_parameter(change.name):
+            return _unknown(node, change.name)
+        param = params.get(change.name)
+        if param is None:
+            continue
+        if param.read_only:
+            now = node.get_parameter(param.name).value
+            return f"{param.name} stays {now!r} while the node runs; start it again with {param.name}:={change.value}"
+        if problem := param.problem(change.value):
+            return problem
+    return ""
 
 
 def read_parameters(name: str, params: Sequence[Param]) -> dict[str, Any]:
@@ -138,7 +147,11 @@ def _refuse_unknown(node: Node) -> None:
                 "change the topic's row in wm_nodes/recording/topics.py"
             )
         if not node.has_parameter(name):
-            known = sorted(declared for declared in node._parameters if "." not in declared)
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
-            raise ParameterError(f"{node.get_name()}: unknown parameter {name!r}; {hint}")
+            raise ParameterError(f"{node.get_name()}: {_unknown(node, name)}")
+
+
+def _unknown(node: Node, name: str) -> str:
+    known = sorted(declared for declared in node._parameters if "." not in declared)
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+    return f"unknown parameter {name!r}; {hint}"

@@ -1,0 +1,13 @@
+#!/usr/bin/env python3
+"""Evaluate a bag's rewards again, bit by bit: python3 launch_scripts/bag_rescore.py runs/x/bags/training_120000."""
+
+import sys
+
+import wm_setup
+
+wm_setup.ensure()
+
+from wm_nodes.learning.rescoring import main  # noqa: E402
+
+if __name__ == "__main__":
+    sys.exit(main())
