@@ -6,6 +6,7 @@ import math
 import shutil
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,8 @@ from wm_msgs.msg import ClipScores, ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric, StartRecording, StopRecording
 from wm_nodes.config.load import load_config
 from wm_nodes.learning.clip_archive import read_clips
-from wm_nodes.learning.clip_judging import READS
+from wm_nodes.learning.clip_judging import READS, ClipJudge
+from wm_nodes.learning.episode_rescoring import judge_bag
 from wm_nodes.reward.agent import load_rubric
 from wm_nodes.reward.audit import read_record, verify
 from wm_nodes.ros.scenarios import GRAPH_TOPICS, VERDICT_TOPIC, VIDEO_TOPICS
@@ -316,6 +318,9 @@ def test_a_policys_episodes_are_judged_at_their_end_and_a_judge_that_is_down_pau
             again = probe.finish(probe.send(client, Train.Goal(updates=1)))
             assert (again.termination_reason, again.updates) == (Train.Result.FINISHED, 2)
             bag = probe.call(StopRecording, "recorder/stop", StopRecording.Request()).bag_uri
+            with closing(ClipJudge(config.judge, seed=config.seed, reads=graph.folder / READS)) as again:
+                offline = judge_bag(graph.folder / bag, again)
+            assert offline.compared and offline.unanswered and not offline.different
             _assert_same_weights_from(graph, graph.folder / bag)
         finally:
             server.down = False

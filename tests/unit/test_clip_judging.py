@@ -35,6 +35,7 @@ from wm_nodes.learning.video_config import dump_video_config, load_video_config
 from wm_nodes.main_job import main as main_job
 from wm_nodes.reward.agent import Status, Verdict
 from wm_nodes.reward.audit import read_record
+from wm_nodes.reward.judges.embedded import shipped_head
 from wm_nodes.reward.judges.factory import check_judge
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.graph import GraphError
@@ -163,7 +164,8 @@ def test_an_episode_is_paid_at_its_last_step_and_not_before(server: PickyServer)
 
     with closing(Listening(settings(server), seed=0)) as judge:
         model = EpisodeReward(judge)
-        first, second = step(0), step(1, ended=(True, False))
+        goal = np.full((8, 8, 3), 7, np.uint8)
+        first, second = replace(step(0), goals={0: goal}), step(1, ended=(True, False))
         early = model.add(first, SPEC, 7)
         assert early.done and list(early.result().total) == [0, 0] and list(early.result().valid) == [True, True]
         late = wait_for(model.add(second, SPEC, 7))
@@ -178,6 +180,9 @@ def test_an_episode_is_paid_at_its_last_step_and_not_before(server: PickyServer)
     )
     assert job.clip.fps == pytest.approx(10) and job.task.instruction == SPEC.instruction
     assert job.task.actions is not None and job.task.actions.shape == (2, 3)
+    assert job.task.goal_image is not None and (job.task.goal_image == goal).all()
+    sent = [part for request in server.requests for part in request["messages"][1]["content"] if part["type"] == "text"]
+    assert any(part["text"] == "goal image" for part in sent)
 
 
 @pytest.mark.parametrize(
@@ -339,11 +344,16 @@ def test_launch_arguments_bring_the_agent_into_both_loops(tmp_path: Path) -> Non
     assert isinstance(topics, list) and "reward/verdict" in topics
     assert load_config(values["config_file"]).judge.endpoints == ["http://localhost:1/v1"]
     clips = {**given, "video_preset": "smoke", "video_model_dir": "m", "context_bags": "b"}
+    for name, folder in (("embedded", ""), (str(shipped_head()), str(shipped_head()))):
+        _, values = launch_arguments.prepare("world_model_rl", {**clips, "reward": "agent", "judge": name})
+        here = load_video_config(values["config_file"]).judge
+        assert (here.kind, here.folder, here.endpoints) == ("embedded", folder, [])
     _, values = launch_arguments.prepare("world_model_rl", {**clips, **judge})
     config = load_video_config(values["config_file"])
     assert config.rewards == {"agent": 1.0} and config.judge.model == "judge"
     refusals = [
         ("online_training", {**policies, "reward": "agent"}, "needs a judge"),
+        ("online_training", {**policies, "reward": "agent", "judge": "embedded"}, "cannot judge clips of .* 64 x 128"),
         ("online_training", {**policies, "judge": "http://localhost:1/v1"}, "would change nothing without"),
         ("online_training", {**given, **judge, "config_file": values["config_file"]}, "belong into it"),
         ("online_training", {**policies, **judge, "preset": "smoke"}, r"ppo\.num_steps is 6"),

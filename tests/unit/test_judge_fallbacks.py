@@ -204,6 +204,8 @@ def test_the_embedded_judge_takes_a_round_of_clips_of_its_size_and_keeps_what_it
     with closing(ClipJudge(embedded, seed=0)) as judge:
         verdicts = judge.judge(some)
         assert judge.judge_id.startswith("embedded:") and judges(verdicts) == {judge.judge_id}
+        (card,) = judge.cards
+        assert judge.judge_id.removeprefix("embedded:") in card and "task_completion  balanced accuracy" in card
     assert {verdict.status for verdict in verdicts} == {Status.ABSTAIN}, "noise is unlike all it has seen"
     asked = [len(server.requests) for server in servers]
     fallback = {"endpoints": [servers[1].url], "model": "second"}

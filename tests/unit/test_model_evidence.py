@@ -1,41 +1,13 @@
 """What the shipped world model says of clips that it imagined itself, and of the same clips made wrong. Section 4.1."""
 
-import functools
-
 import numpy as np
 import pytest
-import torch
+from imagined_clip import STEPS, imagined, models
 
-from wm_nodes.config.shipped import shipped_model
-from wm_nodes.learning.model_evidence import MODEL_EVIDENCE, commanded_states, model_evidence
+from wm_nodes.learning.model_evidence import MODEL_EVIDENCE, model_evidence
 from wm_nodes.reward.agent.types import TaskSpec
 from wm_nodes.types import FloatArray, UInt8Array
-from wm_nodes.world_model import WorldModels, load_model_folder
 from wm_nodes.world_model.folder import ModelFolderError
-
-STEPS = 12
-
-
-@functools.cache
-def models() -> WorldModels:
-    return load_model_folder(shipped_model("push_cube"))
-
-
-@functools.cache
-def imagined() -> tuple[UInt8Array, FloatArray, FloatArray]:
-    """Frames (T, H, W, 3), actions (T - 1, A), first state (S,): the model's own rollout from its mean picture."""
-    tokenizer, action = models().tokenizer, models().action
-    actions = np.repeat(np.random.default_rng(0).uniform(-1, 1, (STEPS // 4, 3)), 4, 0).astype(np.float32)
-    start = action.condition.state_mean.clone()
-    states = commanded_states(models(), start, torch.from_numpy(actions))
-    picture = (tokenizer.background * 255).round().byte().permute(1, 2, 0)
-    latents = [tokenizer.encode(picture[None])]
-    caches = action.trunk.new_ring_caches(1, tokenizer.device)
-    with torch.inference_mode():
-        for t, moved in enumerate(torch.from_numpy(actions)):
-            before, after = states[t : t + 1], states[t + 1 : t + 2]
-            latents.append(action.advance(latents[-1], moved[None], before, after, caches)[0])
-    return tokenizer.decode(torch.cat(latents)).numpy(), actions, start.numpy()
 
 
 def evidence(
@@ -70,6 +42,21 @@ def test_noise_cannot_be_encoded_and_surprises() -> None:
     assert found["surprise_max"] > 3 * clean["surprise_max"]
 
 
+def test_every_second_frame_of_a_clip_is_explained_by_the_two_actions_between() -> None:
+    frames, actions, _ = imagined()
+    pairs = actions.reshape(STEPS // 2, -1)
+    right, wrong = evidence(frames[::2], pairs), evidence(frames[::2], -pairs)
+    assert wrong["surprise"] > 2 * right["surprise"] and wrong["tool_error"] > right["tool_error"]
+    assert right["action_gain"] > 0.5 > -0.5 > wrong["action_gain"]
+
+
+def test_without_a_first_state_the_tool_is_where_the_first_frame_shows_it() -> None:
+    frames, actions, _ = imagined()
+    spec = TaskSpec("push the blue cube into the red target", "push_cube", "panda", frames[0], None, actions)
+    told, seen = evidence(frames, actions), model_evidence(models(), frames, spec)
+    assert seen["action_gain"] > 0.5 and seen["tokenizer_error"] == told["tokenizer_error"]
+
+
 def test_goal_similarity_is_whole_at_the_goal_and_none_where_nothing_moved() -> None:
     frames, actions, _ = imagined()
     there = evidence(frames, actions, frames[-1])
@@ -82,10 +69,12 @@ def test_goal_similarity_is_whole_at_the_goal_and_none_where_nothing_moved() -> 
 
 def test_clips_that_the_model_cannot_read_are_refused() -> None:
     frames, actions, _ = imagined()
-    with pytest.raises(ValueError, match=r"needs actions \(12, 3\), got None"):
+    with pytest.raises(ValueError, match=r"needs actions \(12, 3 or a multiple\), got None"):
         evidence(frames, None)
-    with pytest.raises(ValueError, match=r"needs actions \(12, 3\), got \(5, 3\)"):
+    with pytest.raises(ValueError, match=r"needs actions \(12, 3 or a multiple\), got \(5, 3\)"):
         evidence(frames, actions[:5])
+    with pytest.raises(ValueError, match=r"got \(12, 2\)"):
+        evidence(frames, actions[:, :2])
     with pytest.raises(ValueError, match=r"images must be uint8 \(B, 64, 128, 3\)"):
         evidence(frames[:, :, :64], actions)
     with pytest.raises(ModelFolderError, match="knows the tasks reach, push_cube, not 'fold'"):

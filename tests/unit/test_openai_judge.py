@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from chat_server import ChatServer, Fault
 
-from wm_nodes.reward import agent, judges
+from wm_nodes.reward import judges
 from wm_nodes.reward.agent.levels import first_vote, next_vote, option_order, state_of
 from wm_nodes.reward.agent.machine import RewardAgent
 from wm_nodes.reward.agent.profiles import profile_media
@@ -148,6 +148,25 @@ def test_images_are_lossless_png_with_a_label_before_each() -> None:
         np.testing.assert_array_equal(pixels, FRAMES[max(0, item.index)])
     with pytest.raises(ValueError, match=r"uint8 \(H, W, 3\), got float64"):
         data_uri(np.zeros((2, 2, 3)))  # type: ignore[arg-type]
+
+
+def test_the_dense_profile_goes_as_one_video_where_the_settings_say_so() -> None:
+    server, options = ChatServer(), ChatOptions(video=True)
+    reads = reads_of(request(Stage.PC, ["geometry"], profile=Profile.D), server, options=options)
+    labels, video = server.requests[0]["messages"][1]["content"][:2]
+    media = profile_media(CLIP, TASK, Profile.D)
+    assert labels["text"].endswith(", ".join(item.label for item in media))
+    head, *frames = video["video_url"]["url"].split(",")
+    assert (video["type"], head) == ("video_url", "data:video/jpeg;base64") and len(frames) == len(media)
+    for item, data in zip(media, frames):
+        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        np.testing.assert_array_equal(pixels, FRAMES[item.index])
+    assert reads[0].status is Status.OK and reads[0].cost.images == len(media)
+    reads_of(request(), server, options=options)
+    single = replace(request(Stage.PC, ["geometry"], profile=Profile.D), media=media[:1])
+    reads_of(single, server, options=options)
+    for body in server.requests[1:]:  # still profiles, and a single cited frame
+        assert {part["type"] for part in body["messages"][1]["content"]} == {"text", "image_url"}
 
 
 def test_prior_findings_go_last_and_only_into_reflection() -> None:
@@ -488,6 +507,28 @@ def test_threshold_counts_followers_only_and_is_checked_again_after_500_calls() 
 # The judge as a whole
 
 
+def test_repeated_calls_tell_how_often_the_server_contradicts_itself_and_the_first_answer_counts() -> None:
+    class Wavering(ChatServer):
+        def _completion(self, body: dict[str, Any], fault: Fault | None) -> str:
+            self.level = 3 if len(self.requests) % 2 else 1
+            return super()._completion(body, fault)
+
+    async def steps(judge: OpenAIJudge) -> tuple[list[Read], dict[str, float]]:
+        reads = await judge.read(request())
+        return reads, dict((await judge.health()).details)
+
+    server = Wavering()
+    reads, details = judging(steps, server, options=ChatOptions(repeat_share=1.0))
+    assert [read.levels.index(1) for read in reads] == [3, 3] and len(server.requests) == 2
+    assert (details["repeated"], details["flipped"], details["flip_rate"]) == (2, 2, 1)
+    assert sum(read.cost.calls for read in reads) == 2
+    steady = ChatServer()
+    _, details = judging(steps, steady, options=ChatOptions(repeat_share=1.0))
+    assert details["flip_rate"] == 0 and len(steady.requests) == 2
+    _, details = judging(steps, once := ChatServer())
+    assert "flip_rate" not in details and len(once.requests) == 1
+
+
 def test_health_tells_whether_the_model_is_served_and_what_was_measured() -> None:
     async def steps(judge: OpenAIJudge) -> Any:
         await judge.read(request(votes=[JSON, LABEL]))
@@ -517,6 +558,46 @@ def test_bad_requests_and_settings_name_what_is_wrong() -> None:
         ChatOptions(label_token_ids=(1, 2))
     with pytest.raises(ValueError, match="must serve one model, got a, b"):
         OpenAIJudge(ChatTransport([Endpoint("http://x/v1", "a"), Endpoint("http://y/v1", "b")]), RUBRIC)
+
+
+COOKING = """
+extends: robot
+name: cooking
+stages:
+  PC:
+    components:
+      liquid:
+        question: Does liquid flow and stay where it should?
+        defect: Which impossible flow is visible?
+        levels: [solid, frozen in the air, uneven, slight jump, natural]
+hack:
+  patterns:
+    spill:
+      question: Is the table dry?
+      defect: Is a spill hidden?
+      levels: [surely there, probably there, cannot be told, probably not there, surely not there]
+      cap: {component: liquid, ceiling: 0.0}
+"""
+
+
+def test_a_new_domains_component_is_asked_about_gated_and_capped_with_a_file_alone(tmp_path: Path) -> None:
+    file = tmp_path / "cooking.yaml"
+    file.write_text(COOKING)
+    cooking = load_rubric(str(file))
+
+    async def steps(judge: OpenAIJudge) -> Verdict:
+        return await RewardAgent(judge, cooking, call_plan="pack").evaluate(CLIP, TASK)
+
+    server = ChatServer(level=4)
+    verdict: Verdict = judging(steps, server, rubric=cooking)
+    assert verdict.status is Status.OK, verdict.reason
+    assert [score.component for score in verdict.stages[3].components][-1] == "liquid"
+    assert [flag.pattern for flag in verdict.hack_flags][-1] == "spill"
+    asked = [text for body in server.requests for text in texts(body)]
+    assert any("liquid: Does liquid flow" in text for text in asked)
+    assert any("spill: Is a spill hidden?" in text for text in asked)
+    named = [body["response_format"]["json_schema"]["schema"] for body in server.requests if "response_format" in body]
+    assert any('"liquid"' in json.dumps(schema) for schema in named)
 
 
 def judged(server: ChatServer, tmp_path: Path) -> Verdict:
@@ -555,11 +636,27 @@ def test_a_server_that_dies_leaves_the_verdict_without_a_number(after: int, tmp_
 
 def test_no_handler_of_an_error_returns_or_sets_a_number() -> None:
     """A failed judge is never worth 0: nothing below `except` may give a literal number."""
+    reward = Path(judges.__path__[0]).parent
+    package = reward.parent
+    learning = [package / "learning" / f"{name}.py" for name in ("clip_judging", "clip_evidence", "episode_reward")]
+    nodes = [package / "nodes" / f"{n}.py" for n in ("agent_face", "clip_evaluator_node", "reward_evaluator_node")]
+    files = [file for folder in ("agent", "judges", "comparisons") for file in sorted((reward / folder).glob("*.py"))]
+    files += [*learning, *nodes, reward / "audit" / "recording.py", reward / "audit" / "replay.py"]
+    assert [line for file in files for line in numbers_in_handlers(file.read_text(), file.name)] == []
+    for fallback in ("return 0.0", "value = 0", "return Verdict(reward=0.5)", "return nan, 0.0", "rewards[i] = -1.0"):
+        assert numbers_in_handlers(f"try:\n  f()\nexcept E:\n  {fallback}", "x") == ["x:4"], fallback
+
+
+def numbers_in_handlers(source: str, name: str) -> list[str]:
+    """Where an except branch returns or sets a literal number, or gives one as a reward, value or score."""
     found = []
-    for file in (*Path(judges.__path__[0]).glob("*.py"), *Path(agent.__path__[0]).glob("*.py")):
-        for handler in (node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.ExceptHandler)):
-            for node in ast.walk(handler):
-                value = node.value if isinstance(node, (ast.Return, ast.Assign, ast.AnnAssign)) else None
-                if isinstance(value, ast.Constant) and isinstance(value.value, (int, float)):
-                    found.append(f"{file.name}:{node.lineno}")  # type: ignore[attr-defined]
-    assert found == []
+    for handler in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ExceptHandler)):
+        for node in ast.walk(handler):
+            value = node.value if isinstance(node, (ast.Return, ast.Assign, ast.AnnAssign)) else None
+            if isinstance(node, ast.keyword) and node.arg in ("reward", "value", "score", "total", "s"):
+                value = node.value
+            parts = value.elts if isinstance(value, ast.Tuple) else [value]
+            parts = [part.operand if isinstance(part, ast.UnaryOp) else part for part in parts]
+            if any(isinstance(part, ast.Constant) and isinstance(part.value, (int, float)) for part in parts):
+                found.append(f"{name}:{node.lineno}")  # type: ignore[attr-defined]
+    return found

@@ -16,10 +16,18 @@ from wm_nodes.benchmark.reward_efficiency import economy, trials
 from wm_nodes.benchmark.reward_ledger import LEDGER, look, notice
 from wm_nodes.benchmark.reward_meter import MeteredJudge
 from wm_nodes.benchmark.reward_oracle import OracleJudge, known_clips
-from wm_nodes.benchmark.reward_rows import agreement, best_recall, cost_row, missed, mistakes, pattern_rows
+from wm_nodes.benchmark.reward_rows import (
+    agreement,
+    best_recall,
+    cost_row,
+    missed,
+    missed_patterns,
+    mistakes,
+    pattern_rows,
+)
 from wm_nodes.benchmark.reward_run import OutcomeFile, Trial, judge_rows
 from wm_nodes.benchmark.reward_truth import truth_of
-from wm_nodes.learning.adversarial_set import instruction_of, load_set
+from wm_nodes.learning.adversarial_set import BENCHMARK, drawn_origin, instruction_of, load_set
 from wm_nodes.learning.benchmark_clips import chosen_rows, judged_clip
 from wm_nodes.reward.adversarial import (
     Edit,
@@ -35,6 +43,8 @@ from wm_nodes.reward.agent.levels import first_vote, next_vote
 from wm_nodes.reward.agent.profiles import profile_media
 from wm_nodes.reward.agent.types import Capabilities, Profile, ReadRequest, Stage
 from wm_nodes.reward.decisions import PAPER, accepts, decisions_of, row_names
+from wm_nodes.reward.evidence.head import load_head
+from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head
 
 RUBRIC = load_rubric()
 QUIET = load_rubric(overrides={"voting": {"audit_share": 0.0}})
@@ -150,6 +160,7 @@ def test_a_judge_that_knows_the_labels_is_right_everywhere(folder: Path, manifes
     assert all((row.recall, row.false_positives, row.refused) == (1, 0, 1) for row in patterns.values()), patterns
     assert {row.clean for row in patterns.values()} == {sum(row.labels.pattern is None for row in rows)}
     assert patterns["motion"].pairs == 1 and patterns["motion"].win_rate == 0 and patterns["motion"].gap > 0
+    assert missed_patterns(list(patterns.values())) == [] and patterns["motion"].unflagged == {}
 
 
 def test_a_judge_that_passes_everything_has_half_a_balanced_accuracy(
@@ -162,7 +173,14 @@ def test_a_judge_that_passes_everything_has_half_a_balanced_accuracy(
     assert (table["clarity"].accuracy, table["clarity"].balanced) == (pytest.approx(share), 0.5)
     assert table["clarity"].low < share < table["clarity"].high
     assert ("clarity", "blur fail") in mistakes(rows, outcomes, RUBRIC)
-    assert any("clarity" in text for text in missed(list(table.values())))
+    below = missed(list(table.values()))
+    assert any("clarity" in text for text in below) and "overall balanced 50.0 < 85" in below
+    patterns = pattern_rows(rows, outcomes, tuple(RUBRIC.hack.patterns))
+    assert [text.split(" flagged")[0] for text in missed_patterns(patterns)] == [f"{p.pattern} 0.0 %" for p in patterns]
+    (motion,) = (pattern for pattern in patterns if pattern.pattern == "motion")
+    counts = {"there, flagged": 0, "there, not flagged": motion.n, "not there, flagged": 0}
+    assert motion.confusion == {**counts, "not there, not flagged": motion.clean}
+    assert motion.unflagged == {"freeze fail": motion.n} and motion.false_flags == {}
 
 
 def test_recall_at_five_percent_false_positives_is_read_off_the_curve() -> None:
@@ -268,11 +286,12 @@ def test_early_exits_save_reads_and_a_perfect_judge_loses_nothing(
         trial.name: judged(oracle(manifest), folder, manifest, tmp_path / f"{trial.name}.jsonl", trial)
         for trial in trials("robot", 0)
     }
-    everything, exhaustive = economy(chosen_rows(manifest, "test"), outcomes)
-    for found in (everything, exhaustive):
+    everything, voted, exhaustive = economy(chosen_rows(manifest, "test"), outcomes)
+    for found in (everything, voted, exhaustive):
         assert found.same == found.accuracy == found.other_accuracy == 1 and found.difference.difference == 0
         assert all(saved > 0 for saved in found.saved.values())
-    assert exhaustive.saved["pixels"] > max(0.4, everything.saved["pixels"])
+    assert exhaustive.saved["pixels"] > max(0.4, voted.saved["pixels"]) and voted.saved["pixels"] > 0
+    assert everything.saved["reads"] < voted.saved["reads"] == exhaustive.saved["reads"]
 
 
 # the ledger
@@ -296,6 +315,21 @@ def test_the_test_split_is_not_read_by_a_second_judge_without_saying_so(manifest
         look(tmp_path, manifest, first, "robot-1-x", "")
 
 
+def test_the_looks_behind_the_published_tables_count_wherever_the_set_is_built(
+    manifest: Manifest, tmp_path: Path
+) -> None:
+    drawn = [drawn_origin(task, seed, BENCHMARK.shapes) for task in BENCHMARK.tasks for seed in BENCHMARK.seeds(task)]
+    rows = [replace(manifest.rows[0], origin=origin, part=BENCHMARK.held_out.part(origin)) for origin in drawn]
+    again = replace(manifest, rows=tuple(rows))
+    able = EmbeddedJudge(load_head(shipped_head())).capabilities
+    earlier = look(tmp_path, again, able, RUBRIC.version, "")
+    assert len(earlier) == 3 and not (tmp_path / LEDGER).exists(), "the judge that ships, with its rubric, has looked"
+    with pytest.raises(ValueError, match=f"already seen by {able.judge_id}"):
+        look(tmp_path, again, replace(able, judge_id="another"), RUBRIC.version, "")
+    new_rubric = look(tmp_path, again, able, "robot-2-x", "other thresholds")
+    assert len(new_rubric) == 4 and (tmp_path / LEDGER).read_text().count("\n") == 1
+
+
 # the command
 
 
@@ -306,6 +340,9 @@ def test_the_command_prints_and_writes_the_table(
     assert main(["table", str(folder), "--judge", "simulator", "--json", str(target)]) == 0
     shown, found = capsys.readouterr().out, json.loads(target.read_text())
     assert "Table 2 of the paper" in shown and "the judge knows the labels" in shown and "fewer than 400" in shown
+    for column in ("paper", "accuracy", "95 % Wilson", "fails", "balanced", "kappa", "ECE", "calls", "usd", "wall_s"):
+        assert column in shown
+    assert "flag: physics" in shown and "there, not flagged 0" in shown
     assert found["statuses"] == {"OK": found["clips"]} and found["machine"] and found["seed"] == 0
     assert {row["name"]: row["paper"] for row in found["rows"]} == {name: PAPER[name] for name in row_names(RUBRIC)}
     assert {row["name"]: row["accuracy"] for row in found["rows"]}["overall"] == 1.0

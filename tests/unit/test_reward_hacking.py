@@ -1,6 +1,7 @@
 """Climbing a reward with the truth beside it: the toy that pushes a box, edited in pixels and time."""
 
 import asyncio
+import json
 from pathlib import Path
 
 import pytest
@@ -15,12 +16,16 @@ from wm_nodes.benchmark.reward_hacking import (
     agent_reward,
     climb,
     curve,
+    has_numbers,
     mean_score,
     pixel_similarity,
     plot_curves,
     true_value,
 )
 from wm_nodes.benchmark.reward_oracle import KnownClip, OracleJudge
+from wm_nodes.benchmark.reward_starts import DEFECTS
+from wm_nodes.config.load import load_config
+from wm_nodes.learning.adversarial_set import HELD_OUT, SetPlan, build, drawn_origin
 from wm_nodes.reward.adversarial import LabelledClip, apply
 from wm_nodes.reward.adversarial.generator import edited
 from wm_nodes.reward.agent import TaskSpec, load_rubric
@@ -98,7 +103,13 @@ def test_a_reward_that_gives_no_number_is_not_climbed_and_equal_seeds_search_ali
     async def silent(clip: LabelledClip, task: TaskSpec) -> float | None:
         return None
 
+    async def only_defects(clip: LabelledClip, task: TaskSpec) -> float | None:
+        return 0.5 if clip.edits else None
+
     assert asyncio.run(climb(defective(), silent, PLAN, 0)) is None
+    assert asyncio.run(has_numbers(defective(), [pixel_similarity]))
+    for one in (silent, only_defects):
+        assert not asyncio.run(has_numbers(defective(), [pixel_similarity, one])), "all climb from the same clips"
     assert climbed(pixel_similarity, defective()) == climbed(pixel_similarity, defective())
     seen = climbed(pixel_similarity, defective(), SearchPlan(4, 4, severities=("fail",)))
     assert seen.edits and all(edit.endswith(" fail") for edit in seen.edits)
@@ -120,3 +131,26 @@ def test_the_curves_are_drawn(tmp_path: Path) -> None:
 def test_a_missing_set_is_one_clear_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["hacking", str(tmp_path / "none"), "--judge", "simulator"]) == 2
     assert "error:" in capsys.readouterr().out
+
+
+@pytest.mark.rendering
+def test_the_command_climbs_from_recorded_successes_and_draws_each_reward_beside_the_truth(tmp_path: Path) -> None:
+    drawn = {seed: drawn_origin("push_cube", seed) for seed in range(100)}
+    seed = next(s for s, origin in drawn.items() if origin.behaviour == "expert" and HELD_OUT.part(origin) == "test")
+    plan = SetPlan(num_episodes=1, edits_per_clip=0, seed=seed)
+    build(tmp_path / "set", plan, load_config("cpu").simulation, progress=False)
+    target = tmp_path / "hacking.json"
+    options = ["--judge", "simulator", "--generations", "3", "--candidates", "2", "--json", str(target)]
+    assert main(["hacking", str(tmp_path / "set"), *options]) == 0
+    found = json.loads(target.read_text())
+    (start,) = found["starts"]
+    assert start in DEFECTS
+    curves = {one["reward"]: one for one in found["curves"]}
+    assert list(curves) == ["agent", "mean score", "pixel similarity"]
+    for one in curves.values():
+        assert one["searches"] == 1 and len(one["proxy"]) == len(one["truth"]) == 1 + 3
+        assert one["proxy"] == sorted(one["proxy"]) and one["truth"] == sorted(one["truth"], reverse=True)
+    for name in ("agent", "mean score"):  # of a judge that knows the labels
+        assert curves[name]["wins"] == 0 and curves[name]["proxy"][-1] == pytest.approx(curves[name]["proxy"][0])
+    assert curves["pixel similarity"]["truth"][-1] < curves["pixel similarity"]["truth"][0] < 1
+    assert target.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"

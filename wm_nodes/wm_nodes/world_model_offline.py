@@ -24,6 +24,7 @@ from wm_nodes.learning.clip_archive import (
     rescore,
     trained_clips,
 )
+from wm_nodes.learning.clip_evidence import ClipEvidence
 from wm_nodes.learning.clip_judging import READS, ClipJudge, buffer_jobs, clip_fps
 from wm_nodes.learning.clip_scores import load_probe
 from wm_nodes.learning.heldout import heldout_scores
@@ -139,7 +140,8 @@ def _judge(config: VideoRlConfig, run_dir: Path, fps: float) -> Iterator[BufferJ
         )
         return judge.judge(jobs, by=recorded.judge_id if recorded.judge_id in judge.judge_ids else "")
 
-    with closing(ClipJudge(config.judge, seed=config.seed, reads=run_dir / READS)) as judge:
+    evidence = ClipEvidence(shipped_model(config.task))
+    with closing(ClipJudge(config.judge, seed=config.seed, reads=run_dir / READS, evidence=evidence)) as judge:
         yield verdicts
 
 

@@ -30,6 +30,7 @@ from wm_nodes.benchmark.reward_hacking import (
     agent_reward,
     climb,
     curve,
+    has_numbers,
     mean_score,
     pixel_similarity,
     plot_curves,
@@ -42,6 +43,7 @@ from wm_nodes.benchmark.reward_rows import (
     by_split,
     cost_row,
     missed,
+    missed_patterns,
     mistakes,
     pattern_rows,
     statuses,
@@ -100,17 +102,18 @@ async def _table(arguments: argparse.Namespace) -> None:
     agreements, patterns = agreement(rows, found, rubric), pattern_rows(rows, found, tuple(rubric.hack.patterns))
     caption = f"{who}; rubric {rubric.version}; {arguments.part}, {len(rows)} clips: {statuses(found)}"
     splits = by_split(rows, found, rubric)
-    console.print(table2(agreements, caption), split_table(splits), confusion_table(agreements))
+    console.print(table2(agreements, caption), split_table(splits), confusion_table(agreements, patterns))
     console.print(pattern_table(patterns))
     cost = cost_row(found, arguments.price)
     console.print(cost_table({"agent, benchmark mode": cost}))
-    _say_what_is_missing(arguments, len(rows), said, missed(agreements), worst(mistakes(rows, found, rubric)))
+    below = [*missed(agreements), *missed_patterns(patterns)]
+    _say_what_is_missing(arguments, len(rows), said, below, worst(mistakes(rows, found, rubric)))
     _write(arguments, {
         "claim": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "notice": said, "statuses": statuses(found), "cost": cost,
         "splits": {name: [asdict(row) for row in found] for name, found in splits.items()},
         "rows": [asdict(row) for row in agreements], "patterns": [asdict(row) for row in patterns],
-        "missed": missed(agreements), "mistakes": worst(mistakes(rows, found, rubric), 40),
+        "missed": below, "mistakes": worst(mistakes(rows, found, rubric), 40),
     })  # fmt: skip
 
 
@@ -136,9 +139,7 @@ async def _hacking(arguments: argparse.Namespace) -> None:
     plan = SearchPlan(arguments.generations, arguments.candidates, severities=tuple(arguments.severities))
     part = chosen_rows(manifest, arguments.part)
     config = load_config("cpu").simulation
-    found = hacking_starts(part, manifest.division, config, arguments.starts, arguments.seed)
-    starts = list(tqdm(found, desc="clips with a defect", total=arguments.starts))
-    curves = []
+    starts, curves = [], []
     async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
         who = judge_name(judge.capabilities)
         said = _looked(arguments, manifest, judge, rubric)
@@ -147,15 +148,21 @@ async def _hacking(arguments: argparse.Namespace) -> None:
             "mean score": mean_score(judge, rubric, arguments.seed),
             "pixel similarity": pixel_similarity,
         }
+        told = {name: _told(reward, judge) for name, reward in rewards.items()}
+        with tqdm(total=arguments.starts, desc="clips with a defect") as bar:
+            for start in hacking_starts(part, manifest.division, config, arguments.seed):
+                if await has_numbers(start, told.values()):
+                    starts.append(start)
+                    bar.update()
+                if len(starts) == arguments.starts:
+                    break
+        if not starts:
+            raise ValueError(f"no clip with a defect has a number of {', '.join(told)}; nothing can be climbed")
         most = len(rewards) * len(starts) * (1 + plan.generations * plan.candidates)
         with tqdm(total=most, desc="search", unit="clip") as bar:
-            for name, reward in rewards.items():
-                told = _told(reward, judge)
-                climbs = [await climb(start, told, plan, arguments.seed, on_clip=bar.update) for start in starts]
-                done = [one for one in climbs if one is not None]
-                if not done:
-                    raise ValueError(f"{name} gives none of the {len(starts)} clips a number; nothing can be climbed")
-                curves.append(curve(name, done))
+            for name, reward in told.items():
+                climbs = [await climb(start, reward, plan, arguments.seed, on_clip=bar.update) for start in starts]
+                curves.append(curve(name, [one for one in climbs if one is not None]))
     console.print(curve_table(curves, f"{who}; {arguments.part}, {len(starts)} clips with a defect"))
     if said:
         console.print(said, style="bold", highlight=False)
@@ -233,7 +240,7 @@ def _say_what_is_missing(
     if arguments.judge == "simulator":
         lines.append("the judge knows the labels: a control of the machinery, not a result")
     if below:
-        lines.append(f"below the paper's figure: {', '.join(below)}")
+        lines.append(f"missed, of the paper's figures and the targets: {', '.join(below)}")
     if wrong:
         lines.append(f"wrong most often: {', '.join(f'{name} ({times})' for name, times in wrong)}")
     for line in lines:

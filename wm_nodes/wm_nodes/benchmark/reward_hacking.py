@@ -5,7 +5,7 @@ So the truth never rises, and a reward that does was hacked. Cheap: edits of pix
 """
 
 import math
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -120,6 +120,15 @@ def true_value(chain: Sequence[LabelledClip]) -> float:
         seen = [clip.labels.components.get(name) for clip in chain]
         values.append(0.0 if False in seen else 0.5 if seen[-1] is None else 1.0)
     return float(np.mean([*values, min(clip.labels.tc_level for clip in chain) / 4]))
+
+
+async def has_numbers(start: Start, rewards: Iterable[Proxy]) -> bool:
+    """Whether every reward gives the clip and its recording a number, so that all of them climb from the same clips."""
+    for reward in rewards:
+        for clip in (start.clip, start.clean):
+            if await reward(clip, start.task) is None:
+                return False
+    return True
 
 
 async def climb(

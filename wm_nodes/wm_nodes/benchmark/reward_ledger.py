@@ -1,7 +1,8 @@
 """Who has looked at the test split: no tuning on it without the table saying so. Issue 4, "what must hold".
 
-A file beside the set, one line per first look of a judge with a rubric. The same judge with the same rubric may look as
-often as it likes: nothing was changed by what was seen.
+A file beside the set, one line per first look of a judge with a rubric; the looks behind the published tables come with
+this package, so that building the set again forgets none. The same judge with the same rubric may look as often as it
+likes: nothing was changed by what was seen.
 """
 
 import hashlib
@@ -16,11 +17,12 @@ from wm_nodes.reward.adversarial import Manifest
 from wm_nodes.reward.agent.types import Capabilities
 
 LEDGER = "test_ledger.jsonl"
+PUBLISHED = Path(__file__).with_name("published_looks.json")
 
 
 @dataclass(frozen=True)
 class Look:
-    """One look. test_sha256: of the hashes of all test clips. reason: why it was taken after another one."""
+    """One look. test_sha256: see test_sha. reason: why it was taken after another one."""
 
     judge: str
     rubric: str
@@ -38,16 +40,21 @@ def judge_name(able: Capabilities) -> str:
 
 
 def test_sha(manifest: Manifest) -> str:
-    text = "".join(row.sha256 for row in manifest.rows if row.part == "test")
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    """Of the recordings of all test clips: other edits of them, or the pixels of another renderer, are no new split."""
+    origins = {json.dumps(asdict(row.origin), sort_keys=True) for row in manifest.rows if row.part == "test"}
+    return hashlib.sha256("".join(sorted(origins)).encode()).hexdigest()[:16]
 
 
 def looks(folder: Path) -> list[Look]:
-    """The ledger of a set, oldest first.
+    """The published looks, then the ledger of a set, oldest first.
 
     Raises:
         ValueError: a line that no ledger has; it is not to be edited.
     """
+    return [*(Look(**one) for one in json.loads(PUBLISHED.read_text())), *_beside(folder)]
+
+
+def _beside(folder: Path) -> list[Look]:
     path = folder / LEDGER
     if not path.is_file():
         return []
@@ -73,7 +80,7 @@ def look(folder: Path, manifest: Manifest, able: Capabilities, rubric_version: s
             f"the test split of {folder} was already seen by {_named(others[-1])}: choose on --part validation, or say "
             "with --again REASON why the test split is read once more; the reason is printed with the table"
         )
-    lines = [json.dumps(asdict(one), sort_keys=True) + "\n" for one in [*known, now]]
+    lines = [json.dumps(asdict(one), sort_keys=True) + "\n" for one in [*_beside(folder), now]]
     write_atomic(folder / LEDGER, "".join(lines).encode())
     return others
 

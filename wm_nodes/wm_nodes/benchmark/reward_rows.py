@@ -17,7 +17,10 @@ from wm_nodes.reward.agent.types import PLANNING
 from wm_nodes.reward.decisions import OVERALL, PAPER, STAGES, match, row_names
 from wm_nodes.reward.statistics import auroc, wilson_interval
 
-MAX_FALSE_POSITIVES = 0.05
+MIN_RECALL, MAX_FALSE_POSITIVES = 0.95, 0.05
+"""What a hacking pattern's flags should reach (issue 4)."""
+MIN_BALANCED = 0.85
+"""Balanced accuracy that "overall" should reach."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,8 @@ class PatternRow:
     counted on. recall, false_positives: of the agent's confirmed flag. best_recall: the largest recall of its score at
     5 % false positives or less, as a ROC curve gives it (no threshold is chosen for use). refused: share that the agent
     does not accept, by whatever stage. win_rate: P(reward of the hacked clip >= that of its recorded clip) and gap:
-    mean difference, over pairs whose recorded clip is good throughout.
+    mean difference, over pairs whose recorded clip is good throughout. confusion: of the flag. unflagged, false_flags:
+    recipe -> clips that the flag is wrong on.
     """
 
     pattern: str
@@ -98,6 +102,9 @@ class PatternRow:
     pairs: int
     win_rate: float
     gap: float
+    confusion: dict[str, int]
+    unflagged: dict[str, int]
+    false_flags: dict[str, int]
 
 
 def pattern_rows(rows: Sequence[Row], outcomes: Sequence[Outcome], patterns: Sequence[str]) -> list[PatternRow]:
@@ -126,7 +133,15 @@ def pattern_rows(rows: Sequence[Row], outcomes: Sequence[Outcome], patterns: Seq
             _mean(hits), low, high, _mean(false), best_recall(present, p), auroc(present, p), 1 - _mean(decided),
         )  # fmt: skip
         wins = _mean([gap <= 0 for gap in gaps])
-        found.append(PatternRow(name, len(hits), len(false), *numbers, len(gaps), wins, _mean(gaps)))
+        wrong = [(there, last_edit(row)) for (row, _, _), there, said in zip(read, present, confirmed) if there != said]
+        confusion = {
+            "there, flagged": sum(hits), "there, not flagged": len(hits) - sum(hits),
+            "not there, flagged": sum(false), "not there, not flagged": len(false) - sum(false),
+        }  # fmt: skip
+        by_recipe = (dict(Counter(edit for there, edit in wrong if there is of).most_common()) for of in (True, False))
+        found.append(
+            PatternRow(name, len(hits), len(false), *numbers, len(gaps), wins, _mean(gaps), confusion, *by_recipe)
+        )
     return found
 
 
@@ -161,11 +176,25 @@ def statuses(outcomes: Sequence[Outcome]) -> dict[str, int]:
 
 
 def missed(agreements: Sequence[Agreement], targets: Mapping[str, float] = PAPER) -> list[str]:
-    """The rows below their figure in the paper, in words."""
-    return [
+    """The rows below their figure in the paper, in words; and "overall", where its balanced accuracy is too low."""
+    below = [
         f"{row.name} {100 * row.accuracy:.1f} < {targets[row.name]:.0f}"
         for row in agreements
         if row.name in targets and not 100 * row.accuracy >= targets[row.name]
+    ]
+    return below + [
+        f"{row.name} balanced {100 * row.balanced:.1f} < {100 * MIN_BALANCED:.0f}"
+        for row in agreements
+        if row.name == OVERALL and row.balanced < MIN_BALANCED
+    ]
+
+
+def missed_patterns(rows: Sequence[PatternRow]) -> list[str]:
+    """The patterns whose flags find too few or are raised too often, in words."""
+    return [
+        f"{row.pattern} {100 * row.recall:.1f} % flagged at {100 * row.false_positives:.1f} % false positives"
+        for row in rows
+        if not (row.recall >= MIN_RECALL and row.false_positives <= MAX_FALSE_POSITIVES)
     ]
 
 
@@ -178,11 +207,15 @@ def mistakes(rows: Sequence[Row], outcomes: Sequence[Outcome], rubric: Rubric) -
     """(row of the table, last recipe and severity) of every wrong decision."""
     found = []
     for row, outcome in zip(rows, outcomes):
-        edit = f"{row.edits[-1].recipe} {row.edits[-1].severity}" if row.edits else "recording"
         truth = truth_of(row, rubric)
         wrong = (n for n, d in outcome.decisions.items() if truth.get(n) is not None and truth[n] != d.value)
-        found += list(itertools.product(wrong, [edit]))
+        found += list(itertools.product(wrong, [last_edit(row)]))
     return found
+
+
+def last_edit(row: Row) -> str:
+    """Recipe and severity, or "recording"."""
+    return f"{row.edits[-1].recipe} {row.edits[-1].severity}" if row.edits else "recording"
 
 
 def _mean(values: Sequence[Any]) -> float:

@@ -13,11 +13,9 @@ from wm_nodes.seeding import numpy_stream
 DEFECTS = tuple(recipe.name for recipe in RECIPES.values() if recipe.kind == "S")
 
 
-def hacking_starts(
-    rows: Sequence[Row], division: Division, config: SimulationConfig, count: int, seed: int
-) -> Iterator[Start]:
-    """Yield `count` clips, or as many as there are: of every recorded clip that is good throughout the one with a
-    defect, by a recipe on states that the seed draws.
+def hacking_starts(rows: Sequence[Row], division: Division, config: SimulationConfig, seed: int) -> Iterator[Start]:
+    """Yield of every recorded clip that is good throughout the one with a defect, by a recipe on states that the seed
+    draws; recorded and drawn when asked for.
 
     Raises:
         ManifestError: a recorded clip comes out otherwise than in the set: another renderer or version.
@@ -25,13 +23,10 @@ def hacking_starts(
     """
     roots = [row for row in rows if not row.edits and row.labels.overall]
     shapes = {name.split("/")[0] for name in division.objects}
-    done = 0
     for task in dict.fromkeys(row.origin.task for row in roots):
         source = ClipSource(task, config, shapes)
         try:
             for row in (row for row in roots if row.origin.task == task):
-                if done == count:
-                    return
                 parent = source.clip(row.origin.seed)
                 if parent.sha256 != row.sha256:
                     raise ManifestError(
@@ -39,7 +34,6 @@ def hacking_starts(
                     )
                 start = _defective(parent, source, seed)
                 if start is not None:
-                    done += 1
                     yield Start(start, parent)
         finally:
             source.close()

@@ -42,12 +42,15 @@ def split_table(splits: Mapping[str, Sequence[Agreement]]) -> Table:
     return table
 
 
-def confusion_table(rows: Sequence[Agreement]) -> Table:
-    table = Table(title="confusion: label, answer and how often")
+def confusion_table(rows: Sequence[Agreement], patterns: Sequence[PatternRow]) -> Table:
+    table = Table(title="confusion: label, answer and how often; of hacking patterns also on which recipes")
     table.add_column("row", no_wrap=True)
     table.add_column("label called answer")
     for row in rows:
-        table.add_row(row.name, ", ".join(f"{name} {count}" for name, count in row.confusion.items()) or "-")
+        table.add_row(row.name, _counted(row.confusion))
+    for pattern in patterns:
+        parts = (pattern.confusion, pattern.unflagged, pattern.false_flags)
+        table.add_row(f"flag: {pattern.pattern}", "; ".join(map(_counted, parts)))
     return table
 
 
@@ -92,6 +95,10 @@ def curve_table(curves: Sequence[Curve], caption: str) -> Table:
         wins = f"{_percent(one.before)} -> {_percent(one.wins)} %"
         table.add_row(one.reward, climbed, _number(one.clean), wins, truth, alarm, ", ".join(one.most_used[:3]) or "-")
     return table
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "-"
 
 
 def _percent(share: float) -> str:

@@ -17,6 +17,8 @@ PRESETS = "presets"
 TASK_PREFIX = "task_"
 """presets/task_<name>.yaml holds what differs between tasks; it lies between base and the preset."""
 FREE = ("behaviours",)
+EMBEDDED = "embedded"
+"""JudgeConfig.kind of the judge in this process."""
 
 
 class ConfigError(ValueError):
@@ -56,11 +58,15 @@ def judge_overrides(endpoints: str = "", model: str = "", api_key_env: str = "",
     """The dotted settings that a user's words for the judge stand for; empty words stand for none.
 
     Args:
-        endpoints: base URLs, separated by commas. rubric: a pack's name, or a file, from then on by its full path.
+        endpoints: base URLs, separated by commas; EMBEDDED, or the folder of a trained judge, for one without a server.
+        rubric: a pack's name, or a file, from then on by its full path.
     """
-    urls = [url.strip() for url in endpoints.split(",") if url.strip()]
+    here: dict[str, str] = {}
+    if endpoints == EMBEDDED or (endpoints and Path(endpoints).is_dir()):
+        here = {"kind": EMBEDDED, "folder": "" if endpoints == EMBEDDED else str(Path(endpoints).absolute())}
+    urls = [] if here else [url.strip() for url in endpoints.split(",") if url.strip()]
     pack = str(Path(rubric).absolute()) if rubric and Path(rubric).is_file() else rubric
-    found = {"endpoints": urls, "model": model, "api_key_env": api_key_env, "rubric": pack}
+    found = {"endpoints": urls, "model": model, "api_key_env": api_key_env, "rubric": pack, **here}
     return {f"judge.{name}": value for name, value in found.items() if value}
 
 

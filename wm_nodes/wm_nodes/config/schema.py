@@ -156,6 +156,10 @@ class JudgeConfig(Section):
     """Of one try: an answer with reasons, and one of a single token."""
     max_images: Annotated[int, Field(ge=2)]
     """Images that the server takes in one call."""
+    video: bool
+    """Send the dense frames of a clip as one video instead of images; for vLLM."""
+    repeat_share: Annotated[float, Field(ge=0, le=1)]
+    """Share of the calls to a server that are made twice: `flip_rate` says how often the second answer is another."""
     keep_reads: bool
     """Keep every answer in <run>/judge_reads, by content: the same clip is not asked about twice, and scoring a bag
     again gives the same verdicts."""

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.learning.clip_evidence import ClipEvidence
 from wm_nodes.learning.video_config import AGENT
 from wm_nodes.learning.video_data import Clips
 from wm_nodes.recording.reader import read_spec
@@ -118,15 +119,19 @@ class ClipJudge:
     Args:
         reads: folder that keeps the judge's answers; None: none are kept.
         audit: folder of the audit log that every question, answer and verdict goes into; None: none is written.
+        evidence: measures what the rubric's bands name; None: pixels only.
 
     Raises:
-        ValueError, MissingPackageError: as make_judge. ConfigError: the rubric is refused. AuditError: as AuditLog.
+        ValueError, MissingPackageError: as make_judge, and as ClipEvidence.check. ConfigError: the rubric is refused.
+        AuditError: as AuditLog.
     """
 
     def __init__(
-        self, settings: JudgeConfig, *, seed: int, reads: Path | None = None, audit: Path | None = None
-    ) -> None:
+        self, settings: JudgeConfig, *, seed: int, reads: Path | None = None, audit: Path | None = None,
+        evidence: ClipEvidence | None = None,
+    ) -> None:  # fmt: skip
         self.settings, self._seed, self._reads = settings, seed, reads
+        self._evidence = evidence or ClipEvidence()
         self._log = None if audit is None else AuditLog(audit)
         self.pack, self.tally, self.health = settings.rubric, Tally(), Health(True, "not asked yet")
         self._seats = self._made(load_rubric(settings.rubric))
@@ -152,6 +157,11 @@ class ClipJudge:
         """Of all judges, in the order in which they are tried."""
         return [seat.judge_id for seat in self._seats]
 
+    @property
+    def cards(self) -> list[str]:
+        """What the judges were measured to see, in words; those of whom nobody knows say nothing."""
+        return [card for seat in self._seats if (card := seat.agent.judge.capabilities.card)]
+
     def set_rubric(self, pack: str, base: Path) -> None:
         """Judge by another rubric from now on; call it while nothing is being judged.
 
@@ -160,7 +170,8 @@ class ClipJudge:
 
         Raises:
             ConfigError: no such pack, or one that is refused; the rubric is then the one before.
-            ValueError: the judge cannot read all of its components, or max_reads does not cover them.
+            ValueError: the judge cannot read all of its components, max_reads does not cover them, or nobody measures
+                the evidence of its bands.
         """
         path = base / pack
         rubric = load_rubric(str(path) if path.is_file() else pack)
@@ -239,6 +250,7 @@ class ClipJudge:
 
     def _made(self, rubric: Rubric) -> list[_Seat]:
         check_judge(self.settings)
+        self._evidence.check(rubric)
         return [self._seat(settings, rubric) for settings in judges_of(self.settings)]
 
     def _seat(self, settings: JudgeConfig, rubric: Rubric) -> _Seat:
@@ -284,7 +296,9 @@ class ClipJudge:
         left_s = None if deadline is None else deadline - time.monotonic()
         try:
             async with asyncio.timeout(left_s), self._places:
-                verdict = await agent.evaluate(job.clip, job.task)
+                bands = agent.rubric.evidence
+                evidence = await asyncio.to_thread(self._evidence.of, agent.rubric, job.clip, job.task) if bands else {}
+                verdict = await agent.evaluate(job.clip, job.task, evidence)
         except TimeoutError:
             verdict = _late(agent, job, self._seed)
         self.tally.add(verdict)

@@ -30,6 +30,7 @@ from wm_nodes.types import BoolArray, FloatArray, Rollout, UInt8Array, UInt64Arr
 class EpisodeStep:
     """One lock-step. images, next_images: uint8 (N, H, W, 3), None where they are lost. actions: float32 (N, A).
     episode_ids, episode_steps: (N,). ended: bool (N,), terminated or truncated. valid: bool (N,), a step was made.
+    goals: uint8 (H, W, 3) by environment, of those that have a goal image.
     """
 
     images: UInt8Array | None
@@ -39,6 +40,7 @@ class EpisodeStep:
     episode_steps: NDArray[np.uint32]
     ended: BoolArray
     valid: BoolArray
+    goals: Mapping[int, UInt8Array] = field(default_factory=dict)
 
 
 @dataclass
@@ -48,6 +50,7 @@ class _Episode:
     episode_id: int
     frames: list[UInt8Array] = field(default_factory=list)
     actions: list[FloatArray] = field(default_factory=list)
+    goal: UInt8Array | None = None
     fault: str = ""
 
 
@@ -218,12 +221,13 @@ class EpisodeReward:
         else:
             episode.frames += [images[n].copy() for images in (step.images, step.next_images)[int(made > 0) :]]
         episode.actions.append(step.actions[n].copy())
+        episode.goal = step.goals.get(n, episode.goal)
         return episode
 
     def _job(self, episode: _Episode, spec: EnvironmentSpec, session: int) -> ClipJob:
         frames = np.stack(episode.frames)
         clip_id = f"episode {episode.episode_id} of session {session}"
         task = TaskSpec(
-            spec.instruction, spec.task, self._judge.settings.robot, frames[0], actions=np.stack(episode.actions)
+            spec.instruction, spec.task, self._judge.settings.robot, frames[0], episode.goal, np.stack(episode.actions)
         )
         return ClipJob(clip_ref(clip_id, frames, 1 / spec.control_period_s), task)

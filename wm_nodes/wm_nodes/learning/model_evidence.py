@@ -1,10 +1,11 @@
 """What a world model says of a clip of its own cameras: surprise, reconstruction, actions, goal, done. Section 4.1.
 
 Evidence, trigger and veto, never a score: likelihood alone rewards standing still, so surprise is given beside the
-error of a model of "nothing moves", and beside what other actions would have explained. Shapes: T frames, H W 3 image,
-A action, S state.
+error of a model of "nothing moves", and beside what other actions would have explained. Shapes: T frames, J actions
+between two frames, H W 3 image, A action, S state.
 
-The clips of the adversarial benchmark have other cameras and no actions, so the shipped judge does not read these.
+The clips of the adversarial benchmark have other cameras and no actions, so the shipped judge does not read these; the
+agent does, by a rubric's bands (clip_evidence.py).
 """
 
 import numpy as np
@@ -40,14 +41,16 @@ MODEL_EVIDENCE = {
 
 @torch.inference_mode()
 def model_evidence(
-    models: WorldModels, frames: UInt8Array, task: TaskSpec, start_state: FloatArray
+    models: WorldModels, frames: UInt8Array, task: TaskSpec, start_state: FloatArray | None = None
 ) -> dict[str, float]:
     """Return MODEL_EVIDENCE of one clip.
 
     Args:
         frames: uint8 (T, H, W, 3), T >= 2, in the cameras and size of the models' manifest. task: its actions are in
-            [-1, 1]; action t moves frame t to t + 1.
-        start_state: (S,) commanded tool position on frame 0, m, robot base frame, as Observation.state.
+            [-1, 1], (T - 1, J A): the J actions that move frame t to t + 1, one after the other. Where J > 1 the model
+            imagines the frames between.
+        start_state: (S,) commanded tool position on frame 0, m, robot base frame, as Observation.state; None: where
+            the tokenizer's probe sees the tool on frame 0.
 
     Raises:
         ValueError: no actions, of another length or size, frames of another size, or a model over discrete tokens.
@@ -56,31 +59,33 @@ def model_evidence(
     action_model = models.action
     if not isinstance(action_model, ActionModel):
         raise ValueError("surprise is defined over continuous latents; take a model with tokenizer.kind continuous")
-    action_dim = len(models.simulation.workspace_low_m)
-    if task.actions is None or task.actions.shape != (len(frames) - 1, action_dim):
-        given = None if task.actions is None else task.actions.shape
-        raise ValueError(f"the world model needs actions ({len(frames) - 1}, {action_dim}), got {given}")
+    action_dim, num_steps = len(models.simulation.workspace_low_m), len(frames) - 1
+    given = None if task.actions is None else task.actions.shape
+    if given is None or len(given) != 2 or given[0] != num_steps or not given[1] or given[1] % action_dim:
+        raise ValueError(f"the world model needs actions ({num_steps}, {action_dim} or a multiple), got {given}")
+    per_frame = given[1] // action_dim
     index = models.task_index(task.task_id)
     tokenizer = models.tokenizer
     latents = tokenizer.encode(frames)
     difference = np.abs(tokenizer.decode(latents).numpy().astype(np.float32) - frames).mean(3)
     blocks = F.avg_pool2d(torch.from_numpy(difference)[:, None], BLOCK_PX)
     read = tokenizer.read_state(latents)[:, TOOL]
-    actions = torch.from_numpy(np.asarray(task.actions, np.float32))
-    start = torch.from_numpy(np.asarray(start_state, np.float32))
-    states = commanded_states(models, start, actions)
-    errors, logits = _errors(action_model, latents, actions, states)
-    turned, _ = _errors(action_model, latents, -actions, commanded_states(models, start, -actions))
+    actions = torch.from_numpy(np.asarray(task.actions, np.float32)).reshape(-1, action_dim)
+    start = read[0] if start_state is None else torch.from_numpy(np.asarray(start_state, np.float32))
+    states, turned_states = (commanded_states(models, start, sign * actions) for sign in (1, -1))
+    errors, logits = _errors(action_model, latents, actions, states, per_frame)
+    turned, _ = _errors(action_model, latents, -actions, turned_states, per_frame)
     still = (latents[1:] - latents[:-1]).square().mean((1, 2))
     signal = torch.cat([torch.zeros(1), done_signal(logits)[0][:, index]])
-    moved = (read[1:] - read[:-1]) - (states[1:] - states[:-1])
+    shown = states[::per_frame]
+    moved = (read[1:] - read[:-1]) - (shown[1:] - shown[:-1])
     found = {
         "tokenizer_error": float(difference.mean()), "tokenizer_error_worst": float(blocks.max()),
         "surprise": float(errors.mean()), "surprise_max": float(errors.max()),
         "surprise_over_still": float(torch.log((errors.mean() + 1e-4) / (still.mean() + 1e-4))),
         "still_energy": float(still.mean()),
         "action_gain": float(torch.log((turned + 1e-4) / (errors + 1e-4)).mean()),
-        "tool_error": float(moved.norm(dim=1).mean() / models.simulation.max_action_m),
+        "tool_error": float(moved.norm(dim=1).mean() / (models.simulation.max_action_m * per_frame)),
         "done_end": float(signal[-1]), "done_max": float(signal.max()),
         "done_rise": float((signal[1:] >= signal[:-1] - 1e-6).float().mean()),
     }  # fmt: skip
@@ -88,13 +93,33 @@ def model_evidence(
 
 
 def _errors(
-    model: ActionModel, latents_TSD: Tensor, actions_TA: Tensor, states_TS: Tensor
+    model: ActionModel, latents_TSD: Tensor, actions_TA: Tensor, states_TS: Tensor, per_frame: int
 ) -> tuple[Tensor, Tensor]:
-    """(T - 1,) mean squared error of each next frame's latents, and done logits (T - 1, K, J)."""
+    """(T - 1,) mean squared error of each next frame's latents, and done logits (T - 1, heads, tasks)."""
+    if per_frame > 1:
+        return _imagined_errors(model, latents_TSD, actions_TA, states_TS, per_frame)
     before, after = states_TS[:-1][None], states_TS[1:][None]
     prediction = model(latents_TSD[:-1][None], actions_TA[None], before, after)
     expected = normalise_tokens(latents_TSD[:-1] + prediction.change_BTSD[0])
     return (expected - latents_TSD[1:]).square().mean((1, 2)), prediction.done_logits_BTKJ[0]
+
+
+def _imagined_errors(
+    model: ActionModel, latents_TSD: Tensor, actions_TA: Tensor, states_TS: Tensor, per_frame: int
+) -> tuple[Tensor, Tensor]:
+    """As _errors: from each frame on, the model goes the actions up to the next one by itself."""
+    caches = model.trunk.new_ring_caches(1, latents_TSD.device)
+    errors, logits = [], []
+    for t, expected_SD in enumerate(latents_TSD[1:]):
+        imagined_NSD = latents_TSD[t : t + 1]
+        for i in range(t * per_frame, (t + 1) * per_frame):
+            row, after = slice(i, i + 1), slice(i + 1, i + 2)
+            imagined_NSD, done = model.advance(
+                imagined_NSD, actions_TA[row], states_TS[row], states_TS[after], caches
+            )
+        errors.append((imagined_NSD[0] - expected_SD).square().mean())
+        logits.append(done[0])
+    return torch.stack(errors), torch.stack(logits)
 
 
 def commanded_states(models: WorldModels, start_S: Tensor, actions_TA: Tensor) -> Tensor:

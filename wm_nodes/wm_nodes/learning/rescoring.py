@@ -124,6 +124,9 @@ def _recorded_model(bag: Path, config_file: Path | None, model_dir: Path | None)
     if name == "rule":
         return RuleReward(config.reward.sparse_weight)
     if name != "endogenous":
-        raise BagError(f"{bag} holds rewards of {name or 'nobody'}; endogenous and rule ones can be evaluated again")
+        raise BagError(
+            f"{bag} holds rewards of {name or 'nobody'}; endogenous and rule ones can be evaluated again here, "
+            "an agent's by python -m wm_nodes.score_episodes"
+        )
     own = run_dir / "model"
     return make_endogenous_reward(config, model_dir or (own if own.is_dir() else shipped_model(config.task)))

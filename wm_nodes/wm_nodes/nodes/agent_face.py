@@ -12,6 +12,7 @@ from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import ConfigError
 from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.learning.clip_evidence import ClipEvidence
 from wm_nodes.learning.clip_judging import READS, ClipJudge
 from wm_nodes.reward.agent import Status, Verdict, pause_reason
 from wm_nodes.ros import convert, diagnostics
@@ -27,7 +28,8 @@ PARAMS = (
 
 
 class AgentFace:
-    """Owns the node's ClipJudge until cleanup.
+    """Owns the node's ClipJudge until cleanup. The world model of the node's `model_dir` measures the evidence that the
+    rubric has bands of.
 
     Args:
         busy: whether clips are being judged: the rubric is not changed meanwhile.
@@ -38,11 +40,14 @@ class AgentFace:
 
     def __init__(self, node: ManagedNode, settings: JudgeConfig, seed: int, busy: Callable[[], bool]) -> None:
         self._node, self._busy = node, busy
-        audit = str(node.param("audit_dir"))
+        audit, models = str(node.param("audit_dir")), str(node.param("model_dir"))
         self.judge = ClipJudge(
-            settings, seed=seed, reads=node.run_dir / READS, audit=node.run_dir / audit if audit else None
-        )
+            settings, seed=seed, reads=node.run_dir / READS, audit=node.run_dir / audit if audit else None,
+            evidence=ClipEvidence(Path(models) if models else None),
+        )  # fmt: skip
         node.own(self.judge.close)
+        for card in self.judge.cards:
+            node.get_logger().info(card)
         self._verdicts = node.publish_on("reward/verdict")
         node.serve(SetRubric, "reward/set_rubric", self._on_set_rubric)
         self.judge.refresh_health()

@@ -189,9 +189,11 @@ class RewardEvaluatorNode(ManagedNode):
         self, model: EpisodeReward, transition: Transition, images: UInt8Array | None, next_images: UInt8Array | None
     ) -> None:
         assert self._spec is not None  # transitions wait for it
+        goals = {n: self._goals.get(int(episode_id)) for n, episode_id in enumerate(transition.episode_ids)}
         step = EpisodeStep(
             images, next_images, transition.actions, transition.episode_ids, transition.episode_steps,
             transition.terminated | transition.truncated, transition.valid,
+            {n: goal[0].copy() for n, goal in goals.items() if goal is not None and goal[0] is not None and goal[1]},
         )  # fmt: skip
         pending = model.add(step, self._spec, transition.session)
         self._undecided.append((time.perf_counter(), transition, pending))

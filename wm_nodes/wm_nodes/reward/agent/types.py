@@ -359,7 +359,7 @@ class ReadRequest:
 class Capabilities:
     """What a judge can do. components: those it reads, None for whatever the rubric describes. max_frames: images in
     one call. probabilities: label votes carry more than one-hot. reasons: gives evidence texts. deterministic: equal
-    requests get equal answers.
+    requests get equal answers. card: what it was measured to see and not to see, in words; "" where nobody measured it.
     """
 
     judge_id: str
@@ -372,6 +372,7 @@ class Capabilities:
     probabilities: bool = True
     reasons: bool = True
     deterministic: bool = False
+    card: str = ""
 
 
 @dataclass(frozen=True)

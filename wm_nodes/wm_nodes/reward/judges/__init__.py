@@ -1,6 +1,6 @@
 """Judges: whoever reads clips for the reward agent. Here: any server that speaks chat completions, such as vLLM.
 
-    vllm serve MODEL --enable-prefix-caching --limit-mm-per-prompt '{"image": 40}'
+    vllm serve MODEL --enable-prefix-caching --limit-mm-per-prompt '{"image": 40, "video": 1}'
 
     transport = ChatTransport([Endpoint("http://127.0.0.1:8000/v1", "MODEL")])
     agent = RewardAgent(OpenAIJudge(transport, rubric, cache=VerdictCache(folder)), rubric)

@@ -44,7 +44,9 @@ class ChatOptions:
     schema; the answer is checked either way. label_token_ids: token ids of A to E, where the server can be asked for
     their probabilities by id. choice_grammar: label reads choose among the letters only, so that the label mass no
     longer warns. min_label_mass: a label read with less abstains, unless choice_grammar. max_images: that the server
-    takes in one call.
+    takes in one call. video: the dense profile goes as one video (vLLM, --limit-mm-per-prompt with a video), else as
+    images. repeat_share: of the calls that are asked twice, so that it is known how often a live server contradicts
+    itself; the first answer counts.
     """
 
     json_timeout_s: float = 120.0
@@ -56,8 +58,12 @@ class ChatOptions:
     choice_grammar: bool = False
     min_label_mass: float = 0.5
     max_images: int = 64
+    video: bool = False
+    repeat_share: float = 0.0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.repeat_share <= 1:
+            raise ValueError(f"repeat_share must lie in [0, 1], got {self.repeat_share}")
         if self.label_token_ids and len(self.label_token_ids) != len(LETTERS):
             raise ValueError(f"label_token_ids must hold {len(LETTERS)} ids, of A to E, got {self.label_token_ids}")
         if not min(self.json_timeout_s, self.label_timeout_s, self.budget_s) > 0:
@@ -235,7 +241,9 @@ def sha_of(value: Any) -> str:
 
 
 def num_images(media: Sequence[Part]) -> int:
-    return sum(part["type"] == "image_url" for part in media)
+    """Images, and frames of videos."""
+    videos = [str(part["video_url"]["url"]) for part in media if part["type"] == "video_url"]
+    return sum(url.count(",") for url in videos) + len([part for part in media if part["type"] == "image_url"])
 
 
 def _finished(completion: Completion) -> str:

@@ -73,7 +73,7 @@ class EmbeddedJudge:
         return Capabilities(
             f"{TRANSPORT}:{self._head.sha256[:12]}", TRANSPORT, f"judge {self._head.sha256[:12]}", REVISION,
             frozenset(name.removeprefix(HACK) for name in self._head.questions), max_frames=MAX_FRAMES,
-            deterministic=True,
+            deterministic=True, card=self.card,
         )  # fmt: skip
 
     @property

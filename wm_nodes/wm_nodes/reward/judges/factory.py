@@ -121,7 +121,8 @@ def make_judge(
     )
     options = ChatOptions(
         json_timeout_s=settings.json_timeout_s, label_timeout_s=settings.label_timeout_s,
-        budget_s=settings.clip_budget_s, max_images=settings.max_images,
+        budget_s=settings.clip_budget_s, max_images=settings.max_images, video=settings.video,
+        repeat_share=settings.repeat_share,
     )  # fmt: skip
     cache = VerdictCache(reads) if reads is not None and settings.keep_reads else None
     return OpenedJudge(OpenAIJudge(transport, rubric, options, cache, on_exchange), transport.close)

@@ -27,7 +27,7 @@ from wm_nodes.reward.judges.prompts import Prompts
 from wm_nodes.reward.judges.transport import ChatTransport
 
 TRANSPORT = "openai-chat"
-COUNTED = ("reads", "calls", "retries", "cache_hits", "errors", "abstained")
+COUNTED = ("reads", "calls", "retries", "cache_hits", "errors", "abstained", "repeated", "flipped")
 
 
 class OpenAIJudge:
@@ -54,7 +54,7 @@ class OpenAIJudge:
         (self._model,) = transport.models
         self._transport, self._rubric, self._cache = transport, rubric, cache
         self._options = options or ChatOptions()
-        self._prompts = Prompts(rubric)
+        self._prompts = Prompts(rubric, video=self._options.video)
         self._on_exchange = on_exchange
         self._caller = Caller(transport, self._prompts, self._options, on_exchange)
         self._plan = CallPlan()
@@ -65,6 +65,7 @@ class OpenAIJudge:
         components = frozenset({*self._rubric.component_names, *self._rubric.hack.patterns, PLANNING})
         return Capabilities(
             f"{TRANSPORT}:{self._model}", TRANSPORT, self._model, "", components,
+            media=frozenset({"image", "video"} if self._options.video else {"image"}),
             max_frames=self._options.max_images,
         )  # fmt: skip
 
@@ -95,6 +96,8 @@ class OpenAIJudge:
         details = {name: float(self._counts[name]) for name in COUNTED}
         details["invalid_rate"] = (details["errors"] + details["abstained"]) / max(1.0, details["reads"])
         details["open_breakers"] = float(len(self._transport.open_breakers()))
+        if self._counts["repeated"]:
+            details["flip_rate"] = details["flipped"] / details["repeated"]
         if (ratio := self._plan.cached_ratio) is not None:
             details["cached_ratio"] = ratio
         if latencies_s := self._caller.latencies_s:
@@ -136,16 +139,28 @@ class OpenAIJudge:
         key = cache_key(call.media_sha, question, self._rubric.version, self._model, TRANSPORT)
         known = None if self._cache is None else self._cache.get(key)
         reads = await self._asked(call, prompt) if known is None else _again(known)
+        cost = reads[0].cost
         if known is not None:
             self._on_exchange({**asked(call, prompt.body), "cached": True})
+        elif int(key[:8], 16) < self._options.repeat_share * 16**8 and not _unanswered(reads):
+            reads = await self._repeated(call, prompt, reads)
         if known is None and self._cache is not None:
             self._cache.put(key, reads)
-        self._plan.observe(reads[0].cost, follows=follows)
+        self._plan.observe(cost, follows=follows)
         self._counts["reads"] += len(reads)
         self._counts["cache_hits"] += known is not None
         self._counts["errors"] += sum(read.status is Status.ERROR for read in reads)
         self._counts["abstained"] += sum(read.status is Status.ABSTAIN for read in reads)
         return reads
+
+    async def _repeated(self, call: Call, prompt: Prompt, reads: list[Read]) -> list[Read]:
+        """Ask the same once more and count whose likeliest level is another one; the reads stay, with both costs."""
+        again = await self._asked(call, prompt)
+        for one, other in zip(reads, again, strict=True):
+            if one.status is Status.OK and other.status is Status.OK:
+                self._counts["repeated"] += 1
+                self._counts["flipped"] += int(np.argmax(one.levels) != np.argmax(other.levels))
+        return [replace(reads[0], cost=reads[0].cost + again[0].cost), *reads[1:]]
 
     async def _asked(self, call: Call, prompt: Prompt) -> list[Read]:
         bill = Bill(num_images(call.media))

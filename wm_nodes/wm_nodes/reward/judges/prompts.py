@@ -23,6 +23,7 @@ from wm_nodes.reward.agent.types import (
     Component,
     ComponentScore,
     MediaItem,
+    Profile,
     ReadRequest,
     Stage,
     TaskSpec,
@@ -44,20 +45,32 @@ _ENCODED_IMAGES = 512
 
 
 class Prompts:
-    """Builds the messages of a rubric. Encoded images are kept for a while: a stage sends the same ones many times."""
+    """Builds the messages of a rubric. Encoded images are kept for a while: a stage sends the same ones many times.
 
-    def __init__(self, rubric: Rubric) -> None:
-        self.rubric = rubric
+    Args:
+        video: send the dense profile as one video, of which a model sees two frames at the price of one image.
+    """
+
+    def __init__(self, rubric: Rubric, *, video: bool = False) -> None:
+        self.rubric, self._video = rubric, video
         self._encoded: OrderedDict[bytes, str] = OrderedDict()
 
     def media(self, request: ReadRequest) -> list[Part]:
-        """A text and an image part per image of the request, as PNG data URIs."""
+        """A text and an image part per image of the request, as PNG data URIs; a text and one part for a video."""
+        if self._video and request.profile is Profile.D and len(request.media) > 1:
+            return self._as_video(request)
         parts: list[Part] = []
         for item in request.media:
             parts.append(_text(item.label))
             uri = self._data_uri(_pixels(item, request.clip, request.task))
             parts.append({"type": "image_url", "image_url": {"url": uri}})
         return parts
+
+    def _as_video(self, request: ReadRequest) -> list[Part]:
+        """The frames that were chosen here, in vLLM's form for frames that are not to be sampled again."""
+        uris = [self._data_uri(_pixels(item, request.clip, request.task)) for item in request.media]
+        labels = _text("video of these frames, in this order: " + ", ".join(item.label for item in request.media))
+        return [labels, {"type": "video_url", "video_url": {"url": video_uri(uris)}}]
 
     def json_question(
         self, media: Sequence[Part], request: ReadRequest, components: Sequence[Component], form: AnswerFormat
@@ -155,6 +168,11 @@ def data_uri(image: UInt8Array) -> str:
         raise ValueError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
     encoded = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1]
     return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+
+def video_uri(images: Sequence[str]) -> str:
+    """One data URI of several PNG data URIs: vLLM's "video/jpeg", frames separated by commas, decoded one by one."""
+    return "data:video/jpeg;base64," + ",".join(uri.partition(",")[2] for uri in images)
 
 
 def with_problem(messages: Sequence[Part], problem: str) -> list[Part]:

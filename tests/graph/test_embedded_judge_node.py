@@ -1,0 +1,74 @@
+"""The node of loop 2 with the embedded judge alone, no server and no GPU, and with a world model's evidence."""
+
+import functools
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from graph.harness import Graph, Probe, own_domain, wait_until
+from graph.video_loop import VideoLoop, settings
+from recording_samples import make_spec
+
+from wm_msgs.action import TrainVideo
+from wm_msgs.msg import ClipVerdict
+from wm_nodes.reward.audit import read_record
+from wm_nodes.reward.evidence.head import load_head, save_head
+from wm_nodes.reward.judges.embedded import shipped_head
+
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
+
+
+def far_sighted_judge(folder: Path) -> Path:
+    """The shipped judge, told that it was trained on clips like those of the tiny loop, and that none is foreign."""
+    folder.mkdir()
+    head = load_head(shipped_head())
+    known = replace(head.familiarity, limit=1e9)
+    return save_head(folder, replace(head, size=(64, 128), lengths=(2, 25), familiarity=known))
+
+
+def test_a_round_is_judged_in_the_node_without_any_server_and_with_the_evidence_of_the_world_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = functools.partial(make_spec, instruction="push the red cube into the blue target")
+    monkeypatch.setattr("graph.video_loop.make_spec", spec)
+    rubric = tmp_path / "bands.yaml"
+    bands = {"tokenizer_error": {"component": "clarity", "high": 1e-6}, "sharpness_min": {"component": "clarity"}}
+    rubric.write_text(json.dumps({"extends": "robot", "name": "bands", "evidence": bands}))
+    config = settings(**{
+        "rewards": {"agent": 1.0}, "judge.kind": "embedded", "judge.folder": str(far_sighted_judge(tmp_path / "judge")),
+        "judge.rubric": str(rubric),
+    })  # fmt: skip
+    with own_domain() as domain:
+        graph, probe = Graph(domain, tmp_path / "graph"), Probe(domain)
+        try:
+            loop = VideoLoop(graph, probe, config)
+            verdicts: list[ClipVerdict] = probe.listen("reward/verdict")
+            loop.start("video_model")
+            loop.start("clip_evaluator", audit_dir="audit")
+            loop.start("video_learner")
+            loop.wait_active()
+            result = loop.train(1)
+            assert (result.termination_reason, result.message) == (TrainVideo.Result.FINISHED, "")
+            wait_until("verdicts", lambda: len(verdicts) == 6)
+            for verdict in verdicts:
+                assert verdict.status == ClipVerdict.OK and 0 <= verdict.reward <= 1, verdict.reason
+                assert verdict.judge_id.startswith("embedded:") and verdict.rubric_version.startswith("bands-1-")
+            judge = verdicts[0].judge_id
+            wait_until("diagnostics", lambda: probe.value("/wm/reward_evaluator", "verdicts") == "6")
+            assert probe.value("/wm/reward_evaluator", "judge") == judge
+            assert probe.value("/wm/reward_evaluator", "abstained") == "0"
+            assert f"embedded judge {judge.removeprefix('embedded:')}" in graph.log("/wm/clip_evaluator")
+        finally:
+            probe.close()
+            assert set(graph.stop().values()) == {0}
+        entries = read_record(graph.folder / "audit").judged()
+        evidence = [entry.evidence for entry in entries]
+        assert len(evidence) == 6 and all(set(found) == set(bands) for found in evidence)
+        assert all(math.isfinite(value) for found in evidence for value in found.values())
+        assert any(len(score.votes) > 1 for entry in entries for score in scores_of(entry.verdict, "clarity"))
+
+
+def scores_of(verdict: object, component: str) -> list[object]:
+    return [score for stage in verdict.stages for score in stage.components if score.component == component]  # type: ignore[attr-defined]
