@@ -8,7 +8,7 @@ import asyncio
 import json
 import math
 from collections import deque
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -28,6 +28,18 @@ class Fault:
     status: int = 500
     text: str = "on purpose"
     retry_after: str = ""
+
+
+@asynccontextmanager
+async def listening(
+    serve: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]],
+) -> AsyncIterator[str]:
+    """Serve connections on a free port of this host; yields http://host:port."""
+    server = await asyncio.start_server(serve, "127.0.0.1", 0, limit=1 << 26)
+    try:
+        yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    finally:
+        server.close()
 
 
 @dataclass
@@ -51,12 +63,9 @@ class ChatServer:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator["ChatServer"]:
-        server = await asyncio.start_server(self._serve, "127.0.0.1", 0, limit=1 << 26)
-        self.url = f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}/v1"
-        try:
+        async with listening(self._serve) as origin:
+            self.url = f"{origin}/v1"
             yield self
-        finally:
-            server.close()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:

@@ -13,7 +13,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
-from chat_server import Fault
+from chat_server import Fault, listening
 
 DRIP_S = 0.5
 """Between two bytes of a slow answer."""
@@ -35,12 +35,9 @@ class FaultProxy:
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator["FaultProxy"]:
-        server = await asyncio.start_server(self._serve, "127.0.0.1", 0, limit=1 << 26)
-        self.url = f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}{urlsplit(self.target).path}"
-        try:
+        async with listening(self._serve) as origin:
+            self.url = origin + urlsplit(self.target).path
             yield self
-        finally:
-            server.close()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """One request per connection."""

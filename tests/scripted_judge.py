@@ -25,6 +25,28 @@ from wm_nodes.reward.agent.types import (
 
 CLEAN, FLAWED, BORDERLINE, WRONG, UNUSABLE = (one_hot(level) for level in (4, 3, 2, 1, 0))
 GOOD, FAIR, POOR, INVALID = (one_hot(level, 4) for level in (3, 2, 1, 0))
+
+COOKING = """
+extends: robot
+name: cooking
+revision: 3
+stages:
+  PC:
+    components:
+      liquid:
+        question: Does liquid flow and stay where it should?
+        defect: Which impossible flow is visible?
+        levels: [solid, frozen in the air, uneven, slight jump, natural]
+        weight: 2.0
+hack:
+  patterns:
+    spill:
+      question: Is the table dry?
+      defect: Is a spill hidden?
+      levels: [surely there, probably there, cannot be told, probably not there, surely not there]
+      cap: {component: liquid, ceiling: 0.0}
+"""
+"""A domain's pack: it adds a component and a pattern to the robot pack's."""
 Levels = tuple[float, ...]
 
 

@@ -12,6 +12,8 @@ pytest.importorskip("rclpy", reason="the graph tests need rclpy")
 
 from graph.harness import Graph, Probe, own_domain
 
+from wm_nodes.ros.runner import clean_shared_memory
+
 LOG_LINES = 25
 
 
@@ -52,7 +54,7 @@ def graph(domain: int, tmp_path: Path, request: pytest.FixtureRequest) -> Iterat
     codes = graph.stop()
     killed = request.node.get_closest_marker("kills") is not None
     if killed:
-        os.system("fastdds shm clean >/dev/null 2>&1")
+        clean_shared_memory(os.environ)
     else:
         assert all(code == 0 for code in codes.values()), f"exit codes {codes}; logs in {graph.folder}"
 

@@ -31,6 +31,7 @@ from wm_nodes.nodes.bag_qos import message_class
 from wm_nodes.recording import Bag, read_episodes, read_rollouts, recover, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.ros import qos as table
+from wm_nodes.ros.runner import clean_shared_memory
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
@@ -113,7 +114,7 @@ def peer() -> Iterator[Start]:
     yield start
     for each in peers:
         each.close()
-    subprocess.run(["fastdds", "shm", "clean"], capture_output=True, check=False)
+    clean_shared_memory(os.environ)
 
 
 def padded(streams: Streams) -> Streams:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scripted_judge import BORDERLINE, CLEAN, FAIR, GOOD, INVALID, UNUSABLE, WRONG
+from scripted_judge import BORDERLINE, CLEAN, COOKING, FAIR, GOOD, INVALID, UNUSABLE, WRONG
 
 from wm_nodes.config.load import ConfigError
 from wm_nodes.reward.agent.levels import first_vote, score
@@ -177,28 +177,6 @@ def test_stages_out_of_order_and_skipped_ones_behind_an_open_gate_are_refused() 
         reward(weights, stages[::-1], ROBOT)
     with pytest.raises(ValueError, match="TC was skipped"):
         reward(weights, [*stages[:2], skipped(TC), skipped(PC)], ROBOT)
-
-
-COOKING = """
-extends: robot
-name: cooking
-revision: 3
-stages:
-  PC:
-    components:
-      liquid:
-        question: Does liquid flow and stay where it should?
-        defect: Which impossible flow is visible?
-        levels: [solid, frozen in the air, uneven, slight jump, natural]
-        weight: 2.0
-hack:
-  patterns:
-    spill:
-      question: Is the table dry?
-      defect: Is a spill hidden?
-      levels: [surely there, probably there, cannot be told, probably not there, surely not there]
-      cap: {component: liquid, ceiling: 0.0}
-"""
 
 
 def test_another_domain_adds_components_and_patterns_with_a_file_alone(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from chat_server import ChatServer, Fault
+from scripted_judge import COOKING
 
 from wm_nodes.reward import judges
 from wm_nodes.reward.agent.levels import first_vote, next_vote, option_order, state_of
@@ -558,26 +559,6 @@ def test_bad_requests_and_settings_name_what_is_wrong() -> None:
         ChatOptions(label_token_ids=(1, 2))
     with pytest.raises(ValueError, match="must serve one model, got a, b"):
         OpenAIJudge(ChatTransport([Endpoint("http://x/v1", "a"), Endpoint("http://y/v1", "b")]), RUBRIC)
-
-
-COOKING = """
-extends: robot
-name: cooking
-stages:
-  PC:
-    components:
-      liquid:
-        question: Does liquid flow and stay where it should?
-        defect: Which impossible flow is visible?
-        levels: [solid, frozen in the air, uneven, slight jump, natural]
-hack:
-  patterns:
-    spill:
-      question: Is the table dry?
-      defect: Is a spill hidden?
-      levels: [surely there, probably there, cannot be told, probably not there, surely not there]
-      cap: {component: liquid, ceiling: 0.0}
-"""
 
 
 def test_a_new_domains_component_is_asked_about_gated_and_capped_with_a_file_alone(tmp_path: Path) -> None:

@@ -419,7 +419,6 @@ def _parser() -> argparse.ArgumentParser:
     training.add_argument("--eval-contexts", type=_positive, default=ClipPlan.eval_contexts)
     training.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and held-out ones")
     for claim in (clips, training):
-        claim.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model")
         claim.add_argument(
             "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
             help=f"episodes to take contexts from (default: new ones in {EPISODES}, of seeds that no model has seen)",
@@ -430,7 +429,8 @@ def _parser() -> argparse.ArgumentParser:
         "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
         help="the same episodes in several sizes, a bag of each, the model's own size first (default: new ones)",
     )  # fmt: skip
-    resolution.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model")
+    for claim in (clips, training, resolution):
+        claim.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model")
     for claim in (clips, resolution):
         claim.add_argument("--contexts", type=_positive, default=100)
         claim.add_argument("--preset", default="recommended", help="settings of loop 2: rewards, sampler steps, task")

@@ -54,6 +54,11 @@ def default_judge() -> JudgeConfig:
     return JudgeConfig.model_validate(read_preset("base")["judge"])
 
 
+def named_pack(rubric: str) -> str:
+    """A rubric pack by its name, or by its file's full path, which holds in another working directory too."""
+    return str(Path(rubric).absolute()) if rubric and Path(rubric).is_file() else rubric
+
+
 def judge_overrides(endpoints: str = "", model: str = "", api_key_env: str = "", rubric: str = "") -> dict[str, Any]:
     """The dotted settings that a user's words for the judge stand for; empty words stand for none.
 
@@ -65,8 +70,7 @@ def judge_overrides(endpoints: str = "", model: str = "", api_key_env: str = "",
     if endpoints == EMBEDDED or (endpoints and Path(endpoints).is_dir()):
         here = {"kind": EMBEDDED, "folder": "" if endpoints == EMBEDDED else str(Path(endpoints).absolute())}
     urls = [] if here else [url.strip() for url in endpoints.split(",") if url.strip()]
-    pack = str(Path(rubric).absolute()) if rubric and Path(rubric).is_file() else rubric
-    found = {"endpoints": urls, "model": model, "api_key_env": api_key_env, "rubric": pack, **here}
+    found = {"endpoints": urls, "model": model, "api_key_env": api_key_env, "rubric": named_pack(rubric), **here}
     return {f"judge.{name}": value for name, value in found.items() if value}
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
+from wm_nodes.config.load import named_pack
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.model_evidence import model_evidence
 from wm_nodes.recording import read_episodes
@@ -136,9 +137,8 @@ def main(argv: Sequence[str]) -> int:
         base = load_rubric(arguments.rubric)
         models = load_model_folder(arguments.model_dir)
         rows = _rows(models, arguments.bags, arguments.stride)
-        extended = str(Path(arguments.rubric).absolute()) if Path(arguments.rubric).is_file() else arguments.rubric
         pack = {
-            "extends": extended, "name": arguments.output.stem, "revision": base.revision,
+            "extends": named_pack(arguments.rubric), "name": arguments.output.stem, "revision": base.revision,
             "evidence": bands_of(rows, arguments.tail),
         }  # fmt: skip
         head = f"# python -m wm_nodes.learning.evidence_bands {' '.join(argv)}\n# from {len(rows)} clips\n"

@@ -193,7 +193,7 @@ class RewardEvaluatorNode(ManagedNode):
         step = EpisodeStep(
             images, next_images, transition.actions, transition.episode_ids, transition.episode_steps,
             transition.terminated | transition.truncated, transition.valid,
-            {n: goal[0].copy() for n, goal in goals.items() if goal is not None and goal[0] is not None and goal[1]},
+            {n: goal[0] for n, goal in goals.items() if goal is not None and goal[0] is not None and goal[1]},
         )  # fmt: skip
         pending = model.add(step, self._spec, transition.session)
         self._undecided.append((time.perf_counter(), transition, pending))
