@@ -1,6 +1,10 @@
 """The simulator for real: rendering, the controller's rule, demonstrations, collection. One environment serves all."""
 
 import dataclasses
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -86,7 +90,7 @@ def test_a_device_that_cannot_render_names_the_remedy() -> None:
         render_backend("cuda:77")
 
 
-@pytest.mark.parametrize(("able", "chosen", "patches"), [("cuda", "cuda", 0), ("pci:0", "pci:0", 1)])
+@pytest.mark.parametrize(("able", "chosen", "patches"), [("cuda", "cuda", 0), ("pci:0", "pci:0", 2)])
 def test_only_the_software_device_needs_maniskill_patched(
     monkeypatch: pytest.MonkeyPatch, able: str, chosen: str, patches: int
 ) -> None:
@@ -99,9 +103,51 @@ def test_only_the_software_device_needs_maniskill_patched(
 
     patched: list[str] = []
     monkeypatch.setattr(backend.sapien, "Device", Device)
-    monkeypatch.setattr(backend, "keep_pci_names_whole", lambda: patched.append(able))
+    for patch in ("keep_pci_names_whole", "leave_out_reflection_table"):
+        monkeypatch.setattr(backend, patch, lambda: patched.append(able))
     assert render_backend("auto") == chosen
     assert len(patched) == patches
+
+
+STOCK_PICTURES = """
+import sys
+import numpy as np
+from wm_nodes.config.load import load_config
+from wm_nodes.simulation import backend
+from wm_nodes.simulation.environment import ManiSkillEnvironment
+assert backend.shaders_without_table() is None, "the cache folder was to be one that cannot be written"
+environment = ManiSkillEnvironment("push_cube", load_config("smoke").simulation)
+pictures = [environment.reset(seeds=np.array([5], np.uint64)).image]
+pictures += [environment.step(np.array([[0.5, -1, 0.25]], np.float32)).observation.image for _ in range(5)]
+np.save(sys.argv[1], np.concatenate(pictures))
+"""
+
+
+def test_pictures_without_the_reflection_table_are_those_of_the_installed_shaders(
+    env: ManiSkillEnvironment, tmp_path: Path
+) -> None:
+    assert backend.shaders_without_table() is not None
+    pictures = [env.reset(seeds=np.array([5], np.uint64)).image]
+    pictures += [env.step(np.array([[0.5, -1, 0.25]], np.float32)).observation.image for _ in range(5)]
+    stock = tmp_path / "stock.npy"
+    subprocess.run(
+        [sys.executable, "-c", STOCK_PICTURES, str(stock)], check=True, timeout=200,
+        env={**os.environ, "XDG_CACHE_HOME": "/proc/nowhere"},
+    )  # fmt: skip
+    np.testing.assert_array_equal(np.concatenate(pictures), np.load(stock))
+
+
+def test_shaders_that_are_not_the_known_ones_stay_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for pack in ("common", "minimal"):
+        shutil.copytree(backend.SHADERS / pack, tmp_path / pack)
+    monkeypatch.setattr(backend, "SHADERS", tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    made = backend.shaders_without_table()
+    assert made is not None and made == backend.shaders_without_table() and made.parent == tmp_path / "cache/wm_nodes"
+    assert [path.name for path in made.parent.iterdir()] == [made.name]
+    changed = tmp_path / "minimal" / "gbuffer.frag"
+    changed.write_text(changed.read_text().replace("vec2(roughness, dotNV)", "vec2(dotNV, roughness)"))
+    assert backend.shaders_without_table() is None
 
 
 def test_one_seed_shows_one_picture_and_steps_move_the_commanded_tool_exactly(env: ManiSkillEnvironment) -> None:

@@ -1,11 +1,22 @@
-"""Rendering device: a GPU if there is one, else Mesa's software device, which needs one repair of ManiSkill 3.0.1."""
+"""Rendering device: a GPU if there is one, else Mesa's software device, which needs one repair of ManiSkill 3.0.1 and
+draws its first picture thirteen times as fast with another."""
 
+import contextlib
 import functools
+import hashlib
+import os
+import tempfile
+from pathlib import Path
 
 import sapien
 from mani_skill.envs.utils.system import backend as maniskill_backend
+from mani_skill.render import ShaderConfig
+from mani_skill.sensors import camera as maniskill_camera
 
 SOFTWARE_DEVICE = "pci:0"
+SHADERS = Path(sapien.__file__).parent / "vulkan_shader"
+TABLE = "uniform sampler2D samplerBRDFLUT;"
+TABLE_READ = "texture(samplerBRDFLUT, vec2(roughness, dotNV)).xy"
 
 
 class NoRendererError(OSError):
@@ -23,6 +34,57 @@ def keep_pci_names_whole() -> None:
     maniskill_backend.parse_backend_device_id = parse
 
 
+@functools.cache
+def leave_out_reflection_table() -> None:
+    """Let cameras use ManiSkill's `minimal` shaders without their table of how a surface reflects an environment map.
+
+    SAPIEN computes that table in every process before the first picture, which takes 10 s of a CPU. No scene of ours
+    has an environment map, so its factor is always 0 and the pictures stay the same to the bit.
+    """
+    folder = shaders_without_table()
+    if folder is None:
+        return
+    original = maniskill_camera.set_shader_pack
+
+    def set_shader_pack(config: ShaderConfig) -> None:
+        original(config)
+        if config.shader_pack == "minimal":
+            sapien.render.set_camera_shader_dir(str(folder / "minimal"))
+
+    maniskill_camera.set_shader_pack = set_shader_pack
+
+
+def shaders_without_table() -> Path | None:
+    """Return a folder with the packs `common` and `minimal` as installed, less the table; made once per version of them
+    in the user's cache folder. None where that cannot be written, or the shaders are not those that we know."""
+    texts = {path.relative_to(SHADERS): path.read_text() for pack in ("common", "minimal")
+             for path in sorted((SHADERS / pack).iterdir())}  # fmt: skip
+    changed = {name: _without_table(text) for name, text in texts.items()}
+    if any("BRDFLUT" in text for text in changed.values()):
+        return None
+    version = hashlib.sha256("".join(f"{name}\n{text}" for name, text in changed.items()).encode()).hexdigest()
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wm_nodes"
+    folder = cache / f"shaders_{version[:16]}"
+    if folder.is_dir():
+        return folder
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache) as made:
+            for name, text in changed.items():
+                (Path(made) / "packs" / name).parent.mkdir(parents=True, exist_ok=True)
+                (Path(made) / "packs" / name).write_text(text)
+            with contextlib.suppress(OSError):  # another process was first
+                (Path(made) / "packs").rename(folder)
+    except OSError:
+        return None
+    return folder if folder.is_dir() else None
+
+
+def _without_table(shader: str) -> str:
+    lines = [line for line in shader.splitlines(keepends=True) if TABLE not in line]
+    return "".join(lines).replace(TABLE_READ, "vec2(0)")
+
+
 def render_backend(device: str) -> str:
     """Return the ManiSkill render backend for `device` (auto, gpu, cuda:N, or pci:N).
 
@@ -35,6 +97,7 @@ def render_backend(device: str) -> str:
             if sapien.Device(name).can_render():
                 if name.startswith("pci:"):
                     keep_pci_names_whole()
+                    leave_out_reflection_table()
                 return name
         except RuntimeError:
             continue
