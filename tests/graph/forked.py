@@ -1,4 +1,4 @@
-"""Node processes that fork from an interpreter in which torch, rclpy and the nodes' modules are imported already.
+"""Node processes that fork from an interpreter in which torch, rclpy, ManiSkill and the nodes' modules are imported.
 
 Of the 3 s of CPU that a node costs before it does anything, nearly all are imports, and the graph tests start about two
 hundred nodes. A forked node is a process like any other: own pid, own DDS participant, killed, stopped and awaited in
@@ -102,6 +102,7 @@ def serve(connection: Connection) -> dict[str, str]:
     """Fork a child for each request until the client hangs up. Returns in the child only, with its request."""
     for name in PRELOADED:
         importlib.import_module(f"wm_nodes.nodes.{name}_node")
+    importlib.import_module("wm_nodes.simulation.environment")
     gc.collect()
     gc.freeze()
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -107,6 +107,20 @@ def test_a_silent_peer_is_lost_once_and_a_leaving_one_is_not() -> None:
     assert peers.lost == []
 
 
+def test_time_in_which_a_process_stood_still_makes_no_peer_lost() -> None:
+    peers = PeerWatch("/wm/me", timeout_s=3.0)
+    peers.heard("/wm/a", now=0.0)
+    assert peers.check(now=0.5) == []
+    assert peers.check(now=20.5) == [], "it was this process that slept for 20 s"
+    assert [peers.check(now=20.5 + 0.5 * k) for k in range(1, 6)] == [[], [], [], [], ["/wm/a"]], "1 s and then 2 s"
+
+
+def test_a_process_that_is_always_late_still_finds_out_who_is_lost() -> None:
+    peers = PeerWatch("/wm/me", timeout_s=3.0)
+    peers.heard("/wm/a", now=0.0)
+    assert [now for now in range(0, 30, 2) if peers.check(now=float(now))] == [14]
+
+
 def test_the_image_cache_keeps_the_newest() -> None:
     cache = ImageCache(2)
     for stamp in (1, 2, 3):

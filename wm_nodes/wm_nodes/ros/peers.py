@@ -3,6 +3,8 @@
 import time
 
 HEARTBEAT_S = 0.5
+ASLEEP_S = 3 * HEARTBEAT_S
+"""Checks come once per heartbeat. Where one comes later than this, its own process stood still and heard nobody."""
 
 
 class PeerWatch:
@@ -13,6 +15,7 @@ class PeerWatch:
         self._heard: dict[str, float] = {}
         self._lost: set[str] = set()
         self._identities: dict[str, str] = {}
+        self._checked: float | None = None
 
     def heard(self, name: str, now: float | None = None, identity: str = "") -> bool:
         """Note a sign of life of a process; return whether the peer is new or had been lost."""
@@ -31,8 +34,13 @@ class PeerWatch:
         self._lost.discard(name)
 
     def check(self, now: float | None = None) -> list[str]:
-        """Return the peers that became lost since the last check."""
+        """Return the peers that became lost since the last check; time in which this process stood still does not
+        count."""
         now = time.monotonic() if now is None else now
+        apart = 0.0 if self._checked is None else now - self._checked
+        if apart > ASLEEP_S:
+            self._heard = {name: min(now, last + apart - HEARTBEAT_S) for name, last in self._heard.items()}
+        self._checked = now
         silent = {name for name, last in self._heard.items() if now - last > self.timeout_s}
         fresh = sorted(silent - self._lost)
         self._lost |= silent
