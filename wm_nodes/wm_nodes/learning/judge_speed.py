@@ -1,11 +1,13 @@
 """How many clips the embedded judge reads per second. Issue 4 asks for 20 on 2 cores at 96 px and 25 frames.
 
-    python -m wm_nodes.learning.judge_speed [FOLDER]
+    python -m wm_nodes.learning.judge_speed [FOLDER] [--json FILE]
 
 Each core works alone on its own clips; processor time is what a clip costs on an idle core, whatever else runs here.
 """
 
 import argparse
+import json
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -17,6 +19,7 @@ import numpy as np
 import torch
 
 from wm_nodes.allocator import keep_freed_memory
+from wm_nodes.files import write_atomic
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reward.evidence.clip import clip_evidence
 from wm_nodes.reward.evidence.head import load_head
@@ -63,7 +66,10 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("folder", type=Path, nargs="?", default=shipped_head(), help="a trained judge; the shipped one")
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--clips", type=int, default=40, help="per core")
+    parser.add_argument("--json", type=Path, help="write it here, too")
     arguments = parser.parse_args(argv)
+    if min(arguments.cores, arguments.clips) < 1:
+        parser.error(f"--cores and --clips must be at least 1, got {arguments.cores} and {arguments.clips}")
     try:
         with ProcessPoolExecutor(arguments.cores) as pool:
             jobs = [pool.submit(read_clips, arguments.folder, arguments.clips, seed) for seed in range(arguments.cores)]
@@ -73,6 +79,15 @@ def main(argv: Sequence[str]) -> int:
         return 2
     processor_s, wall_s = (float(np.mean(column)) for column in zip(*found))
     facts = machine_facts()
+    if arguments.json:
+        measured = {
+            "command": shlex.join(["judge_speed", *argv]), "judge": load_head(arguments.folder).sha256,
+            "frames": FRAMES, "side_px": SIDE_PX, "processes": arguments.cores, "clips_each": arguments.clips,
+            "processor_s_per_clip": processor_s, "wall_s_per_clip": wall_s,
+            "clips_per_s": arguments.cores / processor_s, "clips_per_s_by_the_clock": arguments.cores / wall_s,
+            "machine": facts,
+        }  # fmt: skip
+        write_atomic(arguments.json, (json.dumps(measured, indent=1) + "\n").encode())
     print(f"{FRAMES} frames of {SIDE_PX} px on {arguments.cores} processes, {facts['processor']}, {facts['date']}")
     print(f"processor {1000 * processor_s:.1f} ms a clip: {arguments.cores / processor_s:.1f} clips/s on idle cores")
     print(f"wall      {1000 * wall_s:.1f} ms a clip: {arguments.cores / wall_s:.1f} clips/s now")
