@@ -344,6 +344,7 @@ def test_the_command_prints_and_writes_the_table(
         assert column in shown
     assert "flag: physics" in shown and "there, not flagged 0" in shown
     assert found["statuses"] == {"OK": found["clips"]} and found["machine"] and found["seed"] == 0
+    assert found["command"] == f"benchmark_reward.py table {folder} --judge simulator --json {target}"
     assert {row["name"]: row["paper"] for row in found["rows"]} == {name: PAPER[name] for name in row_names(RUBRIC)}
     assert {row["name"]: row["accuracy"] for row in found["rows"]}["overall"] == 1.0
     overall = [row for row in found["splits"]["new_scene"] if row["name"] == "overall"]

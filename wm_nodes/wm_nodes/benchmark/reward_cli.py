@@ -5,6 +5,7 @@ climbing the reward climbs the truth (hacking); other papers' rewards on the sam
 import argparse
 import asyncio
 import json
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -78,6 +79,7 @@ console = Console()
 def main(argv: Sequence[str]) -> int:
     """Return the exit code: 0 done, 2 a clear error, 130 interrupted (judged clips are kept)."""
     arguments = parser().parse_args(argv)
+    arguments.command = shlex.join(["benchmark_reward.py", *argv])
     if not console.is_terminal:
         console.width = LOG_COLUMNS
     claims = {"table": _table, "efficiency": _efficiency, "hacking": _hacking, "comparisons": _comparisons}
@@ -250,7 +252,7 @@ def _say_what_is_missing(
 def _write(arguments: argparse.Namespace, found: dict[str, Any]) -> None:
     if arguments.json is None:
         return
-    facts = {"machine": machine_facts(), "date": time.strftime("%Y-%m-%d")}
+    facts = {"command": arguments.command, "machine": machine_facts(), "date": time.strftime("%Y-%m-%d")}
     rounded = json.loads(json.dumps({**found, **facts}), parse_float=lambda digits: float(f"{float(digits):.5g}"))
     write_atomic(arguments.json, (json.dumps(_finite(rounded), indent=1) + "\n").encode())
 
