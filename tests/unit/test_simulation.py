@@ -145,8 +145,12 @@ def test_shaders_that_are_not_the_known_ones_stay_as_they_are(tmp_path: Path, mo
     made = backend.shaders_without_table()
     assert made is not None and made == backend.shaders_without_table() and made.parent == tmp_path / "cache/wm_nodes"
     assert [path.name for path in made.parent.iterdir()] == [made.name]
+    (made / "minimal" / "gbuffer.frag").write_text("half of it")
+    assert backend.shaders_without_table() is None, "a spoiled copy was used"
     changed = tmp_path / "minimal" / "gbuffer.frag"
     changed.write_text(changed.read_text().replace("vec2(roughness, dotNV)", "vec2(dotNV, roughness)"))
+    assert backend.shaders_without_table() is None
+    shutil.rmtree(tmp_path / "common")
     assert backend.shaders_without_table() is None
 
 

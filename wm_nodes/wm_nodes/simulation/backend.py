@@ -6,6 +6,7 @@ import functools
 import hashlib
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import sapien
@@ -57,27 +58,30 @@ def leave_out_reflection_table() -> None:
 def shaders_without_table() -> Path | None:
     """Return a folder with the packs `common` and `minimal` as installed, less the table; made once per version of them
     in the user's cache folder. None where that cannot be written, or the shaders are not those that we know."""
-    texts = {path.relative_to(SHADERS): path.read_text() for pack in ("common", "minimal")
-             for path in sorted((SHADERS / pack).iterdir())}  # fmt: skip
-    changed = {name: _without_table(text) for name, text in texts.items()}
-    if any("BRDFLUT" in text for text in changed.values()):
-        return None
-    version = hashlib.sha256("".join(f"{name}\n{text}" for name, text in changed.items()).encode()).hexdigest()
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wm_nodes"
-    folder = cache / f"shaders_{version[:16]}"
-    if folder.is_dir():
-        return folder
     try:
-        cache.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache) as made:
-            for name, text in changed.items():
-                (Path(made) / "packs" / name).parent.mkdir(parents=True, exist_ok=True)
-                (Path(made) / "packs" / name).write_text(text)
-            with contextlib.suppress(OSError):  # another process was first
-                (Path(made) / "packs").rename(folder)
-    except OSError:
+        texts = {path.relative_to(SHADERS): _without_table(path.read_text()) for pack in ("common", "minimal")
+                 for path in sorted((SHADERS / pack).iterdir())}  # fmt: skip
+        if any("BRDFLUT" in text for text in texts.values()):
+            return None
+        version = hashlib.sha256("".join(f"{name}\n{text}" for name, text in texts.items()).encode()).hexdigest()
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wm_nodes"
+        folder = cache / f"shaders_{version[:16]}"
+        if not folder.is_dir():
+            _write_whole(texts, folder)
+        as_made = all((folder / name).read_text() == text for name, text in texts.items())
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home
         return None
-    return folder if folder.is_dir() else None
+    return folder if as_made else None
+
+
+def _write_whole(texts: Mapping[Path, str], folder: Path) -> None:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as made:
+        for name, text in texts.items():
+            (Path(made) / "packs" / name).parent.mkdir(parents=True, exist_ok=True)
+            (Path(made) / "packs" / name).write_text(text)
+        with contextlib.suppress(OSError):  # another process was first
+            (Path(made) / "packs").rename(folder)
 
 
 def _without_table(shader: str) -> str:
