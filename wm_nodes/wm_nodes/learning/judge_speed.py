@@ -7,6 +7,7 @@ Each core works alone on its own clips; processor time is what a clip costs on a
 
 import argparse
 import json
+import multiprocessing as mp
 import shlex
 import sys
 import time
@@ -71,7 +72,7 @@ def main(argv: Sequence[str]) -> int:
     if min(arguments.cores, arguments.clips) < 1:
         parser.error(f"--cores and --clips must be at least 1, got {arguments.cores} and {arguments.clips}")
     try:
-        with ProcessPoolExecutor(arguments.cores) as pool:
+        with ProcessPoolExecutor(arguments.cores, mp_context=mp.get_context("spawn")) as pool:
             jobs = [pool.submit(read_clips, arguments.folder, arguments.clips, seed) for seed in range(arguments.cores)]
             found = [job.result() for job in jobs]
     except (ValueError, OSError) as error:
