@@ -19,14 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 LONG_FIRST = ("tests/graph", "tests/parity", "tests/unit", "tests/contracts")
-AT_ONCE = ("--dist", "loadfile", "--no-loadscope-reorder", *LONG_FIRST, "-n")
-TOGETHER = (
-    ("not deadline and not alone", (*AT_ONCE, "3")), ("deadline and not alone", (*AT_ONCE, "2")), ("alone", LONG_FIRST),
-)  # fmt: skip
-"""What runs in one go, for two cores; pyproject.toml says what the marks mean. Tests of a graph often wait: a third one
-uses the core that they leave idle."""
-NONE_SELECTED = 5
-"""pytest's exit code where no test has the marks."""
+TWO_AT_A_TIME = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", *LONG_FIRST)
 
 
 def main(argv):
@@ -43,11 +36,8 @@ def main(argv):
     system.install(system.browser_plan(system.find_browser(), system.read_os_release()), ROOT / ".venv_setup.log")
     if failed:
         print(f"failed before the tests: {', '.join(failed)}", flush=True)
-    if named:
-        codes = [_pytest(["-m", " and ".join(fast), *named])]
-    else:
-        codes = [_pytest(["-m", " and ".join([marks, *fast]), *arguments]) for marks, arguments in TOGETHER]
-        codes = [code for code in codes if code != NONE_SELECTED]
+    runs = [([], named)] if named else [(["not alone"], TWO_AT_A_TIME), (["alone"], LONG_FIRST)]
+    codes = [_pytest(["-m", " and ".join(marks + fast), *arguments]) for marks, arguments in runs]
     return max(codes) or int(bool(failed))
 
 

@@ -15,7 +15,7 @@ from wm_nodes.ros import calls, convert
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.wire import StepCommand
 
-pytestmark = [pytest.mark.graph, pytest.mark.deadline]
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 N = 2
 
 

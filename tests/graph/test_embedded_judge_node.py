@@ -17,7 +17,7 @@ from wm_nodes.reward.audit import read_record
 from wm_nodes.reward.evidence.head import load_head, save_head
 from wm_nodes.reward.judges.embedded import shipped_head
 
-pytestmark = [pytest.mark.graph, pytest.mark.deadline]
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 
 def far_sighted_judge(folder: Path) -> Path:

@@ -38,7 +38,7 @@ def test_evaluation_over_dds_equals_evaluation_in_one_process(graph: Graph, prob
     assert "gone.safetensors" in missing.message
 
 
-@pytest.mark.deadline
+@pytest.mark.alone
 def test_cancel_ends_an_evaluation_and_a_rollout_within_a_second(graph: Graph, probe: Probe) -> None:
     save_weights(toy.make_policy(graph.config), graph.folder / "start.safetensors")
     graph.start_environment("toy:make_long_environment", namespace="/wm/sim", num_envs=3)

@@ -15,7 +15,7 @@ from wm_msgs.msg import Credit, TransitionBatch
 from wm_nodes.learning.weights import save_weights
 from wm_nodes.ros.wire import WireError
 
-pytestmark = [pytest.mark.graph, pytest.mark.deadline]
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 
 @pytest.mark.kills
@@ -192,7 +192,6 @@ def test_the_largest_image_is_not_refused(graph: Graph, probe: Probe) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 def test_fifty_start_stop_cycles_leave_no_shared_memory(domain: int) -> None:
     cycle = (
         "import os, signal\n"

@@ -13,7 +13,7 @@ from wm_msgs.srv import StopRecording
 from wm_nodes.ros.scenarios import VIDEO_TOPICS
 from wm_nodes.world_model_job import main
 
-pytestmark = [pytest.mark.graph, pytest.mark.deadline]
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 
 def test_another_judge_takes_the_rounds_of_an_outage_and_each_round_is_scored_again_by_the_one_it_had(

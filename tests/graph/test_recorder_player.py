@@ -33,7 +33,7 @@ from wm_nodes.recording import messages as m
 from wm_nodes.ros import qos as table
 from wm_nodes.ros.runner import clean_shared_memory
 
-pytestmark = [pytest.mark.graph, pytest.mark.deadline]
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 TOPICS = [topics.SPEC, topics.IMAGES, topics.TRANSITION, topics.REWARD, topics.EPISODE]
 Streams = dict[str, list[bytes]]

@@ -19,7 +19,7 @@ from wm_nodes.learning.weights import save_weights
 from wm_nodes.recording import BagReport, read_episodes, read_rollouts, recover
 from wm_nodes.ros.scenarios import ENVIRONMENT_TOPICS, GRAPH_TOPICS
 
-pytestmark = [pytest.mark.graph, pytest.mark.deadline]
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 RECORDED = [*GRAPH_TOPICS, *(f"sim/{name}" for name in ENVIRONMENT_TOPICS)]
 

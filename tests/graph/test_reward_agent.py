@@ -29,7 +29,7 @@ from wm_nodes.reward.audit import read_record, verify
 from wm_nodes.ros.scenarios import GRAPH_TOPICS, VERDICT_TOPIC, VIDEO_TOPICS
 from wm_nodes.world_model_job import main
 
-pytestmark = [pytest.mark.graph, pytest.mark.deadline]
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 STAGES = ["VQ", "IF", "TC", "PC"]
 ANSWER_S = 1.0

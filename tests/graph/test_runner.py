@@ -17,7 +17,7 @@ from wm_nodes.ros.graph import Graph, NodeSpec
 from wm_nodes.ros.readiness import NotReadyError
 from wm_nodes.ros.runner import NodeDiedError, Runner
 
-pytestmark = [pytest.mark.graph, pytest.mark.deadline]
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 TESTS = Path(__file__).resolve().parents[1]
 
 

@@ -130,7 +130,7 @@ def test_training_from_the_bag_and_from_its_replay_gives_the_weights_of_the_live
                 offline.stop()
 
 
-@pytest.mark.deadline
+@pytest.mark.alone
 def test_a_replay_that_starts_with_the_learner_trains_and_a_short_one_says_so(graph: Graph, probe: Probe) -> None:
     bag = recorded_training(graph, probe, updates=2)
     live = weights_in(graph.folder)
@@ -194,7 +194,7 @@ def test_two_ranks_under_torchrun_give_the_update_of_one(graph: Graph, probe: Pr
     toy.assert_trained_in_one_process(file, updates=2, tolerance=1e-5)
 
 
-@pytest.mark.deadline
+@pytest.mark.alone
 def test_cancel_ends_training_within_a_second_and_the_next_goal_works(graph: Graph, probe: Probe) -> None:
     graph.start_training_nodes()
     client = probe.action(Train, "train")

@@ -25,7 +25,7 @@ from wm_nodes.recording import recover
 from wm_nodes.ros.scenarios import VIDEO_TOPICS
 from wm_nodes.video_model.buffer import concatenate_buffers
 
-pytestmark = [pytest.mark.graph, pytest.mark.deadline]
+pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 ACTIONS = ((EvaluateClips, "clips/evaluate"), (GenerateClips, "video/generate"), (TrainVideo, "video/train"))
 ANSWER_S = 1.0

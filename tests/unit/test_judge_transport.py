@@ -50,6 +50,11 @@ async def ask(transport: ChatTransport, _: ChatServer) -> Any:
     return await transport.complete(BODY, timeout_s=0.5)
 
 
+async def ask_patiently(transport: ChatTransport, _: ChatServer) -> Any:
+    """For answers that come at once, on a host that may not."""
+    return await transport.complete(BODY, timeout_s=20)
+
+
 def test_answer_usage_and_unknown_fields_pass_through() -> None:
     async def steps(transport: ChatTransport, server: ChatServer) -> None:
         answer = await transport.complete({**BODY, "logprob_token_ids": [5], "seed": 7}, timeout_s=1)
@@ -78,7 +83,7 @@ def test_refusals_are_never_retried(status: int) -> None:
     server = ChatServer()
     server.faults.append(Fault("status", status, "bad thing"))
     with pytest.raises(TransportError, match=f"HTTP {status}.*bad thing") as caught:
-        talk(ask, server)
+        talk(ask_patiently, server)
     assert (caught.value.status, caught.value.tries, len(server.requests)) == (status, 1, 1)
 
 
