@@ -111,8 +111,8 @@ def test_node_that_never_becomes_active_is_named_with_its_last_words(
 ) -> None:
     monkeypatch.setattr(readiness, "OBSERVER_S", 1.0)  # so that a second participant looks, too
     with Runner(graph(replace(tiny("a", text="good morning"), lifecycle=True), tiny("b")), log=None) as runner:
-        with pytest.raises(NotReadyError, match=r"after 4 s: /wm/a \(seen\): tiny says 'good morning'"):
-            runner.wait_ready(4)
+        with pytest.raises(NotReadyError, match=r"after 12 s: /wm/a \(seen\): tiny says 'good morning'"):
+            runner.wait_ready(12)
 
 
 def test_ctrl_c_ends_all_nodes_and_the_starter_with_code_0(ros_domain: int, tmp_path: Path) -> None:
