@@ -79,19 +79,19 @@ def main(argv: Sequence[str]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     processor_s, wall_s = (float(np.mean(column)) for column in zip(*found))
+    clips_per_s, clips_per_s_now = arguments.cores / processor_s, arguments.cores / wall_s
     facts = machine_facts()
     if arguments.json:
         measured = {
             "command": shlex.join(["judge_speed", *argv]), "judge": load_head(arguments.folder).sha256,
             "frames": FRAMES, "side_px": SIDE_PX, "processes": arguments.cores, "clips_each": arguments.clips,
             "processor_s_per_clip": processor_s, "wall_s_per_clip": wall_s,
-            "clips_per_s": arguments.cores / processor_s, "clips_per_s_by_the_clock": arguments.cores / wall_s,
-            "machine": facts,
+            "clips_per_s": clips_per_s, "clips_per_s_by_the_clock": clips_per_s_now, "machine": facts,
         }  # fmt: skip
         write_atomic(arguments.json, (json.dumps(measured, indent=1) + "\n").encode())
     print(f"{FRAMES} frames of {SIDE_PX} px on {arguments.cores} processes, {facts['processor']}, {facts['date']}")
-    print(f"processor {1000 * processor_s:.1f} ms a clip: {arguments.cores / processor_s:.1f} clips/s on idle cores")
-    print(f"wall      {1000 * wall_s:.1f} ms a clip: {arguments.cores / wall_s:.1f} clips/s now")
+    print(f"processor {1000 * processor_s:.1f} ms a clip: {clips_per_s:.1f} clips/s on idle cores")
+    print(f"wall      {1000 * wall_s:.1f} ms a clip: {clips_per_s_now:.1f} clips/s now")
     return 0
 
 

@@ -1,18 +1,17 @@
 """Rendering device: a GPU if there is one, else Mesa's software device, which needs one repair of ManiSkill 3.0.1 and
 draws its first picture thirteen times as fast with another."""
 
-import contextlib
 import functools
 import hashlib
 import os
-import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 
 import sapien
 from mani_skill.envs.utils.system import backend as maniskill_backend
 from mani_skill.render import ShaderConfig
 from mani_skill.sensors import camera as maniskill_camera
+
+from wm_nodes.files import write_atomic
 
 SOFTWARE_DEVICE = "pci:0"
 SHADERS = Path(sapien.__file__).parent / "vulkan_shader"
@@ -66,22 +65,13 @@ def shaders_without_table() -> Path | None:
         version = hashlib.sha256("".join(f"{name}\n{text}" for name, text in texts.items()).encode()).hexdigest()
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wm_nodes"
         folder = cache / f"shaders_{version[:16]}"
-        if not folder.is_dir():
-            _write_whole(texts, folder)
+        for name, text in texts.items():
+            if not (folder / name).exists():
+                write_atomic(folder / name, text.encode())
         as_made = all((folder / name).read_text() == text for name, text in texts.items())
     except (OSError, RuntimeError):  # RuntimeError: the user has no home
         return None
     return folder if as_made else None
-
-
-def _write_whole(texts: Mapping[Path, str], folder: Path) -> None:
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent) as made:
-        for name, text in texts.items():
-            (Path(made) / "packs" / name).parent.mkdir(parents=True, exist_ok=True)
-            (Path(made) / "packs" / name).write_text(text)
-        with contextlib.suppress(OSError):  # another process was first
-            (Path(made) / "packs").rename(folder)
 
 
 def _without_table(shader: str) -> str:
