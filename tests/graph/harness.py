@@ -37,6 +37,8 @@ IN_MIDDLEWARE = re.compile(r"Garbage-collecting\n  File \".*/ros/spin\.py\", lin
 """The stack of a node that has stopped, and whose participant does not come back from its destructor: Fast DDS can
 deadlock where all leave at once (https://github.com/eProsima/Fast-DDS/issues/6193). Seen once so far;
 ros.runner kills such a node after 10 s."""
+MATCHED_S = 30.0
+"""A restarted node that nobody has matched after this time stays deaf."""
 RESEND_S = 8.0
 """A request without an answer is sent once more after this time, for the same reason."""
 
@@ -248,6 +250,30 @@ class Graph:
         """kill -9 and reap."""
         self.processes[name].kill()
         self.processes[name].wait(10)
+
+    def restart(self, start: Callable[[], Any], book: LinkBook, *names: str, process: str = "") -> None:
+        """Start the killed node names[0] again; return when it and the other names have matched each other.
+
+        A new process may stay deaf under load (3 of some 350 kills on two busy cores): Fast DDS 2.14 gives it the port
+        of the killed one, and a process that was still sending to that port removes its shared memory, by its name
+        (compare https://github.com/eProsima/Fast-DDS/issues/5053). A user would start it again, and so does this, with
+        a warning.
+
+        Args:
+            book: what the probe knows of the links.
+            process: its key in `processes`, where that is not its name.
+        """
+        for last in (False, True):
+            book.forget(names[0], lost=True)
+            start()
+            try:
+                wait_until(f"links of {names[0]}", lambda: not book.missing(names), START_S if last else MATCHED_S)
+                return
+            except AssertionError:
+                lacking = "; ".join(book.missing(names))
+                assert not last, f"started twice, and {lacking}"
+                warnings.warn(f"{names[0]} started once more: {lacking}", stacklevel=2)
+                self.kill(process or names[0])
 
     def stop(self) -> dict[str, int]:
         """SIGINT all; after 20 s SIGABRT, which leaves the stack in the log. Return the exit codes; 0, with a warning,

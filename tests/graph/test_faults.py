@@ -22,6 +22,7 @@ pytestmark = [pytest.mark.graph, pytest.mark.alone]
 def test_each_killed_node_is_reported_within_5_s_and_training_goes_on_after_its_restart(
     graph: Graph, probe: Probe
 ) -> None:
+    book = probe.links()
     graph.start_training_nodes()
     client = probe.action(Train, "train")
     updates: list[Any] = []
@@ -37,14 +38,12 @@ def test_each_killed_node_is_reported_within_5_s_and_training_goes_on_after_its_
         graph.kill(name)
         wait_until(f"a report that {name} is lost", lambda n=name: _reported(probe, "/wm/learner", n), 5.0)
         count = len(updates)
-        start()
+        graph.restart(start, book, name, "/wm/learner", *restart)
         wait_until(f"an update after {name} is back", lambda c=count: len(updates) > c, 180)
     graph.kill("/wm/learner")
     wait_until("a report that the learner is lost", lambda: _reported(probe, "/wm/policy", "/wm/learner"), 5.0)
     probe.diagnostics.pop("/wm/learner")
-    graph.start_learner()
-    wait_until("the restarted learner", lambda: probe.value("/wm/learner", "state") == "active", 60)
-    time.sleep(1.0)
+    graph.restart(graph.start_learner, book, "/wm/learner", *restart)
     result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=1)))
     assert result.termination_reason == Train.Result.FINISHED
     assert result.updates > 1
@@ -71,13 +70,14 @@ def test_training_ends_with_peer_lost_when_a_node_does_not_come_back(graph: Grap
 
 @pytest.mark.kills
 def test_a_policy_that_is_back_before_it_was_missed_gets_its_rollout_again(graph: Graph, probe: Probe) -> None:
+    book = probe.links()
     graph.start_training_nodes(peer_timeout_s=60.0)
     updates: list[Any] = []
     handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
     wait_until("an update", lambda: updates, 60)
     graph.kill("/wm/policy")
     count = len(updates)
-    graph.start_policy()
+    graph.restart(graph.start_policy, book, "/wm/policy", "/wm/environment", "/wm/reward_evaluator", "/wm/learner")
     wait_until("an update by the new policy process", lambda: len(updates) > count + 1, 60)
     assert not _reported(probe, "/wm/learner", "/wm/policy")
     assert "/wm/policy was stopped or restarted" in graph.log("/wm/learner")

@@ -44,6 +44,7 @@ def _reported(probe: Probe, reporter: str, lost: str) -> bool:
 
 @pytest.mark.kills
 def test_a_killed_recorder_records_again_beside_what_it_left(graph: Graph, probe: Probe) -> None:
+    book = probe.links()
     start_recorder(graph)
     graph.start_training_nodes()
     client = probe.action(Train, "train")
@@ -52,7 +53,7 @@ def test_a_killed_recorder_records_again_beside_what_it_left(graph: Graph, probe
     graph.kill("/wm/recorder")
     wait_until("the report", lambda: _reported(probe, "/wm/learner", "/wm/recorder"), 5.0)
     probe.diagnostics.pop("/wm/recorder", None)
-    start_recorder(graph)
+    graph.restart(lambda: start_recorder(graph), book, "/wm/recorder", "/wm/learner", "/wm/policy", "/wm/environment")
     active(probe, "/wm/recorder")
     assert (probe.value("/wm/recorder", "bag") or "").endswith("bags/run_1")
     assert probe.finish(probe.send(client, Train.Goal(updates=1))).termination_reason == Train.Result.FINISHED

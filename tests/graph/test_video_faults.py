@@ -6,6 +6,7 @@ import hashlib
 import signal
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -207,8 +208,7 @@ def test_a_killed_video_model_ends_training_by_its_name_and_the_next_goal_finds_
     handle = _until_training(loop)
     loop.graph.kill("/wm/video_model")
     _assert_lost(loop, handle, "/wm/video_model", "silent")
-    loop.start("video_model")
-    loop.wait_active("video_model")
+    loop.restart("video_model")
     loop.assert_undisturbed(loop.train(1))
 
 
@@ -220,8 +220,7 @@ def test_an_evaluator_that_is_killed_and_back_before_it_was_missed_ends_training
     loop.graph.processes["/wm/clip_evaluator"].send_signal(signal.SIGSTOP)
     time.sleep(1.0)  # the learner has asked it for scores by now
     loop.graph.kill("/wm/clip_evaluator")
-    loop.start("clip_evaluator")
-    loop.wait_active("clip_evaluator")
+    loop.restart("clip_evaluator")
     _assert_lost(loop, handle, "/wm/reward_evaluator", "restarted")
     loop.assert_undisturbed(loop.train(1))
 
@@ -233,8 +232,7 @@ def test_a_killed_learner_is_reported_and_goes_on_exactly_from_its_checkpoint(lo
     loop.graph.kill("/wm/video_learner")
     lost = "/wm/learner is lost"
     wait_until("a report", lambda: any(lost in text for text in loop.probe.seen_errors["/wm/video_model"]), LOST_S)
-    loop.start("video_learner")
-    loop.wait_active("video_learner")
+    loop.restart("video_learner")
     loop.assert_undisturbed(loop.train(2))
 
 
@@ -244,14 +242,12 @@ def test_a_killed_recorder_disturbs_no_training_and_records_again_beside_what_it
     bags = loop.graph.folder / "bags"
     awaited = Parameter("await_nodes", value=["recorder"]).to_parameter_msg()
     loop.probe.call(SetParameters, "learner/set_parameters", SetParameters.Request(parameters=[awaited]))
-    book = loop.probe.links()
     for _ in range(2):
-        loop.graph.start("recorder", bag_uri="bags/run", topics=topics, min_free_mib=16)
-        wait_until("a recorder that all have matched", lambda: not book.missing(["/wm/recorder", *NAMES.values()]), 60)
+        start = partial(loop.graph.start, "recorder", bag_uri="bags/run", topics=topics, min_free_mib=16)
+        loop.graph.restart(start, loop.links, "/wm/recorder", *NAMES.values())
         loop.assert_undisturbed(loop.train(1))
         time.sleep(2.0)  # a kill may cost the recorder's last second
         loop.graph.kill("/wm/recorder")
-        book.forget("/wm/recorder", lost=True)
     first, second = (list(read_clips(recover(bags / name).bag)) for name in ("run.partial", "run_1.partial"))
     assert [clips.iteration + 1 for clips in first] == [clips.iteration for clips in second]
 

@@ -119,6 +119,7 @@ class VideoLoop:
         self.model = make_video_folder(graph.folder / "video_model", load_clips([self.bag], STRIDE))
         (graph.folder / "video_config.yaml").write_text(dump_video_config(config))
         self.local = LocalLoop(config, self.model, self.bag, lag)
+        self.links = probe.links()
 
     def start(self, node: str, **params: Any) -> None:
         """Start one of NAMES; its parameters may be replaced."""
@@ -141,6 +142,12 @@ class VideoLoop:
     def _lost(self, name: str) -> bool:
         learner = self.probe.diagnostics.get("/wm/learner")
         return learner is not None and f"{name} is lost" in learner.message
+
+    def restart(self, node: str) -> None:
+        """Start a killed node again; return when it is active, matched, and not lost to the learner any more."""
+        others = [name for name in NAMES.values() if name != NAMES[node]]
+        self.graph.restart(lambda: self.start(node), self.links, NAMES[node], *others, process=f"/wm/{node}")
+        self.wait_active(node)
 
     def stop(self, node: str) -> None:
         """SIGINT, as a person would."""
