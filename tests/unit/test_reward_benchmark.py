@@ -323,11 +323,11 @@ def test_the_looks_behind_the_published_tables_count_wherever_the_set_is_built(
     again = replace(manifest, rows=tuple(rows))
     able = EmbeddedJudge(load_head(shipped_head())).capabilities
     earlier = look(tmp_path, again, able, RUBRIC.version, "")
-    assert len(earlier) == 3 and not (tmp_path / LEDGER).exists(), "the judge that ships, with its rubric, has looked"
+    assert len(earlier) == 4 and not (tmp_path / LEDGER).exists(), "the judge that ships, with its rubric, has looked"
     with pytest.raises(ValueError, match=f"already seen by {able.judge_id}"):
         look(tmp_path, again, replace(able, judge_id="another"), RUBRIC.version, "")
     new_rubric = look(tmp_path, again, able, "robot-2-x", "other thresholds")
-    assert len(new_rubric) == 4 and (tmp_path / LEDGER).read_text().count("\n") == 1
+    assert len(new_rubric) == 5 and (tmp_path / LEDGER).read_text().count("\n") == 1
 
 
 # the command
