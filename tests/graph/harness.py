@@ -24,6 +24,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.links import LinkBook
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.runner import clean_shared_memory
@@ -137,7 +138,7 @@ class Probe:
 
     def finish(self, handle: Any, timeout_s: float = 60.0) -> Any:
         """Wait for a goal's result; return the Result message."""
-        return self.run(handle.get_result_async, timeout_s, "result").result
+        return goal_result(handle, timeout_s, lambda: None)
 
     def run(self, send: Callable[[], Any], timeout_s: float, what: str) -> Any:
         """Call `send` in the executor's thread (rclpy's action client races with it otherwise) and wait."""

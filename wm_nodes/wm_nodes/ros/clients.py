@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
+from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
 from rclpy.client import Client
 from rclpy.task import Future
@@ -26,6 +27,11 @@ ATTEMPT_S = 2.0
 """A step request without an answer is sent again after this time; the environment answers the same step_id once."""
 
 BUSY_WAIT_S = 0.005
+
+LOST_S = 2.0
+"""A result that has not arrived so long after the end of its goal is asked for again."""
+
+ENDED = (GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED)
 
 Check = Callable[[], None]
 
@@ -243,7 +249,14 @@ class LocalEnvironmentClient:
 
 
 def from_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Any:
-    """Call `send` in the executor's thread and wait for the future it returns.
+    """Call `send` in the executor's thread and wait for the future it returns."""
+    deadline = time.monotonic() + timeout_s
+    future = sent_by_executor(node, send, timeout_s, check)
+    return wait_for(future, max(0.0, deadline - time.monotonic()), check)
+
+
+def sent_by_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Future:
+    """Call `send` in the executor's thread and return the future it returns.
 
     rclpy's ActionClient notes a request only after sending it: sent from another thread, the answer may come before the
     note and is then dropped ("Ignoring unexpected goal response").
@@ -261,7 +274,42 @@ def from_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: fl
         check()
         if time.monotonic() >= deadline:
             raise PeerLost(f"this node's executor did not run for {timeout_s:g} s")
-    return wait_for(sent[0], max(0.0, deadline - time.monotonic()), check)
+    return sent[0]
+
+
+def goal_result(handle: Any, timeout_s: float, check: Check) -> Any:
+    """Wait in a worker thread for the result of an accepted goal; return the Result message.
+
+    A server that has just started may not have matched this client's reader yet, and then drops its answer for good
+    (rmw_fastrtps 556); the goal's status, which is kept for late readers, arrives. So the result is asked for again
+    where the goal has ended and its result is not here LOST_S later.
+
+    Raises:
+        PeerLost: not here after timeout_s, or the server does not know the goal (any more).
+    """
+    name, node = handle._action_client._action_name, handle._action_client._node
+    deadline = time.monotonic() + timeout_s
+    done = threading.Event()
+    asked: list[Future] = []
+    ask_at = 0.0
+    while not done.wait(POLL_S if asked else 0.0):
+        check()
+        now = time.monotonic()
+        if now >= deadline:
+            raise PeerLost(f"{name}: no result within {timeout_s:g} s")
+        if handle.status not in ENDED and asked:
+            ask_at = now + LOST_S
+        elif now >= ask_at:
+            if asked:
+                node.get_logger().warning(f"{name}: the goal has ended and its result did not arrive; asked again")
+            asked.append(sent_by_executor(node, handle.get_result_async, deadline - now, check))
+            asked[-1].add_done_callback(lambda _: done.set())
+            ask_at = time.monotonic() + LOST_S
+    response = next(future for future in asked if future.done()).result()
+    node.executor.create_task(lambda: [future.cancel() for future in asked])
+    if response.status == GoalStatus.STATUS_UNKNOWN:
+        raise PeerLost(f"{name} does not know the goal it accepted; was its node restarted?")
+    return response.result
 
 
 def run_goal(
@@ -307,7 +355,7 @@ def run_goal(
         check()
         time.sleep(POLL_S)
     try:
-        return from_executor(node, handle.get_result_async, float("inf"), both).result
+        return goal_result(handle, float("inf"), both)
     except BaseException:
         node.executor.create_task(handle.cancel_goal_async)
         raise

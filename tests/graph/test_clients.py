@@ -1,0 +1,70 @@
+"""Answers of action servers that are lost, on a real wire."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from action_msgs.msg import GoalStatus
+from graph.harness import Probe, wait_until
+from rclpy.action import ActionServer
+
+from wm_msgs.action import Train
+from wm_nodes.ros.clients import goal_result
+from wm_nodes.ros.wire import PeerLost
+
+
+class LossyServer(ActionServer):
+    """Answers no request for a result until `lost` of them have come, as where the client's reader is not matched."""
+
+    def __init__(self, node: Any, lost: int) -> None:
+        super().__init__(node, Train, "train", self._train)
+        self.lost, self.asked = lost, 0
+
+    def forget(self) -> None:
+        """Know no goal, as after a restart."""
+        self._goal_handles.clear()
+
+    async def _execute_get_result_request(self, request_header_and_message: Any) -> None:
+        self.asked += 1
+        if self.asked > self.lost:
+            await super()._execute_get_result_request(request_header_and_message)
+
+    def _train(self, goal: Any) -> Train.Result:
+        goal.succeed()
+        return Train.Result(termination_reason=Train.Result.FINISHED, updates=goal.request.updates)
+
+
+@pytest.fixture
+def other(domain: int) -> Iterator[Probe]:
+    """Has the server; in a context and an executor of its own."""
+    probe = Probe(domain)
+    yield probe
+    probe.close()
+
+
+def test_a_lost_result_of_a_goal_is_asked_for_again(probe: Probe, other: Probe) -> None:
+    server = LossyServer(other.node, lost=2)
+    handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=5))
+    result = goal_result(handle, 30.0, lambda: None)
+    assert (result.termination_reason, result.updates) == (Train.Result.FINISHED, 5)
+    assert server.asked == 3
+    server.destroy()
+
+
+def test_a_result_is_asked_for_once_where_it_arrives(probe: Probe, other: Probe) -> None:
+    server = LossyServer(other.node, lost=0)
+    assert goal_result(probe.send(probe.action(Train, "train"), Train.Goal(updates=5)), 30.0, lambda: None).updates == 5
+    assert server.asked == 1
+    server.destroy()
+
+
+def test_a_server_that_has_forgotten_the_goal_gives_an_error_and_not_an_empty_result(
+    probe: Probe, other: Probe
+) -> None:
+    server = LossyServer(other.node, lost=1)
+    handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=5))
+    wait_until("the end of the goal", lambda: handle.status == GoalStatus.STATUS_SUCCEEDED)
+    server.forget()
+    with pytest.raises(PeerLost, match="train does not know the goal it accepted; was its node restarted"):
+        goal_result(handle, 30.0, lambda: None)
+    server.destroy()
