@@ -270,6 +270,7 @@ class Graph:
             start()
             try:
                 wait_until(f"links of {names[0]}", lambda: not book.missing(names), START_S if last else MATCHED_S)
+                time.sleep(MATCH_S)  # for the probe's clients
                 return
             except AssertionError:
                 lacking = "; ".join(book.missing(names))

@@ -64,5 +64,7 @@ def test_a_post_stands_on_the_table_is_taller_and_is_named(source: ClipSource) -
 def test_the_benchmark_is_of_seeds_and_shapes_of_its_own() -> None:
     assert set(HELD_OUT.objects) < set(BENCHMARK.held_out.objects) and "slab/green" in BENCHMARK.held_out.objects
     assert SetPlan().held_out == HELD_OUT
+    assert {BENCHMARK.part("pull_cube", seed) for seed in BENCHMARK.seeds("pull_cube")} == {"test"}
+    assert {BENCHMARK.part("push_cube", seed) for seed in BENCHMARK.seeds("push_cube")} >= {"test", "train"}
     with pytest.raises(ValueError, match=r"unknown shapes \['ball'\]"):
         SetPlan(shapes=("ball",))
