@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ import pytest
 from scripted_judge import BORDERLINE, POOR, WRONG, FaultyJudge, ScriptedJudge, clean_table, make_clip, make_task
 from toy_set import write_toy_set
 
-from wm_nodes.benchmark.reward_cli import main
+from wm_nodes.benchmark.reward_cli import main, parser
 from wm_nodes.benchmark.reward_efficiency import economy, trials
+from wm_nodes.benchmark.reward_judges import open_judge
 from wm_nodes.benchmark.reward_ledger import LEDGER, look, notice
 from wm_nodes.benchmark.reward_meter import MeteredJudge
 from wm_nodes.benchmark.reward_oracle import OracleJudge, known_clips
@@ -352,9 +354,21 @@ def test_the_command_prints_and_writes_the_table(
     for wrong, complaint in (
         (["table", str(tmp_path / "none"), "--judge", "simulator"], "No such file"),
         (["table", str(folder), "--judge", "openai"], "needs --url http://HOST:PORT/v1 and --model NAME"),
+        (["table", str(folder), "--stages", "PC"], "needs --url http://HOST:PORT/v1 and --model NAME"),
+        (["table", str(folder), "--judge", "simulator", "--stages", "PC"], "got --judge simulator"),
         (["comparisons", str(folder), "--url", "http://127.0.0.1:1/v1"], "--model NAME"),
         (["table", str(folder), "--folder", str(tmp_path)], "holds no readable judge"),
         (["table", str(folder), "--judge", "simulator", "--error", "2"], "got 2.0"),
     ):
         assert main(wrong) == 2
         assert "error:" in (shown := capsys.readouterr().out) and complaint in shown
+
+
+def test_stages_of_the_embedded_judge_can_be_given_to_a_server(manifest: Manifest, tmp_path: Path) -> None:
+    words = ["table", "set", "--stages", "TC", "PC", "--url", "http://127.0.0.1:1/v1", "--model", "m"]
+
+    async def opened() -> str:
+        async with open_judge(parser().parse_args(words), RUBRIC, manifest, tmp_path) as judge:
+            return judge.capabilities.model
+
+    assert re.fullmatch(r"else: embedded:[0-9a-f]{12}; TC\+PC: openai-chat:m", asyncio.run(opened()))

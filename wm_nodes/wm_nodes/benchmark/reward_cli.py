@@ -69,10 +69,12 @@ from wm_nodes.reward.adversarial import LabelledClip, Manifest
 from wm_nodes.reward.adversarial.generator import SEVERITIES
 from wm_nodes.reward.adversarial.manifest import Row
 from wm_nodes.reward.agent import Judge, Rubric, TaskSpec, load_rubric
+from wm_nodes.reward.agent.types import Stage
 
 LOG_COLUMNS = 180
 JUDGED = "judged"
 """Folder of a set that holds the outcomes, and the reads bought from a server."""
+ROUTED = [stage for stage in Stage if stage is not Stage.REFLECT]
 console = Console()
 
 
@@ -278,6 +280,7 @@ def parser() -> argparse.ArgumentParser:
     common.add_argument("--seed", type=int, default=0)
     common.add_argument("--at-once", type=int, default=1, help="clips under way together, behind a server")
     common.add_argument("--folder", type=Path, help="of the embedded judge; the shipped one by default")
+    common.add_argument("--stages", nargs="+", choices=ROUTED, default=[], help="that --model reads in its place")
     common.add_argument("--url", nargs="+", default=[], help="of chat servers, http://HOST:PORT/v1")
     common.add_argument("--model", default="", help="that they serve")
     common.add_argument("--api-key-env", default="", help="environment variable that holds their key")

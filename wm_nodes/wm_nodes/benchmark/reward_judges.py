@@ -8,7 +8,7 @@ from typing import Any
 
 from wm_nodes.benchmark.reward_oracle import OracleJudge, known_clips
 from wm_nodes.config.load import load_config
-from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.config.schema import JudgeConfig, StageJudge
 from wm_nodes.reward.adversarial import Manifest
 from wm_nodes.reward.agent import Judge, Rubric
 from wm_nodes.reward.comparisons import ChatComparison
@@ -30,16 +30,24 @@ async def open_judge(
         reads: folder of the answers that were bought from a server.
 
     Raises:
-        ValueError: a setting it needs is missing, named. MissingPackageError: the client of a chat server.
+        ValueError: a setting it needs is missing, named, or --stages is given to another judge than the embedded one.
+        MissingPackageError: the client of a chat server.
     """
+    if arguments.stages and arguments.judge != "embedded":
+        raise ValueError(f"--stages gives stages of the embedded judge to --model; got --judge {arguments.judge}")
     if arguments.judge == "simulator":
         rows = ((row.sha256, row.labels, row.edits) for row in manifest.rows)
         yield OracleJudge(known_clips(rows), rubric, error=arguments.error, seed=arguments.seed)
         return
-    if arguments.judge == "embedded":
+    if arguments.judge == "embedded" and not arguments.stages:
         yield EmbeddedJudge(load_head(arguments.folder or shipped_head()))
         return
-    opened = make_judge(server_settings(arguments), rubric, reads)
+    settings = server_settings(arguments)
+    if arguments.judge == "embedded":
+        server = {name: getattr(settings, name) for name in ("endpoints", "model", "api_key_env")}
+        changes = {"kind": "embedded", "folder": str(arguments.folder or ""), "endpoints": [], "model": ""}
+        settings = settings.model_copy(update={**changes, "routes": [StageJudge(stages=arguments.stages, **server)]})
+    opened = make_judge(settings, rubric, reads)
     try:
         yield opened.judge
     finally:

@@ -110,14 +110,20 @@ class RewardConfig(Section):
     """An imagined step above it pays no sparse reward and truncates the episode; 0: off."""
 
 
-class FallbackJudge(Section):
-    """Who judges a whole round where no judge before it answered; as in JudgeConfig, whose other values it shares."""
+class OtherJudge(Section):
+    """A further judge; as in JudgeConfig, whose other values it shares."""
 
     kind: Literal["openai", "embedded"] = "openai"
     endpoints: list[str] = []
     model: str = ""
     api_key_env: str = ""
     folder: str = ""
+
+
+class StageJudge(OtherJudge):
+    """Who reads some stages of every clip."""
+
+    stages: Annotated[list[Literal["PLAN", "VQ", "IF", "TC", "PC", "HACK"]], Field(min_length=1)]
 
 
 class JudgeConfig(Section):
@@ -163,7 +169,10 @@ class JudgeConfig(Section):
     keep_reads: bool
     """Keep every answer in <run>/judge_reads, by content: the same clip is not asked about twice, and scoring a bag
     again gives the same verdicts."""
-    fallbacks: list[FallbackJudge]
+    routes: list[StageJudge]
+    """Other judges for some stages, e.g. [{stages: [TC, PC], endpoints: [URL], model: NAME}] beside the embedded one. A
+    verdict is of all of them together; where one does not answer, the clip has no reward."""
+    fallbacks: list[OtherJudge]
     """Loop 2: other judges, in the order in which they are tried, e.g. [{kind: openai, endpoints: [URL], model: NAME}].
     A round that the judge could not judge is judged anew by the next one, as a whole; the round after begins with the
     first again. Empty: an outage pauses training."""

@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.config.schema import JudgeConfig, OtherJudge
 from wm_nodes.reward.agent.rubric import Rubric
-from wm_nodes.reward.agent.types import Judge
+from wm_nodes.reward.agent.types import Judge, Stage
 from wm_nodes.reward.evidence.head import load_head
 from wm_nodes.reward.judges.cache import VerdictCache
 from wm_nodes.reward.judges.calls import ChatOptions, Exchange
 from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head, unfit
 from wm_nodes.reward.judges.openai_client import OpenAIJudge
+from wm_nodes.reward.judges.routed import RoutedJudge
 from wm_nodes.reward.judges.transport import ChatTransport, Endpoint, RetryPolicy
 
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -28,9 +29,14 @@ class OpenedJudge:
 
 
 def judges_of(settings: JudgeConfig) -> list[JudgeConfig]:
-    """The judge and its fallbacks, in the order in which they are tried, none of them with fallbacks of its own."""
-    others = [fallback.model_dump() for fallback in settings.fallbacks]
-    return [settings.model_copy(update={**changes, "fallbacks": []}) for changes in ({}, *others)]
+    """The judge with its routes, and its fallbacks, in the order in which they are tried; none has fallbacks itself."""
+    return [settings.model_copy(update={"fallbacks": []}), *(_alone(settings, other) for other in settings.fallbacks)]
+
+
+def _alone(settings: JudgeConfig, other: JudgeConfig | OtherJudge) -> JudgeConfig:
+    """The settings of one judge, who has nobody beside it."""
+    given = {name: getattr(other, name) for name in OtherJudge.model_fields}
+    return settings.model_copy(update={**given, "routes": [], "fallbacks": []})
 
 
 def check_judge(settings: JudgeConfig) -> None:
@@ -39,19 +45,26 @@ def check_judge(settings: JudgeConfig) -> None:
     Raises:
         ValueError: names the setting and the remedy; never repeats what may be a key.
     """
-    seen = set[tuple[str, str]]()
+    _check_one(_alone(settings, settings))
+    for kind, others in (("routes", settings.routes), ("fallbacks", settings.fallbacks)):
+        for number, other in enumerate(others):
+            try:
+                _check_one(_alone(settings, other))
+            except ValueError as error:
+                raise ValueError(f"judge.{kind}[{number}]: {error}") from None
+    stages = [stage for route in settings.routes for stage in route.stages]
+    if twice := sorted({stage for stage in stages if stages.count(stage) > 1}):
+        raise ValueError(f"judge.routes names {', '.join(twice)} more than once; one judge reads a stage")
+    seen = list[tuple[object, ...]]()
     for number, judge in enumerate(judges_of(settings)):
-        try:
-            _check_one(judge)
-        except ValueError as error:
-            raise ValueError(f"judge.fallbacks[{number - 1}]: {error}" if number else str(error)) from None
-        identity = (judge.kind, judge.model if judge.kind == "openai" else str(_folder(judge)))
+        name = judge.model if judge.kind == "openai" else str(_folder(judge))
+        identity = (judge.kind, name, judge.routes)
         if identity in seen:
             raise ValueError(
-                f"judge.fallbacks[{number - 1}] is {identity[1]!r} once more; further servers of one model belong into "
-                "the endpoints of its judge"
+                f"judge.fallbacks[{number - 1}] is {name!r} once more; further servers of one model belong into the "
+                "endpoints of its judge"
             )
-        seen.add(identity)
+        seen.append(identity)
 
 
 def _check_one(settings: JudgeConfig) -> None:
@@ -75,13 +88,14 @@ def _check_one(settings: JudgeConfig) -> None:
 
 
 def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
-    """Refuse a judge that would abstain on every clip of this shape, (frames, height, width, 3); likewise a fallback.
-    Servers take any.
+    """Refuse a judge that would abstain on every clip of this shape, (frames, height, width, 3); likewise routed ones
+    and fallbacks. Servers take any.
 
     Raises:
         ValueError: names the shape and the remedy; or the folder holds no judge.
     """
-    for judge in judges_of(settings):
+    others: list[JudgeConfig | OtherJudge] = [settings, *settings.routes, *settings.fallbacks]
+    for judge in (_alone(settings, other) for other in others):
         if judge.kind != "embedded" or not (reason := unfit(load_head(_folder(judge)), shape)):
             continue
         raise ValueError(
@@ -93,9 +107,11 @@ def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
 
 def judge_name(settings: JudgeConfig) -> str:
     """Who judges, in words for people."""
-    if settings.kind == "embedded":
-        return f"embedded judge {_folder(settings)}"
-    return f"{settings.model} at {', '.join(settings.endpoints)}"
+    alone = _alone(settings, settings)
+    by = [f"{'+'.join(route.stages)} by {judge_name(_alone(settings, route))}" for route in settings.routes]
+    if alone.kind == "embedded":
+        return "; ".join([f"embedded judge {_folder(alone)}", *by])
+    return "; ".join([f"{alone.model} at {', '.join(alone.endpoints)}", *by])
 
 
 def make_judge(
@@ -113,6 +129,22 @@ def make_judge(
         MissingPackageError: the client package is not installed.
     """
     check_judge(settings)
+    first = _opened(_alone(settings, settings), rubric, reads, on_exchange)
+    if not settings.routes:
+        return first
+    routed = [_opened(_alone(settings, route), rubric, reads, on_exchange) for route in settings.routes]
+    routes = [([Stage(s) for s in r.stages], o.judge) for r, o in zip(settings.routes, routed, strict=True)]
+
+    async def close() -> None:
+        for opened in (first, *routed):
+            await opened.close()
+
+    return OpenedJudge(RoutedJudge(first.judge, routes, rubric), close)
+
+
+def _opened(
+    settings: JudgeConfig, rubric: Rubric, reads: Path | None, on_exchange: Callable[[Exchange], None]
+) -> OpenedJudge:
     if settings.kind == "embedded":
         return OpenedJudge(EmbeddedJudge(load_head(_folder(settings))), _nothing)
     transport = ChatTransport(
