@@ -193,8 +193,9 @@ def test_the_largest_image_is_not_refused(graph: Graph, probe: Probe) -> None:
 
 @pytest.mark.slow
 def test_fifty_start_stop_cycles_leave_no_shared_memory(domain: int) -> None:
+    """Not counted: Fast DDS's four ports for all processes and domains of the host, taken in turns and left there."""
     cycle = (
-        "import os, signal\n"
+        "import os, re, signal\n"
         "from pathlib import Path\n"
         "from wm_nodes.ros.lifecycle import ManagedNode\n"
         "from wm_nodes.ros.spin import run_node\n"
@@ -206,8 +207,9 @@ def test_fifty_start_stop_cycles_leave_no_shared_memory(domain: int) -> None:
         "        os.kill(os.getpid(), signal.SIGINT)\n"
         "for _ in range(50):\n"
         "    assert run_node(lambda: Cycle('cycle')) == 0\n"
-        "    left = [os.stat(path).st_size for path in ever if os.path.exists(path)]\n"
-        "    print(len(ever), len(left), sum(left))\n"
+        "    own = [path for path in ever if not re.search('fastrtps_port700[0-3]$', path)]\n"
+        "    left = [os.stat(path).st_size for path in own if os.path.exists(path)]\n"
+        "    print(len(own), len(left), sum(left))\n"
     )
     before = shm_files()
     env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
