@@ -15,7 +15,7 @@ from toy_set import write_toy_set
 from wm_nodes.benchmark.reward_cli import main, parser
 from wm_nodes.benchmark.reward_efficiency import economy, trials
 from wm_nodes.benchmark.reward_judges import open_judge
-from wm_nodes.benchmark.reward_ledger import LEDGER, look, notice
+from wm_nodes.benchmark.reward_ledger import LEDGER, look, looks, notice
 from wm_nodes.benchmark.reward_meter import MeteredJudge
 from wm_nodes.benchmark.reward_oracle import OracleJudge, known_clips
 from wm_nodes.benchmark.reward_rows import (
@@ -325,11 +325,13 @@ def test_the_looks_behind_the_published_tables_count_wherever_the_set_is_built(
     again = replace(manifest, rows=tuple(rows))
     able = EmbeddedJudge(load_head(shipped_head())).capabilities
     earlier = look(tmp_path, again, able, RUBRIC.version, "")
-    assert len(earlier) == 4 and not (tmp_path / LEDGER).exists(), "the judge that ships, with its rubric, has looked"
+    assert len(earlier) == 5 and not (tmp_path / LEDGER).exists(), "the judge that ships, with its rubric, has looked"
     with pytest.raises(ValueError, match=f"already seen by {able.judge_id}"):
         look(tmp_path, again, replace(able, judge_id="another"), RUBRIC.version, "")
     new_rubric = look(tmp_path, again, able, "robot-2-x", "other thresholds")
-    assert len(new_rubric) == 5 and (tmp_path / LEDGER).read_text().count("\n") == 1
+    assert len(new_rubric) == 6 and (tmp_path / LEDGER).read_text().count("\n") == 1
+    (tmp_path / LEDGER).write_text(json.dumps(vars(earlier[0])) + "\n")
+    assert looks(tmp_path).count(earlier[0]) == 1, "what is published and in the ledger, too, is one look"
 
 
 # the command

@@ -16,6 +16,7 @@ from wm_nodes.reward.evidence.definitions import EVIDENCE
 from wm_nodes.reward.evidence.head import load_head
 from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head
 from wm_nodes.reward.judges.factory import make_judge
+from wm_nodes.simulation.tasks import TASKS
 
 FIRST_SEED = 70_000
 
@@ -29,7 +30,7 @@ def test_it_is_small_says_how_it_was_made_and_knows_its_evidence() -> None:
     size = sum(path.stat().st_size for path in shipped_head().iterdir())
     head = load_head(shipped_head())
     assert size < 3_000_000
-    assert set(head.names) == set(EVIDENCE)
+    assert set(head.names) == set(EVIDENCE) and set(head.story["tasks"]) == set(TASKS)
     assert {"made", "data", "seed", "segmenter", "trees", "validation"} <= head.story.keys()
     assert head.story["made"]["command"].startswith("python -m wm_nodes.learning.train_judge")
     card = EmbeddedJudge(head).card

@@ -46,12 +46,13 @@ def test_sha(manifest: Manifest) -> str:
 
 
 def looks(folder: Path) -> list[Look]:
-    """The published looks, then the ledger of a set, oldest first.
+    """The published looks, then those that only the ledger of a set has, oldest first.
 
     Raises:
         ValueError: a line that no ledger has; it is not to be edited.
     """
-    return [*(Look(**one) for one in json.loads(PUBLISHED.read_text())), *_beside(folder)]
+    published = [Look(**one) for one in json.loads(PUBLISHED.read_text())]
+    return [*published, *(one for one in _beside(folder) if one not in published)]
 
 
 def _beside(folder: Path) -> list[Look]:
