@@ -193,8 +193,8 @@ def test_the_largest_image_is_not_refused(graph: Graph, probe: Probe) -> None:
 
 @pytest.mark.slow
 def test_fifty_start_stop_cycles_leave_no_shared_memory(domain: int) -> None:
-    """Not counted: Fast DDS's ports from 7000 on. Those that are free are taken in turns by all processes and domains of
-    the host and stay there, as many as were ever in use at once."""
+    """Not counted: Fast DDS's ports from 7000 on, which all processes and domains of the host take in turns and which
+    stay there, as many as were ever in use at once."""
     cycle = (
         "import os, re, signal\n"
         "from pathlib import Path\n"
