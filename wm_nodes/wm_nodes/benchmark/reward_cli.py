@@ -75,6 +75,7 @@ LOG_COLUMNS = 180
 JUDGED = "judged"
 """Folder of a set that holds the outcomes, and the reads bought from a server."""
 ROUTED = [stage for stage in Stage if stage is not Stage.REFLECT]
+"""Stages that may have a judge of their own."""
 console = Console()
 
 

@@ -291,20 +291,24 @@ def goal_result(handle: Any, timeout_s: float, check: Check) -> Any:
     deadline = time.monotonic() + timeout_s
     done = threading.Event()
     asked: list[Future] = []
-    ask_at = 0.0
-    while not done.wait(POLL_S if asked else 0.0):
+
+    def ask() -> None:
+        asked.append(sent_by_executor(node, handle.get_result_async, deadline - time.monotonic(), check))
+        asked[-1].add_done_callback(lambda _: done.set())
+
+    ask()
+    lost_at = time.monotonic() + LOST_S
+    while not done.wait(POLL_S):
         check()
         now = time.monotonic()
         if now >= deadline:
             raise PeerLost(f"{name}: no result within {timeout_s:g} s")
-        if handle.status not in ENDED and asked:
-            ask_at = now + LOST_S
-        elif now >= ask_at:
-            if asked:
-                node.get_logger().warning(f"{name}: the goal has ended and its result did not arrive; asked again")
-            asked.append(sent_by_executor(node, handle.get_result_async, deadline - now, check))
-            asked[-1].add_done_callback(lambda _: done.set())
-            ask_at = time.monotonic() + LOST_S
+        if handle.status not in ENDED:
+            lost_at = now + LOST_S
+        elif now >= lost_at:
+            node.get_logger().warning(f"{name}: the goal has ended and its result did not arrive; asked again")
+            ask()
+            lost_at = time.monotonic() + LOST_S
     response = next(future for future in asked if future.done()).result()
     node.executor.create_task(lambda: [future.cancel() for future in asked])
     if response.status == GoalStatus.STATUS_UNKNOWN:

@@ -33,8 +33,8 @@ def judges_of(settings: JudgeConfig) -> list[JudgeConfig]:
     return [settings.model_copy(update={"fallbacks": []}), *(_alone(settings, other) for other in settings.fallbacks)]
 
 
-def _alone(settings: JudgeConfig, other: JudgeConfig | OtherJudge) -> JudgeConfig:
-    """The settings of one judge, who has nobody beside it."""
+def _alone(settings: JudgeConfig, other: OtherJudge) -> JudgeConfig:
+    """The settings of another judge, who has nobody beside it."""
     given = {name: getattr(other, name) for name in OtherJudge.model_fields}
     return settings.model_copy(update={**given, "routes": [], "fallbacks": []})
 
@@ -45,7 +45,7 @@ def check_judge(settings: JudgeConfig) -> None:
     Raises:
         ValueError: names the setting and the remedy; never repeats what may be a key.
     """
-    _check_one(_alone(settings, settings))
+    _check_one(settings)
     for kind, others in (("routes", settings.routes), ("fallbacks", settings.fallbacks)):
         for number, other in enumerate(others):
             try:
@@ -94,8 +94,8 @@ def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
     Raises:
         ValueError: names the shape and the remedy; or the folder holds no judge.
     """
-    others: list[JudgeConfig | OtherJudge] = [settings, *settings.routes, *settings.fallbacks]
-    for judge in (_alone(settings, other) for other in others):
+    others: list[OtherJudge] = [*settings.routes, *settings.fallbacks]
+    for judge in (settings, *(_alone(settings, other) for other in others)):
         if judge.kind != "embedded" or not (reason := unfit(load_head(_folder(judge)), shape)):
             continue
         raise ValueError(
@@ -107,11 +107,10 @@ def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
 
 def judge_name(settings: JudgeConfig) -> str:
     """Who judges, in words for people."""
-    alone = _alone(settings, settings)
+    embedded = settings.kind == "embedded"
+    name = f"embedded judge {_folder(settings)}" if embedded else f"{settings.model} at {', '.join(settings.endpoints)}"
     by = [f"{'+'.join(route.stages)} by {judge_name(_alone(settings, route))}" for route in settings.routes]
-    if alone.kind == "embedded":
-        return "; ".join([f"embedded judge {_folder(alone)}", *by])
-    return "; ".join([f"{alone.model} at {', '.join(alone.endpoints)}", *by])
+    return "; ".join([name, *by])
 
 
 def make_judge(
@@ -129,7 +128,7 @@ def make_judge(
         MissingPackageError: the client package is not installed.
     """
     check_judge(settings)
-    first = _opened(_alone(settings, settings), rubric, reads, on_exchange)
+    first = _opened(settings, rubric, reads, on_exchange)
     if not settings.routes:
         return first
     routed = [_opened(_alone(settings, route), rubric, reads, on_exchange) for route in settings.routes]
@@ -145,6 +144,7 @@ def make_judge(
 def _opened(
     settings: JudgeConfig, rubric: Rubric, reads: Path | None, on_exchange: Callable[[Exchange], None]
 ) -> OpenedJudge:
+    """The judge itself, whatever its routes."""
     if settings.kind == "embedded":
         return OpenedJudge(EmbeddedJudge(load_head(_folder(settings))), _nothing)
     transport = ChatTransport(
