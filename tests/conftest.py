@@ -3,8 +3,10 @@
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 from wm_nodes.ros.domain import DomainLock, first_free
 from wm_nodes.ros.environment import graph_environment
@@ -31,6 +33,24 @@ def pytest_configure() -> None:
 def pytest_unconfigure() -> None:
     if _session_lock is not None:
         _session_lock.release()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--one-graph", action="store_true", help="with -n: tests of graphs one after the other, beside the others"
+    )
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling | None:
+    return OneGraph(config, log) if config.getoption("one_graph") else None
+
+
+class OneGraph(LoadFileScheduling):
+    """The tests of a file go to one worker, and those of all graphs to one."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return "graph" if nodeid.startswith("tests/graph/") else super()._split_scope(nodeid)
 
 
 @pytest.fixture

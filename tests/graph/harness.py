@@ -1,6 +1,5 @@
 """Real nodes in real processes on an own ROS domain, and a probe node that talks to them."""
 
-import atexit
 import contextlib
 import fcntl
 import os
@@ -18,7 +17,7 @@ from typing import IO, Any, ClassVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from graph.forked import ForkedNode, Forks
+from graph.forked import ForkedNode, fork_node
 from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
@@ -202,7 +201,7 @@ class Graph:
         name = f"{namespace}/{node}"
         launcher = self._launcher if launcher is None else launcher
         if launcher is None:
-            self.processes[name] = forks().start(module, args, self.environment(), self.log_path(name))
+            self.processes[name] = fork_node([module, *args], self.environment(), self.log_path(name))
             return self.processes[name]
         log = open(self.log_path(name), "ab")  # noqa: SIM115
         self._logs.append(log)
@@ -310,18 +309,6 @@ def thread_names(pid: int) -> list[str]:
 def removed_ports(pid: int) -> list[str]:
     """Ports of Fast DDS that a process still has in its memory, and whose files are gone."""
     return re.findall(r"/dev/shm/(fastrtps_port\d+) \(deleted\)", Path(f"/proc/{pid}/maps").read_text())
-
-
-_forks: Forks | None = None
-
-
-def forks() -> Forks:
-    """The fork server of this test process, started by the first node."""
-    global _forks
-    if _forks is None:
-        _forks = Forks()
-        atexit.register(_forks.close)
-    return _forks
 
 
 def shm_files() -> set[str]:

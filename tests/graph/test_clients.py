@@ -12,6 +12,8 @@ from wm_msgs.action import Train
 from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.wire import PeerLost
 
+pytestmark = pytest.mark.graph
+
 
 class LossyServer(ActionServer):
     """Answers no request for a result until `lost` of them have come, as where the client's reader is not matched."""

@@ -20,6 +20,7 @@ from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports import read_summary
 from wm_nodes.world_model import load_model_folder
 
+pytestmark = pytest.mark.graph
 PROGRAM = "import sys; from wm_nodes.main_job import main; sys.exit(main(sys.argv[1:]))"
 RATES = ("real_before", "real_after", "imagined_before", "imagined_after")
 

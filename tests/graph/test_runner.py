@@ -22,28 +22,41 @@ TESTS = Path(__file__).resolve().parents[1]
 
 
 def tiny(name: str, **parameters: object) -> NodeSpec:
+    return NodeSpec("graph.tiny_node", name, "/wm", parameters, lifecycle=False)
+
+
+def graph(*nodes: NodeSpec, forks: bool = True) -> Graph:
+    """forks: nodes fork where there are several; a node with an environment of its own never does."""
     path = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
-    return NodeSpec("graph.tiny_node", name, "/wm", parameters, lifecycle=False, environment={"PYTHONPATH": path})
+    own = {} if forks else {"WM_OWN": "1"}
+    return Graph("tiny", tuple(replace(node, environment=own) for node in nodes), {"PYTHONPATH": path})
 
 
-def graph(*nodes: NodeSpec) -> Graph:
-    return Graph("tiny", nodes)
+def state_and_parent(pid: int) -> list[str]:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[:2]
+
+
+def parent(pid: int) -> int:
+    return int(state_and_parent(pid)[1])
 
 
 def alive(pid: int) -> bool:
+    """A zombie is not: whoever inherits an orphan may take its time to look after it."""
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
+        return state_and_parent(pid)[0] != "Z"
+    except FileNotFoundError:
         return False
-    return True
 
 
-def test_nodes_start_become_ready_and_end_without_a_trace(ros_domain: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("forks", [True, False])
+def test_nodes_start_become_ready_and_end_without_a_trace(ros_domain: int, tmp_path: Path, forks: bool) -> None:
     log = io.StringIO()
-    with Runner(graph(tiny("a", text="1"), tiny("b")), log=log, log_dir=tmp_path) as runner:
+    with Runner(graph(tiny("a", text="1"), tiny("b"), forks=forks), log=log, log_dir=tmp_path) as runner:
         runner.wait_ready(30)
         pids = [runner.pid("a"), runner.pid("wm/b")]
         assert all(os.getpgid(pid) == pid for pid in pids)
+        assert all((parent(pid) == os.getpid()) != forks for pid in pids)
+        assert all("-m\0graph.tiny_node\0" in Path(f"/proc/{pid}/cmdline").read_text() for pid in pids)
         assert runner.failure() is None
     assert not any(alive(pid) for pid in pids)
     assert runner.wait_ended("a") == runner.wait_ended("b") == 0
@@ -51,18 +64,20 @@ def test_nodes_start_become_ready_and_end_without_a_trace(ros_domain: int, tmp_p
     assert "tiny says '1'" in (tmp_path / "wm.a.log").read_text()
 
 
-def test_end_of_a_required_node_is_reported_with_its_last_words_and_code(ros_domain: int) -> None:
+@pytest.mark.parametrize("forks", [True, False])
+def test_end_of_a_required_node_is_reported_with_its_last_words_and_code(ros_domain: int, forks: bool) -> None:
     log = io.StringIO()
-    with Runner(graph(tiny("short", die_after_s=1.0), tiny("long")), log=log) as runner:
+    with Runner(graph(tiny("short", die_after_s=1.0), tiny("long"), forks=forks), log=log) as runner:
         assert runner.wait(timeout_s=60) == 7
         with pytest.raises(NodeDiedError, match="required node wm/short ended with code 7: tiny gives up"):
             runner.check()
     assert "[runner] required node wm/short ended with code 7" in log.getvalue()
 
 
+@pytest.mark.parametrize("forks", [True, False])
 @pytest.mark.kills
-def test_death_by_sigkill_is_reported_within_five_seconds(ros_domain: int) -> None:
-    with Runner(graph(tiny("a"), tiny("b")), log=None) as runner:
+def test_death_by_sigkill_is_reported_within_five_seconds(ros_domain: int, forks: bool) -> None:
+    with Runner(graph(tiny("a"), tiny("b"), forks=forks), log=None) as runner:
         runner.wait_ready(30)
         os.kill(runner.pid("b"), signal.SIGKILL)
         since = time.monotonic()
@@ -70,9 +85,10 @@ def test_death_by_sigkill_is_reported_within_five_seconds(ros_domain: int) -> No
         assert time.monotonic() - since < 5.0
 
 
+@pytest.mark.parametrize("forks", [True, False])
 @pytest.mark.kills
-def test_killed_node_can_be_restarted_and_its_end_is_no_failure(ros_domain: int) -> None:
-    with Runner(graph(tiny("a"), tiny("b")), log=None) as runner:
+def test_killed_node_can_be_restarted_and_its_end_is_no_failure(ros_domain: int, forks: bool) -> None:
+    with Runner(graph(tiny("a"), tiny("b"), forks=forks), log=None) as runner:
         runner.wait_ready(30)
         first = runner.pid("a")
         runner.kill("a")
@@ -91,6 +107,22 @@ def test_node_that_ignores_sigint_and_sigterm_is_killed_in_the_end(ros_domain: i
         since = time.monotonic()
     assert not alive(pid) and runner.killed
     assert time.monotonic() - since < 20
+
+
+@pytest.mark.kills
+def test_nodes_end_with_their_fork_server_and_start_again_without_it(ros_domain: int) -> None:
+    with Runner(graph(tiny("a"), tiny("b")), log=None) as runner:
+        runner.wait_ready(30)
+        pids = [runner.pid("a"), runner.pid("b")]
+        assert parent(pids[0]) == parent(pids[1])
+        os.kill(parent(pids[0]), signal.SIGKILL)
+        assert runner.wait(timeout_s=30) == 128 + signal.SIGTERM
+        for name in "ab":
+            runner.wait_ended(name)
+            runner.restart(name)
+        runner.wait_ready(30)
+        assert parent(runner.pid("a")) == os.getpid()
+        assert not any(alive(pid) for pid in pids)
 
 
 def test_second_runner_on_the_domain_is_refused(ros_domain: int) -> None:
@@ -144,7 +176,7 @@ def test_nodes_do_not_outlive_a_killed_starter(ros_domain: int, tmp_path: Path) 
     script.write_text(
         "import time; from graph.test_runner import graph, tiny\n"
         "from wm_nodes.ros.runner import Runner\n"
-        "with Runner(graph(tiny('a')), log=None) as runner:\n"
+        "with Runner(graph(tiny('a'), tiny('b')), log=None) as runner:\n"
         "    runner.wait_ready(30); print(runner.pid('a'), flush=True); time.sleep(60)\n"
     )
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])}

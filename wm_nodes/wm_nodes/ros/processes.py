@@ -1,22 +1,21 @@
 """One node's process: own session and process group, prefixed output, ended with its parent."""
 
-import ctypes
 import os
 import signal
 import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import TextIO
 
+from wm_nodes.ros.forks import ForkServer, ForkServerError, end_with_parent
 from wm_nodes.ros.graph import NodeSpec
 
 COLOURS = (36, 33, 32, 35, 34, 96, 93, 92, 95, 94)
-_PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 class NodeProcess:
@@ -36,17 +35,20 @@ class NodeProcess:
         self._prefix = f"[{label}] " if colour is None else f"\x1b[{COLOURS[colour % len(COLOURS)]}m[{label}]\x1b[0m "
         self._file = file
         self._lines: deque[str] = deque(maxlen=1000)
-        self._process: subprocess.Popen[str] | None = None
+        self._pid: int | None = None
+        self._code = 0
         self._ended = threading.Event()
         self._pump: threading.Thread | None = None
 
     @property
     def running(self) -> bool:
-        return self._process is not None and not self._ended.is_set()
+        return self._pid is not None and not self._ended.is_set()
 
     @property
     def pid(self) -> int:
-        return self._started().pid
+        if self._pid is None:
+            raise RuntimeError(f"{self.spec.label} was never started")
+        return self._pid
 
     @property
     def exit_code(self) -> int:
@@ -54,17 +56,23 @@ class NodeProcess:
         code = self.wait(0.0)
         return 128 - code if code < 0 else code or 1
 
-    def start(self) -> None:
-        """Start the process; the calling thread must live as long as the process is to live."""
+    def start(self, forks: ForkServer | None = None) -> None:
+        """Start the process, in an interpreter of its own where no fork server answers; the calling thread must live as
+        long as the process is to live.
+        """
         self.ended_at = None
         self._ended.clear()
-        self._process = subprocess.Popen(
-            self.command, env=self._env, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True, errors="replace", start_new_session=True, preexec_fn=_end_with_parent,
-        )  # fmt: skip
-        self._pump = threading.Thread(target=self._read, args=(self._process,), daemon=True)
+        reader, output = os.pipe()
+        try:
+            self._pid, wait = self._launch(forks, output)
+        except BaseException:
+            os.close(reader)
+            raise
+        finally:
+            os.close(output)
+        self._pump = threading.Thread(target=self._read, args=(os.fdopen(reader, errors="replace"),), daemon=True)
         self._pump.start()
-        threading.Thread(target=self._reap, args=(self._process,), daemon=True).start()
+        threading.Thread(target=self._reap, args=(wait,), daemon=True).start()
 
     def signal(self, number: int) -> None:
         """Signal the whole group; nothing happens where it has ended."""
@@ -74,10 +82,9 @@ class NodeProcess:
 
     def wait(self, timeout_s: float) -> int:
         """Return the exit code (negative: the signal). Raises TimeoutError where it still runs."""
-        process = self._started()
-        if not self._ended.wait(timeout_s):
+        if self.pid and not self._ended.wait(timeout_s):
             raise TimeoutError(f"{self.spec.label} still runs after {timeout_s:g} s")
-        return int(process.returncode)
+        return self._code
 
     def close(self) -> None:
         """After the end: let the output be read to its end."""
@@ -100,12 +107,23 @@ class NodeProcess:
         last = next((line.strip() for line in reversed(self._lines) if line.strip()), "no output")
         return last + (f" (log: {self._file})" if self._file else "")
 
-    def _read(self, process: "subprocess.Popen[str]") -> None:
-        if process.stdout is None:
-            return
+    def _launch(self, forks: ForkServer | None, output: int) -> tuple[int, Callable[[], int]]:
+        """Return the pid, and what waits for the exit code."""
+        if forks is not None:
+            with suppress(ForkServerError):
+                pid, end = forks.start(self.command[2:], self._env, output)
+                return pid, end.result
+        process = subprocess.Popen(
+            self.command, env=self._env, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+            start_new_session=True, preexec_fn=end_with_parent,
+        )  # fmt: skip
+        return process.pid, partial(_await, process)
+
+    def _read(self, stream: TextIO) -> None:
         with ExitStack() as stack:
+            stack.enter_context(stream)
             sink = stack.enter_context(self._file.open("a")) if self._file is not None else None
-            for line in process.stdout:
+            for line in stream:
                 self._lines.append(line)
                 if sink is not None:
                     sink.write(line)
@@ -114,20 +132,15 @@ class NodeProcess:
                     self._log.write(f"{self._prefix}{line.rstrip()}\n")
                     self._log.flush()
 
-    def _reap(self, process: "subprocess.Popen[str]") -> None:
-        """Wait for the end; then end what is left of the group, before its number can belong to anybody else."""
-        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    def _reap(self, wait: Callable[[], int]) -> None:
+        self._code = wait()
         self.ended_at = time.monotonic()
         self._ended.set()
 
-    def _started(self) -> "subprocess.Popen[str]":
-        if self._process is None:
-            raise RuntimeError(f"{self.spec.label} was never started")
-        return self._process
 
-
-def _end_with_parent() -> None:
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+def _await(process: "subprocess.Popen[bytes]") -> int:
+    """Wait for the end; then end what is left of the group, before its number can belong to anybody else."""
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    return process.wait()

@@ -19,7 +19,8 @@ from typing import TextIO
 from wm_nodes.ros import arguments as launch_arguments
 from wm_nodes.ros.domain import DomainInUseError, DomainLock
 from wm_nodes.ros.environment import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES, graph_environment, interpreter
-from wm_nodes.ros.graph import Graph, GraphError
+from wm_nodes.ros.forks import ForkServer
+from wm_nodes.ros.graph import Graph, GraphError, NodeSpec
 from wm_nodes.ros.processes import NodeProcess
 from wm_nodes.ros.readiness import NotReadyError, activate, wait_ready
 from wm_nodes.ros.scenarios import describe_arguments
@@ -64,6 +65,7 @@ class Runner:
         self._processes: dict[str, NodeProcess] = {}
         # Linux signals a child when the *thread* that made it ends; this one lives until stop().
         self._starter: ThreadPoolExecutor | None = None
+        self._forks: ForkServer | None = None
         self._expected: set[str] = set()
         self.killed = False
 
@@ -81,6 +83,10 @@ class Runner:
             if self._log_dir is not None:
                 self._log_dir.mkdir(parents=True, exist_ok=True)
             self._starter = ThreadPoolExecutor(max_workers=1, thread_name_prefix="runner")
+            modules = [node.module for node in self.graph.nodes if _forks(node)]
+            if len(modules) > 1:
+                ours = sorted(module for module in {*modules} if module.startswith("wm_nodes."))
+                self._forks = self._starter.submit(ForkServer, self._python, ours, self.environment).result()
             for index, node in enumerate(self.graph.nodes):
                 self._processes[node.label] = NodeProcess(
                     node, self._python, self.environment, log=self._log, colour=index if self._colour else None,
@@ -192,6 +198,9 @@ class Runner:
         self._end(list(self._processes.values()))
         for process in self._processes.values():
             process.close()
+        if self._forks is not None:
+            self._forks.close()
+            self._forks = None
         if self._starter is not None:
             self._starter.shutdown()
             self._starter = None
@@ -214,7 +223,8 @@ class Runner:
     def _start(self, label: str) -> None:
         if self._starter is None:
             raise RuntimeError("the runner is stopped; make another one")
-        self._starter.submit(self._processes[label].start).result()
+        process = self._processes[label]
+        self._starter.submit(process.start, self._forks if _forks(process.spec) else None).result()
 
     def _end(self, processes: Sequence[NodeProcess]) -> None:
         for number in STOP_SIGNALS:
@@ -305,6 +315,11 @@ def _raise(runner: Runner, received: Sequence[int]) -> None:
     if received:
         raise KeyboardInterrupt
     runner.check()
+
+
+def _forks(node: NodeSpec) -> bool:
+    """Whether the node can fork: torchrun starts its own processes, and variables may count from the first moment."""
+    return node.ranks == 1 and not node.environment
 
 
 def _domain(env: Mapping[str, str]) -> int:
