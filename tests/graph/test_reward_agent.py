@@ -156,6 +156,7 @@ def test_a_judge_that_is_down_pauses_training_and_the_same_clips_are_judged_once
 
 
 def test_clips_without_a_verdict_by_the_deadline_have_no_reward(judged: VideoLoop, server: PickyServer) -> None:
+    judged.probe.action(EvaluateClips, "clips/evaluate")  # matched by the time its feedback counts
     forget_reads(judged.graph)
     judged.train(1)
     forget_reads(judged.graph)

@@ -6,10 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from graph.harness import removed_ports
 
 from wm_nodes.ros import readiness
 from wm_nodes.ros.domain import DomainInUseError
@@ -96,7 +98,15 @@ def test_killed_node_can_be_restarted_and_its_end_is_no_failure(ros_domain: int,
         assert runner.failure() is None
         runner.restart("a")
         assert runner.pid("a") != first
-        runner.wait_ready(30)
+        try:
+            runner.wait_ready(30)
+        except NotReadyError as error:  # as in harness.Graph.restart
+            removed = removed_ports(runner.pid("a"))
+            if not removed:
+                raise
+            warnings.warn(f"a started once more: {error}; {removed} removed", stacklevel=2)
+            runner.restart("a")
+            runner.wait_ready(30)
 
 
 @pytest.mark.kills

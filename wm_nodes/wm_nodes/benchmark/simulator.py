@@ -1,14 +1,16 @@
 """World model against simulator, each with the same cores: torch threads there, one process per core here.
 
-No episode ends early on either side, so that every step of every environment counts.
+The simulator twice: our scene, as the nodes use it, which draws less (docs/adr/0003), and ManiSkill's own task. No
+episode ends early on any side, so that every step of every environment counts.
 """
 
 import multiprocessing as mp
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -25,13 +27,16 @@ from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.types import Environment
 
 IMAGINED_ENVS, SIMULATOR_ENVS = 64, 4
+STOCK = {"push_cube": "PushCube-v1", "pull_cube": "PullCube-v1"}
+"""ManiSkill's own tasks."""
 WORKER_TIMEOUT_S = 300.0
 
 
 def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Path) -> dict[str, Any]:
     """imagined_steps_per_s: environment steps with reward, 64 imagined environments, a torch thread per core;
-    imagined_over_simulator: over those of ManiSkill with rendering and rule reward, a process per core. Resets are not
-    counted on either side."""
+    imagined_over_simulator: over those of our scene in ManiSkill with rendering and rule reward, a process per core.
+    imagined_over_stock_simulator: over those of ManiSkill's own task with its own reward, as installed, two cameras of
+    the same size and as much time per step. Resets are not counted on any side."""
     from wm_nodes.simulation.backend import NoRendererError, render_backend
 
     endless = config.model_copy(update={"reward": config.reward.model_copy(update={"success_threshold": 1.0})})
@@ -45,36 +50,40 @@ def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Pa
         missing = str(error)
         console.print(f"simulator left out: {error}", highlight=False)
     console.print(f"world model against ManiSkill with rendering, {len(cores)} cores each", highlight=False)
-    with simulator_workers(config, [] if missing else cores) as workers:
-        contenders = [lambda block: rate_episode(imagined, reward, block).steps_per_s]
-        if workers:
-            contenders.append(lambda block: rate_workers(workers, block))
-        rates = [float(np.median(blocks)) for blocks in interleave(contenders, effort.simulator_blocks)]
+    kinds = {} if missing else {"simulator": _serve_blocks, **({"stock": _serve_stock} if config.task in STOCK else {})}
+    with ExitStack() as stack:
+        contenders = {"imagined": lambda block: rate_episode(imagined, reward, block).steps_per_s}
+        for kind, serve in kinds.items():
+            contenders[kind] = partial(rate_workers, stack.enter_context(simulator_workers(config, cores, serve)))
+        blocks = interleave([*contenders.values()], effort.simulator_blocks)
+    rates = {kind: float(np.median(values)) for kind, values in zip(contenders, blocks, strict=True)}
     details: dict[str, Any] = {
         "imagined_envs": IMAGINED_ENVS, "imagined_threads": torch.get_num_threads(),
         "imagined_goals": imagined.goals() is not None, "dense_weight": config.reward.dense_weight,
-        "simulator_envs": SIMULATOR_ENVS, "simulator_processes": len(workers), "cores": len(cores), "missing": missing,
+        "simulator_envs": SIMULATOR_ENVS, "simulator_processes": len(cores), "cores": len(cores), "missing": missing,
         "reward": reward.name,
     }  # fmt: skip
-    if not missing:
-        details["simulator_steps_per_s"] = rates[1]
+    details |= {f"{kind}_steps_per_s": rates[kind] for kind in kinds}
     return {
-        "imagined_steps_per_s": rates[0],
-        "imagined_over_simulator": None if missing else rates[0] / rates[1],
+        "imagined_steps_per_s": rates["imagined"],
+        "imagined_over_simulator": rates["imagined"] / rates["simulator"] if "simulator" in kinds else None,
+        "imagined_over_stock_simulator": rates["imagined"] / rates["stock"] if "stock" in kinds else None,
         "simulator": details,
     }
 
 
 @contextmanager
-def simulator_workers(config: RunConfig, cores: list[int]) -> Iterator[list[Connection]]:
-    """One process per core with SIMULATOR_ENVS scenes each; idle until a block number comes."""
+def simulator_workers(
+    config: RunConfig, cores: list[int], serve: Callable[[RunConfig, int, Connection], None]
+) -> Iterator[list[Connection]]:
+    """One process per core that runs serve(config, core, connection); idle until a block number comes."""
     context = mp.get_context("spawn")
     ends: list[Connection] = []
     processes = []
     try:
         for core in cores:
             here, there = context.Pipe()
-            process = context.Process(target=_serve_blocks, args=(config, core, there), daemon=True)
+            process = context.Process(target=serve, args=(config, core, there), daemon=True)
             process.start()
             there.close()
             ends.append(here)
@@ -103,6 +112,28 @@ def _serve_blocks(config: RunConfig, core: int, commands: Connection) -> None:
     try:
         while True:
             commands.send(rate_episode(env, rule, commands.recv()))
+    except EOFError:
+        env.close()
+
+
+def _serve_stock(config: RunConfig, core: int, commands: Connection) -> None:
+    """The same of ManiSkill's own task in one scene, which is all that a process has on a CPU."""
+    os.sched_setaffinity(0, {core})
+    torch.set_num_threads(1)
+    keep_freed_memory()
+    from wm_nodes.simulation.scenes import make
+
+    size = {"width": config.simulation.image_size, "height": config.simulation.image_size}
+    env = make(STOCK[config.task], config.simulation, robot_uids="panda_wristcam", sensor_configs=size)
+    try:
+        while True:
+            block = commands.recv()
+            env.reset(seed=block)
+            env.action_space.seed(block)
+            start = time.perf_counter()
+            for _ in range(config.simulation.max_episode_steps):
+                env.step(env.action_space.sample())
+            commands.send(Rate(config.simulation.max_episode_steps / (time.perf_counter() - start)))
     except EOFError:
         env.close()
 

@@ -80,7 +80,7 @@ class ForkServer:
                 raise ForkServerError(f"the process that starts nodes does not answer: {error!r}") from None
 
     def close(self) -> None:
-        """End the server, and what still runs."""
+        """End the server; nodes that still run are sent SIGTERM."""
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         try:
@@ -153,9 +153,7 @@ def serve(connection: socket.socket, modules: Sequence[str]) -> dict[str, Any]:
         if connection in ready:
             message, files, _, _ = socket.recv_fds(connection, MESSAGE_BYTES, 1)
             if not message:
-                for pid in children:
-                    os.kill(pid, signal.SIGKILL)
-                os._exit(0)
+                os._exit(0)  # the kernel sends SIGTERM to what still runs
             pid = os.fork()
             if pid == 0:
                 end_with_parent()

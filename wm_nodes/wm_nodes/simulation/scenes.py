@@ -78,17 +78,22 @@ register_env("WmPullCube-v1", max_episode_steps=10_000)(WmPullCube)
 
 
 def make_scene(scene: str, config: SimulationConfig) -> BaseEnv:
-    """Build one scene on the CPU physics, rendered by config.render_device."""
+    """Build one of our scenes on the CPU physics, rendered by config.render_device."""
     TableTopScene.image_size = config.image_size
-    env = gym.make(
+    return make(scene, config).unwrapped
+
+
+def make(scene: str, config: SimulationConfig, **options: Any) -> gym.Env[Any, Any]:
+    """Build a scene of ours or of ManiSkill; options are ManiSkill's."""
+    return gym.make(
         scene,
         obs_mode="rgb",
         control_mode="pd_ee_target_delta_pos",
         sim_backend="physx_cpu",
         render_backend=render_backend(config.render_device),
         sim_config={"sim_freq": SIMULATION_HZ, "control_freq": _control_frequency(config.control_hz)},
+        **options,
     )
-    return env.unwrapped
 
 
 def render(scene: BaseEnv, cameras: Sequence[str]) -> np.ndarray[Any, np.dtype[np.uint8]]:
