@@ -3,7 +3,9 @@
 import itertools
 
 import numpy as np
+import pytest
 
+from wm_nodes.benchmark.cli import show
 from wm_nodes.benchmark.inputs import actions_of, interleave, seeds_of
 from wm_nodes.benchmark.simulator import rate_episode
 from wm_nodes.benchmark.stages import fresh_pictures
@@ -37,3 +39,25 @@ def test_the_costless_environment_never_ends_so_that_every_step_counts() -> None
     for actions in actions_of(env.spec, 0, 3 * env.spec.max_episode_steps):
         assert env.step(actions).valid.all()
     assert rate_episode(env, RuleReward(), 1).steps_per_s > 0
+
+
+def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_number(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    times = ("dds_step", "in_process_step", "growth_first", "growth_last", "growth_first_p10", "growth_last_p10")
+    graph = {"num_envs": 16, "image": "64x128", "threads_each": 1, "overhead_95": (1.0, 1.1), "pairs": 3,
+             "growth_steps": 9, **{f"{name}_ms": 1.0 for name in times}}  # fmt: skip
+    found = {
+        "machine": {"processor": "one", "cores": 2}, "date": "today", "model": "small", "graph": graph,
+        "graph_overhead": 1.0, "step_growth": 1.0, "imagined_steps_per_s": 640.0, "imagined_over_simulator": 6.4,
+        "imagined_over_stock_simulator": None, "stages": {},
+        "simulator": {"missing": "", "simulator_processes": 2, "simulator_steps_per_s": 100.0, "imagined_envs": 64,
+                      "reward": "endogenous"},
+    }  # fmt: skip
+    show(found)
+    ours, stock = (line for line in capsys.readouterr().out.splitlines() if "imagined_over" in line)
+    assert "6.4" in ours and "2 processes: 100.0 steps/s" in ours
+    assert "-" in stock and "ManiSkill has no such task" in stock
+    show(found | {"imagined_over_simulator": None, "simulator": found["simulator"] | {"missing": "no Vulkan device"}})
+    assert capsys.readouterr().out.count("no Vulkan device") == 2

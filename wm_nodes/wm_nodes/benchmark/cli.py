@@ -64,7 +64,7 @@ def show(found: dict[str, Any]) -> None:
     graph, simulator, facts = found["graph"], found["simulator"], found["machine"]
     table = Table(title=f"{facts['processor']}, {facts['cores']} cores, {found['date']}", caption=found["model"])
     for name in ("", "value", "goal", "measured"):
-        table.add_column(name, justify="right" if name == "value" else "left")
+        table.add_column(name, justify="right" if name == "value" else "left", no_wrap=not name)
     table.add_row(
         "graph_overhead", f"{found['graph_overhead']:.3f}", "<= 1.10",
         f"{graph['num_envs']} x {graph['image']} step: {graph['dds_step_ms']:.1f} ms over DDS, "
