@@ -16,13 +16,10 @@ import wm_setup
 from setup_steps import system
 
 ROOT = Path(__file__).resolve().parents[1]
-TWO_AT_A_TIME = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
-LONG_FIRST = tuple(f"tests/graph/test_{name}.py" for name in ("main_job", "world_model_rl", "training"))
-RUNS = (
-    ("alone or not graph", ("--one-graph", "tests/graph", "tests/parity", "tests/unit", "tests/contracts")),
-    ("graph and not alone", (*LONG_FIRST, "tests/graph")),
-)
-"""Tests that measure deadlines run one after the other, beside tests that start no graph; then the other graphs."""
+
+
+LONG_FIRST = ("tests/graph", "tests/parity", "tests/unit", "tests/contracts")
+TWO_AT_A_TIME = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", *LONG_FIRST)
 
 
 def main(argv):
@@ -39,7 +36,7 @@ def main(argv):
     system.install(system.browser_plan(system.find_browser(), system.read_os_release()), ROOT / ".venv_setup.log")
     if failed:
         print(f"failed before the tests: {', '.join(failed)}", flush=True)
-    runs = [([], named)] if named else [([f"({tests})"], (*TWO_AT_A_TIME, *folders)) for tests, folders in RUNS]
+    runs = [([], named)] if named else [(["not alone"], TWO_AT_A_TIME), (["alone"], LONG_FIRST)]
     codes = [_pytest(["-m", " and ".join(marks + fast), *arguments]) for marks, arguments in runs]
     return max(codes) or int(bool(failed))
 

@@ -3,10 +3,8 @@
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from xdist.scheduler import LoadFileScheduling
 
 from wm_nodes.ros.domain import DomainLock, first_free
 from wm_nodes.ros.environment import graph_environment
@@ -14,7 +12,6 @@ from wm_nodes.ros.environment import graph_environment
 ROOT = Path(__file__).resolve().parents[1]
 DOMAINS = range(91, 102)
 """tests/graph/harness.py uses 20 to 89 for its own graphs."""
-BESIDE_NICE = 5
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -34,30 +31,6 @@ def pytest_configure() -> None:
 def pytest_unconfigure() -> None:
     if _session_lock is not None:
         _session_lock.release()
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--one-graph", action="store_true", help="with -n: tests of graphs one after the other, beside the others"
-    )
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling | None:
-    return OneGraph(config, log) if config.getoption("one_graph") else None
-
-
-class OneGraph(LoadFileScheduling):
-    """The tests of a file go to one worker, and those of all graphs to one."""
-
-    def _split_scope(self, nodeid: str) -> str:
-        return "graph" if nodeid.startswith("tests/graph/") else super()._split_scope(nodeid)
-
-
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """With --one-graph what runs beside a graph stands back, because tests of graphs measure deadlines."""
-    if item.config.getoption("one_graph") and not item.get_closest_marker("graph") and os.nice(0) == 0:
-        os.nice(BESIDE_NICE)
 
 
 @pytest.fixture

@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from wm_nodes.benchmark.cli import show
+from wm_nodes.benchmark import cli
 from wm_nodes.benchmark.inputs import actions_of, interleave, seeds_of
 from wm_nodes.benchmark.simulator import rate_episode
 from wm_nodes.benchmark.stages import fresh_pictures
@@ -44,7 +45,7 @@ def test_the_costless_environment_never_ends_so_that_every_step_counts() -> None
 def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_number(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(cli, "console", Console(width=200))
     times = ("dds_step", "in_process_step", "growth_first", "growth_last", "growth_first_p10", "growth_last_p10")
     graph = {"num_envs": 16, "image": "64x128", "threads_each": 1, "overhead_95": (1.0, 1.1), "pairs": 3,
              "growth_steps": 9, **{f"{name}_ms": 1.0 for name in times}}  # fmt: skip
@@ -55,9 +56,10 @@ def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_numbe
         "simulator": {"missing": "", "simulator_processes": 2, "simulator_steps_per_s": 100.0, "imagined_envs": 64,
                       "reward": "endogenous"},
     }  # fmt: skip
-    show(found)
+    cli.show(found)
     ours, stock = (line for line in capsys.readouterr().out.splitlines() if "imagined_over" in line)
     assert "6.4" in ours and "2 processes: 100.0 steps/s" in ours
     assert "-" in stock and "ManiSkill has no such task" in stock
-    show(found | {"imagined_over_simulator": None, "simulator": found["simulator"] | {"missing": "no Vulkan device"}})
+    simulator = found["simulator"] | {"missing": "no Vulkan device"}
+    cli.show(found | {"imagined_over_simulator": None, "simulator": simulator})
     assert capsys.readouterr().out.count("no Vulkan device") == 2

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from rclpy.duration import Duration
 
 from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
@@ -30,6 +31,7 @@ from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireEr
 from wm_nodes.specs import EnvironmentSpec
 
 FEEDBACK_S = 0.5
+HOLD_ARRIVES = Duration(seconds=1)
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
@@ -102,6 +104,7 @@ class PolicyNode(ManagedNode):
         if self._pilot is not None:
             self._pilot.stop()
             self._actions.publish(ActionBatch(mode=ActionBatch.MODE_HOLD))
+            self._actions.publisher.wait_for_all_acked(HOLD_ARRIVES)  # a publisher that is gone delivers nothing
 
     def update_diagnostics(self) -> None:
         if hasattr(self, "_holder"):

@@ -27,6 +27,7 @@ from typing import Any
 ANSWER_S = 60.0
 """Longest time for the imports."""
 CLOSE_S, ORPHAN_S = 1.0, 5.0
+"""Time for the server's end, and for a node's whose server is gone; then they are killed."""
 MESSAGE_BYTES = 2**20
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True)
@@ -37,7 +38,8 @@ class ForkServerError(RuntimeError):
 
 
 class ForkServer:
-    """A server process and its client. The server, and every node it made, ends with close() and with this process.
+    """A server process and its client. The server ends with close() and with this process, and the kernel then sends
+    SIGTERM to every node it made.
 
     Args:
         python: the interpreter.

@@ -1,4 +1,4 @@
-"""One node's process: own session and process group, prefixed output, ended with its parent."""
+"""One node's process: own process group, prefixed output, ended with its parent."""
 
 import os
 import signal
