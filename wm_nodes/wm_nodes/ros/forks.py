@@ -132,6 +132,12 @@ def end_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
+def end_group(pid: int) -> None:
+    """End what is left of the group of an ended process, before its number can belong to anybody else."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(pid, signal.SIGKILL)
+
+
 def serve(connection: socket.socket, modules: Sequence[str]) -> dict[str, Any]:
     """Fork for each request until the client hangs up. Returns in a child only, with its request."""
     for name in modules:
@@ -149,7 +155,8 @@ def serve(connection: socket.socket, modules: Sequence[str]) -> dict[str, Any]:
             wakes.recv(4096)
             for pid in [pid for pid in children if os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT)]:
                 children.remove(pid)
-                code = _bury(pid)
+                end_group(pid)
+                code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
                 with suppress(OSError):
                     connection.send(json.dumps({"pid": pid, "code": code}).encode())
         if connection in ready:
@@ -174,13 +181,6 @@ def serve(connection: socket.socket, modules: Sequence[str]) -> dict[str, Any]:
             os.close(files[0])
             children.add(pid)
             connection.send(json.dumps({"pid": pid}).encode())
-
-
-def _bury(pid: int) -> int:
-    """End what is left of the group, before its number can belong to anybody else; return the exit code."""
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(pid, signal.SIGKILL)
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-from wm_nodes.ros.forks import ForkServer, ForkServerError, end_with_parent
+from wm_nodes.ros.forks import ForkServer, ForkServerError, end_group, end_with_parent
 from wm_nodes.ros.graph import NodeSpec
 
 COLOURS = (36, 33, 32, 35, 34, 96, 93, 92, 95, 94)
@@ -139,8 +139,7 @@ class NodeProcess:
 
 
 def _await(process: "subprocess.Popen[bytes]") -> int:
-    """Wait for the end; then end what is left of the group, before its number can belong to anybody else."""
+    """Wait for the end, also of what is left of the group."""
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
+    end_group(process.pid)
     return process.wait()

@@ -83,7 +83,7 @@ class Runner:
             if self._log_dir is not None:
                 self._log_dir.mkdir(parents=True, exist_ok=True)
             self._starter = ThreadPoolExecutor(max_workers=1, thread_name_prefix="runner")
-            modules = [node.module for node in self.graph.nodes if _forks(node)]
+            modules = [node.module for node in self.graph.nodes if _can_fork(node)]
             if len(modules) > 1:
                 ours = sorted(module for module in {*modules} if module.startswith("wm_nodes."))
                 self._forks = self._starter.submit(ForkServer, self._python, ours, self.environment).result()
@@ -224,7 +224,7 @@ class Runner:
         if self._starter is None:
             raise RuntimeError("the runner is stopped; make another one")
         process = self._processes[label]
-        self._starter.submit(process.start, self._forks if _forks(process.spec) else None).result()
+        self._starter.submit(process.start, self._forks if _can_fork(process.spec) else None).result()
 
     def _end(self, processes: Sequence[NodeProcess]) -> None:
         for number in STOP_SIGNALS:
@@ -317,7 +317,7 @@ def _raise(runner: Runner, received: Sequence[int]) -> None:
     runner.check()
 
 
-def _forks(node: NodeSpec) -> bool:
+def _can_fork(node: NodeSpec) -> bool:
     """Whether the node can fork: torchrun starts its own processes, and variables may count from the first moment."""
     return node.ranks == 1 and not node.environment
 
