@@ -4,8 +4,12 @@ with a browser, which only the tests of pages need.
 python3 launch_scripts/run_tests.py            # everything
 python3 launch_scripts/run_tests.py --fast     # without the tests marked slow
 python3 launch_scripts/run_tests.py tests/unit -k setup    # other arguments go to pytest; the checks still run
+
+Tests run two at a time, those with deadlines after the others. A test of a graph that fails so is run once more by
+itself, which the output says: deadlines are promised where nothing else keeps the machine busy.
 """
 
+import json
 import os
 import subprocess
 import sys
@@ -16,10 +20,12 @@ import wm_setup
 from setup_steps import system
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
+LAST_FAILED = Path(".pytest_cache/v/cache/lastfailed")
+MOST_AGAIN = 8
+"""More failed tests than this are no accident of their neighbours."""
+BY_FILE = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
 LONG_FIRST = ("tests/graph", "tests/parity", "tests/unit", "tests/contracts")
-TWO_AT_A_TIME = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", *LONG_FIRST)
+WITH_DEADLINES = ("tests/graph",)  # tests/conftest.py sees to it that there are no others
 
 
 def main(argv):
@@ -36,9 +42,22 @@ def main(argv):
     system.install(system.browser_plan(system.find_browser(), system.read_os_release()), ROOT / ".venv_setup.log")
     if failed:
         print(f"failed before the tests: {', '.join(failed)}", flush=True)
-    runs = [([], named)] if named else [(["not alone"], TWO_AT_A_TIME), (["alone"], LONG_FIRST)]
-    codes = [_pytest(["-m", " and ".join(marks + fast), *arguments]) for marks, arguments in runs]
-    return max(codes) or int(bool(failed))
+    if named:
+        return _pytest(["-m", " and ".join(fast), *named]) or int(bool(failed))
+    codes = [
+        _pytest(["-m", " and ".join(["not alone", *fast]), "--cache-clear", *BY_FILE, *LONG_FIRST]),
+        _pytest(["-m", " and ".join(["alone", *fast]), *BY_FILE, *WITH_DEADLINES]),
+    ]
+    return (repeated() if max(codes) == 1 else max(codes)) or int(bool(failed))
+
+
+def repeated():
+    """Run the tests that failed once more, without neighbours, if all are of graphs and few. Return pytest's code."""
+    tests = list(json.loads((ROOT / LAST_FAILED).read_text()))
+    if len(tests) > MOST_AGAIN or not all(test.startswith("tests/graph/") for test in tests):
+        return 1
+    print("\nonce more, by themselves:", *tests, sep="\n  ", flush=True)
+    return _pytest(tests)
 
 
 def _pytest(arguments):

@@ -28,6 +28,13 @@ def pytest_configure() -> None:
     os.environ.update({name: environment[name] for name in ("AMENT_PREFIX_PATH", "PATH")})
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """run_tests.py looks for tests marked alone in tests/graph only, so that it need not import all others twice."""
+    for item in items:
+        if item.get_closest_marker("alone") and "graph" not in item.path.parts:
+            raise pytest.UsageError(f"{item.nodeid} is marked alone; run_tests.py looks for such tests in tests/graph")
+
+
 def pytest_unconfigure() -> None:
     if _session_lock is not None:
         _session_lock.release()

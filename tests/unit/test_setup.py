@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import run_tests
 
 import wm_setup
 from setup_steps import interpreter, messages, packages, stamp
@@ -133,6 +134,39 @@ def test_entry_points_are_readable_for_old_pythons(repository: Path) -> None:
 
     for name in ("wm_setup.py", "online_rl.py", "run_tests.py", "benchmark.py", "setup_steps/interpreter.py"):
         ast.parse((repository / "launch_scripts" / name).read_text(), feature_version=(3, 8))
+
+
+def test_a_graph_test_that_failed_beside_another_has_to_pass_by_itself_and_others_are_not_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run_tests, "ROOT", tmp_path)
+    for folder in ("graph", "unit"):
+        (tmp_path / "tests" / folder).mkdir(parents=True)
+    body = """
+from pathlib import Path
+
+def test_one():
+    with Path("{0}").open("a+") as runs:
+        assert runs.write(".") and runs.tell() > {1}
+"""
+    second, never, unit = (tmp_path / "tests" / name for name in (
+        "graph/test_second.py", "graph/test_never.py", "unit/test_unit.py"
+    ))  # fmt: skip
+    for path, passes_after in ((second, 1), (never, 99), (unit, 1)):
+        path.write_text(body.format(tmp_path / path.stem, passes_after))
+
+    def first(*paths: Path) -> None:
+        names = [str(path.relative_to(tmp_path)) for path in paths]
+        assert run_tests._pytest(["-q", "-p", "no:xdist", "--cache-clear", *names]) == 1
+
+    first(second)
+    capfd.readouterr()
+    assert run_tests.repeated() == 0
+    assert "once more, by themselves:\n  tests/graph/test_second.py::test_one" in capfd.readouterr().out
+    first(never)
+    assert run_tests.repeated() == 1
+    first(unit)
+    assert run_tests.repeated() == 1 and (tmp_path / "test_unit").read_text() == "."
 
 
 def test_sourced_ros_and_other_environments_do_not_leak_into_ours(
