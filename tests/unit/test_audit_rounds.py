@@ -1,5 +1,6 @@
 """Sampling, agreement and adoption: a round of the paper's loop, with numbers worked by hand."""
 
+import asyncio
 import json
 import math
 from collections.abc import Mapping
@@ -8,15 +9,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from audit_logs import JudgeByClip, clips, judge_all
+from audit_logs import Job, JudgeByClip, clips, judge_all
 from scripted_judge import CLEAN, FLAWED, WRONG, ScriptedJudge, clean_table
 
+from wm_nodes.reward.agent import RewardAgent
+from wm_nodes.reward.agent.levels import next_vote
 from wm_nodes.reward.agent.rubric import Rubric, load_rubric
+from wm_nodes.reward.agent.types import Profile, Read, ReadRequest, Stage, Status
 from wm_nodes.reward.audit.adoption import Comparison, Registry, compare, decide
 from wm_nodes.reward.audit.agreement import Row, joined, report
 from wm_nodes.reward.audit.commands import main
 from wm_nodes.reward.audit.labels import FORMAT, read_labels
 from wm_nodes.reward.audit.log import AuditError
+from wm_nodes.reward.audit.people import HumanJudge
 from wm_nodes.reward.audit.reading import Evaluation, read_record
 from wm_nodes.reward.audit.sampling import SHARES, draw, read_sample, sample_size, stratified, stratum_of
 from wm_nodes.reward.statistics import wilson_interval
@@ -117,6 +122,58 @@ def test_equal_verdicts_and_seeds_choose_equal_clips(tmp_path: Path) -> None:
     with pytest.raises(AuditError, match=r"no verdict of round 3; rounds: \[0\]"):
         draw(read_record(tmp_path / "a"), 3)
     assert sum(SHARES.values()) == pytest.approx(0.6)
+
+
+# --- people as the judge ------------------------------------------------------------------------------------------
+def everything(**changed: Any) -> dict[str, Any]:
+    """What a person says who finds nothing wrong but what is named; a level where it is a number."""
+    names = [*RUBRIC.component_names, *(f"hack: {name}" for name in RUBRIC.hack.patterns)]
+    return dict.fromkeys(names, True) | {"planning": 3} | changed
+
+
+def test_people_are_a_judge_whose_votes_are_persons(tmp_path: Path) -> None:
+    evaluations = judged(tmp_path / "log", [{}, {}])
+    said = [write_labels(tmp_path / f"{who}.json", evaluations, rows, who) for who, rows in (
+        ("Ada", [everything(clarity=False), everything(clarity=None)]),
+        ("Bob", [everything(), everything()]),
+        ("Cleo", [everything(clarity=False), everything(clarity=True)]),
+    )]  # fmt: skip
+    judge, (first, second) = HumanJudge([read_labels(path) for path in said]), clips(2)
+    assert judge.capabilities.judge_id.startswith("human:") and "Ada, Bob, Cleo" in judge.capabilities.card
+
+    def votes(job: Job, stage: Stage, *names: str) -> list[Read]:
+        asked = tuple(next_vote(j, 0) for j in range(3))
+        return asyncio.run(judge.read(ReadRequest(*job, stage, names, Profile.S, asked, ())))
+
+    assert [read.levels for read in votes(first, Stage.VQ, "clarity")] == [WRONG, CLEAN, WRONG]
+    assert [read.levels for read in votes(second, Stage.VQ, "clarity")] == [CLEAN] * 3  # Bob, Cleo, Bob: Ada is unsure
+    assert votes(first, Stage.PLAN, "planning")[0].focus == ("clarity",)
+    (silent, *_) = votes(first, Stage.PC, "liquid")
+    assert silent.status is Status.ABSTAIN and silent.reason == "nobody labelled liquid"
+    agent = RewardAgent(judge, load_rubric("robot", {"voting": {"audit_share": 1.0}}), mode="benchmark")
+    verdict = asyncio.run(agent.evaluate(*first))
+    (clarity,) = [score for score in verdict.stages[0].components if score.component == "clarity"]
+    assert not clarity.passed and clarity.decided_by == "2 of 3 votes"
+
+
+def test_the_command_names_the_clips_that_are_paid_more_than_people_would(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A judge that passes everything; a person sees a failed task in clip 1, and left clip 2 half labelled."""
+    evaluations = judged(tmp_path / "log", [{}, {}, {}, {}])
+    rows: list[Mapping[str, Any]] = [everything(), everything(task_completion=False), {"planning": 3, "clarity": True}]
+    labels = write_labels(tmp_path / "ada.json", evaluations, rows)
+    assert main(["people", str(tmp_path / "log"), "--labels", str(labels), "--output", str(tmp_path / "people")]) == 0
+    out = capsys.readouterr().out
+    assert "3 clips, 2 with a reward by people, 2 by both" in out and "people would: 1 of 2" in out
+    by_people = read_record(tmp_path / "people").judged()
+    paid = [e.verdict.reward for e in by_people if e.verdict]
+    assert paid[0] == 1.0 and paid[1] < 0.6 and math.isnan(paid[2])
+    assert f"clip1: judge 1.000, people {paid[1]:.3f}" in out
+    assert by_people[2].verdict and "nobody labelled" in by_people[2].verdict.reason
+    assert main(["verify", str(tmp_path / "people")]) == 0 and main(["replay", str(tmp_path / "people")]) == 0
+    with pytest.raises(SystemExit):
+        main(["people", str(tmp_path / "log"), "--labels", str(labels)])
 
 
 # --- agreement --------------------------------------------------------------------------------------------------

@@ -149,6 +149,27 @@ def test_a_component_that_was_measured_as_unseen_is_not_answered() -> None:
     assert "geometry" in (card := EmbeddedJudge(blind).card) and "not answered" in card
 
 
+def test_where_both_answers_stay_possible_it_abstains_and_is_another_judge() -> None:
+    """The hand-made heads say p_fail 0.0067 of what is clean and 0.9933 of what is not."""
+
+    def at(low: float, high: float, recipe: str = "") -> Verdict:
+        clip = apply(clean(), recipe, "fail", 0) if recipe else clean()
+        unsure = replace(head(), story=STORY | {"conformal": {"clarity": {"0.9": [low, high]}}})
+        agent = RewardAgent(EmbeddedJudge(unsure, 0.9), rubric(), mode="benchmark")
+        return asyncio.run(agent.evaluate(clip.ref, task_of(clip)))
+
+    sure = at(0.1, 0.05)
+    assert sure.valid and sure.reward == judged(clean()).reward
+    assert sure.provenance.judge_id == "embedded:aaaaaaaaaaaa@0.9"
+    verdict = at(0.005, 0.0)
+    assert verdict.status is Status.ABSTAIN and np.isnan(verdict.reward)
+    assert "p_fail 0.007 leaves both possible at 90% coverage: clips that fail begin at 0.005" in verdict.reason
+    assert passed(at(0.0, 0.99, "blur"))["clarity"] is False  # sure enough: clips that pass end at 0.99
+    assert "clips that pass end at 0.995" in at(0.1, 0.995, "blur").reason
+    with pytest.raises(ValueError, match="was not calibrated for this judge"):
+        EmbeddedJudge(head(), 0.9)
+
+
 def ask(request: ReadRequest) -> list[Read]:
     return asyncio.run(EmbeddedJudge(head()).read(request))
 

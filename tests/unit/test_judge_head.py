@@ -6,12 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from wm_nodes.learning.judge_fitting import (
+    CONFORMAL,
     PATTERNS,
     TARGETS,
     Examples,
     _flagging_line,
+    conformal_errors,
+    conformal_limits,
     fit_all,
     fit_familiarity,
     fit_questions,
@@ -20,6 +24,7 @@ from wm_nodes.learning.judge_fitting import (
 )
 from wm_nodes.reward.adversarial import COMPONENTS, TC, Edit, Labels, Origin
 from wm_nodes.reward.adversarial.manifest import Row
+from wm_nodes.reward.agent.levels import p_fail_of
 from wm_nodes.reward.agent.types import PLANNING
 from wm_nodes.reward.evidence.head import (
     HACK,
@@ -34,6 +39,7 @@ from wm_nodes.reward.evidence.head import (
 )
 from wm_nodes.reward.evidence.segmentation import Segmenter
 from wm_nodes.reward.evidence.trees import Trees, TreeSettings, fit_trees
+from wm_nodes.types import FloatArray
 
 SETTINGS = TreeSettings(num_trees=12, depth=2, learning_rate=0.3, row_share=1.0, feature_share=1.0)
 NAMES = (*COMPONENTS, TC, *(HACK + name for name in PATTERNS), "idle")
@@ -155,6 +161,71 @@ def test_every_head_finds_its_number_on_clips_it_has_not_seen_and_is_calibrated(
     assert measured(head.questions, TC, test)["level_accuracy"] > 0.85
     text = head.evidence_text("clarity", np.eye(len(NAMES), dtype=np.float32)[:1] * 3)
     assert text.startswith("clarity 3 (clean ") and "idle" not in text
+
+
+class Slope(Question):
+    """p_fail rises with the only evidence, 0.5 where that is 0.5; no two clips are alike."""
+
+    def __init__(self) -> None:
+        """Without trees."""
+
+    def probability(self, rows: FloatArray) -> NDArray[np.float64]:
+        return np.asarray(1 / (1 + np.exp(4 * (rows[:, 0].astype(float) - 0.5))))
+
+
+def test_conformal_limits_cover_each_class_of_clips_that_did_not_make_them() -> None:
+    """As often as promised, over 60 draws of a head that errs in one of six clips; too few clips promise nothing."""
+    rng = np.random.default_rng(0)
+
+    def noisy(count: int) -> Examples:
+        rows = [row(i, {"clarity"} if i % 4 == 0 else set(), 4, None) for i in range(count)]
+        fails = np.array([i % 4 == 0 for i in range(count)])
+        return Examples(("x",), (fails + rng.normal(0, 0.5, count)).astype(np.float32)[:, None], rows)
+
+    asked = {"clarity": (Slope(),)}
+    kept: dict[str, list[tuple[float, float]]] = {f"{c:g}": [] for c in CONFORMAL}
+    for _ in range(60):
+        limits, new = conformal_limits(asked, "clarity", noisy(160)), noisy(400)
+        p_fail, fails = 1 - asked["clarity"][0].probability(new.evidence), true_levels("clarity", new.rows) == 0
+        for coverage, (low, high) in limits.items():
+            kept[coverage].append((float((p_fail[fails] >= low).mean()), float((p_fail[~fails] <= high).mean())))
+    for coverage, shares in kept.items():
+        reached = np.mean(shares, 0)
+        assert (reached > float(coverage) - 0.01).all() and (reached < float(coverage) + 0.025).all(), coverage
+    few = conformal_limits(asked, "clarity", noisy(8))
+    assert few["0.9"] == (0.0, 1.0)
+
+
+def test_what_abstaining_costs_and_saves_is_counted_by_class() -> None:
+    """Evidence x has p_fail 1 / (1 + exp(4 (0.5 - x))): 0.12, 0.31, 0.40, 0.60, 0.69, 0.88; the last is unknown."""
+    fails = [False, True, True, False, True, True, None]
+    rows = [row(i, {"clarity"} if fail else set(), 4, None) for i, fail in enumerate(fails)]
+    rows[-1] = replace(rows[-1], labels=Labels({"robot": False}, 4))
+    clips = Examples(("x",), np.array([[0.0], [0.3], [0.4], [0.6], [0.7], [1.0], [0.45]], np.float32), rows)
+    found = conformal_errors({"clarity": (Slope(),)}, {"clarity": (0.35, 0.65)}, clips)
+    assert found["answered"] == pytest.approx(4 / 7)  # 0.40, 0.60 and the unknown one lie between the limits
+    of = found["targets"]["clarity"]
+    assert of["silent"] == pytest.approx(3 / 7)
+    assert of["fail_as_pass"] == [2 / 4, 1 / 4] and of["pass_as_fail"] == [1 / 2, 0.0]
+
+
+def test_conformal_limits_of_task_completion_are_of_its_pass_and_fail(head: JudgeHead) -> None:
+    held = examples(160, 2)
+    low, high = conformal_limits(head.questions, TC, held)["0.8"]
+    p_fail = np.array([p_fail_of(head.levels(TC, held.evidence[i : i + 1])) for i in range(160)])
+    fails = true_levels(TC, held.rows) < 3
+    assert (p_fail[fails] < low).mean() <= 0.2 and (p_fail[~fails] > high).mean() <= 0.2
+    assert low in p_fail[fails] and high in p_fail[~fails]
+
+
+def test_a_coverage_that_was_not_calibrated_is_refused_with_those_that_were(head: JudgeHead) -> None:
+    limits = {"clarity": {"0.9": [0.2, 0.7]}}
+    known = replace(head, story={"conformal": limits})
+    assert known.conformal(0.9) == {"clarity": (0.2, 0.7)}
+    with pytest.raises(ValueError, match=r"conformal coverage 0\.5 was not calibrated .* there are: 0\.9"):
+        known.conformal(0.5)
+    with pytest.raises(ValueError, match="there are: none; train it anew"):
+        head.conformal(0.9)
 
 
 def test_evidence_unlike_training_is_far_and_the_limit_keeps_most_of_validation(head: JudgeHead) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from wm_nodes.config.load import load_config
 from wm_nodes.learning.adversarial_set import HELD_OUT, ClipSource, instruction_of
+from wm_nodes.learning.judge_fitting import CONFORMAL
 from wm_nodes.reward.adversarial import LabelledClip
 from wm_nodes.reward.adversarial.generator import edited
 from wm_nodes.reward.agent import RewardAgent, load_rubric
@@ -15,7 +16,7 @@ from wm_nodes.reward.agent.types import ClipRef, Stage, Status, TaskSpec, Verdic
 from wm_nodes.reward.evidence.definitions import EVIDENCE
 from wm_nodes.reward.evidence.head import load_head
 from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head
-from wm_nodes.reward.judges.factory import make_judge
+from wm_nodes.reward.judges.factory import check_judge, make_judge
 from wm_nodes.simulation.tasks import TASKS
 
 FIRST_SEED = 70_000
@@ -41,6 +42,15 @@ def test_the_settings_name_it_by_its_kind_alone() -> None:
     settings = load_config("smoke", {"judge.kind": "embedded"}).judge
     shipped = EmbeddedJudge(load_head(shipped_head()))
     assert make_judge(settings, load_rubric()).judge.capabilities == shipped.capabilities
+
+
+def test_it_abstains_at_every_coverage_that_it_says_and_a_run_refuses_others_at_once() -> None:
+    for coverage in CONFORMAL:
+        settings = load_config("smoke", {"judge.kind": "embedded", "judge.conformal": coverage}).judge
+        check_judge(settings)
+        assert make_judge(settings, load_rubric()).judge.capabilities.judge_id.endswith(f"@{coverage:g}")
+    with pytest.raises(ValueError, match=r"conformal coverage 0\.5 was not calibrated .* 0\.8, 0\.9, 0\.95, 0\.98"):
+        check_judge(load_config("smoke", {"judge.kind": "embedded", "judge.conformal": 0.5}).judge)
 
 
 def test_noise_and_another_size_are_not_judged() -> None:

@@ -281,6 +281,10 @@ def parser() -> argparse.ArgumentParser:
     common.add_argument("--seed", type=int, default=0)
     common.add_argument("--at-once", type=int, default=1, help="clips under way together, behind a server")
     common.add_argument("--folder", type=Path, help="of the embedded judge; the shipped one by default")
+    common.add_argument(
+        "--conformal", type=float, default=0.0, metavar="COVERAGE",
+        help="the embedded judge abstains where it is not sure at this coverage, e.g. 0.9; 0: it always decides",
+    )  # fmt: skip
     common.add_argument("--stages", nargs="+", choices=ROUTED, default=[], help="that --model reads in its place")
     common.add_argument("--url", nargs="+", default=[], help="of chat servers, http://HOST:PORT/v1")
     common.add_argument("--model", default="", help="that they serve")

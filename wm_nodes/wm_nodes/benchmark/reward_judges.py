@@ -40,12 +40,15 @@ async def open_judge(
         yield OracleJudge(known_clips(rows), rubric, error=arguments.error, seed=arguments.seed)
         return
     if arguments.judge == "embedded" and not arguments.stages:
-        yield EmbeddedJudge(load_head(arguments.folder or shipped_head()))
+        yield EmbeddedJudge(load_head(arguments.folder or shipped_head()), arguments.conformal)
         return
     settings = server_settings(arguments)
     if arguments.judge == "embedded":
         server = {name: getattr(settings, name) for name in ("endpoints", "model", "api_key_env")}
-        changes = {"kind": "embedded", "folder": str(arguments.folder or ""), "endpoints": [], "model": ""}
+        changes: dict[str, Any] = {
+            "kind": "embedded", "folder": str(arguments.folder or ""), "conformal": arguments.conformal,
+            "endpoints": [], "model": "",
+        }  # fmt: skip
         settings = settings.model_copy(update={**changes, "routes": [StageJudge(stages=arguments.stages, **server)]})
     opened = make_judge(settings, rubric, reads)
     try:

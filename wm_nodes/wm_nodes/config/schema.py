@@ -139,6 +139,8 @@ class JudgeConfig(Section):
     """openai: name of the environment variable that holds the key; empty: the server wants none."""
     folder: str
     """embedded: folder of the trained judge; empty: the shipped one."""
+    conformal: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """embedded: abstain where the answer is not sure at this coverage (0.8, 0.9, 0.95 or 0.98); 0: always decide."""
     rubric: str
     """Rubric pack: a name, or a .yaml file."""
     mode: Literal["reward", "benchmark"]

@@ -15,8 +15,17 @@ from tqdm import tqdm
 from wm_nodes.reward.adversarial import COMPONENTS, TC
 from wm_nodes.reward.adversarial.manifest import Row
 from wm_nodes.reward.adversarial.planning import planning_level
+from wm_nodes.reward.agent.levels import p_fail_of
 from wm_nodes.reward.agent.types import PLANNING
-from wm_nodes.reward.evidence.head import CLIP_AT, HACK, Familiarity, Question, above_levels, num_questions
+from wm_nodes.reward.evidence.head import (
+    CLIP_AT,
+    HACK,
+    Familiarity,
+    Question,
+    above_levels,
+    levels_of,
+    num_questions,
+)
 from wm_nodes.reward.evidence.trees import TreeSettings, fit_trees
 from wm_nodes.reward.statistics import auroc, balanced_accuracy, expected_calibration_error
 from wm_nodes.seeding import numpy_stream
@@ -32,6 +41,10 @@ COVERAGE = 0.99
 MIN_SLOPE, MAX_SLOPE = 0.1, 3.0
 FLAG, MAX_FALSE_FLAGS = 0.8, 0.02
 """The agent confirms a pattern from this probability on (rubrics: hack.confirm)."""
+CONFORMAL = (0.8, 0.9, 0.95, 0.98)
+"""Coverages whose limits are kept with a judge."""
+LAST_FAIL = {PLANNING: 1, TC: 2}
+"""The highest level that counts as failing, where it is not 0."""
 MIN_CASES = 5
 """With fewer passes or fails in the validation part, log-odds are only corrected for the balance of training."""
 
@@ -158,6 +171,54 @@ def fit_all(
     return {target: fit_questions(target, train, validation, settings, seed) for target in targets}
 
 
+def conformal_limits(
+    questions: Mapping[str, tuple[Question, ...]], target: str, validation: Examples
+) -> dict[str, tuple[float, float]]:
+    """Split-conformal limits of p_fail per coverage, class by class (Vovk 2012, label-conditional).
+
+    (low, high): a further clip that fails the target has p_fail >= low, and one that passes has p_fail <= high, each
+    with at least this probability, if it is exchangeable with the validation clips of its class. So a judge that says
+    "passes" below 0.5 and below low only, and "fails" from 0.5 on and above high only, calls at most 1 - coverage of
+    either class the other one. 0 and 1 where there are too few clips to say.
+    """
+    p_fail, levels = _p_fail(questions, target, validation), true_levels(target, validation.rows)
+    last = LAST_FAIL.get(target, 0)
+    lowest, highest = np.sort(p_fail[(levels != UNKNOWN) & (levels <= last)]), np.sort(p_fail[levels > last])[::-1]
+    limits = {}
+    for coverage in CONFORMAL:
+        ranks = [int((1 - coverage) * (len(of) + 1) + 1e-9) for of in (lowest, highest)]
+        low = float(lowest[ranks[0] - 1]) if ranks[0] else 0.0
+        limits[f"{coverage:g}"] = (low, float(highest[ranks[1] - 1]) if ranks[1] else 1.0)
+    return limits
+
+
+def conformal_errors(
+    questions: Mapping[str, tuple[Question, ...]], limits: Mapping[str, tuple[float, float]], examples: Examples
+) -> dict[str, Any]:
+    """What abstaining between conformal limits costs and saves. answered: share of the clips in which every target is.
+    targets: of each one the share without answer, and how many of the clips that fail are said to pass (fail_as_pass)
+    and of those that pass to fail (pass_as_fail), first if it always decided.
+    """
+    answered, targets = np.ones(len(examples.rows), bool), {}
+    for target, (low, high) in limits.items():
+        p_fail, levels = _p_fail(questions, target, examples), true_levels(target, examples.rows)
+        silent = np.where(p_fail < 0.5, p_fail >= low, p_fail <= high)
+        passes = levels > LAST_FAIL.get(target, 0)
+        fails = (levels != UNKNOWN) & ~passes
+        answered &= ~silent
+        targets[target] = {
+            "silent": float(silent.mean()),
+            "fail_as_pass": [float(wrong[fails].mean()) for wrong in (p_fail < 0.5, (p_fail < 0.5) & ~silent)],
+            "pass_as_fail": [float(wrong[passes].mean()) for wrong in (p_fail >= 0.5, (p_fail >= 0.5) & ~silent)],
+        }
+    return {"answered": float(answered.mean()), "targets": targets}
+
+
+def _p_fail(questions: Mapping[str, tuple[Question, ...]], target: str, examples: Examples) -> Floats:
+    above = above_levels(questions, target, examples.evidence)
+    return np.array([p_fail_of(levels_of(target, column)) for column in above.T])
+
+
 def measured(
     questions: Mapping[str, tuple[Question, ...]], target: str, examples: Examples
 ) -> dict[str, Any]:
@@ -167,7 +228,7 @@ def measured(
     levels = true_levels(target, examples.rows)
     known = levels != UNKNOWN
     above = np.minimum.accumulate(above_levels(questions, target, examples.evidence[known]), 0)
-    k = {PLANNING: 1, TC: 2}.get(target, 0)
+    k = LAST_FAIL.get(target, 0)
     truth, p = levels[known] > k, above[k]
     found = {
         "n": int(known.sum()), "fails": int((~truth).sum()), "accuracy": float(((p >= 0.5) == truth).mean()),

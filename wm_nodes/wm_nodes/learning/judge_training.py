@@ -19,9 +19,16 @@ from tqdm import tqdm
 import wm_nodes.reward.evidence
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.judge_data import load_sets, rows_of, set_clips
-from wm_nodes.learning.judge_fitting import TARGETS, Examples, fit_all, fit_familiarity, measured
+from wm_nodes.learning.judge_fitting import (
+    TARGETS,
+    Examples,
+    conformal_limits,
+    fit_all,
+    fit_familiarity,
+    measured,
+)
 from wm_nodes.learning.judge_segmenter import overlaps, segmentation_data, train_segmenter
-from wm_nodes.reward.adversarial import Manifest
+from wm_nodes.reward.adversarial import COMPONENTS, TC, Manifest
 from wm_nodes.reward.adversarial.manifest import Part, Row, to_bytes
 from wm_nodes.reward.evidence.clip import clip_evidence
 from wm_nodes.reward.evidence.head import JudgeHead
@@ -67,6 +74,7 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
         "tasks": sorted({row.origin.task for row in train.rows}),
         "cameras": sorted({row.origin.camera.split()[0] for row in train.rows}),
         "validation": {target: measured(questions, target, validation) for target in TARGETS},
+        "conformal": {target: conformal_limits(questions, target, validation) for target in (*COMPONENTS, TC)},
     }  # fmt: skip
     known = fit_familiarity(train, validation)
     size = (first.frames.shape[1], first.frames.shape[2])

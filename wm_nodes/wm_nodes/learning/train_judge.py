@@ -20,7 +20,7 @@ import torch
 from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.judge_data import load_sets
-from wm_nodes.learning.judge_fitting import TARGETS, measured
+from wm_nodes.learning.judge_fitting import CONFORMAL, TARGETS, conformal_errors, measured
 from wm_nodes.learning.judge_training import JudgePlan, collect_evidence, make_judge
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reward.evidence.head import load_head, save_head
@@ -75,6 +75,11 @@ def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
         for split in sorted({row.split for row in examples.rows})
         if (chosen := [i for i, row in enumerate(examples.rows) if row.split == split])
     }
+    if head.story.get("conformal"):
+        found["conformal"] = {
+            f"{coverage:g}": conformal_errors(head.questions, head.conformal(coverage), examples)
+            for coverage in CONFORMAL
+        }
     write_atomic(arguments.out / f"measured-{part}.json", (json.dumps(found, indent=1) + "\n").encode())
     return found
 
@@ -89,6 +94,15 @@ def table(report: Mapping[str, Any]) -> str:
             f"{name:16} {found['n']:6} {found['fails']:6} {100 * found['accuracy']:6.1f} "
             f"{100 * found['balanced_accuracy']:6.1f} {found['auroc']:6.3f} {found['ece']:6.3f} {level}"
         )
+    for coverage, at in report.get("conformal", {}).items():
+        lines.append(f"abstaining at conformal coverage {coverage}: {100 * at['answered']:.1f} % of the clips answered")
+        for name, of in at["targets"].items():
+            if of["silent"] >= 0.002:
+                errors = [
+                    f"{words} {' -> '.join(f'{100 * share:.1f}' for share in of[key])} %"
+                    for key, words in (("fail_as_pass", "fail called pass"), ("pass_as_fail", "pass called fail"))
+                ]
+                lines.append(f"  {name:16} silent {100 * of['silent']:.1f} %; {'; '.join(errors)}")
     lines += [f"too foreign to judge, {split}: {a} of {n}" for split, (a, n) in report.get("foreign", {}).items()]
     return "\n".join(lines)
 

@@ -159,7 +159,7 @@ class Read:
 
     component: Component
     levels: tuple[float, ...]
-    source: Literal["json", "label", "decision", "embedded"]
+    source: Literal["json", "label", "decision", "embedded", "human"]
     vote: Vote
     label_mass: float = 1.0
     status: Status = Status.OK

@@ -8,6 +8,7 @@
 """
 
 from wm_nodes.reward.audit.log import AuditError, AuditLog
+from wm_nodes.reward.audit.people import HumanJudge
 from wm_nodes.reward.audit.reading import Record, read_record, verify
 from wm_nodes.reward.audit.recording import AuditedAgent, RecordingJudge, write_exchange
 from wm_nodes.reward.audit.replay import ReplayJudge, replayed
@@ -16,6 +17,7 @@ __all__ = [
     "AuditError",
     "AuditLog",
     "AuditedAgent",
+    "HumanJudge",
     "Record",
     "RecordingJudge",
     "ReplayJudge",

@@ -1,4 +1,4 @@
-"""The commands over audit logs: verify, recover, sample, view, agree, replay, adopt."""
+"""The commands over audit logs: verify, recover, sample, view, agree, people, replay, adopt."""
 
 import argparse
 import asyncio
@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from statistics import fmean
 
 from rich.console import Console
 from tqdm import tqdm
@@ -20,13 +21,16 @@ from wm_nodes.reward.audit.agreement import joined, report, table
 from wm_nodes.reward.audit.entries import plain
 from wm_nodes.reward.audit.labels import load_all
 from wm_nodes.reward.audit.log import AuditError, AuditLog, recover
+from wm_nodes.reward.audit.people import HumanJudge
 from wm_nodes.reward.audit.reading import read_record, verify
-from wm_nodes.reward.audit.replay import reaggregated, replayed
+from wm_nodes.reward.audit.replay import judged_again, reaggregated, replayed
 from wm_nodes.reward.audit.sampling import draw, read_sample, write_sample
 from wm_nodes.reward.audit.viewer import FILE_NAME, write_view
 
 OK, FOUND, ERROR = 0, 1, 2
 """Exit codes: all well; something was found (a fault, a differing verdict, a rubric not adopted); a clear error."""
+OVERPAID, SHOWN = 0.1, 10
+"""`people` names so many clips whose reward is higher by more than this."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -92,6 +96,27 @@ def _agree(arguments: argparse.Namespace) -> int:
         text = json.dumps([plain(asdict(found)) for found in reports], indent=1, allow_nan=False)
         write_atomic(arguments.json, (text + "\n").encode())
         print(f"wrote {arguments.json}")
+    return OK
+
+
+def _people(arguments: argparse.Namespace) -> int:
+    record, labels = read_record(arguments.log), load_all(arguments.labels)
+    chosen = [clip.evaluation for clip in joined(record, labels)]
+    judge, progress = HumanJudge(labels), tqdm(chosen, desc="people", disable=None)
+    with AuditLog(arguments.output) as log:
+        by_people = asyncio.run(judged_again(record, progress, lambda e: (judge, record.rubric(e)), log))
+    pairs = [(e.verdict, new) for e, new in zip(chosen, by_people) if e.verdict is not None]
+    both = [(old.clip_id, (old.reward, new.reward)) for old, new in pairs if old.valid and new.valid]
+    rewards = [pair for _, pair in both]
+    print(f"{len(by_people)} clips, {sum(new.valid for new in by_people)} with a reward by people, {len(both)} by both")
+    if both:
+        means = [fmean(pair[k] for pair in rewards) for k in (0, 1)]
+        print(f"mean reward: judge {means[0]:.3f}, people {means[1]:.3f}")
+        overpaid = sorted((new - old, clip_id, old, new) for clip_id, (old, new) in both if old - new > OVERPAID)
+        print(f"paid over {OVERPAID} more than people would: {len(overpaid)} of {len(both)}")
+        for _, clip_id, old, new in overpaid[:SHOWN]:
+            print(f"  {clip_id}: judge {old:.3f}, people {new:.3f}")
+    print(f"wrote {arguments.output}; view and verify it as any log")
     return OK
 
 
@@ -179,6 +204,9 @@ def _parser() -> argparse.ArgumentParser:
     one.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
     one.add_argument("--sample", type=Path, nargs="*", default=[], help="weight labels to the rounds drawn from")
     one.add_argument("--json", type=Path, help="also write the numbers to this file")
+    one = of_log("people", _people, "what labelled clips earn with people as the judge, and which ones are overpaid")
+    one.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
+    one.add_argument("--output", type=Path, required=True, help="folder of the new log")
     one = of_log("replay", _replay, "work verdicts out again, equal bit for bit or under a rubric with other numbers")
     one.add_argument("--round", type=int, help="only this round")
     one.add_argument("--rubric", help="pack or .yaml file with the same questions and other numbers")

@@ -5,7 +5,7 @@ that nobody was asked then, e.g. of a stage behind a gate that is now open: such
 question, never a guess. Logs of benchmark mode hold a read of everything.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from wm_nodes.reward.agent.types import (
     Component,
     Cost,
     Health,
+    Judge,
     JudgeError,
     MediaItem,
     Read,
@@ -129,14 +130,35 @@ async def reaggregated(
     Raises:
         AuditError: `rubric` asks in other words, or a picture is missing.
     """
+
+    def judge_of(evaluation: Evaluation) -> tuple[Judge, Rubric]:
+        check_words(record.rubric(evaluation), rubric)
+        same = [other for other in record.judged() if other.agent.number == evaluation.agent.number]
+        return ReplayJudge(same), rubric
+
+    return await judged_again(record, evaluations, judge_of, log)
+
+
+async def judged_again(
+    record: Record,
+    evaluations: Iterable[Evaluation],
+    judge_of: Callable[[Evaluation], tuple[Judge, Rubric]],
+    log: AuditLog,
+) -> list[Verdict]:
+    """Judge the clips of a log once more, each as its agent was set then, and write that into a log of its own.
+
+    Args:
+        judge_of: who judges, and by which rubric; asked once per agent.
+
+    Raises:
+        AuditError: a picture is missing.
+    """
     agents: dict[int, AuditedAgent] = {}
     verdicts = []
     for evaluation in evaluations:
         number = evaluation.agent.number
         if number not in agents:
-            check_words(record.rubric(evaluation), rubric)
-            judge = ReplayJudge([other for other in record.judged() if other.agent.number == number])
-            agents[number] = AuditedAgent(judge, rubric, log, **evaluation.agent.settings)
+            agents[number] = AuditedAgent(*judge_of(evaluation), log, **evaluation.agent.settings)
         agents[number].round_number = evaluation.round_number
         clip, task = record.clip(evaluation), record.task(evaluation)
         verdicts.append(await agents[number].evaluate(clip, task, evaluation.evidence))

@@ -116,6 +116,20 @@ class JudgeHead:
         """
         return levels_of(target, [float(p) for p in above_levels(self.questions, target, row)[:, 0]])
 
+    def conformal(self, coverage: float) -> dict[str, tuple[float, float]]:
+        """(low, high) of p_fail per component at a coverage, learning.judge_fitting.conformal_limits.
+
+        Raises:
+            ValueError: not one of the coverages that were calibrated; names those.
+        """
+        kept: Mapping[str, Mapping[str, Sequence[float]]] = self.story.get("conformal", {})
+        known = sorted({name for limits in kept.values() for name in limits})
+        if f"{coverage:g}" not in known:
+            there = ", ".join(known) or "none; train it anew"
+            raise ValueError(f"conformal coverage {coverage:g} was not calibrated for this judge; there are: {there}")
+        limits = {target: of[f"{coverage:g}"] for target, of in kept.items()}
+        return {target: (float(low), float(high)) for target, (low, high) in limits.items()}
+
     def evidence_text(self, target: str, row: FloatArray, limit: int = 3) -> str:
         """The evidence that this target's trees ask most about and that lies outside of what clean clips show."""
         weight = np.sum([q.trees.importance(len(self.names)) for q in self.questions[target]], 0)

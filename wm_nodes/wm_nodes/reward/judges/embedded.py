@@ -56,10 +56,20 @@ class EmbeddedJudge:
     Answers ABSTAIN, with a reason, for clips of another size or length than it was trained on, for clips unlike any in
     training, for components that it was measured not to see, and for the completion of tasks that it was not trained on
     or has no geometry of.
+
+    Args:
+        conformal: a coverage, e.g. 0.9: it abstains, too, where p_fail lies in between, so that of the clips like its
+            validation part at most a tenth of those that fail a component are said to pass it, and the other way
+            round. 0: it always decides.
+
+    Raises:
+        ValueError: the head was not calibrated for this coverage.
     """
 
-    def __init__(self, head: JudgeHead) -> None:
+    def __init__(self, head: JudgeHead, conformal: float = 0.0) -> None:
         self._head = head
+        self._coverage = conformal
+        self._limits = head.conformal(conformal) if conformal else {}
         measured: Mapping[str, Mapping[str, float]] = head.story.get("validation", {})
         self.blind = frozenset(
             name for name in head.questions if not measured.get(name, {}).get("auroc", 1.0) >= BLIND_AUROC
@@ -71,10 +81,15 @@ class EmbeddedJudge:
     @property
     def capabilities(self) -> Capabilities:
         return Capabilities(
-            f"{TRANSPORT}:{self._head.sha256[:12]}", TRANSPORT, f"judge {self._head.sha256[:12]}", REVISION,
+            self.name, TRANSPORT, f"judge {self._head.sha256[:12]}", REVISION,
             frozenset(name.removeprefix(HACK) for name in self._head.questions), max_frames=MAX_FRAMES,
             deterministic=True, card=self.card,
         )  # fmt: skip
+
+    @property
+    def name(self) -> str:
+        """Two coverages are two judges."""
+        return f"{TRANSPORT}:{self._head.sha256[:12]}" + (f"@{self._coverage:g}" if self._coverage else "")
 
     @property
     def card(self) -> str:
@@ -158,6 +173,8 @@ class EmbeddedJudge:
         if reason := foreign or self._silence(target, task):
             return Read(target, (), "embedded", vote, status=Status.ABSTAIN, reason=reason)
         levels, text = self._head.levels(target, row), self._head.evidence_text(target, row)[:TEXT_LIMIT]
+        if reason := self._doubt(target, levels):
+            return Read(target, (), "embedded", vote, status=Status.ABSTAIN, reason=reason, evidence_text=text)
         focus = self._focus(row) if target == PLANNING else ()
         return Read(target, levels, "embedded", vote, evidence_text=text, focus=focus)
 
@@ -170,6 +187,16 @@ class EmbeddedJudge:
             return f"not trained on task {task.task_id!r}, only on {', '.join(trained)}: what is done there?"
         if name == TASK_COMPLETION and not (" into " in words or " above " in words):
             return f"no geometry for the task {task.instruction!r}: known are '.. into the .. target', '.. above ..'"
+        return ""
+
+    def _doubt(self, name: str, levels: tuple[float, ...]) -> str:
+        """Why the conformal limits allow no answer, or ""."""
+        if name not in self._limits:
+            return ""
+        (low, high), p_fail = self._limits[name], p_fail_of(levels)
+        if p_fail >= low if p_fail < 0.5 else p_fail <= high:
+            other = f"clips that fail begin at {low:.3f}" if p_fail < 0.5 else f"clips that pass end at {high:.3f}"
+            return f"p_fail {p_fail:.3f} leaves both possible at {self._coverage:.0%} coverage: {other}"
         return ""
 
     def _focus(self, row: FloatArray) -> tuple[Component, ...]:

@@ -74,6 +74,8 @@ def _check_one(settings: JudgeConfig) -> None:
                 f"judge.folder {settings.folder!r} is no folder; name that of a trained judge (make one with "
                 "python -m wm_nodes.learning.train_judge), or leave it empty for the shipped one"
             )
+        if settings.conformal:
+            load_head(_folder(settings)).conformal(settings.conformal)
         return
     if not settings.endpoints or not settings.model:
         raise ValueError(
@@ -146,7 +148,7 @@ def _opened(
 ) -> OpenedJudge:
     """The judge itself, whatever its routes."""
     if settings.kind == "embedded":
-        return OpenedJudge(EmbeddedJudge(load_head(_folder(settings))), _nothing)
+        return OpenedJudge(EmbeddedJudge(load_head(_folder(settings)), settings.conformal), _nothing)
     transport = ChatTransport(
         [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
         retry=RetryPolicy(settings.tries),
