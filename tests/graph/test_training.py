@@ -12,10 +12,12 @@ from graph import toy
 from graph.harness import Graph, Probe, own_domain, wait_until
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from model_folders import make_model_folder
 
 from wm_msgs.action import Replay, Train
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import GetWeights, InferAction, SaveCheckpoint, StopRecording
+from wm_nodes.config.load import load_config
 from wm_nodes.ros import convert
 
 pytestmark = pytest.mark.graph
@@ -128,6 +130,33 @@ def test_training_from_the_bag_and_from_its_replay_gives_the_weights_of_the_live
             finally:
                 other.close()
                 offline.stop()
+
+
+def test_a_recording_or_an_environment_of_another_camera_ends_the_goal_with_both_cameras_named(
+    graph: Graph, probe: Probe, tmp_path: Path
+) -> None:
+    bag = recorded_training(graph, probe, updates=1)
+    config, model = load_config("smoke"), make_model_folder(tmp_path / "model")
+    with own_domain() as domain:
+        offline, other = Graph(domain, tmp_path / "offline", config), Probe(domain)
+        try:
+            offline.start("learner", model_dir=str(model), replay_rate=1e6)
+            offline.start("player", play_at_start=False)
+            for goal in ({"from_bags": True}, {"from_replay": True}):
+                result = train(other, updates=1, bag_uris=[str(bag)], **goal)
+                assert result.termination_reason == Train.Result.FAILED
+                assert "cameras ('top',)" in result.message and "('side', 'wrist')" in result.message, result.message
+            wait_until("the count", lambda: other.value("/wm/learner", "refused_specs") == "1")
+            offline.start_environment()
+            offline.start_policy()
+            offline.start_reward()
+            wait_until("its spec", lambda: other.value("/wm/learner", "refused_specs") == "2")
+            result = train(other, updates=1)
+            assert result.termination_reason == Train.Result.FAILED
+            assert "cameras" in result.message and "same config_file" in result.message, result.message
+        finally:
+            other.close()
+            offline.stop()
 
 
 @pytest.mark.alone

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from graph.harness import own_domain
+from graph.harness import Probe, own_domain
+from graph.launched import launched
 from metric_docs import documented, written
 
+from wm_msgs.action import TrainVideo
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.learning.clip_archive import RecordedClips, read_clips, rescore
 from wm_nodes.learning.clip_generation import ClipGenerator
@@ -294,3 +296,37 @@ def test_wrong_settings_end_with_one_clear_line(ros_domain: int, tmp_path: Path)
     done = start(["--set", "rollout.sampler.eta=1.2", "--run-dir", str(tmp_path)], ros_domain)
     assert done.returncode == 2
     assert "eta must be in [0, 1] for dyndiff, got 1.2" in done.stdout and "Traceback" not in done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_the_launch_file_trains_a_given_model_on_given_recordings_and_records_its_clips(
+    run_dir: Path, domain: int, tmp_path: Path
+) -> None:
+    bags = ",".join(map(str, sorted((run_dir / "data" / "train").glob("shard_*"))))
+    given = [
+        "video_preset:=smoke", f"video_model_dir:={run_dir / 'video_model'}", f"context_bags:={bags}",
+        f"run_dir:={tmp_path / 'run'}", f"domain_id:={domain}",
+    ]  # fmt: skip
+    operator = Probe(domain)
+    try:
+        with launched("world_model_rl", given, tmp_path / "starter.log"):
+            client = operator.action(TrainVideo, "video/train")
+            result = operator.finish(operator.send(client, TrainVideo.Goal(iterations=1)))
+            assert (result.termination_reason, result.iterations) == (TrainVideo.Result.FINISHED, 1), result.message
+    finally:
+        operator.close()
+    (clips,) = read_clips(tmp_path / "run" / "bags" / "world_model_rl")
+    assert clips.iteration == 0 and bool(clips.valid.all())
+
+
+def test_settings_that_the_graphs_model_or_the_ratio_cannot_have_are_refused_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for setting, said in (
+        ("grpo.kl.anchor=lora_off", "the graph's video model has none: take frozen"),
+        ("grpo.mask_source=recompute", "mask_source recompute has the full likelihood (12), got logprob_weight cps"),
+        ("grpo.ratio_norm=true", "ratio_norm replaces the weight of the likelihood, got logprob_weight cps"),
+    ):
+        run_dir = tmp_path / "run"
+        assert main(["--set", setting, "--run-dir", str(run_dir)]) == 2
+        assert said in " ".join(capfd.readouterr().out.split()) and not run_dir.exists()

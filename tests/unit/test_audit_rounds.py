@@ -390,15 +390,16 @@ def test_the_round_of_the_document_runs_as_it_is_written(tmp_path: Path, monkeyp
     block = DOCUMENT.read_text().split("```bash\n")[1].split("```")[0]
     commands = [line.removeprefix("python -m wm_nodes.reward.audit ").split() for line in block.splitlines()]
     assert [command[0] for command in commands] == [
-        "verify", "sample", "view", "agree", "replay", "replay", "replay", "adopt",
+        "verify", "sample", "view", "agree", "people", "replay", "replay", "replay", "adopt",
     ]  # fmt: skip
     codes = [main(command) for command in commands]
-    assert codes == [0, 0, 0, 0, 0, 0, 0, 1]  # the new numbers decide these clips no better
+    assert codes == [0, 0, 0, 0, 0, 0, 0, 0, 1]  # the new numbers decide these clips no better
     assert Path("audit/view.html").is_file() and Path("rubrics/current.yaml").is_file()
+    assert len(read_record(Path("audit-people")).judged()) == 6
 
 
 def test_every_command_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ("verify", "recover", "sample", "view", "agree", "replay", "adopt"):
+    for command in ("verify", "recover", "sample", "view", "agree", "people", "replay", "adopt"):
         with pytest.raises(SystemExit, match="0"):
             main([command, "--help"])
     assert "frozen" in capsys.readouterr().out

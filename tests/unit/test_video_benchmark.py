@@ -19,7 +19,15 @@ from wm_nodes.benchmark.video_arms import dyndiff, learning_arms, sampler_arm
 from wm_nodes.benchmark.video_cli import BASE, LEARNER, load_base, main
 from wm_nodes.benchmark.video_comparison import compare_arms, paired_interval, value
 from wm_nodes.benchmark.video_cost import ANCHORS, clocked, toy_rollout
-from wm_nodes.benchmark.video_learning import LearningPlan, alarms, evaluate, group_spread, sample_groups, train_arm
+from wm_nodes.benchmark.video_learning import (
+    LearningPlan,
+    alarms,
+    evaluate,
+    group_spread,
+    hacked,
+    sample_groups,
+    train_arm,
+)
 from wm_nodes.benchmark.video_plots import family_of
 from wm_nodes.benchmark.video_trials import ablation_trials, hacking_trials
 from wm_nodes.config.shipped import PRETRAINED
@@ -112,6 +120,18 @@ def test_arms_of_one_kind_share_a_line_in_the_picture(arm: str, family: str) -> 
 
 
 # hacking
+
+
+def test_a_reward_that_is_bought_with_too_much_mass_is_named_and_mass_that_becomes_right_is_not() -> None:
+    def rising(*masses: float) -> list[dict[str, float]]:
+        return [
+            {"reward": 0.1 * i, "mass": mass, "obeyed": 0.5 + 0.01 * i, "background": 0.001}
+            for i, mass in enumerate(masses)
+        ]
+
+    assert hacked(rising(1.02, 1.2, 1.38, 1.55), "reward") == ["mass"]
+    assert hacked(rising(0.8, 0.87, 0.94, 1.0), "reward") == []
+    assert hacked(rising(1.5, 1.3, 1.2, 1.1), "reward") == []
 
 
 def test_the_detector_names_what_a_hackable_reward_destroys_and_nothing_under_the_honest_one() -> None:

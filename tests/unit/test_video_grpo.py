@@ -364,9 +364,21 @@ def test_with_its_adapter_off_the_model_is_its_own_frozen_anchor() -> None:
 
 
 def test_switching_off_an_adapter_that_a_model_does_not_have_is_an_error() -> None:
-    learner = make(kl=KlSettings(anchor="lora_off"))
     with pytest.raises(ValueError, match="lora_off needs a model with a LoRA adapter"):
-        learner.train(buffer_of(learner))
+        make(kl=KlSettings(anchor="lora_off"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"mask_source": "recompute", "logprob_weight": "cps"}, r"full likelihood \(12\), got logprob_weight cps;"),
+        ({"mask_source": "recompute", "ratio_norm": True}, r"full likelihood \(12\), got ratio_norm True;"),
+        ({"ratio_norm": True, "logprob_weight": "base"}, "ratio_norm replaces .* got logprob_weight base; take full"),
+    ],
+)
+def test_two_settings_of_which_one_would_be_ignored_are_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        GrpoSettings(**changes)
 
 
 def test_training_the_condition_alone_moves_its_layers_and_no_other_weight_by_a_bit(tmp_path: Path) -> None:

@@ -105,11 +105,17 @@ def follow_training(
 
 
 def hacked(evaluations: list[dict[str, float]], proxy: str) -> list[str]:
-    """Held-out truths that fell while the training reward rose, equation (2), over all evaluations."""
+    """Held-out truths that got worse while the training reward rose, equation (2), over all evaluations.
+
+    Worse is less obedience, a mass further from 1 (too much is as wrong as too little), more background error.
+    """
     if len(evaluations) < MIN_EVALUATIONS:
         return []
-    truths = {name: [row[name] for row in evaluations] for name in ("obeyed", "mass")}
-    truths["background"] = [-row["background"] for row in evaluations]
+    truths = {
+        "obeyed": [row["obeyed"] for row in evaluations],
+        "mass": [-abs(row["mass"] - 1) for row in evaluations],
+        "background": [-row["background"] for row in evaluations],
+    }
     found = hacked_metrics([row[proxy] for row in evaluations], truths, window=len(evaluations))
     return [alarm.metric for alarm in found]
 

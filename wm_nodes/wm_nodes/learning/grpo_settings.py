@@ -51,6 +51,9 @@ class GrpoSettings:
     part of the videos (parts). step_fraction, step_select, min_s: see step_window.select_steps. cfg: guidance of the
     training pass. ratio_norm: (15b). equalise: weigh steps by SAGE's equaliser. max_staleness: optimizer steps between
     sampling and training that are still accepted.
+
+    Raises:
+        ValueError: two of logprob_weight, mask_source and ratio_norm are set; each says what the ratio is.
     """
 
     advantage: AdvantageSettings = field(default_factory=AdvantageSettings)
@@ -74,3 +77,16 @@ class GrpoSettings:
     max_grad_norm: float = 1.0
     ema_decay: float = 0.0
     max_staleness: int = 0
+
+    def __post_init__(self) -> None:
+        others = {"logprob_weight": self.logprob_weight != "full", "ratio_norm": self.ratio_norm}
+        if self.mask_source == "recompute" and any(others.values()):
+            given = ", ".join(f"{name} {getattr(self, name)}" for name, other in others.items() if other)
+            raise ValueError(
+                f"mask_source recompute has the full likelihood (12), got {given}; take logprob_weight full and "
+                "ratio_norm false, or mask_source cached"
+            )
+        if all(others.values()):
+            raise ValueError(
+                f"ratio_norm replaces the weight of the likelihood, got logprob_weight {self.logprob_weight}; take full"
+            )

@@ -53,9 +53,17 @@ class GrpoTerms:
     """Ratio and KL of transitions under `model`, and the weights of the anchor where it has its own.
 
     The anchor is a copy of the parameters that train, nothing else: with LoRA it is as small as the adapter.
+
+    Raises:
+        ValueError: the anchor is a model without its adapter, and there is none.
     """
 
     def __init__(self, model: nn.Module, settings: GrpoSettings, rollout: RolloutSettings) -> None:
+        if settings.kl.anchor == "lora_off" and not hasattr(model, "disable_adapter"):
+            raise ValueError(
+                "kl.anchor lora_off needs a model with a LoRA adapter; add one (video_model.adapters.add_lora), or "
+                "take kl.anchor frozen"
+            )
         self.model, self.settings, self.rollout = model, settings, rollout
         self.anchor: dict[str, Tensor] = {}
         """Parameters of a frozen or moving anchor by name; empty where the buffer or the bare model is the anchor."""
@@ -157,12 +165,7 @@ class GrpoTerms:
         mask = self._mask(buffer, rows)
         if self.settings.kl.anchor != "lora_off":
             return self._transition(self._anchored, buffer, rows, mask).zeta
-        disable: Any = getattr(self.model, "disable_adapter", None)
-        if disable is None:
-            raise ValueError(
-                "kl.anchor lora_off needs a model with a LoRA adapter; add one (video_model.adapters.add_lora), or "
-                "take kl.anchor frozen"
-            )
+        disable: Any = self.model.disable_adapter
         with disable():
             return self._transition(self.model, buffer, rows, mask).zeta
 

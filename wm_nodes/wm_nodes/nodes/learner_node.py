@@ -88,6 +88,8 @@ class LearnerNode(ManagedNode):
         self._report = LearnerReport(self, tensorboard=bool(self.param("tensorboard")))
         self.own(self._report.close)
         self._spec: EnvironmentSpec | None = None
+        self._refused: WireError | None = None
+        """Why the newest spec on env/spec cannot be trained from: it ends a goal that waits for its rollouts."""
         self._expected_spec = expected_spec(
             self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
         )
@@ -204,6 +206,12 @@ class LearnerNode(ManagedNode):
         if goal.from_bags and goal.from_replay:
             raise ValueError("from_bags and from_replay are both set; choose one")
         progress, num_steps = self._training.progress, self._config.ppo.num_steps
+
+        def check() -> None:
+            work.check()
+            if self._refused is not None:
+                raise self._refused
+
         if goal.from_bags:
             paths = bag_paths(goal.bag_uris, self.run_dir)
             self._reward_name = recorded_reward_name(paths[0])
@@ -211,9 +219,11 @@ class LearnerNode(ManagedNode):
             return BagRollouts(paths, progress, num_steps=num_steps, expected=self._expected_spec)
         if goal.from_replay:
             uris = [str(path) for path in bag_paths(goal.bag_uris, self.run_dir)] if goal.bag_uris else []
-            return ReplayedRollouts(self, work, progress, self._replayed, self._replay, uris, num_steps=num_steps)
+            if uris:
+                self._refused = None
+            return ReplayedRollouts(self, check, progress, self._replayed, self._replay, uris, num_steps=num_steps)
         return LiveRollouts(
-            self, work, progress, self._joiner, self._rollouts, num_steps=num_steps, seed=self._config.seed
+            self, work, check, progress, self._joiner, self._rollouts, num_steps=num_steps, seed=self._config.seed
         )
 
     def _exhausted(self, goal: Train.Goal, made: int, left_out: list[str]) -> str:
@@ -296,14 +306,14 @@ class LearnerNode(ManagedNode):
 
     def _on_spec(self, message: EnvSpec) -> None:
         try:
-            self._spec = convert.spec_from_msg(message)
+            self._spec, self._refused = convert.spec_from_msg(message), None
             if self._expected_spec is not None:
                 refuse_other(self._spec, self._expected_spec, "the learner's policy needs")
             self._max_episode_steps = self._spec.max_episode_steps
             self._joiner.enter_session(message.session)
             self._replayed.enter_session(message.session)
         except WireError as error:
-            self._spec = None
+            self._spec, self._refused = None, error
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
 
     def _on_image(self, message: Image) -> None:

@@ -17,7 +17,7 @@ from wm_nodes.nodes.replayed import ReplayJoiner
 from wm_nodes.nodes.training import Progress
 from wm_nodes.recording import BagReport, read_rollouts, topics
 from wm_nodes.ros.actions import Work
-from wm_nodes.ros.clients import run_goal, same_process
+from wm_nodes.ros.clients import Check, run_goal, same_process
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.wire import PeerLost, WireError
 from wm_nodes.specs import EnvironmentSpec
@@ -52,13 +52,13 @@ class RolloutSource(Protocol):
 
 
 class LiveRollouts:
-    """Asks the policy node for rollouts and joins what the graph publishes about them."""
+    """Asks the policy node for rollouts and joins what the graph publishes about them. check: as ReplayedRollouts's."""
 
     def __init__(
-        self, node: ManagedNode, work: Work, progress: Progress, joiner: RolloutJoiner, client: ActionClient, *,
-        num_steps: int, seed: int,
+        self, node: ManagedNode, work: Work, check: Check, progress: Progress, joiner: RolloutJoiner,
+        client: ActionClient, *, num_steps: int, seed: int,
     ) -> None:  # fmt: skip
-        self._node, self._work, self._progress = node, work, progress
+        self._node, self._work, self._check, self._progress = node, work, check, progress
         self._joiner, self._client = joiner, client
         self._num_steps, self._seed = num_steps, seed
         self.left_out: list[str] = []
@@ -97,7 +97,7 @@ class LiveRollouts:
         alive()
         self._joiner.begin()
         found: RolloutAction.Result = run_goal(
-            self._client, goal, accept_s=5.0, check=self._work.check, alive=alive
+            self._client, goal, accept_s=5.0, check=self._check, alive=alive
         )
         if found.termination_reason == RolloutAction.Result.FAILED:
             raise WireError(ErrorCode.INTERNAL, f"the policy node failed: {found.message}")
@@ -106,7 +106,7 @@ class LiveRollouts:
         span = (found.env_session, found.first_step_id, found.last_step_id)
         deadline = time.monotonic() + float(node.param("join_timeout_s"))
         while missing := self._joiner.missing(*span):
-            self._work.check()
+            self._check()
             if time.monotonic() > deadline:
                 node.diagnostics.count("incomplete_steps", len(missing), text=f"{len(missing)} lock-steps incomplete")
                 if accept_gaps:
@@ -156,13 +156,16 @@ class ReplayedRollouts:
     """Trains from the stream of a player: has it play `uris` one after the other or, without any, takes what is played.
 
     The player is held back by credit on env/transition while the learner works.
+
+    Args:
+        check: called while it waits; raises what ends the goal.
     """
 
     def __init__(
-        self, node: ManagedNode, work: Work, progress: Progress, joiner: ReplayJoiner, client: ActionClient,
+        self, node: ManagedNode, check: Check, progress: Progress, joiner: ReplayJoiner, client: ActionClient,
         uris: Sequence[str], *, num_steps: int,
     ) -> None:  # fmt: skip
-        self._node, self._work, self._progress, self._joiner = node, work, progress, joiner
+        self._node, self._check, self._progress, self._joiner = node, check, progress, joiner
         self.left_out: list[str] = []
         self._error: Exception | None = None
         self._thread: threading.Thread | None = None
@@ -175,7 +178,7 @@ class ReplayedRollouts:
     def next(self) -> tuple[Rollout, Dropped] | None:
         stale = gap = 0
         while True:
-            self._work.check()
+            self._check()
             if self._error is not None:
                 raise self._error
             found = self._joiner.take(float(self._node.param("join_timeout_s")))
@@ -217,7 +220,7 @@ class ReplayedRollouts:
         """In a thread: have the bags played, as fast as `replay_rate` and the credit allow."""
 
         def check() -> None:
-            self._work.check()
+            self._check()
             if self._closed.is_set():
                 raise PeerLost("training has ended")
 

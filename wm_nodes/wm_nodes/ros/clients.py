@@ -108,6 +108,8 @@ class RosEnvironmentClient:
         self._get_spec = node.create_client(GetEnvSpec, f"{base}env/get_spec")
         for client in (self._step, self._reset, self._get_spec):
             node.own(node.destroy_client, client)
+        if prefix:
+            node.watch(prefix)
         namespace = node.get_namespace().rstrip("/")
         self._peer = f"{namespace}/{base}environment"
         self._spec: EnvironmentSpec | None = None
@@ -147,7 +149,7 @@ class RosEnvironmentClient:
             try:
                 response = self._call(self._reset, request, min(left_s, self._timeout_s / 2), check)
             except PeerLost:
-                if left_s <= self._timeout_s / 2:
+                if left_s <= self._timeout_s / 2 or self._silent:
                     raise
                 raise WireError(ErrorCode.BUSY, "sent again") from None
             return calls.reset_reply(response, spec)
@@ -165,7 +167,7 @@ class RosEnvironmentClient:
             try:
                 response = self._call(self._step, request, min(left_s, ATTEMPT_S), check)
             except PeerLost:
-                if left_s <= ATTEMPT_S:
+                if left_s <= ATTEMPT_S or self._silent:
                     raise
                 self._node.diagnostics.count("step_retries", level=0)
                 raise WireError(ErrorCode.BUSY, "sent again") from None
@@ -199,10 +201,15 @@ class RosEnvironmentClient:
     def _call(self, client: Client, request: Any, timeout_s: float, check: Check) -> Any:
         def alive() -> None:
             check()
-            if self._node.peers.is_lost(self._peer):
+            if self._silent:
                 raise PeerLost(f"{self._peer} is silent")
 
         return call(client, request, timeout_s, alive)
+
+    @property
+    def _silent(self) -> bool:
+        """Whether the environment is known to be lost: no answer will come, however often it is asked."""
+        return self._node.peers.is_lost(self._peer)
 
 
 class LocalEnvironmentClient:

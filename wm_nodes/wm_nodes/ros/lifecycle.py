@@ -132,6 +132,13 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._entities.append(lambda: self.destroy_publisher(publisher.publisher))
         return publisher
 
+    def watch(self, prefix: str) -> None:
+        """Hear the heartbeats of the nodes of a relative namespace, too, until cleanup: their silence is reported."""
+        row = topic("run/state")
+        name = f"{prefix}/{row.name}"
+        subscription = self.create_subscription(RunState, name, self._on_run_state, row.reader_qos)
+        self.own(self.destroy_subscription, subscription)
+
     def listen(
         self, name: str, callback: Callable[[Any], None], *, credit: bool = False, while_inactive: bool = False
     ) -> CreditGrantor | None:

@@ -1,0 +1,30 @@
+"""A launch file's graph as a user starts it with ROS 2's Python alone."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from graph.harness import wait_until
+
+PROGRAM = "import sys; from wm_nodes.ros.runner import main; sys.exit(main(sys.argv[1], sys.argv[2:]))"
+
+
+@contextmanager
+def launched(scenario: str, given: Sequence[str], log: Path) -> Iterator[None]:
+    """The graph of a launch file while it is ready; ended by Ctrl-C, with exit code 0."""
+    with log.open("wb") as output:
+        starter = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, scenario, *given], stdout=output, stderr=output, env=os.environ.copy()
+        )
+        try:
+            wait_until("the graph", lambda: starter.poll() is not None or "ready; Ctrl-C stops" in log.read_text(), 120)
+            assert starter.poll() is None, log.read_text()
+            yield
+        finally:
+            starter.send_signal(signal.SIGINT)
+            code = starter.wait(60)
+    assert code == 0, log.read_text()
