@@ -14,8 +14,9 @@ from wm_nodes.config.load import ConfigError, default_judge, load_config
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.learning.clip_judging import ClipJob, ClipJudge
 from wm_nodes.reward.agent import RewardAgent, Rubric, Status, Verdict, load_rubric
-from wm_nodes.reward.agent.types import GATED, Capabilities, Judge, Stage
-from wm_nodes.reward.judges.factory import check_judge, judge_name
+from wm_nodes.reward.agent.levels import next_vote
+from wm_nodes.reward.agent.types import GATED, Capabilities, Judge, Profile, Read, ReadRequest, Stage
+from wm_nodes.reward.judges.factory import check_judge, judge_name, make_judge
 from wm_nodes.reward.judges.routed import RoutedJudge
 
 RUBRIC = load_rubric()
@@ -86,6 +87,27 @@ def test_a_judge_may_know_its_own_stages_only_and_one_that_lacks_a_component_is_
     for stages in ([Stage.REFLECT], [Stage.PC, Stage.PC]):
         with pytest.raises(ValueError, match="each stage has one route and REFLECT follows its components"):
             RoutedJudge(robot, [(stages, robot)], RUBRIC)
+
+
+def test_a_server_that_can_do_it_is_asked_for_letters_only_and_for_their_probabilities_by_id() -> None:
+    with serving(PickyServer()) as server:
+        ids = [5, 6, 7, 8, 9]
+        values = {"endpoints": [server.url], "model": "judge", "choice_grammar": True, "label_token_ids": ids}
+        opened = make_judge(JudgeConfig.model_validate({**default_judge().model_dump(), **values}), RUBRIC)
+        clip = make_clip()
+        request = ReadRequest(clip, make_task(clip), Stage.VQ, ("clarity",), Profile.S, (next_vote(1, 0),), ())
+
+        async def asked() -> list[Read]:
+            reads = await opened.judge.read(request)
+            await opened.close()
+            return reads
+
+        assert [read.status for read in asyncio.run(asked())] == [Status.OK]
+    body = server.requests[-1]
+    assert body["structured_outputs"] == {"choice": list("ABCDE")} and body["logprob_token_ids"] == ids
+    wrong = JudgeConfig.model_validate({**default_judge().model_dump(), **values, "label_token_ids": [1, 2]})
+    with pytest.raises(ValueError, match=r"label_token_ids must hold 5 ids, of A to E, got \(1, 2\)"):
+        make_judge(wrong, RUBRIC)
 
 
 @contextmanager

@@ -166,6 +166,11 @@ class JudgeConfig(Section):
     """Images that the server takes in one call."""
     video: bool
     """Send the dense frames of a clip as one video instead of images; for vLLM."""
+    choice_grammar: bool = False
+    """openai: a read of one token may only be a listed letter (vLLM); without it, a read that is mostly other words
+    abstains."""
+    label_token_ids: list[int] = []
+    """openai: token ids of A to E, for servers that give the probabilities of given ids (vLLM: logprob_token_ids)."""
     repeat_share: Annotated[float, Field(ge=0, le=1)]
     """Share of the calls to a server that are made twice: `flip_rate` says how often the second answer is another."""
     keep_reads: bool

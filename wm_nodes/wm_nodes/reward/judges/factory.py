@@ -156,6 +156,7 @@ def _opened(
     options = ChatOptions(
         json_timeout_s=settings.json_timeout_s, label_timeout_s=settings.label_timeout_s,
         budget_s=settings.clip_budget_s, max_images=settings.max_images, video=settings.video,
+        choice_grammar=settings.choice_grammar, label_token_ids=tuple(settings.label_token_ids),
         repeat_share=settings.repeat_share,
     )  # fmt: skip
     cache = VerdictCache(reads) if reads is not None and settings.keep_reads else None
