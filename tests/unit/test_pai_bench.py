@@ -9,7 +9,8 @@ import pytest
 from chat_server import ChatServer, Fault
 from judge_server import serving
 
-from wm_nodes.benchmark.pai_bench import main, metrics_of, read_video
+from wm_nodes.benchmark.pai_bench import main, metrics_of
+from wm_nodes.learning.clip_files import read_video
 from wm_nodes.learning.frame_features import load_backbone
 from wm_nodes.reward.agent import clip_ref
 from wm_nodes.reward.comparisons import pai_bench as pai

@@ -18,14 +18,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from wm_nodes.files import write_atomic
+from wm_nodes.learning.clip_files import read_picture, read_video
 from wm_nodes.learning.frame_features import FrameFeatures, load_backbone
-from wm_nodes.reward.agent import ClipRef, clip_ref
+from wm_nodes.reward.agent import ClipRef
 from wm_nodes.reward.comparisons import ChatComparison
 from wm_nodes.reward.comparisons import pai_bench as pai
 from wm_nodes.reward.judges import ChatTransport, Endpoint
@@ -35,25 +35,6 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 BACKBONE_METRICS = {"subject": ("subject_consistency", "i2v_subject"),
                     "background": ("background_consistency", "i2v_background")}  # fmt: skip
 """By the option that names the backbone: the metric of the video alone, and the one with its conditioning image."""
-
-
-def read_video(path: Path) -> ClipRef:
-    """Every frame of a video, RGB.
-
-    Raises:
-        ValueError: no readable video of two frames or more.
-    """
-    capture = cv2.VideoCapture(str(path))
-    fps, frames = capture.get(cv2.CAP_PROP_FPS), []
-    while True:
-        there, frame = capture.read()
-        if not there:
-            break
-        frames.append(frame[..., ::-1])
-    capture.release()
-    if len(frames) < 2 or not fps > 0:
-        raise ValueError(f"{path} is no readable video: {len(frames)} frames at {fps:g} per second")
-    return clip_ref(path.stem, np.stack(frames), fps)
 
 
 def metrics_of(clip: ClipRef, image: UInt8Array | None, backbones: dict[str, FrameFeatures]) -> dict[str, float]:
@@ -107,10 +88,9 @@ def _image(folder: Path | None, name: str) -> UInt8Array | None:
     if folder is None:
         return None
     path = next((path for suffix in IMAGE_SUFFIXES if (path := folder / f"{name}{suffix}").is_file()), None)
-    image = None if path is None else cv2.imread(str(path))
-    if image is None:
+    if path is None:
         raise ValueError(f"{folder} has no readable {name}{'|'.join(IMAGE_SUFFIXES)}; every video needs its image")
-    return np.asarray(image[..., ::-1], np.uint8)
+    return read_picture(path)
 
 
 def main(argv: Sequence[str]) -> int:
