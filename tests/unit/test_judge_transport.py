@@ -236,6 +236,14 @@ def test_second_endpoint_answers_at_once_where_the_first_fails() -> None:
     asyncio.run(run())
 
 
+class EchoingServer(ChatServer):
+    """Says in a valid answer what key it was sent."""
+
+    def _completion(self, body: dict[str, Any], fault: Fault | None) -> str:
+        key = self.headers[-1]["authorization"].removeprefix("Bearer ")
+        return super()._completion(body, fault).replace("The clip looks fine to me.", f"I was sent {key}.")
+
+
 def test_key_comes_from_the_named_variable_and_reaches_no_log_and_no_error(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -248,6 +256,8 @@ def test_key_comes_from_the_named_variable_and_reaches_no_log_and_no_error(
         talk(ask, server, api_key_env="WM_TEST_KEY")
     assert server.headers[0]["authorization"] == "Bearer sk-very-secret"
     assert "secret" not in caplog.text + repr(caught.value) + repr(caught.value.__cause__)
+    echo = talk(ask_patiently, EchoingServer(), api_key_env="WM_TEST_KEY")
+    assert echo.completion.choices[0].message.content == "I was sent [WM_TEST_KEY]."
     open_server = ChatServer()
     talk(ask, open_server)
     assert open_server.headers[0]["authorization"] == "Bearer none"

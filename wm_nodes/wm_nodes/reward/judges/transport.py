@@ -112,7 +112,7 @@ class _Server:
         self.breaker = CircuitBreaker(time.monotonic, probe_s=probe_s)
 
     def clean(self, text: str) -> str:
-        """The text without the key: servers repeat headers in their error messages."""
+        """The text without the key: servers repeat headers in their error messages, and some in their answers."""
         return text.replace(self.key, f"[{self.endpoint.api_key_env}]") if self.endpoint.api_key_env else text
 
 
@@ -261,7 +261,7 @@ class ChatTransport:
                     messages=body["messages"],
                     extra_body={key: value for key, value in body.items() if key != "messages"},
                 )
-            return Completion.model_validate_json(raw.http_response.content)
+            return Completion.model_validate_json(server.clean(raw.http_response.text))
         except (TimeoutError, openai.APITimeoutError):
             text = f"no answer within {allowed_s:.1f} s"
             if cut_short:
