@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from wm_nodes.ros import arguments as launch_arguments
+from wm_nodes.ros import launch_face
 from wm_nodes.ros.domain import DomainInUseError, DomainLock
 from wm_nodes.ros.environment import PROFILE, graph_environment
 from wm_nodes.ros.graph import Graph, GraphError, NodeSpec
@@ -235,6 +236,11 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
     defaults = {action.arguments[0]: action.named["default_value"] for action in declared}
     assert defaults == {argument.name: argument.default for argument in ARGUMENTS if argument.name in defaults}
     nodes = start.named["function"]({**defaults, **values})
+    (lock,) = launch_face.HELD
+    with pytest.raises(DomainInUseError, match=r"ROS domain 7 is already in use .*domain_id:=8"):
+        start.named["function"]({**defaults, **values})
+    launch_face.HELD.clear()
+    lock.release()
 
     runner = Runner(launch_arguments.prepare(scenario, values)[0], log=None, use_domain_lock=False)
     assert len(nodes) == len(runner.graph.nodes)

@@ -11,9 +11,13 @@ import subprocess
 from collections.abc import Mapping
 from typing import Any
 
+from wm_nodes.ros.domain import DomainLock
 from wm_nodes.ros.environment import graph_environment, interpreter
 from wm_nodes.ros.graph import Graph, NodeSpec
 from wm_nodes.ros.scenarios import argument_table
+
+HELD: list[DomainLock] = []
+"""Of the graphs that this process launched, until it ends: ros2 launch runs nothing of ours at its own end."""
 
 
 def launch_description(scenario: str) -> Any:
@@ -44,13 +48,19 @@ def launch_description(scenario: str) -> Any:
 
 
 def _start(scenario: str, context: Any) -> list[Any]:
+    """Raises DomainInUseError where another graph of this host works on the domain, whichever way it was started."""
     from launch.substitutions import LaunchConfiguration
 
     given = {
         argument.name: LaunchConfiguration(argument.name).perform(context) for argument in argument_table(scenario)
     }
     python = interpreter(given)
-    return node_actions(prepared(scenario, given, python), python)
+    graph = prepared(scenario, given, python)
+    domain = int(graph_environment(graph.environment, python=python)["ROS_DOMAIN_ID"])
+    lock = DomainLock(domain, f"graph {graph.name!r}")
+    lock.acquire()
+    HELD.append(lock)
+    return node_actions(graph, python)
 
 
 def prepared(scenario: str, given: Mapping[str, str], python: str) -> Graph:
