@@ -15,17 +15,18 @@ from wm_msgs.action import TrainVideo
 from wm_msgs.msg import ClipVerdict
 from wm_nodes.reward.audit import read_record
 from wm_nodes.reward.evidence.head import load_head, save_head
-from wm_nodes.reward.judges.embedded import shipped_head
+from wm_nodes.reward.judges.embedded import shipped_heads
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 
 def far_sighted_judge(folder: Path) -> Path:
-    """The shipped judge, told that it was trained on clips like those of the tiny loop, and that none is foreign."""
+    """The shipped judge of the loops' pictures, told that it was trained on clips as short as the tiny loop's, and that
+    none is foreign."""
     folder.mkdir()
-    head = load_head(shipped_head())
+    head = load_head(shipped_heads()[1])
     known = replace(head.familiarity, limit=1e9)
-    return save_head(folder, replace(head, size=(64, 128), lengths=(2, 25), familiarity=known))
+    return save_head(folder, replace(head, lengths=(2, 25), familiarity=known))
 
 
 def test_a_round_is_judged_in_the_node_without_any_server_and_with_the_evidence_of_the_world_model(

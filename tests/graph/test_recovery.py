@@ -85,7 +85,8 @@ def test_evaluation_episodes_are_recorded_and_a_killed_simulator_or_evaluation_n
         wait_until("its steps", lambda c=count: len(steps) > c + 5)
         graph.kill(name)
         if name == "/wm/sim/environment":
-            lost = probe.finish(running, 5.0)  # long before its step_timeout_s: it hears /wm/sim's heartbeats
+            wait_until("the report", lambda: _reported(probe, "/wm/evaluation", "/wm/sim/environment"), 5.0)
+            lost = probe.finish(running, 8.0)  # before its step_timeout_s: it hears /wm/sim's heartbeats
             assert lost.termination_reason == Evaluate.Result.PEER_LOST and "environment" in lost.message
             lost = evaluate(probe, 1)
             assert lost.termination_reason == Evaluate.Result.PEER_LOST and "environment" in lost.message

@@ -293,7 +293,8 @@ def test_the_settings_of_loop_2_hold_the_judges_and_come_back_from_their_file(tm
 def test_the_command_refuses_an_agent_without_a_judge_before_anything_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["--preset", "smoke", "--reward", "agent", "--run-dir", str(tmp_path / "run")]) == 2
+    nobody = ["--reward", "agent", "--judge-model", "judge"]
+    assert main(["--preset", "smoke", *nobody, "--run-dir", str(tmp_path / "run")]) == 2
     assert "needs a judge" in capsys.readouterr().out and not (tmp_path / "run").exists()
 
 
@@ -302,7 +303,7 @@ def test_the_command_refuses_an_embedded_judge_that_cannot_read_its_clips_before
 ) -> None:
     bags = [write_contexts(tmp_path / "contexts")]
     monkeypatch.setattr("wm_nodes.world_model_job._data", lambda *given: (bags, bags))
-    embedded = ["--reward", "agent", "--set", "judge.kind=embedded", "--from-scratch"]
+    embedded = ["--reward", "agent", "--judge", str(shipped_head()), "--from-scratch"]
     run_dir = tmp_path / "run"
     assert main(["--preset", "smoke", *embedded, "--run-dir", str(run_dir)]) == 2
     said = " ".join(capsys.readouterr().out.split())
@@ -313,12 +314,12 @@ def test_the_command_refuses_an_embedded_judge_that_cannot_read_its_clips_before
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--reward", "agent"], "needs a judge"),
+        (["--reward", "agent", "--judge-model", "judge"], "needs a judge"),
         (["--judge-model", "judge"], "judge.model would change nothing without --reward agent"),
         (["--reward", "agent", *JUDGE, "--set", "ppo.num_steps=15"], "ppo.num_steps is 15"),
         (["--reward", "agent", *JUDGE, "--rubric", "nowhere"], "nowhere"),
-        (["--reward", "agent", "--set", "judge.kind=embedded"], "cannot judge clips of 17 frames, 64 x 128 px"),
-        (["--reward", "agent", "--set", "judge.kind=embedded"], "Name a server"),
+        (["--reward", "agent", "--judge", str(shipped_head())], "cannot judge clips of 17 frames, 64 x 128 px"),
+        (["--reward", "agent", "--judge", str(shipped_head())], "Name a server"),
     ],
     ids=["nobody", "judge_alone", "cut_off", "no_rubric", "size", "remedy"],
 )
@@ -351,14 +352,20 @@ def test_launch_arguments_bring_the_agent_into_both_loops(tmp_path: Path) -> Non
     _, values = launch_arguments.prepare("world_model_rl", {**clips, **judge})
     config = load_video_config(values["config_file"])
     assert config.rewards == {"agent": 1.0} and config.judge.model == "judge"
+    for scenario, arguments, load in (
+        ("online_training", policies, load_config), ("world_model_rl", clips, load_video_config),
+    ):  # fmt: skip
+        _, values = launch_arguments.prepare(scenario, {**arguments, "reward": "agent"})
+        assert load(values["config_file"]).judge.kind == "embedded", "nobody is named: the one that needs nothing"
+    wide = str(shipped_head())
     refusals = [
-        ("online_training", {**policies, "reward": "agent"}, "needs a judge"),
-        ("online_training", {**policies, "reward": "agent", "judge": "embedded"}, "cannot judge clips of .* 64 x 128"),
+        ("online_training", {**policies, "reward": "agent", "judge_model": "judge"}, "needs a judge"),
+        ("online_training", {**policies, "reward": "agent", "judge": wide}, "cannot judge clips of .* 64 x 128"),
         ("online_training", {**policies, "judge": "http://localhost:1/v1"}, "would change nothing without"),
         ("online_training", {**given, **judge, "config_file": values["config_file"]}, "belong into it"),
         ("online_training", {**policies, **judge, "preset": "smoke"}, r"ppo\.num_steps is 6"),
         ("world_model_rl", {**clips, "reward": "rule"}, "is of policies"),
-        ("world_model_rl", {**clips, "reward": "agent"}, "needs a judge"),
+        ("world_model_rl", {**clips, "reward": "agent", "judge_model": "judge"}, "needs a judge"),
     ]
     for scenario, arguments, words in refusals:
         with pytest.raises(GraphError, match=words):

@@ -109,5 +109,5 @@ def test_the_command_writes_a_line_per_episode_and_names_what_is_wrong(
     lines = [json.loads(line) for line in rows.read_text().splitlines()]
     assert lines and all(line["status"] == "OK" and 0 < line["reward"] <= 1 for line in lines)
     assert f"{len(lines)} episodes judged ({len(lines)} OK)" in said and "0 recorded lock-steps" in said
-    assert main([str(bag)]) == 2 and "needs a judge" in capsys.readouterr().err
+    assert main([str(bag), "--judge-model", "judge"]) == 2 and "needs a judge" in capsys.readouterr().err
     assert main([str(tmp_path / "none"), *given[1:]]) == 2 and "none" in capsys.readouterr().err

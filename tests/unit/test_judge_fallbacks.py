@@ -21,7 +21,8 @@ from wm_nodes.learning.episode_reward import EpisodeReward, check_agent
 from wm_nodes.learning.video_config import dump_video_config, load_video_config
 from wm_nodes.reward.agent import Status, Verdict, check_one_judge, pause_reason
 from wm_nodes.reward.audit import read_record, verify
-from wm_nodes.reward.judges.factory import check_clips, check_judge, judges_of
+from wm_nodes.reward.judges.embedded import shipped_heads
+from wm_nodes.reward.judges.factory import check_clips, check_judge, for_clips, judges_of
 from wm_nodes.reward.judges.limits import CircuitBreaker
 
 FIRST, SECOND = "openai-chat:first", "openai-chat:second"
@@ -214,8 +215,20 @@ def test_the_embedded_judge_takes_a_round_of_clips_of_its_size_and_keeps_what_it
     assert judges(stays) == judges(verdicts) and [len(server.requests) for server in servers] == asked, (
         "a judge that cannot say has answered: nobody else is asked"
     )
-    with pytest.raises(ValueError, match=r"cannot judge clips of 8 frames, 64 x 128 px.* Name a server"):
-        check_clips(embedded, (8, 64, 128, 3))
+    check_clips(embedded, (16, 64, 128, 3))  # by the judge of the loops' pictures
+    with pytest.raises(ValueError, match=r"cannot judge clips of 8 frames, 32 x 64 px.* Name a server"):
+        check_clips(embedded, (8, 32, 64, 3))
+
+
+def test_an_embedded_judge_that_is_not_named_is_the_shipped_one_of_such_pictures_and_others_stay() -> None:
+    nobody, here = {"kind": "embedded"}, {"kind": "embedded", "folder": "mine"}
+    other, server = {**here, "stages": ["TC"]}, {"endpoints": ["http://b/v1"], "model": "first"}
+    values = {**default_judge().model_dump(), **nobody, "routes": [other], "fallbacks": [nobody, server]}
+    for size, folder in zip(((96, 96), (64, 128)), shipped_heads(), strict=True):
+        found = for_clips(JudgeConfig.model_validate(values), (17, *size, 3))
+        assert [found.folder, found.fallbacks[0].folder] == [str(folder)] * 2
+        assert found.routes[0].folder == "mine" and found.fallbacks[1].folder == ""
+    assert for_clips(JudgeConfig.model_validate(values), (17, 9, 9, 3)).folder == str(shipped_heads()[0])
 
 
 @pytest.mark.parametrize(

@@ -103,8 +103,9 @@ def test_a_silent_peer_is_lost_once_and_a_leaving_one_is_not() -> None:
     assert peers.check(now=3.1) == ["/wm/a"]
     assert peers.check(now=4.0) == []
     assert peers.is_lost("/wm/a")
+    assert [peers.silence_s(name, now=4.5) for name in ("/wm/a", "/wm/b", "/wm/never")] == [4.5, 0.0, 0.0]
     assert peers.heard("/wm/a", now=5.0)
-    assert peers.lost == []
+    assert peers.lost == [] and peers.silence_s("/wm/a", now=5.5) == 0.5
 
 
 def test_time_in_which_a_process_stood_still_makes_no_peer_lost() -> None:

@@ -63,7 +63,8 @@ def open_run_dir(given: Path | None, name: str, config_text: str, *, begun_with:
 def add_judge_options(parser: argparse.ArgumentParser) -> None:
     """Who judges where the reward is the agent's; judge_options reads them."""
     parser.add_argument("--judge", default="", metavar="URL[,URL]|embedded|FOLDER",
-                        help="the judge's servers, e.g. http://host:8000/v1; or a judge without one")  # fmt: skip
+                        help="the judge's servers, e.g. http://host:8000/v1; or a judge without one. "
+                        "Default: embedded")  # fmt: skip
     parser.add_argument("--judge-model", default="", metavar="NAME", help="its name on the server")
     parser.add_argument("--judge-key-env", default="", metavar="VARIABLE", help="environment variable with its key")
     parser.add_argument("--rubric", default="", help="rubric pack: a name, or a .yaml file")

@@ -22,11 +22,12 @@ from typing import Any
 
 from tqdm import tqdm
 
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.job import add_judge_options, judge_options
 from wm_nodes.learning.clip_files import read_job, read_list
 from wm_nodes.learning.clip_judging import ClipJob, ClipJudge
 from wm_nodes.reward.agent import Status, Verdict
+from wm_nodes.reward.judges.factory import for_clips
 
 VERDICTS = "verdicts.jsonl"
 AT_ONCE = 64
@@ -60,7 +61,9 @@ def _judge(arguments: argparse.Namespace) -> int:
     overrides = judge_options(arguments) | ({"judge.mode": arguments.mode} if arguments.mode else {})
     config, lines = load_config(arguments.config, overrides), read_list(arguments.clips)
     path = arguments.json or arguments.clips / VERDICTS
-    settings = config.judge
+    settings = judge_or_embedded(config.judge)
+    if lines:
+        settings = for_clips(settings, read_job(arguments.clips, lines[0]).clip.frames.shape)
     judge = ClipJudge(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit)
     with closing(judge), path.open("a+") as written:
         asked = {"judge_id": judge.judge_ids[0], "rubric": judge.rubric.version}

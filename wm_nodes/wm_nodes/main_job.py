@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from wm_nodes.allocator import keep_freed_memory
-from wm_nodes.config.load import ConfigError, dump_config, load_config, parse_override, preset_names
+from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.job import (
@@ -32,7 +32,7 @@ from wm_nodes.job import (
     start_graph,
 )
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, collect_plan, gate_plan
-from wm_nodes.learning.episode_reward import check_agent
+from wm_nodes.learning.episode_reward import check_agent, episode_judge
 from wm_nodes.learning.gate import judge_model
 from wm_nodes.learning.pictures import write_pictures
 from wm_nodes.learning.policies import load_policy
@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> Summary:
         imagined_paired=asdict(paired_difference(found.imagined_before.tolist(), found.imagined_after.tolist())),
         gate=json.loads((run_dir / "gate.json").read_text()), samples=found.samples, minutes=stage.minutes,
         command=_command(), machine=machine_facts(), rounds=found.table, reward=arguments.reward,
-        judge=judge_name(config.judge) if arguments.reward == AGENT else "",
+        judge=judge_name(episode_judge(config)) if arguments.reward == AGENT else "",
     )  # fmt: skip
     write_summary(run_dir, summary)
     policy = load_policy(config, found.model_dir, found.policy)
@@ -175,6 +175,7 @@ def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
     config = load_config(arguments.preset, {**overrides, **judge})
     begun_with = ["--from-scratch"] if arguments.from_scratch else []
     if arguments.reward == AGENT:
+        config = config.model_copy(update={"judge": judge_or_embedded(config.judge)})
         check_agent(config)
         begun_with.append("--reward agent")
     return config, open_run_dir(arguments.run_dir, config.task, dump_config(config), begun_with=begun_with)

@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import torch
 from tqdm import tqdm
 
 from wm_nodes.allocator import keep_freed_memory
-from wm_nodes.config.load import ConfigError, load_config, parse_override
+from wm_nodes.config.load import ConfigError, judge_or_embedded, load_config, parse_override
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.job import READY_S, Stages, add_judge_options, console, open_run_dir
@@ -169,6 +170,7 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
         overrides["seed"] = arguments.seed
     config = load_video_config(arguments.preset, {**overrides, **chosen_judge(arguments)})
     if config.rewards.get(AGENT):
+        config = replace(config, judge=judge_or_embedded(config.judge))
         check_judge(config.judge)
     if config.grpo.kl.anchor == "lora_off":
         raise ValueError(

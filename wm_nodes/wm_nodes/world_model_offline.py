@@ -11,7 +11,7 @@ from rich.table import Table
 from torch import Tensor
 from tqdm import tqdm
 
-from wm_nodes.config.load import parse_override
+from wm_nodes.config.load import judge_or_embedded, parse_override
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.files import write_atomic
 from wm_nodes.job import Stages, console, judge_options, open_run_dir
@@ -41,6 +41,7 @@ from wm_nodes.learning.video_run import VideoRun, progress
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.reports.summary import plain
 from wm_nodes.reward.agent import Verdict
+from wm_nodes.reward.judges.factory import for_clips
 from wm_nodes.world_model_results import Finished, conclude
 
 RESCORED = "rescored.json"
@@ -52,7 +53,7 @@ def rescore_run(arguments: argparse.Namespace) -> int:
     probe = load_probe(shipped_model(config.task))
     bags = _shards(run_dir, "train")
     contexts = load_clips(bags, config.model.stride)
-    with _judge(config, run_dir, clip_fps(bags[0], config.model.stride)) as judge:
+    with _judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
         clips = (recorded for bag in recorded_bags(run_dir) for recorded in read_clips(bag, pictures=True))
         rows = [
             rescore(recorded, contexts, probe, config.rewards, config.model.num_conditioning, judge)
@@ -127,7 +128,7 @@ def chosen_judge(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 @contextmanager
-def _judge(config: VideoRlConfig, run_dir: Path, fps: float) -> Iterator[BufferJudge | None]:
+def _judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: float) -> Iterator[BufferJudge | None]:
     """The run's reward agent with the answers that it kept; a round is judged by the judge that did it, where the run
     still has that one. None where the agent is not among the rewards."""
     if not config.rewards.get(AGENT):
@@ -136,12 +137,14 @@ def _judge(config: VideoRlConfig, run_dir: Path, fps: float) -> Iterator[BufferJ
 
     def verdicts(recorded: RecordedClips, frames: Tensor, references: Clips) -> list[Verdict]:
         jobs = buffer_jobs(
-            frames, references, recorded.sha256, fps=fps, task=config.task, robot=config.judge.robot
+            frames, references, recorded.sha256, given=config.model.num_conditioning, fps=fps, task=config.task,
+            robot=config.judge.robot,
         )
         return judge.judge(jobs, by=recorded.judge_id if recorded.judge_id in judge.judge_ids else "")
 
     evidence = ClipEvidence(shipped_model(config.task))
-    with closing(ClipJudge(config.judge, seed=config.seed, reads=run_dir / READS, evidence=evidence)) as judge:
+    settings = for_clips(judge_or_embedded(config.judge), tuple(contexts.frames.shape[1:]))
+    with closing(ClipJudge(settings, seed=config.seed, reads=run_dir / READS, evidence=evidence)) as judge:
         yield verdicts
 
 

@@ -74,6 +74,12 @@ def judge_overrides(endpoints: str = "", model: str = "", api_key_env: str = "",
     return {f"judge.{name}": value for name, value in found.items() if value}
 
 
+def judge_or_embedded(judge: JudgeConfig) -> JudgeConfig:
+    """The judge's settings; where they name nobody, those of the embedded judge, which needs nothing."""
+    nobody = judge.kind != EMBEDDED and not judge.endpoints and not judge.model
+    return judge.model_copy(update={"kind": EMBEDDED}) if nobody else judge
+
+
 def dump_config(config: RunConfig) -> str:
     """The resolved configuration as YAML, as saved with every run."""
     return str(yaml.safe_dump(config.model_dump(), sort_keys=False))

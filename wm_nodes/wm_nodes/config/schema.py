@@ -138,7 +138,7 @@ class JudgeConfig(Section):
     api_key_env: str
     """openai: name of the environment variable that holds the key; empty: the server wants none."""
     folder: str
-    """embedded: folder of the trained judge; empty: the shipped one."""
+    """embedded: folder of the trained judge; empty: the shipped one that reads such pictures."""
     conformal: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """embedded: abstain where the answer is not sure at this coverage (0.8, 0.9, 0.95 or 0.98); 0: always decide."""
     rubric: str

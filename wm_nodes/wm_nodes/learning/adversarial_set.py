@@ -6,11 +6,13 @@ written last: a folder without one is unfinished. Equal arguments give equal byt
     python3 launch_scripts/make_adversarial_set.py FOLDER --tasks push_cube --episodes 8
     python3 launch_scripts/make_adversarial_set.py FOLDER --benchmark
     python3 launch_scripts/make_adversarial_set.py FOLDER --diverse --episodes 40 --edits 26 --seed 20000
+    python3 launch_scripts/make_adversarial_set.py FOLDER --policy-view --development --episodes 40 --edits 26
 
 --benchmark is the set that judges are compared on: three tasks, shapes that no judge was trained on, and seeds of its
 own; its test split is fixed by the manifest (benchmark_clips.chosen_rows) and has 400 clips or more.
 --development leaves out the episodes of the test part, which training does not read; --diverse does so too, and draws
 cameras, colours, light and push directions from ranges that keep away from what is held out (diverse_looks.py).
+--policy-view draws the loops' own scene and camera, most through a world model (policy_view.py).
 """
 
 import argparse
@@ -31,6 +33,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.files import write_atomic
 from wm_nodes.learning.diverse_looks import Variation, drawn_variation
+from wm_nodes.learning.policy_view import IMAGINED, PolicyView, policy_models
 from wm_nodes.reward.adversarial import (
     RECIPES,
     Division,
@@ -54,6 +57,7 @@ from wm_nodes.seeding import numpy_stream
 from wm_nodes.simulation.clip_scenes import (
     CAMERAS,
     ClipStage,
+    Drawing,
     EpisodeStates,
     Look,
     View,
@@ -63,6 +67,7 @@ from wm_nodes.simulation.clip_scenes import (
 from wm_nodes.simulation.environment import ManiSkillEnvironment
 from wm_nodes.simulation.tasks import TASKS, get_task
 from wm_nodes.types import UInt8Array
+from wm_nodes.world_model import load_model_folder
 
 MANIFEST = "manifest.jsonl"
 SIDE_PX = 96
@@ -89,7 +94,7 @@ class SetPlan:
     that are tried on each, None for all. seed: episode i is reset with seed + i; look and recipes follow from it.
     shapes: besides the cube; rare, and test clips only. Not in "reach", whose end state depends on the height.
     development: episodes that no test part has, num_episodes of them. diverse: scenes of diverse_looks.py. recipes: of
-    the edits.
+    the edits. policy: clips of policy_view.py.
     """
 
     tasks: tuple[str, ...] = ("push_cube",)
@@ -101,8 +106,11 @@ class SetPlan:
     development: bool = False
     diverse: bool = False
     recipes: tuple[str, ...] = tuple(RECIPES)
+    policy: bool = False
 
     def __post_init__(self) -> None:
+        if self.policy and (self.diverse or self.shapes):
+            raise ValueError("the loops' own scene has one look and the cube alone; leave out diverse and shapes")
         if self.diverse and (self.shapes or not self.development):
             raise ValueError("a diverse set is of the development parts, and of the cube alone; leave out shapes")
         if self.development and (kept := sorted({*self.tasks} & {*self.division.tasks})):
@@ -144,25 +152,40 @@ class ClipSource:
     """
 
     def __init__(
-        self, task: str, config: SimulationConfig, shapes: Collection[str] = (), *, diverse: bool = False
-    ) -> None:
+        self, task: str, config: SimulationConfig, shapes: Collection[str] = (), *, diverse: bool = False,
+        policy: PolicyView | None = None,
+    ) -> None:  # fmt: skip
         self._task = task
         self._shapes = shapes
         self._diverse = diverse
+        self._policy = policy
         self._config = config
         self._env = ManiSkillEnvironment(task, config.model_copy(update={"image_size": 16}), end_on_success=False)
-        self.stage = ClipStage(task, config.model_copy(update={"image_size": SIDE_PX}))
+        if policy is None:
+            self.stage = ClipStage(task, config.model_copy(update={"image_size": SIDE_PX}))
+        else:
+            self.stage = ClipStage(task, policy.config, policy=True)
 
     def origin(self, seed: int) -> Origin:
+        if self._policy is not None:
+            return self._policy.origin(self._task, seed)
         drawn = drawn_origin(self._task, seed, self._shapes)
         return self._variation(seed).origin(self._task, seed, drawn.behaviour) if self._diverse else drawn
 
     def clip(self, seed: int) -> LabelledClip:
         """Record one episode and draw it."""
-        origin, behaviour = self.origin(seed), drawn_origin(self._task, seed, self._shapes).behaviour
+        origin = self.origin(seed)
         height = SHAPES[origin.object_id.split("/")[0]]
         layout = self._variation(seed).look.layout if self._diverse else None
-        states = scene_states(record_states(self._env, behaviour, seed, layout), height)
+        episode = record_states(self._env, origin.behaviour.split()[0], seed, layout)
+        states = scene_states(episode, height)
+        if self._policy is not None:
+            states = self._policy.ended(states, origin)
+            if origin.scene.startswith(IMAGINED):
+                drawing = self._policy.imagined(self.stage, states, episode)
+                if drawing is not None:
+                    return recorded(self._clip_of(drawing, states, origin))
+                origin = self._policy.decoded(origin)
         return recorded(self._drawn(states, origin))
 
     def redraw(self, parent: LabelledClip, edit: StateEdit) -> LabelledClip:
@@ -176,13 +199,20 @@ class ClipSource:
         return drawn_variation(self._task, seed, _drawn_part(self._task, seed))
 
     def _drawn(self, states: SceneStates, origin: Origin) -> SourceClip:
-        camera, look = self._scenery(origin)
-        drawing = self.stage.draw(
-            states.robot_q, states.poses, states.half_sizes_m * states.scales, states.tool, states.goal, camera, look
-        )
+        if self._policy is not None:
+            drawing = self._policy.drawn(self.stage, states, origin)
+        else:
+            camera, look = self._scenery(origin)
+            sizes_m = states.half_sizes_m * states.scales
+            drawing = self.stage.draw(
+                states.robot_q, states.poses, sizes_m, states.tool, states.goal, camera, look
+            )  # fmt: skip
+        return self._clip_of(drawing, states, origin)
+
+    def _clip_of(self, drawing: Drawing, states: SceneStates, origin: Origin) -> SourceClip:
         return SourceClip(
             drawing.frames, drawing.masks, drawing.tracks, states, origin,
-            instruction_of(origin), self._config.control_hz,
+            instruction_of(origin), self._config.control_hz / (1 if self._policy is None else self._policy.stride),
         )  # fmt: skip
 
     def _scenery(self, origin: Origin) -> tuple[str | View, Look]:
@@ -239,7 +269,7 @@ def scene_states(states: EpisodeStates, height: float = 1.0) -> SceneStates:
 
 
 def build(
-    folder: Path, plan: SetPlan, config: SimulationConfig, *, progress: bool = True
+    folder: Path, plan: SetPlan, config: SimulationConfig, policy: PolicyView | None = None, *, progress: bool = True
 ) -> tuple[Manifest, Counter[str]]:
     """Make the set; returns its manifest, and how often which recipe did not apply and why.
 
@@ -253,7 +283,7 @@ def build(
 
     def kept() -> Iterator[LabelledClip]:
         for task in plan.tasks:
-            source = ClipSource(task, config, plan.shapes, diverse=plan.diverse)
+            source = ClipSource(task, config, plan.shapes, diverse=plan.diverse, policy=policy)
             try:
                 for seed in tqdm(plan.seeds(task), desc=task, disable=not progress):
                     parent = source.clip(seed)
@@ -331,6 +361,11 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--recipes", nargs="+", choices=sorted(RECIPES), default=tuple(RECIPES), help="all by default")
     parser.add_argument("--development", action="store_true", help="only episodes of the training and validation parts")
     parser.add_argument("--diverse", action="store_true", help="the same, with cameras, colours, light, ways at random")
+    parser.add_argument(
+        "--policy-view", nargs="?", type=Path, const=Path(), metavar="MODEL_DIR",
+        help="the loops' own scene and camera, most as a world model draws them; default: the shipped one",
+    )  # fmt: skip
+    parser.add_argument("--stride", type=int, default=1, help="of --policy-view: steps between two frames of a clip")
     parser.add_argument("--benchmark", action="store_true", help="the set that judges are compared on; nothing else")
     parser.add_argument("--check", action="store_true", help="build nothing, verify the set that is there")
     arguments = parser.parse_args(argv)
@@ -342,10 +377,17 @@ def main(argv: Sequence[str]) -> int:
             plan = SetPlan(
                 tuple(arguments.tasks), arguments.episodes, arguments.edits, arguments.seed, shapes=shapes,
                 development=arguments.development or arguments.diverse, diverse=arguments.diverse,
-                recipes=tuple(arguments.recipes),
+                recipes=tuple(arguments.recipes), policy=arguments.policy_view is not None,
             )  # fmt: skip
+            if arguments.stride < 1 or (arguments.stride > 1 and not plan.policy):
+                raise ValueError(f"--stride is of --policy-view and at least 1, got {arguments.stride}")
             plan = BENCHMARK if arguments.benchmark else plan
-            manifest, skipped = build(arguments.folder, plan, load_config("cpu").simulation)
+            policy = None
+            if plan.policy:
+                policy = PolicyView(
+                    load_model_folder(policy_models(arguments.policy_view)), SIDE_PX, arguments.stride
+                )  # fmt: skip
+            manifest, skipped = build(arguments.folder, plan, load_config("cpu").simulation, policy)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -331,14 +331,18 @@ def _late(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict
     return replace(verdict, audit_id=content_hash(verdict))
 
 
-def buffer_jobs(frames: Tensor, references: Clips, sha256: str, *, fps: float, task: str, robot: str) -> list[ClipJob]:
-    """One job per clip of a buffer.
+def buffer_jobs(
+    frames: Tensor, references: Clips, sha256: str, *, given: int, fps: float, task: str, robot: str
+) -> list[ClipJob]:
+    """One job per clip of a buffer. Frames that the model was given are shown as they were recorded: what its codec
+    makes of them is no work of the model's.
 
     Args:
         frames: decoded clips, uint8 (N, F, H, W, 3). references: the recordings of their contexts, a row per clip.
-        sha256: of the buffer's file; names the clips. fps: clip frames per second.
+        sha256: of the buffer's file; names the clips. given: frames. fps: clip frames per second.
     """
-    shown, first = frames.numpy(), references.frames[:, 0].numpy()
+    shown = torch.cat([references.frames[:, :given], frames[:, given:]], 1).numpy()
+    first = references.frames[:, 0].numpy()
     actions = references.actions.numpy().astype(np.float32)
     return [
         ClipJob(

@@ -21,7 +21,7 @@ from wm_nodes.reward import SUCCESS_UNKNOWN, RewardResult
 from wm_nodes.reward.agent import TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.reward.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.reward.base import version_of
-from wm_nodes.reward.judges.factory import check_clips, check_judge
+from wm_nodes.reward.judges.factory import check_clips, check_judge, for_clips
 from wm_nodes.specs import EnvironmentSpec, simulation_spec
 from wm_nodes.types import BoolArray, FloatArray, Rollout, UInt8Array, UInt64Array
 
@@ -107,10 +107,24 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
     check_judge(config.judge)
     _refuse_fallbacks(config.judge)
     load_rubric(config.judge.rubric)
-    spec = simulation_spec(config.task, "", config.simulation, 1)
+    spec = _scene(config)
     if trains:
         check_horizon(config.ppo.num_steps, spec.max_episode_steps)
-    check_clips(config.judge, (spec.max_episode_steps + 1, spec.height, spec.width, spec.channels))
+    check_clips(config.judge, _longest(spec))
+
+
+def episode_judge(config: RunConfig) -> JudgeConfig:
+    """The judge's settings for episodes of the configured scene, see for_clips."""
+    return for_clips(config.judge, _longest(_scene(config)))
+
+
+def _scene(config: RunConfig) -> EnvironmentSpec:
+    return simulation_spec(config.task, "", config.simulation, 1)
+
+
+def _longest(spec: EnvironmentSpec) -> tuple[int, ...]:
+    """Shape of the longest episode as a clip."""
+    return (spec.max_episode_steps + 1, spec.height, spec.width, spec.channels)
 
 
 def _refuse_fallbacks(settings: JudgeConfig) -> None:

@@ -1,6 +1,7 @@
 """Train the segmenter of the embedded judge on simulator masks. Specification: section 4.3.
 
-Only clips whose masks say what is seen: recorded ones, mild edits, edited states, and edits of the whole picture.
+Only clips whose masks say what is seen: recorded ones, mild edits, edited states, and edits of the whole picture;
+none that a world model imagined.
 """
 
 import math
@@ -13,6 +14,7 @@ from torch import Tensor
 from tqdm import trange
 
 from wm_nodes.learning.judge_data import SetClip
+from wm_nodes.learning.policy_view import IMAGINED
 from wm_nodes.reward.adversarial import RECIPES
 from wm_nodes.reward.adversarial.manifest import Row
 from wm_nodes.reward.evidence.segmentation import Segmenter
@@ -32,8 +34,8 @@ WHOLE_PICTURE = frozenset({
 
 
 def masks_hold(row: Row) -> bool:
-    """Whether the masks of a clip say what is seen in it."""
-    return all(
+    """Whether the masks of a clip say what is seen in it; in imagined ones things are near those places only."""
+    return not row.origin.scene.startswith(IMAGINED) and all(
         edit.severity == "mild" or edit.recipe in WHOLE_PICTURE or RECIPES[edit.recipe].kind == "S"
         for edit in row.edits
     )
@@ -104,10 +106,11 @@ def _varied(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator)
 
 
 def overlaps(model: Segmenter, images: UInt8Array, masks: UInt8Array) -> dict[str, float]:
-    """Intersection over union of each class over all pixels."""
+    """Intersection over union of each class over all pixels, of the classes that the masks have."""
     found = model.masks(images)
     names = ("scene", "robot", "object", "clutter")
     return {
         name: float(((found == i) & (masks == i)).sum() / max(1, ((found == i) | (masks == i)).sum()))
         for i, name in enumerate(names)
+        if (masks == i).any()
     }

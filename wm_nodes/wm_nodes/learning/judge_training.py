@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 import wm_nodes.reward.evidence
 from wm_nodes.files import write_atomic
+from wm_nodes.learning.adversarial_set import load_frames
 from wm_nodes.learning.judge_data import load_sets, rows_of, set_clips
 from wm_nodes.learning.judge_fitting import (
     TARGETS,
@@ -28,12 +29,14 @@ from wm_nodes.learning.judge_fitting import (
     measured,
 )
 from wm_nodes.learning.judge_segmenter import overlaps, segmentation_data, train_segmenter
+from wm_nodes.learning.policy_view import SEEN
 from wm_nodes.reward.adversarial import COMPONENTS, TC, Manifest
 from wm_nodes.reward.adversarial.manifest import Part, Row, to_bytes
 from wm_nodes.reward.evidence.clip import clip_evidence
 from wm_nodes.reward.evidence.head import JudgeHead
 from wm_nodes.reward.evidence.segmentation import Segmenter
 from wm_nodes.reward.evidence.trees import TreeSettings
+from wm_nodes.reward.evidence.window import Window
 
 SEGMENTER = "segmenter.safetensors"
 Sets = Sequence[tuple[Path, Manifest]]
@@ -41,12 +44,15 @@ Sets = Sequence[tuple[Path, Manifest]]
 
 @dataclass(frozen=True)
 class JudgePlan:
-    """sets: folders of adversarial sets. segmenter_steps: batches. seed: of everything drawn."""
+    """sets: folders of adversarial sets. segmenter_steps: batches. seed: of everything drawn. window: what the clips
+    show of the pictures that will be judged, of sets that were drawn so (policy_view.py).
+    """
 
     sets: tuple[Path, ...]
     segmenter_steps: int = 2800
     trees: TreeSettings = field(default_factory=TreeSettings)
     seed: int = 0
+    window: Window | None = None
 
 
 def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> JudgeHead:
@@ -56,6 +62,12 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
         ManifestError: a damaged set. ValueError: sets too small to learn from. OSError: a full disk.
     """
     sets = load_sets(plan.sets)
+    windows = {row.origin.camera == SEEN for _, manifest in sets for row in manifest.rows}
+    if windows != {plan.window is not None}:
+        raise ValueError(
+            "a judge reads either the clips of --policy-view or others: give --policy-view to sets that were made so, "
+            "and to no other"
+        )
     segmenter, segmenter_story = _segmenter(folder, sets, plan, progress)
     train, validation = (
         collect_evidence(folder, sets, part, segmenter, progress=progress) for part in ("train", "validation")
@@ -64,9 +76,12 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
         raise ValueError(f"{len(train.rows)} training and {len(validation.rows)} validation clips; build larger sets")
     questions = fit_all(train, validation, plan.trees, plan.seed, progress=progress)
     low, high = np.quantile(train.evidence[train.clean], (0.05, 0.95), axis=0).astype(np.float32)
-    first = next(set_clips(sets, ["train"]))
-    length = len(first.frames)
-    lengths = (-(-2 * length // 3), 3 * length // 2)
+    recorded = [
+        load_frames(path, row.sha256).shape for path, manifest in sets for row in rows_of(manifest, ["train"])
+        if row.sha256 == row.root
+    ]  # fmt: skip
+    found = [shape[0] for shape in recorded]
+    lengths = (-(-2 * min(found) // 3), 3 * max(found) // 2)
     story = {
         "data": [_described(path, manifest) for path, manifest in sets], "seed": plan.seed,
         "fitted": {"train": len(train.rows), "validation": len(validation.rows)},
@@ -77,8 +92,10 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
         "conformal": {target: conformal_limits(questions, target, validation) for target in (*COMPONENTS, TC)},
     }  # fmt: skip
     known = fit_familiarity(train, validation)
-    size = (first.frames.shape[1], first.frames.shape[2])
-    return JudgeHead(segmenter, train.names, questions, known, low, high, size, lengths, story)
+    size = (recorded[0][1], recorded[0][2])
+    return JudgeHead(
+        segmenter, train.names, questions, known, low, high, size, lengths, story, window=plan.window
+    )  # fmt: skip
 
 
 def collect_evidence(
@@ -146,6 +163,6 @@ def _state(segmenter: Segmenter) -> bytes:
 def _sources() -> bytes:
     """Of the code that computes evidence: a changed number is another number."""
     folder = Path(str(wm_nodes.reward.evidence.__path__[0]))
-    others = ("__init__", "definitions", "head", "trees")
+    others = ("__init__", "definitions", "head", "trees", "window")
     files = (path for path in sorted(folder.glob("*.py")) if path.stem not in others)
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()

@@ -8,7 +8,7 @@ are encoded again and read by the tokenizer's probe. The reader's own error on r
 floor, and copying the first frame is measured in the same way.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
 
@@ -52,29 +52,35 @@ def imagine_episodes(
     tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays
 ) -> ImaginedEpisodes:
     """Roll the recorded actions out from the recorded first frames, in batches."""
-    parts = [
-        _imagine_batch(tokenizer, model, episodes.select(range(i, min(i + BATCH, len(episodes)))))
-        for i in range(0, len(episodes), BATCH)
-    ]
-    return ImaginedEpisodes(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    images, actions, states = episodes.images[:, 0], episodes.actions, episodes.states
+    rows = [slice(i, i + BATCH) for i in range(0, len(episodes), BATCH)]
+    parts = [imagine(tokenizer, model, images[row], actions[row], states[row]) for row in rows]
+    names = [field.name for field in fields(ImaginedEpisodes)]
+    return ImaginedEpisodes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
-def _imagine_batch(
-    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays
-) -> tuple[UInt8Array, FloatArray, FloatArray]:
-    actions, states = torch.from_numpy(episodes.actions), torch.from_numpy(episodes.states)
-    current = tokenizer.encode(episodes.images[:, 0])
-    caches = model.trunk.new_ring_caches(len(episodes), current.device)
+@torch.inference_mode()
+def imagine(
+    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, images: UInt8Array, actions: FloatArray,
+    states: FloatArray,
+) -> ImaginedEpisodes:  # fmt: skip
+    """Roll actions out, all at once.
+
+    Args:
+        images: uint8 (E, H, W, 3), first frames. actions: (E, T, A). states: (E, T + 1, S), commanded.
+    """
+    told, commanded = torch.from_numpy(actions), torch.from_numpy(states)
+    current = tokenizer.encode(images)
+    caches = model.trunk.new_ring_caches(len(images), current.device)
     frames, signals, spreads = list[Tensor](), list[Tensor](), list[Tensor]()
-    for t in range(episodes.num_steps):
+    for t in range(actions.shape[1]):
         with compute_context(current.device):
-            current, logits = model.advance(current, actions[:, t], states[:, t], states[:, t + 1], caches)
+            current, logits = model.advance(current, told[:, t], commanded[:, t], commanded[:, t + 1], caches)
         signal, spread = done_signal(logits)
         frames.append(tokenizer.decode(current))
         signals.append(signal)
         spreads.append(spread)
-    stacked = (torch.stack(listed, 1).numpy() for listed in (frames, signals, spreads))
-    return tuple(stacked)  # type: ignore[return-value]
+    return ImaginedEpisodes(*(torch.stack(listed, 1).numpy() for listed in (frames, signals, spreads)))
 
 
 def evaluate_rollouts(

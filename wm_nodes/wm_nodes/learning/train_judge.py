@@ -19,12 +19,15 @@ import torch
 
 from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.files import write_atomic
+from wm_nodes.learning.adversarial_set import SIDE_PX
 from wm_nodes.learning.judge_data import load_sets
 from wm_nodes.learning.judge_fitting import CONFORMAL, TARGETS, conformal_errors, measured
 from wm_nodes.learning.judge_training import JudgePlan, collect_evidence, make_judge
+from wm_nodes.learning.policy_view import policy_models, policy_window
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reward.evidence.head import load_head, save_head
 from wm_nodes.reward.evidence.trees import TreeSettings
+from wm_nodes.world_model import load_model_folder
 
 
 def main(argv: Sequence[str]) -> int:
@@ -36,6 +39,10 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--segmenter-steps", type=int, default=JudgePlan.segmenter_steps, help="batches of 16 pictures")
     parser.add_argument("--trees", type=int, default=TreeSettings.num_trees, help="per question")
     parser.add_argument("--threads", type=int, default=1, help="cores; other numbers give other last bits")
+    parser.add_argument(
+        "--policy-view", nargs="?", type=Path, const=Path(), metavar="MODEL_DIR",
+        help="the sets were made with this option; the judge reads what the loops of this world model show",
+    )  # fmt: skip
     parser.add_argument("--measure", choices=("train", "validation", "test"), help="train nothing, measure this part")
     arguments = parser.parse_args(argv)
     keep_freed_memory()
@@ -44,8 +51,12 @@ def main(argv: Sequence[str]) -> int:
         if arguments.measure:
             report = _measured(arguments)
         else:
+            window = None
+            if arguments.policy_view is not None:
+                models = load_model_folder(policy_models(arguments.policy_view))
+                window = policy_window(models.simulation, SIDE_PX)
             plan = JudgePlan(
-                tuple(arguments.sets), arguments.segmenter_steps, TreeSettings(arguments.trees), arguments.seed
+                tuple(arguments.sets), arguments.segmenter_steps, TreeSettings(arguments.trees), arguments.seed, window
             )
             made = {
                 "command": "python -m wm_nodes.learning.train_judge " + " ".join(argv), "machine": machine_facts(),

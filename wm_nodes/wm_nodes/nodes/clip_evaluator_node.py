@@ -23,7 +23,7 @@ from wm_nodes.nodes import agent_face
 from wm_nodes.nodes.agent_face import AgentFace
 from wm_nodes.reward.agent import Verdict, check_one_judge
 from wm_nodes.reward.agent.types import GATED
-from wm_nodes.reward.judges.factory import check_clips
+from wm_nodes.reward.judges.factory import check_clips, for_clips
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -63,8 +63,10 @@ class ClipEvaluatorNode(ManagedNode):
         self._fps = clip_fps(bags[0], folder.clip["stride"])
         self._agent = None
         if self._config.rewards.get(AGENT):
-            check_clips(self._config.judge, contexts.frames.shape[1:])
-            self._agent = AgentFace(self, self._config.judge, self._config.seed, lambda: self._action.busy)
+            shape = tuple(contexts.frames.shape[1:])
+            check_clips(self._config.judge, shape)
+            judge = for_clips(self._config.judge, shape)
+            self._agent = AgentFace(self, judge, self._config.seed, lambda: self._action.busy)
         self._scores = self.publish_on("clips/scores")
         self._action = WorkerAction(self, EvaluateClips, "clips/evaluate", self._evaluate, self._describe)
         self.own(self._action.destroy)
@@ -104,7 +106,8 @@ class ClipEvaluatorNode(ManagedNode):
         goal: EvaluateClips.Goal = work.request
         references = self._generator.references(self._generator.request(buffer.iteration, buffer.policy_version))
         jobs = buffer_jobs(
-            frames, references, goal.sha256, fps=self._fps, task=self._config.task, robot=self._config.judge.robot
+            frames, references, goal.sha256, given=self._config.model.num_conditioning, fps=self._fps,
+            task=self._config.task, robot=self._config.judge.robot,
         )
         told, progress = dict[int, ClipVerdict](), EvaluateClips.Feedback(stages_passed=[0] * len(GATED))
 

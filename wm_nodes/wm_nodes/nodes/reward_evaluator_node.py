@@ -12,7 +12,7 @@ from sensor_msgs.msg import Image
 
 from wm_msgs.msg import EnvSpec, ErrorCode, RewardSummary, TaskGoal, TransitionBatch
 from wm_msgs.srv import EvaluateReward
-from wm_nodes.learning.episode_reward import EpisodeReward, EpisodeStep, PendingReward
+from wm_nodes.learning.episode_reward import EpisodeReward, EpisodeStep, PendingReward, episode_judge
 from wm_nodes.learning.video_config import AGENT
 from wm_nodes.nodes import agent_face
 from wm_nodes.nodes.agent_face import AgentFace
@@ -57,7 +57,7 @@ class RewardEvaluatorNode(ManagedNode):
         self._undecided: deque[tuple[float, Transition, PendingReward]] = deque()
         self._model: RewardModel | EpisodeReward
         if kind == AGENT and not factory:
-            agent = AgentFace(self, config.judge, config.seed, lambda: bool(self._undecided))
+            agent = AgentFace(self, episode_judge(config), config.seed, lambda: bool(self._undecided))
             self._model = EpisodeReward(agent.judge)
             self._agent = agent
         else:

@@ -6,11 +6,12 @@
 import json
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.config.load import dump_config, judge_overrides, load_config
+from wm_nodes.config.load import dump_config, judge_or_embedded, judge_overrides, load_config
 from wm_nodes.config.schema import JudgeConfig, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.ros.graph import Graph, GraphError, compose
@@ -42,6 +43,8 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
         config = load_config(
             values["preset"], {"task": values["task"]} | ({"seed": int(seed)} if seed.isdigit() else {}) | judge
         )
+        if values.get("reward") == "agent":
+            config = config.model_copy(update={"judge": judge_or_embedded(config.judge)})
         values["config_file"] = str(run_dir / "config.yaml")
     if values.get("reward") == "agent":
         _check_agent(config, values)
@@ -99,6 +102,7 @@ def _resolve_video(values: dict[str, str], run_dir: Path, judge: dict[str, Any])
     weights = reward_overrides(values["reward"] or None)
     config = load_video_config(values["config_file"] or values["video_preset"], {**weights, **judge})
     if config.rewards.get(AGENT):
+        config = replace(config, judge=judge_or_embedded(config.judge))
         _check_judge(config.judge)
     values["model_dir"] = _model_dir(values["model_dir"], config.task)
     values["bag_uri"] = _bag_uri(values["bag_uri"], "world_model_rl", run_dir)

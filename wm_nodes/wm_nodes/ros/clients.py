@@ -26,6 +26,10 @@ POLL_S = 0.1
 ATTEMPT_S = 2.0
 """A step request without an answer is sent again after this time; the environment answers the same step_id once."""
 
+SILENT_S = 8.0
+"""An environment that was silent for so long is not asked any more. A crowded machine can keep one quiet for longer
+than the time after which it is reported (seen on 2026-11-23 while it drew four simulators), and it answers then."""
+
 BUSY_WAIT_S = 0.005
 
 LOST_S = 2.0
@@ -208,8 +212,8 @@ class RosEnvironmentClient:
 
     @property
     def _silent(self) -> bool:
-        """Whether the environment is known to be lost: no answer will come, however often it is asked."""
-        return self._node.peers.is_lost(self._peer)
+        """Whether the environment was silent for so long that no answer will come, however often it is asked."""
+        return self._node.peers.silence_s(self._peer) > SILENT_S
 
 
 class LocalEnvironmentClient:

@@ -49,6 +49,11 @@ class PeerWatch:
     def is_lost(self, name: str) -> bool:
         return name in self._lost
 
+    def silence_s(self, name: str, now: float | None = None) -> float:
+        """How long a peer has not been heard; 0 while it was not heard at all."""
+        now = time.monotonic() if now is None else now
+        return now - self._heard.get(name, now)
+
     def identity(self, name: str) -> str:
         """The process that a peer is; empty while none is known. Another one than before: it was restarted."""
         return self._identities.get(name, "")

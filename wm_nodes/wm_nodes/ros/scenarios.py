@@ -60,7 +60,7 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("reward", "", "Reward model; empty: endogenous if imagined, else rule; of the video model: what its "
                    "settings weigh; agent: a judge's verdict on whole clips", ("", "endogenous", "rule", "agent")),
     LaunchArgument("judge", "", "reward:=agent: base URLs of the judge's servers with their /v1, separated by commas; "
-                   "or embedded, or the folder of a trained judge"),
+                   "or the folder of a trained judge; empty, or embedded: the shipped one"),
     LaunchArgument("judge_model", "", "reward:=agent: the judge's name on the server"),
     LaunchArgument("judge_key_env", "", "reward:=agent: environment variable with the server's key; empty: none"),
     LaunchArgument("rubric", "", "reward:=agent: rubric pack, a name or a .yaml file; empty: the settings'"),

@@ -5,7 +5,7 @@ clutter, coloured things of any size and number. Specification of the agent's re
 T frames, K things, J joints, H W image.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ from wm_nodes.seeding import numpy_stream
 from wm_nodes.simulation.behaviours import script, turned
 from wm_nodes.simulation.environment import ManiSkillEnvironment
 from wm_nodes.simulation.episodes import record_episode
-from wm_nodes.simulation.scenes import WmPullCube, WmPushCube, make_scene
+from wm_nodes.simulation.scenes import WmPullCube, WmPushCube, make_scene, render
 from wm_nodes.simulation.tasks import CUBE_HALF_SIZE_M, get_task
 from wm_nodes.types import BoolArray, FloatArray, Observation, UInt8Array
 
@@ -56,7 +56,8 @@ BACKGROUND, ROBOT, THING, CLUTTER = 0, 1, 2, 3
 class EpisodeStates:
     """What was so at each of T frames. robot_q: (T, J). tool: (T, 3) m. gripper_m: (T,). poses: (T, 1, 7) of the cube,
     x y z m and quaternion w x y z. contact: bool (T,), the hand touched it since the frame before. goal: (T, 3) m, z
-    is NaN. All floats float32, world frame.
+    is NaN. actions: (T - 1, A) in [-1, 1]. commanded: (T, S), Observation.state. All floats float32, the others' frame
+    is the world's.
     """
 
     robot_q: FloatArray
@@ -65,6 +66,8 @@ class EpisodeStates:
     poses: FloatArray
     contact: BoolArray
     goal: FloatArray
+    actions: FloatArray
+    commanded: FloatArray
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ class Look:
     """How a scene is drawn. Colours are RGB in [0, 1]. seed: of the tiles' shades and the clutter's places. shades:
     range of a tile's brightness over the table's. ambient: light from everywhere. lamp: direction and strength of a
     light besides the scene's own two, whose strength is 1 each. layout: of the episode; clutter lies beside its way,
-    without one beside y = 0.
+    without one beside y = 0. tiled: the table has tiles; else it is the loops' plain one, of its own colour.
     """
 
     thing: tuple[float, float, float] = (0.05, 0.16, 0.63)
@@ -91,17 +94,19 @@ class Look:
     ambient: float = 0.3
     lamp: tuple[tuple[float, float, float], float] | None = None
     layout: Layout | None = None
+    tiled: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
     """frames: uint8 (T, H, W, 3). masks: uint8 (T, H, W). tracks: "object" and "tool", float32 (T, 2) row and column
-    in px, whole numbers at pixel centres, NaN out of view.
+    in px, whole numbers at pixel centres, NaN out of view. others: uint8 (T, H, W, 3) by camera, drawn besides.
     """
 
     frames: UInt8Array
     masks: UInt8Array
     tracks: dict[str, FloatArray]
+    others: dict[str, UInt8Array]
 
 
 def record_states(
@@ -147,12 +152,13 @@ def record_states(
 
     scene._after_simulation_step = feel  # ManiSkill calls it after each physics step
     try:
-        record_episode(env, act, behaviour, seed, 0)
+        episode = record_episode(env, act, behaviour, seed, 0)
     finally:
         del scene._after_simulation_step
     keep()
     arrays = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
-    return EpisodeStates(**{n: a if n == "contact" else a.astype(np.float32) for n, a in arrays.items()})
+    kept = {name: a if name == "contact" else a.astype(np.float32) for name, a in arrays.items()}
+    return EpisodeStates(**kept, actions=episode.actions, commanded=episode.states)
 
 
 class _ClipScene(BaseEnv):  # type: ignore[misc]
@@ -182,35 +188,41 @@ register_env("WmClipPullCube-v1", max_episode_steps=10_000)(WmClipPullCube)
 class ClipStage:
     """Draws states of one task's scene; physics never runs.
 
+    Args:
+        policy: through the loops' own cameras in place of CAMERAS.
+
     Raises:
         NoRendererError: Vulkan finds no device.
     """
 
-    def __init__(self, task: str, config: SimulationConfig) -> None:
-        self._env = make_scene(get_task(task).scene.replace("Wm", "WmClip", 1), config)
+    def __init__(self, task: str, config: SimulationConfig, *, policy: bool = False) -> None:
+        scene = get_task(task).scene
+        self._env = make_scene(scene if policy else scene.replace("Wm", "WmClip", 1), config)
         self._size = self._env.image_size = config.image_size
         self._build()
 
     def draw(
         self, robot_q: FloatArray, poses: FloatArray, half_sizes_m: FloatArray, tool: FloatArray, goal: FloatArray,
-        camera: str | View, look: Look,
+        camera: str | View, look: Look, others: Sequence[str] = (),
     ) -> Drawing:  # fmt: skip
         """Draw T frames.
 
         Args:
             robot_q: (T, J). poses: (T, K, 7). half_sizes_m: (T, K, 3), of boxes as they are seen. tool, goal: (T, 3).
+            others: cameras that draw the same besides.
 
         Raises:
             ValueError: no such camera.
         """
-        if isinstance(camera, str) and camera not in CAMERAS:
-            raise ValueError(f"unknown camera {camera!r}; choose one of {', '.join(CAMERAS)}")
+        known = [name for name in self._env._sensors if name != MOVED_CAMERA]
+        if isinstance(camera, str) and camera not in known:
+            raise ValueError(f"unknown camera {camera!r}; choose one of {', '.join(known)}")
         labels = self._dress(look)
         sensor = self._env._sensors[camera if isinstance(camera, str) else MOVED_CAMERA]
         if not isinstance(camera, str):
             pose = sapien_utils.look_at(eye=list(camera[0]), target=list(camera[1])).sp
             sensor.camera._render_cameras[0].set_local_pose(pose)
-        frames, masks = [], []
+        frames, masks, beside = [], [], {name: list[UInt8Array]() for name in others}
         for t in range(len(poses)):
             self._env.agent.robot.set_qpos(torch.from_numpy(robot_q[t])[None])
             place = self._env.goal_region.pose.raw_pose[0].numpy()
@@ -223,12 +235,14 @@ class ClipStage:
             ids = seen["segmentation"][0, ..., 0].numpy()
             frames.append(seen["rgb"][0].numpy())
             masks.append(_mask(ids, labels | {thing.per_scene_id: THING for thing in shown}))
+            for name, pictures in beside.items():
+                pictures.append(render(self._env, [name]))
             for thing in shown:
                 thing.remove_from_scene()
         params = {name: values[0].numpy().astype(np.float64) for name, values in sensor.get_params().items()}
         points = {"object": poses[:, 0, :3], "tool": tool}
         tracks = {name: _project(places, params, self._size) for name, places in points.items()}
-        return Drawing(np.stack(frames), np.stack(masks), tracks)
+        return Drawing(np.stack(frames), np.stack(masks), tracks, {n: np.stack(seen) for n, seen in beside.items()})
 
     def close(self) -> None:
         self._env.close()
@@ -253,9 +267,9 @@ class ClipStage:
             entity.remove_from_scene()
         self._drawn.clear()
         rng = numpy_stream(look.seed, "clip_look")
-        table, half = np.array(look.table), TILE_M / 2
-        for i in range(TILES):
-            for j in range(TILES):
+        table, half, tiles = np.array(look.table), TILE_M / 2, TILES if look.tiled else 0
+        for i in range(tiles):
+            for j in range(tiles):
                 place = [TILE_M * (i - TILES / 2) + 0.05, TILE_M * (j - TILES / 2), TILE_TOP_M / 2]
                 shade = np.clip(table * rng.uniform(*look.shades), 0, 1)
                 self._drawn.append(self._box([half, half, TILE_TOP_M / 2], shade, [*place, 1, 0, 0, 0]))

@@ -9,7 +9,7 @@ Shapes: N clips, F evidence.
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from wm_nodes.files import write_atomic
 from wm_nodes.reward.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING
 from wm_nodes.reward.evidence.segmentation import Segmenter
 from wm_nodes.reward.evidence.trees import Trees
-from wm_nodes.types import FloatArray
+from wm_nodes.reward.evidence.window import Window
+from wm_nodes.types import FloatArray, UInt8Array
 
 FORMAT = "embedded-judge-1"
 TENSORS, MANIFEST = "judge.safetensors", "judge.json"
@@ -83,8 +84,8 @@ class JudgeHead:
     """What was learned. names: F evidence names, in order. questions: for a component or pattern one, "does it pass"
     or "is it absent"; for task completion one per level above the lowest; for planning "is it a video" and "is it
     readable", and it is good where no component fails. clean_low, clean_high: (F,), 5 %
-    and 95 % quantiles over clips in which nothing fails. size: H, W of training. lengths: fewest and most frames.
-    story: how it was made and what it measured.
+    and 95 % quantiles over clips in which nothing fails. size: H, W that evidence is measured at. lengths: fewest and
+    most frames. window: what is read of a picture; None: all of it. story: how it was made and what it measured.
     """
 
     segmenter: Segmenter
@@ -97,6 +98,16 @@ class JudgeHead:
     lengths: tuple[int, int]
     story: Mapping[str, Any] = field(default_factory=dict)
     sha256: str = ""
+    window: Window | None = None
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """H, W of the pictures that it judges."""
+        return self.size if self.window is None else (self.window.height, self.window.width)
+
+    def seen(self, pictures: UInt8Array) -> UInt8Array:
+        """What evidence is measured on, uint8 (..., *size, 3), of pictures (..., H, W, 3)."""
+        return pictures if self.window is None else self.window.pictures(pictures)
 
     def row(self, evidence: Mapping[str, float]) -> FloatArray:
         """(1, F) of named evidence.
@@ -188,7 +199,8 @@ def save_head(folder: Path, head: JudgeHead) -> Path:
     data = save({name: np.ascontiguousarray(array) for name, array in sorted(arrays.items())})
     manifest = {
         "format": FORMAT, "sha256": hashlib.sha256(data).hexdigest(), "evidence": list(head.names), "lines": lines,
-        "limit": known.limit, "size": list(head.size), "lengths": list(head.lengths), **head.story,
+        "limit": known.limit, "size": list(head.size), "lengths": list(head.lengths),
+        **({} if head.window is None else {"window": asdict(head.window)}), **head.story,
     }  # fmt: skip
     write_atomic(folder / TENSORS, data)
     write_atomic(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
@@ -228,15 +240,16 @@ def load_head(folder: Path) -> JudgeHead:
         names = tuple(manifest["evidence"])
         height, width = manifest["size"]
         fewest, most = manifest["lengths"]
+        window = Window(**manifest["window"]) if "window" in manifest else None
         clean_low, clean_high = arrays["clean_low"], arrays["clean_high"]
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise JudgeFolderError(f"{folder} is of another architecture: {error}; train it anew") from error
     _check(folder, names, questions, known, (clean_low, clean_high))
-    own = {"format", "sha256", "evidence", "lines", "limit", "size", "lengths"}
+    own = {"format", "sha256", "evidence", "lines", "limit", "size", "lengths", "window"}
     story = {name: value for name, value in manifest.items() if name not in own}
     return JudgeHead(
         segmenter.eval().requires_grad_(False), names, questions, known, clean_low, clean_high, (height, width),
-        (fewest, most), story, manifest["sha256"],
+        (fewest, most), story, manifest["sha256"], window,
     )  # fmt: skip
 
 

@@ -96,8 +96,8 @@ class EmbeddedJudge:
         """What it can see and how well, on the validation part; one line per component."""
         story, head = self._head.story, self._head
         lines = [
-            f"embedded judge {head.sha256[:12]}: {head.size[0]} x {head.size[1]} px, {head.lengths[0]} to "
-            f"{head.lengths[1]} frames; tasks {', '.join(story.get('tasks', []))}; cameras "
+            f"embedded judge {head.sha256[:12]}: {head.picture_size[0]} x {head.picture_size[1]} px, {head.lengths[0]} "
+            f"to {head.lengths[1]} frames; tasks {', '.join(story.get('tasks', []))}; cameras "
             f"{', '.join(story.get('cameras', []))}"
         ]
         for name, found in story.get("validation", {}).items():
@@ -148,8 +148,9 @@ class EmbeddedJudge:
             f"{clip.sha256} {task.instruction} {task.reference_frame.shape} ".encode() + task.reference_frame.tobytes()
         ).hexdigest()
         if (kept := self._kept.get(key)) is None:
-            segmenter = self._head.segmenter
-            kept = MappingProxyType(clip_evidence(segmenter, clip.frames, task.reference_frame, task.instruction))
+            head = self._head
+            frames, reference = head.seen(clip.frames), head.seen(task.reference_frame)
+            kept = MappingProxyType(clip_evidence(head.segmenter, frames, reference, task.instruction))
             with self._lock:
                 self._kept[key] = kept
                 while len(self._kept) > KEPT_CLIPS:
@@ -209,8 +210,8 @@ class EmbeddedJudge:
 def unfit(head: JudgeHead, shape: tuple[int, ...]) -> str:
     """Why no number can be had from a clip of this shape (frames, height, width, 3), or ""."""
     num_frames, height, width = shape[:3]
-    if (height, width) != head.size:
-        return f"{height} x {width} px, judged are {head.size[0]} x {head.size[1]} px; scale the clip"
+    if (height, width) != head.picture_size:
+        return f"{height} x {width} px, judged are {head.picture_size[0]} x {head.picture_size[1]} px; scale the clip"
     fewest, most = head.lengths
     if not fewest <= num_frames <= most:
         return f"{num_frames} frames, judged are {fewest} to {most}"
@@ -218,5 +219,10 @@ def unfit(head: JudgeHead, shape: tuple[int, ...]) -> str:
 
 
 def shipped_head() -> Path:
-    """The folder of the judge inside the package."""
+    """The folder of the judge inside the package, of the benchmark's clips."""
     return PRETRAINED / "clip_judge"
+
+
+def shipped_heads() -> list[Path]:
+    """The folders of all judges inside the package: of the benchmark's clips, and of what the loops' policy sees."""
+    return [shipped_head(), PRETRAINED / "policy_judge"]

@@ -4,19 +4,20 @@ import re
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from wm_nodes.config.schema import JudgeConfig, OtherJudge
+from wm_nodes.config.schema import JudgeConfig, OtherJudge, StageJudge
 from wm_nodes.reward.agent.rubric import Rubric
 from wm_nodes.reward.agent.types import Judge, Stage
 from wm_nodes.reward.evidence.head import load_head
 from wm_nodes.reward.judges.cache import VerdictCache
 from wm_nodes.reward.judges.calls import ChatOptions, Exchange
-from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head, unfit
+from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit
 from wm_nodes.reward.judges.openai_client import OpenAIJudge
 from wm_nodes.reward.judges.routed import RoutedJudge
 from wm_nodes.reward.judges.transport import ChatTransport, Endpoint, RetryPolicy
 
+AnyJudge = TypeVar("AnyJudge", JudgeConfig, OtherJudge, StageJudge)
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -89,6 +90,23 @@ def _check_one(settings: JudgeConfig) -> None:
         )
 
 
+def for_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> JudgeConfig:
+    """The settings with the shipped judge of such pictures wherever an embedded one is not named; with the first
+    shipped one where there is none.
+
+    Args:
+        shape: (frames, height, width, 3).
+    """
+    fitting = (str(path) for path in shipped_heads() if load_head(path).picture_size == tuple(shape[1:3]))
+    folder = next(fitting, str(shipped_head()))
+
+    def named(judge: AnyJudge) -> AnyJudge:
+        return judge if judge.kind != "embedded" or judge.folder else judge.model_copy(update={"folder": folder})
+
+    routes, fallbacks = [*map(named, settings.routes)], [*map(named, settings.fallbacks)]
+    return named(settings).model_copy(update={"routes": routes, "fallbacks": fallbacks})
+
+
 def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
     """Refuse a judge that would abstain on every clip of this shape, (frames, height, width, 3); likewise routed ones
     and fallbacks. Servers take any.
@@ -96,6 +114,7 @@ def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
     Raises:
         ValueError: names the shape and the remedy; or the folder holds no judge.
     """
+    settings = for_clips(settings, shape)
     others: list[OtherJudge] = [*settings.routes, *settings.fallbacks]
     for judge in (settings, *(_alone(settings, other) for other in others)):
         if judge.kind != "embedded" or not (reason := unfit(load_head(_folder(judge)), shape)):
