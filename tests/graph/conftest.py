@@ -11,6 +11,7 @@ os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 pytest.importorskip("rclpy", reason="the graph tests need rclpy")
 
 from graph.harness import Graph, Probe, own_domain
+from judge_server import PickyServer, serving
 
 from wm_nodes.ros.runner import clean_shared_memory
 
@@ -64,3 +65,11 @@ def probe(domain: int) -> Iterator[Probe]:
     probe = Probe(domain)
     yield probe
     probe.close()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[PickyServer]:
+    """A judge's server of a module's tests; they leave it up and without delay."""
+    with serving(PickyServer()) as server:
+        assert isinstance(server, PickyServer)
+        yield server

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from graph.harness import Graph, Probe, own_domain, wait_until
 from graph.video_loop import VideoLoop, settings
-from judge_server import PickyServer, serving
+from judge_server import PickyServer
 
 from wm_msgs.action import EvaluateClips, Train, TrainVideo
 from wm_msgs.msg import ClipScores, ClipVerdict, ErrorCode
@@ -35,13 +35,6 @@ STAGES = ["VQ", "IF", "TC", "PC"]
 ANSWER_S = 1.0
 """A cancel is answered within this time."""
 KEY = "a-key-that-nobody-may-see"
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[PickyServer]:
-    with serving(PickyServer()) as server:
-        assert isinstance(server, PickyServer)
-        yield server
 
 
 @pytest.fixture(scope="module")

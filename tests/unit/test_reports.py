@@ -125,6 +125,17 @@ def test_curves_are_drawn_from_what_is_there_and_not_at_all_from_nothing(tmp_pat
     assert not (tmp_path / "none.png").exists()
 
 
+def test_a_metric_that_was_never_a_number_is_not_in_the_legend(tmp_path: Path) -> None:
+    def drawn(lines: dict[str, str], name: str) -> np.ndarray:
+        rows = [{"section": "grpo", "step": i, "reward": i / 4, "held": None} for i in range(4)]
+        picture = curves(metrics_file(tmp_path, rows), tmp_path / name, (Panel("reward", lines),))
+        return cv2.imread(str(picture))
+
+    both = drawn({"reward": "trained on", "held": "held out"}, "both.png")
+    assert np.array_equal(both, drawn({"reward": "trained on"}, "one.png"))
+    assert not np.array_equal(both, drawn({"reward": "held out"}, "other.png"))
+
+
 def test_the_table_holds_counts_percent_intervals_and_the_paired_difference() -> None:
     before, after, difference = result_rows(SUMMARY)
     assert (before.real.count, before.real.percent) == ("64 / 200", "32.0 %")

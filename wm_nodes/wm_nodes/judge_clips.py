@@ -24,14 +24,12 @@ from tqdm import tqdm
 
 from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.job import add_judge_options, judge_options
-from wm_nodes.learning.clip_files import read_job, read_list
+from wm_nodes.learning.clip_files import AT_ONCE, read_job, read_list
 from wm_nodes.learning.clip_judging import ClipJob, ClipJudge
 from wm_nodes.reward.agent import Status, Verdict
 from wm_nodes.reward.judges.factory import for_clips
 
 VERDICTS = "verdicts.jsonl"
-AT_ONCE = 64
-"""Clips whose pixels are held at a time, as long as the judge does not take more at once."""
 
 
 def main(argv: Sequence[str]) -> int:

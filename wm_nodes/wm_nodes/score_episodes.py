@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from wm_nodes.config.load import judge_or_embedded, load_config
+from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.files import write_atomic
 from wm_nodes.job import add_judge_options, judge_options
@@ -65,7 +65,7 @@ def _judged(arguments: argparse.Namespace) -> JudgedBag:
     beside = Path(arguments.config).parent / READS
     reads = arguments.reads or (beside if beside.is_dir() else None)
     evidence = ClipEvidence(arguments.model_dir or shipped_model(config.task))
-    settings = episode_judge(config.model_copy(update={"judge": judge_or_embedded(config.judge)}))
+    settings = episode_judge(config)
     with closing(ClipJudge(settings, seed=config.seed, reads=reads, audit=arguments.audit, evidence=evidence)) as judge:
         return judge_bag(arguments.bag, judge, namespace=arguments.namespace)
 

@@ -1,5 +1,6 @@
 """Clips of one's own in a folder: video files, and clips.jsonl, which says what each one should show."""
 
+import hashlib
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,8 @@ from wm_nodes.reward.agent import ClipRef, TaskSpec, clip_ref
 from wm_nodes.types import UInt8Array
 
 LIST = "clips.jsonl"
+AT_ONCE = 64
+"""Clips whose pixels are held at a time, as long as the judge does not take more at once."""
 
 
 class ClipLine(BaseModel):
@@ -58,6 +61,19 @@ def read_list(folder: Path) -> list[ClipLine]:
             where = ".".join(map(str, first["loc"])) or "line"
             raise ValueError(f"{path}:{number}: {where}: {first['msg']}") from None
     return lines
+
+
+def list_sha256(folder: Path, announced: str = "") -> str:
+    """Of the bytes of clips.jsonl.
+
+    Raises:
+        ValueError: it is not the announced one. OSError: it cannot be read.
+    """
+    path = folder / LIST
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if announced and found != announced:
+        raise ValueError(f"{path} is not the announced list (sha256 {found[:12]}, not {announced[:12]}); copy it again")
+    return found
 
 
 def read_job(folder: Path, line: ClipLine) -> ClipJob:

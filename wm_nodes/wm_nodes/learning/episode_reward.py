@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.config.load import judge_or_embedded
 from wm_nodes.config.schema import JudgeConfig, RunConfig
 from wm_nodes.learning.clip_judging import ClipJob, ClipJudge
 from wm_nodes.learning.video_config import AGENT
@@ -114,8 +115,8 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
 
 
 def episode_judge(config: RunConfig) -> JudgeConfig:
-    """The judge's settings for episodes of the configured scene, see for_clips."""
-    return for_clips(config.judge, _longest(_scene(config)))
+    """The judge's settings for episodes of the configured scene, see judge_or_embedded and for_clips."""
+    return for_clips(judge_or_embedded(config.judge), _longest(_scene(config)))
 
 
 def _scene(config: RunConfig) -> EnvironmentSpec:

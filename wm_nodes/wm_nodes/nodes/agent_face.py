@@ -1,21 +1,30 @@
-"""The reward agent's face in the graph, the same in both reward evaluators: verdict topic, rubric service, diagnostics.
+"""The reward agent's face in the graph, the same in both reward evaluators: verdict topic, rubric service, diagnostics,
+and an action that judges clips in a folder.
 
 Specification: section 2.9.
 """
 
-from collections.abc import Callable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from yaml import YAMLError
 
+from wm_msgs.action import JudgeClips
 from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import ConfigError
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.learning.clip_evidence import ClipEvidence
-from wm_nodes.learning.clip_judging import READS, ClipJudge
+from wm_nodes.learning.clip_files import AT_ONCE, list_sha256, read_job, read_list
+from wm_nodes.learning.clip_judging import POLL_S, READS, ClipJob, ClipJudge
 from wm_nodes.reward.agent import Status, Verdict, pause_reason
+from wm_nodes.reward.agent.types import GATED
 from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.verdicts import verdict_msg
@@ -29,10 +38,10 @@ PARAMS = (
 
 class AgentFace:
     """Owns the node's ClipJudge until cleanup. The world model of the node's `model_dir` measures the evidence that the
-    rubric has bands of.
+    rubric has bands of. Rounds are judged one after the other; the node calls stop when it is deactivated.
 
     Args:
-        busy: whether clips are being judged: the rubric is not changed meanwhile.
+        busy: whether the node has clips of its own judged: the rubric is not changed meanwhile.
 
     Raises:
         ValueError, ConfigError: as ClipJudge.
@@ -50,7 +59,49 @@ class AgentFace:
             node.get_logger().info(card)
         self._verdicts = node.publish_on("reward/verdict")
         node.serve(SetRubric, "reward/set_rubric", self._on_set_rubric)
+        self._turn = threading.Lock()
+        self._action = WorkerAction(node, JudgeClips, "reward/judge_clips", self._judge_folder, _describe)
+        node.own(self._action.destroy)
         self.judge.refresh_health()
+
+    def stop(self, reason: str) -> None:
+        """End the judging of a folder."""
+        self._action.stop(reason)
+
+    def judge_round(
+        self, work: Work, jobs: Sequence[ClipJob], progress: Any, *, of: int, sha256: str, deadline: float | None,
+        iteration: int = 0, first: int = 0,
+    ) -> tuple[list[Verdict], list[ClipVerdict]]:  # fmt: skip
+        """Judge clips for an action's goal; every verdict is published as it is given.
+
+        Args:
+            progress: feedback of EvaluateClips or JudgeClips, brought forward and sent with every verdict.
+            of: clips of the goal. first: index of the first of `jobs` among them. sha256: of the file that has them.
+            deadline: on the time.monotonic clock, s; clips without a verdict by then have no reward. None: no limit.
+
+        Raises:
+            Cancelled: the goal is to end.
+        """
+        told = dict[int, ClipVerdict]()
+
+        def done(clip: int, verdict: Verdict) -> None:
+            message = self.publish(verdict, clip=first + clip, iteration=iteration, buffer_sha256=sha256)
+            told[clip] = message
+            progress.clips_done += 1
+            progress.clips_invalid += not verdict.valid
+            passed = zip(progress.stages_passed, message.stage_passed, strict=True)
+            progress.stages_passed = [count + more for count, more in passed]
+            progress.calls += verdict.cost.calls
+            progress.prompt_tokens += verdict.cost.prompt_tokens
+            progress.progress = progress.clips_done / of
+            work.feedback(progress)
+
+        with self._my_turn(work):
+            verdicts = self.judge.judge(
+                jobs, check=work.check, done=done, round_number=iteration,
+                within_s=None if deadline is None else max(0.0, deadline - time.monotonic()),
+            )  # fmt: skip
+        return verdicts, [told[clip] for clip in range(len(jobs))]
 
     def publish(
         self, verdict: Verdict, *, clip: int, iteration: int, buffer_sha256: str = ""
@@ -106,7 +157,7 @@ class AgentFace:
 
     def _on_set_rubric(self, request: SetRubric.Request, response: SetRubric.Response) -> SetRubric.Response:
         try:
-            if request.pack and self._busy():
+            if request.pack and (self._busy() or self._action.busy):
                 raise WireError(ErrorCode.BUSY, "clips are being judged by the present rubric; set another one later")
             if request.pack:
                 self._set_rubric(request.pack, self._node.run_dir)
@@ -123,3 +174,40 @@ class AgentFace:
         except (ConfigError, ValueError, OSError, YAMLError) as error:
             raise WireError(ErrorCode.OUT_OF_RANGE, f"rubric {pack!r} refused: {error}") from None
         self._node.get_logger().info(f"rubric {before} -> {self.judge.rubric.version}")
+
+    # Clips in a folder.
+
+    @contextmanager
+    def _my_turn(self, work: Work) -> Iterator[None]:
+        while not self._turn.acquire(timeout=POLL_S):
+            work.check()
+        try:
+            yield
+        finally:
+            self._turn.release()
+
+    def _judge_folder(self, work: Work) -> JudgeClips.Result:
+        goal: JudgeClips.Goal = work.request
+        result = JudgeClips.Result(termination_reason=JudgeClips.Result.FINISHED)
+        folder, progress = self._node.run_dir / goal.folder, JudgeClips.Feedback(stages_passed=[0] * len(GATED))
+        deadline = time.monotonic() + goal.deadline_s if goal.deadline_s else None
+        verdicts = list[Verdict]()
+        try:
+            lines, sha256 = read_list(folder), list_sha256(folder, goal.sha256)
+            for first in range(0, len(lines), AT_ONCE):
+                jobs = [read_job(folder, line) for line in lines[first : first + AT_ONCE]]
+                found, told = self.judge_round(
+                    work, jobs, progress, of=len(lines), sha256=sha256, deadline=deadline, first=first
+                )
+                verdicts += found
+                result.verdicts = [*result.verdicts, *told]
+        except (ValueError, OSError) as error:
+            result.termination_reason, result.message = JudgeClips.Result.FAILED, str(error)
+            self._node.get_logger().error(f"{goal.folder} not judged: {error}")
+            self._node.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=str(error))
+        result.pause_reason = pause_reason(verdicts)
+        return result
+
+
+def _describe(reason: int, text: str) -> JudgeClips.Result:
+    return JudgeClips.Result(termination_reason=reason, message=text)

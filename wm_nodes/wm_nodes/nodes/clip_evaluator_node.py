@@ -13,6 +13,7 @@ import torch
 
 from wm_msgs.action import EvaluateClips
 from wm_msgs.msg import ClipScores, ClipVerdict
+from wm_nodes.config.load import judge_or_embedded
 from wm_nodes.learning.clip_generation import ClipGenerator
 from wm_nodes.learning.clip_judging import agent_scores, buffer_jobs, clip_fps
 from wm_nodes.learning.clip_scores import mixed, score_clips
@@ -44,7 +45,7 @@ REWARD_NAME = "reference"
 
 
 class ClipEvaluatorNode(ManagedNode):
-    """Action clips/evaluate; publishes clips/scores. With the agent also reward/verdict; service reward/set_rubric."""
+    """Action clips/evaluate; publishes clips/scores. With the agent also what AgentFace has."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("reward_evaluator", PARAMS, **node_arguments)
@@ -64,8 +65,8 @@ class ClipEvaluatorNode(ManagedNode):
         self._agent = None
         if self._config.rewards.get(AGENT):
             shape = tuple(contexts.frames.shape[1:])
-            check_clips(self._config.judge, shape)
-            judge = for_clips(self._config.judge, shape)
+            judge = for_clips(judge_or_embedded(self._config.judge), shape)
+            check_clips(judge, shape)
             self._agent = AgentFace(self, judge, self._config.seed, lambda: self._action.busy)
         self._scores = self.publish_on("clips/scores")
         self._action = WorkerAction(self, EvaluateClips, "clips/evaluate", self._evaluate, self._describe)
@@ -73,6 +74,8 @@ class ClipEvaluatorNode(ManagedNode):
 
     def deactivate(self, reason: str) -> None:
         self._action.stop(reason)
+        if self._agent is not None:
+            self._agent.stop(reason)
 
     def update_diagnostics(self) -> None:
         if self._agent is not None:
@@ -109,26 +112,12 @@ class ClipEvaluatorNode(ManagedNode):
             frames, references, goal.sha256, given=self._config.model.num_conditioning, fps=self._fps,
             task=self._config.task, robot=self._config.judge.robot,
         )
-        told, progress = dict[int, ClipVerdict](), EvaluateClips.Feedback(stages_passed=[0] * len(GATED))
-
-        def done(clip: int, verdict: Verdict) -> None:
-            told[clip] = agent.publish(
-                verdict, clip=clip, iteration=buffer.iteration, buffer_sha256=goal.sha256
-            )
-            progress.clips_done += 1
-            progress.clips_invalid += not verdict.valid
-            passed = zip(progress.stages_passed, told[clip].stage_passed, strict=True)
-            progress.stages_passed = [count + more for count, more in passed]
-            progress.calls += verdict.cost.calls
-            progress.prompt_tokens += verdict.cost.prompt_tokens
-            progress.progress = progress.clips_done / len(jobs)
-            work.feedback(progress)
-
-        verdicts = agent.judge.judge(
-            jobs, check=work.check, done=done, within_s=goal.deadline_s or None, round_number=buffer.iteration
-        )
+        verdicts, told = agent.judge_round(
+            work, jobs, EvaluateClips.Feedback(stages_passed=[0] * len(GATED)), of=len(jobs), sha256=goal.sha256,
+            deadline=time.monotonic() + goal.deadline_s if goal.deadline_s else None, iteration=buffer.iteration,
+        )  # fmt: skip
         check_one_judge(verdicts, buffer.group_ids.tolist())
-        return verdicts, [told[clip] for clip in range(len(jobs))]
+        return verdicts, told
 
     def _score(
         self, buffer: RolloutBuffer, frames: torch.Tensor, verdicts: Sequence[Verdict], sha256: str

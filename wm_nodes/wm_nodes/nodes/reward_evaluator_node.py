@@ -45,7 +45,7 @@ GOALS_KEPT_PER_ENV = 2 * CREDIT_WINDOW
 
 class RewardEvaluatorNode(ManagedNode):
     """Listens to env/spec, env/image, env/transition, env/goal; publishes reward, reward/summary; with the agent also
-    reward/verdict, and serves reward/set_rubric."""
+    what AgentFace has."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("reward_evaluator", PARAMS, **node_arguments)
@@ -86,6 +86,8 @@ class RewardEvaluatorNode(ManagedNode):
 
     def deactivate(self, reason: str) -> None:
         self._drop_undecided()
+        if self._agent is not None:
+            self._agent.stop(reason)
 
     def update_diagnostics(self) -> None:
         if self._agent is not None:

@@ -1,6 +1,7 @@
 """The course of a training as a picture, from the run's metrics.jsonl."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,7 @@ def curves(
     """Draw the panels over the steps of the metrics, two in a row; returns the PNG.
 
     Returns None, and draws nothing, where no line of the file carries any of them. Values that were written as null
-    leave a gap.
+    leave a gap; a metric without any number is neither drawn nor in the legend.
 
     Args:
         step: what a step is; under every panel.
@@ -83,14 +84,17 @@ def _panel(
     axes.spines[["top", "right"]].set_visible(False)
     axes.set_xlabel(step, fontsize=8)
     axes.tick_params(labelsize=8)
-    if not any(series.values()):
+    drawn = {name for name, points in series.items() if any(math.isfinite(value) for _, value in points)}
+    if not drawn:
         axes.text(0.5, 0.5, "not recorded", ha="center", va="center", transform=axes.transAxes, color="gray")
         return
     for number, (name, points) in enumerate(series.items()):
+        if name not in drawn:
+            continue
         colour = COLOURS[(index + number) % len(COLOURS)]
-        steps, values = zip(*points, strict=True) if points else ((), ())
+        steps, values = zip(*points, strict=True)
         axes.plot(steps, values, color=colour, linewidth=1.6, marker="o", markersize=2.5, label=panel.lines[name])
-    if any(panel.lines.values()):
+    if any(panel.lines[name] for name in drawn):
         axes.legend(fontsize=8, frameon=False)
     axes.xaxis.get_major_locator().set_params(integer=True)
     if panel.limits is not None:

@@ -26,6 +26,7 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
         ConfigError: for a wrong preset or setting.
     """
     values = parse_arguments(scenario, given)
+    values |= {"reward": "agent"} if scenario == "judge_clips" else {}
     time = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
     run_dir = Path(values["run_dir"] or f"runs/{time}-{scenario}").expanduser().absolute()
     values["run_dir"] = str(run_dir)
@@ -73,11 +74,12 @@ def _judge_settings(values: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _check_agent(config: RunConfig, values: Mapping[str, str]) -> None:
-    """Before a policy's episodes are judged. A backend of the user's may make images that the settings do not know."""
+    """Before a policy's episodes are judged. A backend of the user's may make images that the settings do not know, and
+    clips in a folder have any size."""
     from wm_nodes.learning.episode_reward import check_agent
 
     _check_judge(config.judge)
-    if values.get("backend") != "factory":
+    if values.get("backend") != "factory" and "num_envs" in values:
         try:
             check_agent(config, trains="learner_ranks" in values)
         except ValueError as error:

@@ -271,6 +271,11 @@ def _world_model_rl(arguments: Mapping[str, str]) -> Graph:
     return Graph("world_model_rl", tuple(nodes))
 
 
+def _judge_clips(arguments: Mapping[str, str]) -> Graph:
+    parameters = {"reward": "agent", "model_dir": arguments["model_dir"], "audit_dir": "audit"}
+    return Graph("judge_clips", (_node(arguments, "reward_evaluator", parameters),))
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A named graph; arguments: names in ARGUMENTS, in the order in which --show-args lists them."""
@@ -308,6 +313,8 @@ SCENARIOS: dict[str, Scenario] = {
                  (*(name for name in _COMMON if name not in ("preset", "task", "compose")), "model_dir",
                   "video_model_dir", "context_bags", "heldout_bags", "video_preset", "keep_buffers", "tensorboard",
                   "record", "bag_uri", "reward", *_JUDGE), _world_model_rl),
+        Scenario("judge_clips", "Have the reward agent judge folders of clips (action reward/judge_clips)",
+                 (*(name for name in _COMMON if name != "compose"), "model_dir", *_JUDGE), _judge_clips),
         Scenario("composed", "online_training with all nodes in one process", _TRAINING, _online_training),
     )
 }  # fmt: skip

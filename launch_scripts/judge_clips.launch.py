@@ -1,0 +1,16 @@
+"""ros2 launch wm_bringup judge_clips.launch.py, or: python3 <this file> [--show-args] [name:=value ...]"""
+
+
+def generate_launch_description():
+    from wm_nodes.ros.launch_face import launch_description
+
+    return launch_description("judge_clips")
+
+
+if __name__ == "__main__":
+    import wm_setup
+
+    wm_setup.ensure()
+    from wm_nodes.ros.runner import main
+
+    raise SystemExit(main("judge_clips"))
