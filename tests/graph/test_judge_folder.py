@@ -18,7 +18,7 @@ from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.learning.clip_files import LIST, list_sha256
+from wm_nodes.learning.clip_files import AT_ONCE, LIST, list_sha256
 from wm_nodes.reward.agent import clip_ref
 from wm_nodes.reward.audit import read_record
 
@@ -92,16 +92,16 @@ def test_a_folder_is_judged_in_its_order_published_and_audited(evaluator: Evalua
 
 
 def test_a_folder_may_be_named_from_the_run_folder_and_a_longer_list_than_is_held_at_once_keeps_its_order(
-    evaluator: Evaluator, monkeypatch: pytest.MonkeyPatch
+    evaluator: Evaluator
 ) -> None:
     folder = evaluator.folder / "own clips"
     folder.mkdir()
-    (line, _) = write_clips(folder)
-    lines = [{**line, "clip_id": f"clip {number}"} for number in range(70)]
+    np.save(folder / "small.npy", np.random.default_rng(0).integers(0, 256, (3, 16, 16, 3), np.uint8))
+    lines = [{"file": "small.npy", "instruction": "push", "clip_id": f"clip {n}"} for n in range(AT_ONCE + 1)]
     (folder / LIST).write_text("".join(json.dumps(line) + "\n" for line in lines))
     result = evaluator.judge(folder="own clips", sha256=list_sha256(folder))
     assert (result.termination_reason, result.message) == (JudgeClips.Result.FINISHED, "")
-    assert [(v.clip, v.clip_id) for v in result.verdicts] == [(n, f"clip {n}") for n in range(70)]
+    assert [(v.clip, v.clip_id) for v in result.verdicts] == [(n, f"clip {n}") for n in range(AT_ONCE + 1)]
 
 
 @pytest.mark.parametrize(
