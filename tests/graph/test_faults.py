@@ -1,6 +1,5 @@
 """What happens when nodes die, messages are missed, or settings are wrong."""
 
-import os
 import subprocess
 import sys
 import time
@@ -192,31 +191,37 @@ def test_the_largest_image_is_not_refused(graph: Graph, probe: Probe) -> None:
 
 
 @pytest.mark.slow
-def test_fifty_start_stop_cycles_leave_no_shared_memory(domain: int) -> None:
-    """Not counted: Fast DDS's ports from 7000 on, which all processes and domains of the host take in turns and which
-    stay there, as many as were ever in use at once."""
+def test_fifty_start_stop_cycles_leave_no_shared_memory(graph: Graph) -> None:
+    """An environment with all its topics and services. Not counted: Fast DDS's ports from 7000 on, which all processes
+    and domains of the host take in turns and which stay there, as many as were ever in use at once."""
     cycle = (
         "import os, re, signal\n"
         "from pathlib import Path\n"
-        "from wm_nodes.ros.lifecycle import ManagedNode\n"
+        "from wm_nodes.nodes.environment_node import EnvironmentNode\n"
         "from wm_nodes.ros.spin import run_node\n"
         "ever = set()\n"
-        "class Cycle(ManagedNode):\n"
+        "class Cycle(EnvironmentNode):\n"
         "    def activate(self):\n"
+        "        super().activate()\n"
         "        lines = Path('/proc/self/maps').read_text().splitlines()\n"
         "        ever.update(line.split()[5] for line in lines if '/dev/shm/' in line)\n"
         "        os.kill(os.getpid(), signal.SIGINT)\n"
         "for _ in range(50):\n"
-        "    assert run_node(lambda: Cycle('cycle')) == 0\n"
+        "    assert run_node(Cycle) == 0\n"
         "    own = [path for path in ever if not re.search('fastrtps_port7[0-3]..$', path)]\n"
         "    left = [os.stat(path).st_size for path in own if os.path.exists(path)]\n"
         "    print(len(own), len(left), sum(left))\n"
     )
     before = shm_files()
-    env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
-    done = subprocess.run([sys.executable, "-c", cycle], env=env, capture_output=True, text=True, timeout=120)
+    given = {
+        "config_file": graph.folder / "config.yaml", "run_dir": graph.folder, "backend": "factory",
+        "backend_factory": "toy:make_environment", "num_envs": 4,
+    }  # fmt: skip
+    parameters = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+    command = [sys.executable, "-c", cycle, "--ros-args", *parameters]
+    done = subprocess.run(command, env=graph.environment(), capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
-    ports = range(7400 + 250 * domain, 7400 + 250 * (domain + 1))
+    ports = range(7400 + 250 * graph.domain, 7400 + 250 * (graph.domain + 1))
     assert not {name for name in shm_files() - before if name in {f"fastrtps_port{port}" for port in ports}}
     rows = (map(int, line.split()) for line in done.stdout.splitlines())
     seen, files, sizes = zip(*rows, strict=True)

@@ -4,6 +4,7 @@ and an action that judges clips in a folder.
 Specification: section 2.9.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -190,9 +191,9 @@ class AgentFace:
         goal: JudgeClips.Goal = work.request
         result = JudgeClips.Result(termination_reason=JudgeClips.Result.FINISHED)
         folder, progress = self._node.run_dir / goal.folder, JudgeClips.Feedback(stages_passed=[0] * len(GATED))
-        deadline = time.monotonic() + goal.deadline_s if goal.deadline_s else None
         verdicts = list[Verdict]()
         try:
+            deadline = deadline_of(goal.deadline_s)
             lines, sha256 = read_list(folder), list_sha256(folder, goal.sha256)
             for first in range(0, len(lines), AT_ONCE):
                 jobs = [read_job(folder, line) for line in lines[first : first + AT_ONCE]]
@@ -207,6 +208,17 @@ class AgentFace:
             self._node.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=str(error))
         result.pause_reason = pause_reason(verdicts)
         return result
+
+
+def deadline_of(seconds: float) -> float | None:
+    """When a goal's clips must be judged, on the time.monotonic clock; None: no limit, which is 0 s.
+
+    Raises:
+        ValueError: no number of seconds.
+    """
+    if not 0 <= seconds < math.inf:
+        raise ValueError(f"deadline_s must be 0 (no limit) or a number of seconds, got {seconds:g}")
+    return time.monotonic() + seconds if seconds else None
 
 
 def _describe(reason: int, text: str) -> JudgeClips.Result:

@@ -21,7 +21,7 @@ from wm_nodes.learning.video_config import AGENT, load_video_config
 from wm_nodes.learning.video_data import load_clips
 from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.nodes import agent_face
-from wm_nodes.nodes.agent_face import AgentFace
+from wm_nodes.nodes.agent_face import AgentFace, deadline_of
 from wm_nodes.reward.agent import Verdict, check_one_judge
 from wm_nodes.reward.agent.types import GATED
 from wm_nodes.reward.judges.factory import check_clips, for_clips
@@ -114,7 +114,7 @@ class ClipEvaluatorNode(ManagedNode):
         )
         verdicts, told = agent.judge_round(
             work, jobs, EvaluateClips.Feedback(stages_passed=[0] * len(GATED)), of=len(jobs), sha256=goal.sha256,
-            deadline=time.monotonic() + goal.deadline_s if goal.deadline_s else None, iteration=buffer.iteration,
+            deadline=deadline_of(goal.deadline_s), iteration=buffer.iteration,
         )  # fmt: skip
         check_one_judge(verdicts, buffer.group_ids.tolist())
         return verdicts, told
