@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -56,8 +57,23 @@ def repository() -> Path:
     return ROOT
 
 
-def pytest_sessionfinish() -> None:
-    """Remove what killed processes left in /dev/shm; files of living processes are locked and stay."""
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Remove what killed processes left in /dev/shm; files of living processes are locked or mapped and stay."""
     from wm_nodes.ros.runner import clean_shared_memory
 
     clean_shared_memory(graph_environment())
+    if not hasattr(session.config, "workerinput"):
+        _remove_unused_ports()
+
+
+def _remove_unused_ports() -> None:
+    """Fast DDS's own tool passes over ports whose lock file is gone."""
+    mapped = ""
+    for maps in Path("/proc").glob("[0-9]*/maps"):
+        with suppress(OSError):
+            mapped += maps.read_text()
+    for port in Path("/dev/shm").glob("fastrtps_port*"):
+        if str(port) not in mapped:
+            for path in (port, port.with_name(f"sem.{port.name}_mutex")):
+                with suppress(OSError):
+                    path.unlink()
