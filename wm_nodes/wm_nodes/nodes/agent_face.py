@@ -191,22 +191,23 @@ class AgentFace:
         goal: JudgeClips.Goal = work.request
         result = JudgeClips.Result(termination_reason=JudgeClips.Result.FINISHED)
         folder, progress = self._node.run_dir / goal.folder, JudgeClips.Feedback(stages_passed=[0] * len(GATED))
-        verdicts = list[Verdict]()
+        verdicts, messages = list[Verdict](), list[ClipVerdict]()
+        at_once = max(AT_ONCE, self.judge.settings.concurrency)
         try:
             deadline = deadline_of(goal.deadline_s)
             lines, sha256 = read_list(folder), list_sha256(folder, goal.sha256)
-            for first in range(0, len(lines), AT_ONCE):
-                jobs = [read_job(folder, line) for line in lines[first : first + AT_ONCE]]
+            for first in range(0, len(lines), at_once):
+                jobs = [read_job(folder, line) for line in lines[first : first + at_once]]
                 found, told = self.judge_round(
                     work, jobs, progress, of=len(lines), sha256=sha256, deadline=deadline, first=first
                 )
                 verdicts += found
-                result.verdicts = [*result.verdicts, *told]
+                messages += told
         except (ValueError, OSError) as error:
             result.termination_reason, result.message = JudgeClips.Result.FAILED, str(error)
             self._node.get_logger().error(f"{goal.folder} not judged: {error}")
             self._node.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=str(error))
-        result.pause_reason = pause_reason(verdicts)
+        result.verdicts, result.pause_reason = messages, pause_reason(verdicts)
         return result
 
 

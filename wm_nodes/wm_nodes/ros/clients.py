@@ -212,8 +212,10 @@ class RosEnvironmentClient:
 
     @property
     def _silent(self) -> bool:
-        """Whether the environment was silent for so long that no answer will come, however often it is asked."""
-        return self._node.peers.silence_s(self._peer) > SILENT_S
+        """Whether the environment is lost, and was silent for so long that no answer will come, however often it is
+        asked."""
+        peers = self._node.peers
+        return peers.is_lost(self._peer) and peers.silence_s(self._peer) > SILENT_S
 
 
 class LocalEnvironmentClient:
