@@ -4,7 +4,11 @@ import time
 
 HEARTBEAT_S = 0.5
 ASLEEP_S = 3 * HEARTBEAT_S
-"""Checks come once per heartbeat. Where one comes later than this, its own process stood still and heard nobody."""
+"""Checks come once per heartbeat. Where one comes later than this, its own process stood still and heard nobody: on a
+crowded machine, or in the middleware, since `kill -9` of a node can hold its peers in a send through shared memory for
+2 to 3 s."""
+AWAKE_S = 2 * HEARTBEAT_S
+"""After it stood still a process takes what has come meanwhile; a peer of which nothing has come by then is lost."""
 
 
 class PeerWatch:
@@ -34,12 +38,13 @@ class PeerWatch:
         self._lost.discard(name)
 
     def check(self, now: float | None = None) -> list[str]:
-        """Return the peers that became lost since the last check; time in which this process stood still does not
-        count."""
+        """Return the peers that became lost since the last check. Of the time in which this process stood still, no
+        more counts than leaves a peer AWAKE_S to be heard."""
         now = time.monotonic() if now is None else now
         apart = 0.0 if self._checked is None else now - self._checked
         if apart > ASLEEP_S:
-            self._heard = {name: min(now, last + apart - HEARTBEAT_S) for name, last in self._heard.items()}
+            slept_s, enough = apart - HEARTBEAT_S, now - max(0.0, self.timeout_s - AWAKE_S)
+            self._heard = {name: max(last, min(last + slept_s, enough)) for name, last in self._heard.items()}
         self._checked = now
         silent = {name for name, last in self._heard.items() if now - last > self.timeout_s}
         fresh = sorted(silent - self._lost)
