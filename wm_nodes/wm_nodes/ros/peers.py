@@ -5,8 +5,8 @@ import time
 HEARTBEAT_S = 0.5
 ASLEEP_S = 3 * HEARTBEAT_S
 """Checks come once per heartbeat. Where one comes later than this, its own process stood still and heard nobody: on a
-crowded machine, or in the middleware, since `kill -9` of a node can hold its peers in a send through shared memory for
-2 to 3 s."""
+crowded machine, or in the middleware, where `kill -9` of a node can hold all its peers up for 2 to 3 s (after 4 of
+264 kills)."""
 AWAKE_S = 2 * HEARTBEAT_S
 """After it stood still a process takes what has come meanwhile; a peer of which nothing has come by then is lost."""
 
