@@ -63,3 +63,15 @@ def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_numbe
     simulator = found["simulator"] | {"missing": "no Vulkan device"}
     cli.show(found | {"imagined_over_simulator": None, "simulator": simulator})
     assert capsys.readouterr().out.count("no Vulkan device") == 2
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [("world_model.width=7", "world_model.width 7"), ("world_model.widht=96", "widht"), ("width", "section.key=value")],
+)
+def test_an_untrained_model_of_an_impossible_size_is_refused_before_anything_is_measured(
+    value: str, words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "console", Console(width=200))
+    assert cli.main(["--preset", "smoke", "--untrained", value]) == 2
+    assert words in capsys.readouterr().out

@@ -15,10 +15,10 @@ from rich.table import Table
 
 from wm_nodes.allocator import keep_freed_memory
 from wm_nodes.benchmark.graph import measure_graph
-from wm_nodes.benchmark.inputs import Effort, console, prepare_model
+from wm_nodes.benchmark.inputs import Effort, console, prepare_model, random_model
 from wm_nodes.benchmark.simulator import IMAGINED_ENVS, measure_simulator
 from wm_nodes.benchmark.stages import measure_stages
-from wm_nodes.config.load import load_config, preset_names
+from wm_nodes.config.load import load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.reports import machine_facts
 from wm_nodes.reports.summary import plain, write_whole
@@ -31,13 +31,17 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(argv)
     effort = QUICK if arguments.quick else FULL
     try:
-        config = load_config(arguments.preset, {"seed": arguments.seed})
-        with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as folder:
-            found = measure(config, effort, Path(folder), arguments.model_dir)
+        untrained = None if arguments.untrained is None else dict(map(parse_override, arguments.untrained))
+        config = load_config(arguments.preset, {**(untrained or {}), "seed": arguments.seed})
+        with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as name:
+            folder, model = Path(name), arguments.model_dir
+            if untrained is not None:
+                model = random_model(config, folder / "model")
+            found = measure(config, effort, folder, model)
     except (ValueError, OSError, RuntimeError) as error:
         console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
         return 2
-    found |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed}
+    found |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
     show(found)
     if arguments.json:
         write_whole(arguments.json, json.dumps(plain(found), indent=1) + "\n")
@@ -105,6 +109,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the numbers there")
     parser.add_argument("--quick", action="store_true", help="a tenth of the work, for a first look; less exact")
     parser.add_argument("--preset", default="cpu", help=f"model size: one of {', '.join(preset_names())}, or a .yaml")
-    parser.add_argument("--model-dir", type=Path, help="world model to measure instead of the shipped one")
+    model = parser.add_mutually_exclusive_group()
+    model.add_argument("--model-dir", type=Path, help="world model to measure instead of the shipped one")
+    model.add_argument(
+        "--untrained", nargs="*", metavar="SECTION.KEY=VALUE",
+        help="measure a model with random weights, of the preset's size but for these settings",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
     return parser
