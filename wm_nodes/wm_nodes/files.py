@@ -1,5 +1,6 @@
-"""Files that are either the old one or the new one, never half of it."""
+"""Files that are either the old one or the new one, never half of it; and what is in one."""
 
+import hashlib
 import os
 from pathlib import Path
 
@@ -27,3 +28,8 @@ def write_atomic(path: Path, data: bytes) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def file_sha256(path: Path) -> str:
+    """Of its bytes. Raises OSError."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()

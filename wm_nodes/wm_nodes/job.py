@@ -5,7 +5,6 @@ goes on where it stopped, and never takes a trained policy for the one it began 
 """
 
 import argparse
-import hashlib
 import json
 import os
 import sys
@@ -22,7 +21,7 @@ from tqdm import tqdm
 
 from wm_nodes.config.load import ConfigError, dump_config, judge_overrides
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.files import write_atomic
+from wm_nodes.files import file_sha256, write_atomic
 from wm_nodes.learning.evaluation import evaluate
 from wm_nodes.learning.policies import load_policy, make_imagined_environment, models_of
 from wm_nodes.learning.preparation import num_starts
@@ -240,10 +239,6 @@ def kept(path: Path, identity: Mapping[str, str], measure: Callable[[], BoolArra
 def rate(success: BoolArray) -> Rate:
     low, high = wilson_interval(int(success.sum()), len(success))
     return Rate(int(success.sum()), len(success), low, high)
-
-
-def file_sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _real(operator: Operator, job: Job, start: Start, label: str, policy: Path) -> BoolArray:

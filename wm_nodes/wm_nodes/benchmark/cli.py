@@ -20,8 +20,9 @@ from wm_nodes.benchmark.simulator import IMAGINED_ENVS, measure_simulator
 from wm_nodes.benchmark.stages import measure_stages
 from wm_nodes.config.load import load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.files import write_atomic
 from wm_nodes.reports import machine_facts
-from wm_nodes.reports.summary import plain, write_whole
+from wm_nodes.reports.summary import plain
 
 FULL, QUICK = Effort(60, 5000, 5, 30), Effort(3, 500, 2, 8)
 
@@ -44,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     found |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
     show(found)
     if arguments.json:
-        write_whole(arguments.json, json.dumps(plain(found), indent=1) + "\n")
+        write_atomic(arguments.json, (json.dumps(plain(found), indent=1) + "\n").encode())
         console.print(f"written {arguments.json}", highlight=False)
     return 0
 

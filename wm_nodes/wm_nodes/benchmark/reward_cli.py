@@ -4,18 +4,16 @@ climbing the reward climbs the truth (hacking); other papers' rewards on the sam
 
 import argparse
 import asyncio
-import json
 import shlex
-import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from tqdm import tqdm
 
+from wm_nodes.benchmark.results import write_results
 from wm_nodes.benchmark.reward_compared import (
     PROTOCOLS,
     AnswerFile,
@@ -61,10 +59,8 @@ from wm_nodes.benchmark.reward_tables import (
     table2,
 )
 from wm_nodes.config.load import load_config
-from wm_nodes.files import write_atomic
 from wm_nodes.learning.adversarial_set import load_set
 from wm_nodes.learning.benchmark_clips import MIN_TEST_CLIPS, chosen_rows
-from wm_nodes.reports import machine_facts
 from wm_nodes.reward.adversarial import LabelledClip, Manifest
 from wm_nodes.reward.adversarial.generator import SEVERITIES
 from wm_nodes.reward.adversarial.manifest import Row
@@ -113,7 +109,7 @@ async def _table(arguments: argparse.Namespace) -> None:
     console.print(cost_table({"agent, benchmark mode": cost}))
     below = [*missed(agreements), *missed_patterns(patterns)]
     _say_what_is_missing(arguments, len(rows), said, below, worst(mistakes(rows, found, rubric)))
-    _write(arguments, {
+    write_results(arguments, {
         "claim": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "notice": said, "statuses": statuses(found), "cost": cost,
         "splits": {name: [asdict(row) for row in found] for name, found in splits.items()},
@@ -133,7 +129,7 @@ async def _efficiency(arguments: argparse.Namespace) -> None:
     compared = economy(rows, outcomes)
     console.print(cost_table(costs), economy_table(compared, f"{who}; {arguments.part}, {len(rows)} clips"))
     _say_what_is_missing(arguments, len(rows), said, [], [])
-    _write(arguments, {
+    write_results(arguments, {
         "claim": "efficiency", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "notice": said, "per_clip": costs, "compared": [asdict(one) for one in compared],
     })  # fmt: skip
@@ -173,7 +169,7 @@ async def _hacking(arguments: argparse.Namespace) -> None:
         console.print(said, style="bold", highlight=False)
     if arguments.json is not None:
         plot_curves(curves, arguments.json.with_suffix(".png"))
-    _write(arguments, {
+    write_results(arguments, {
         "claim": "hacking", "judge": who, "rubric": rubric.version, "part": arguments.part, "notice": said,
         "seed": arguments.seed, "plan": asdict(plan), "starts": [start.clip.recipe for start in starts],
         "curves": [asdict(one) for one in curves],
@@ -196,7 +192,7 @@ async def _comparisons(arguments: argparse.Namespace) -> None:
                 )
     caption = f"{arguments.model}; {arguments.part}, {len(rows)} clips; wins: hacked scores >= its clean recording"
     console.print(compared_table(found, caption))
-    _write(arguments, {
+    write_results(arguments, {
         "claim": "comparisons", "model": arguments.model, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "rows": [asdict(row) for row in found],
     })  # fmt: skip
@@ -250,23 +246,6 @@ def _say_what_is_missing(
         lines.append(f"wrong most often: {', '.join(f'{name} ({times})' for name, times in wrong)}")
     for line in lines:
         console.print(line, style="bold", highlight=False, soft_wrap=True)
-
-
-def _write(arguments: argparse.Namespace, found: dict[str, Any]) -> None:
-    if arguments.json is None:
-        return
-    facts = {"command": arguments.command, "machine": machine_facts(), "date": time.strftime("%Y-%m-%d")}
-    rounded = json.loads(json.dumps({**found, **facts}), parse_float=lambda digits: float(f"{float(digits):.5g}"))
-    write_atomic(arguments.json, (json.dumps(_finite(rounded), indent=1) + "\n").encode())
-
-
-def _finite(value: Any) -> Any:
-    """NaN is no JSON: null."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and value != value else value
 
 
 def parser() -> argparse.ArgumentParser:

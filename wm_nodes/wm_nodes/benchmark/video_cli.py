@@ -7,12 +7,10 @@ picture is drawn beside it (of ablations from two seeds on).
 """
 
 import argparse
-import hashlib
 import json
 import math
 import os
 import shlex
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -28,6 +26,7 @@ from wm_nodes.benchmark.clip_learning import MEASURES as CLIP_MEASURES
 from wm_nodes.benchmark.clip_learning import TASK, ClipPlan, clip_learning_arms, train_on_clips
 from wm_nodes.benchmark.clip_resolution import sample_clips, size_rows
 from wm_nodes.benchmark.moving_disc import CHANNELS, NUM_ACTIONS, training_batch
+from wm_nodes.benchmark.results import write_results
 from wm_nodes.benchmark.video_arms import Arm, diversity_arms, learning_arms
 from wm_nodes.benchmark.video_comparison import MEASURES, Comparison, compare_arms
 from wm_nodes.benchmark.video_cost import (
@@ -55,7 +54,7 @@ from wm_nodes.benchmark.video_tables import (
 from wm_nodes.benchmark.video_trials import Plan, Trial, ablation_trials, hacking_trials
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import PRETRAINED, shipped_model
-from wm_nodes.files import write_atomic
+from wm_nodes.files import file_sha256, write_atomic
 from wm_nodes.learning.clip_scores import load_probe
 from wm_nodes.learning.collecting import HELDOUT_SEEDS, collect_plan, scripted_plan
 from wm_nodes.learning.frame_features import (
@@ -71,7 +70,6 @@ from wm_nodes.learning.video_data import load_clips
 from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.learning.video_training import FlowMatchingSettings, train_video_model
 from wm_nodes.learning.weights import check_same_layout, pack_weights, unpack_weights
-from wm_nodes.reports import machine_facts
 from wm_nodes.seeding import numpy_stream
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.world_model import load_model_folder
@@ -151,7 +149,7 @@ def _diversity(arguments: argparse.Namespace) -> None:
                 for name, row in regime.items() if name.startswith("DynDiff") for base in bases
             ]  # fmt: skip
     of = {"plan": asdict(plan), "seed": arguments.seed, "features": FEATURES, **_settings(arms), **_base_of(arguments)}
-    _write(arguments, {**of, "rows": rows, "comparisons": comparisons})
+    write_results(arguments, {**of, "rows": rows, "comparisons": comparisons})
     _draw(arguments, plot_diversity, rows, arguments.seed)
     console.print(diversity_table(rows, arguments.seed))
 
@@ -178,7 +176,7 @@ def _clips(arguments: argparse.Namespace) -> None:
     compared = clip_comparisons(rows, arguments.seed)
     size = {"contexts": len(contexts), "group_size": arguments.group_size, "features": features.name}
     of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(arms)}
-    _write(arguments, {**size, "seed": arguments.seed, **of, "rows": rows, "comparisons": compared})
+    write_results(arguments, {**size, "seed": arguments.seed, **of, "rows": rows, "comparisons": compared})
     _draw(arguments, plot_diversity, rows, arguments.seed)
     console.print(clip_table(rows, arguments.seed), clip_comparison_table(compared))
 
@@ -198,7 +196,7 @@ def _resolution(arguments: argparse.Namespace) -> None:
         if own is None:
             own = sample_clips(folder, clips, config)
         rows += size_rows(folder, clips, own, config, probe)
-    _write(arguments, {"seed": arguments.seed, "sha256": folder.manifest["sha256"], "rows": rows})
+    write_results(arguments, {"seed": arguments.seed, "sha256": folder.manifest["sha256"], "rows": rows})
     console.print(resolution_table(rows))
 
 
@@ -324,7 +322,7 @@ def _write_trainings(
     """The rows, the resolved settings of their arms, and the comparisons."""
     names = {row["arm"] for row in rows}
     arms = _settings([trial.arm for trial in trials if trial.arm.name in names])
-    _write(arguments, {**of, **arms, "comparisons": [asdict(one) for one in comparisons], "rows": rows})
+    write_results(arguments, {**of, **arms, "comparisons": [asdict(one) for one in comparisons], "rows": rows})
 
 
 def _settings(arms: list[Arm]) -> dict[str, Any]:
@@ -333,7 +331,7 @@ def _settings(arms: list[Arm]) -> dict[str, Any]:
 
 def _base_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Which base model was measured."""
-    return {"sha256": {"base": hashlib.sha256((arguments.base or BASE).read_bytes()).hexdigest()}}
+    return {"sha256": {"base": file_sha256(arguments.base or BASE)}}
 
 
 def _cost(arguments: argparse.Namespace) -> None:
@@ -346,7 +344,7 @@ def _cost(arguments: argparse.Namespace) -> None:
         *measure_anchors("PushCube", *pushcube_buffer(arguments.seed), LEARNER, arguments.repeats),
     ]
     of = {"seed": arguments.seed, "learner": asdict(LEARNER), **_base_of(arguments)}
-    _write(arguments, {**of, "rollouts": rollouts, "rows": rows})
+    write_results(arguments, {**of, "rollouts": rollouts, "rows": rows})
     _draw(arguments, plot_cost, rows)
     console.print(rollout_table(rollouts, arguments.repeats), cost_table(rows, arguments.repeats))
 
@@ -370,14 +368,6 @@ def _finished(path: Path | None, trials: Sequence[Trial[Any]]) -> list[dict[str,
                 f"{path} holds {row['arm']} by plan {row['plan']}, this call has {plans[row['arm']]}; take another file"
             )
     return rows
-
-
-def _write(arguments: argparse.Namespace, found: dict[str, Any]) -> None:
-    if arguments.json is None:
-        return
-    facts = {"command": arguments.command, "machine": machine_facts(), "date": time.strftime("%Y-%m-%d")}
-    rounded = json.loads(json.dumps({**found, **facts}), parse_float=lambda digits: float(f"{float(digits):.5g}"))
-    write_atomic(arguments.json, (json.dumps(rounded) + "\n").encode())
 
 
 def _draw(arguments: argparse.Namespace, plot: Callable[..., None], what: Sequence[Any], *more: Any) -> None:

@@ -1,6 +1,5 @@
 """Clips of one's own in a folder: video files, and clips.jsonl, which says what each one should show."""
 
-import hashlib
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +7,7 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from wm_nodes.files import file_sha256
 from wm_nodes.learning.clip_judging import ClipJob
 from wm_nodes.reward.agent import ClipRef, TaskSpec, clip_ref
 from wm_nodes.types import UInt8Array
@@ -70,7 +70,7 @@ def list_sha256(folder: Path, announced: str = "") -> str:
         ValueError: it is not the announced one. OSError: it cannot be read.
     """
     path = folder / LIST
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    found = file_sha256(path)
     if announced and found != announced:
         raise ValueError(f"{path} is not the announced list (sha256 {found[:12]}, not {announced[:12]}); copy it again")
     return found

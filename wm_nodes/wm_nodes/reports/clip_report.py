@@ -9,9 +9,10 @@ from typing import Any
 
 from rich.table import Table
 
+from wm_nodes.files import write_atomic
 from wm_nodes.reports.curves import Panel
 from wm_nodes.reports.html import Picture, figures, made_on, number_cell, write_page
-from wm_nodes.reports.summary import FILE_NAME, plain, write_whole
+from wm_nodes.reports.summary import FILE_NAME, plain
 
 TITLES = {
     "tracking": "tracking score", "object_cm": "object error, cm", "tool_cm": "tool error, cm", "psnr_db": "PSNR, dB",
@@ -64,7 +65,7 @@ class ClipSummary:
 def write_clip_summary(run_dir: Path, summary: ClipSummary) -> Path:
     """Write <run_dir>/summary.json, complete or not at all."""
     path = Path(run_dir) / FILE_NAME
-    write_whole(path, json.dumps(plain(asdict(summary)), indent=1, allow_nan=False) + "\n")
+    write_atomic(path, (json.dumps(plain(asdict(summary)), indent=1, allow_nan=False) + "\n").encode())
     return path
 
 

@@ -7,7 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.reports.summary import Summary, write_whole
+from wm_nodes.files import write_atomic
+from wm_nodes.reports.summary import Summary
 from wm_nodes.reports.tables import ROUND_COLUMNS, result_rows, round_rows, verdict
 
 FILE_NAME = "report.html"
@@ -79,7 +80,7 @@ def write_page(run_dir: Path, title: str, body: Iterable[str]) -> Path:
         f"<body>{''.join(body)}</body></html>\n"
     )
     path = Path(run_dir) / FILE_NAME
-    write_whole(path, page)
+    write_atomic(path, page.encode())
     return path
 
 

@@ -2,11 +2,12 @@
 
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+from wm_nodes.files import write_atomic
 
 FILE_NAME = "summary.json"
 
@@ -76,7 +77,7 @@ class Summary:
 def write_summary(run_dir: Path, summary: Summary) -> Path:
     """Write <run_dir>/summary.json, complete or not at all."""
     path = Path(run_dir) / FILE_NAME
-    write_whole(path, json.dumps(summary.to_dict(), indent=1, allow_nan=False) + "\n")
+    write_atomic(path, (json.dumps(summary.to_dict(), indent=1, allow_nan=False) + "\n").encode())
     return path
 
 
@@ -103,11 +104,3 @@ def plain(value: Any) -> Any:
         return value
     number = float(value)
     return number if math.isfinite(number) else None
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write under a temporary name, then rename."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
