@@ -205,8 +205,7 @@ class AgentFace:
                 messages += told
         except (ValueError, OSError) as error:
             result.termination_reason, result.message = JudgeClips.Result.FAILED, str(error)
-            self._node.get_logger().error(f"{goal.folder} not judged: {error}")
-            self._node.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=str(error))
+            self._node.say_failed_goal(f"{goal.folder} not judged: {error}")
         result.verdicts, result.pause_reason = messages, pause_reason(verdicts)
         return result
 

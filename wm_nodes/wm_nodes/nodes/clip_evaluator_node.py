@@ -25,7 +25,7 @@ from wm_nodes.nodes.agent_face import AgentFace, deadline_of
 from wm_nodes.reward.agent import Verdict, check_one_judge
 from wm_nodes.reward.agent.types import GATED
 from wm_nodes.reward.judges.factory import check_clips, for_clips
-from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros import convert
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
@@ -98,8 +98,7 @@ class ClipEvaluatorNode(ManagedNode):
             self.diagnostics.latency("evaluate", result.scores.eval_s)
         except (RolloutBufferError, ValueError, OSError) as error:
             result.termination_reason, result.message = EvaluateClips.Result.FAILED, str(error)
-            self.get_logger().error(f"{goal.buffer_uri} not judged: {error}")
-            self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=str(error))
+            self.say_failed_goal(f"{goal.buffer_uri} not judged: {error}")
         return result
 
     def _judged(

@@ -9,7 +9,7 @@ from wm_nodes.learning.evaluation import EvaluationResult, evaluate
 from wm_nodes.nodes.backends import existing, make_policy
 from wm_nodes.nodes.policy_holder import PolicyHolder, read_weights, weights_uri
 from wm_nodes.nodes.remote_environment import RemoteEnvironment
-from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros import convert
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -78,8 +78,7 @@ class EvaluationNode(ManagedNode):
         except (WireError, ValueError) as error:
             result.termination_reason, result.message = Evaluate.Result.FAILED, str(error)
         if result.message:
-            self.get_logger().error(result.message)
-            self.diagnostics.count("failed_evaluations", level=diagnostics.ERROR, text=result.message)
+            self.say_failed_goal(result.message)
         return result
 
     def _load(self, goal: Evaluate.Goal) -> int:

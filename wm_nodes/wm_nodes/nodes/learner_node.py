@@ -178,8 +178,7 @@ class LearnerNode(ManagedNode):
             if source is not None:
                 source.close()
         if result.termination_reason in (Train.Result.PEER_LOST, Train.Result.FAILED, Train.Result.PAUSED):
-            self.get_logger().error(f"training ended: {result.message}")
-            self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=result.message)
+            self.say_failed_goal(f"training ended: {result.message}")
         elif result.message:
             self.get_logger().warning(f"training ended: {result.message}")
         else:

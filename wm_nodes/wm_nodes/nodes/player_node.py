@@ -192,8 +192,7 @@ class PlayerNode(ManagedNode):
             playback = self._open(work.request)
             self._play(playback, work.request, work)
         except (BagError, ValueError) as error:
-            self.get_logger().error(f"replay failed: {error}")
-            self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=f"replay failed: {error}")
+            self.say_failed_goal(f"replay failed: {error}")
             return _describe(Replay.Result.FAILED, str(error))
         if not self.active:
             raise Cancelled("deactivated")

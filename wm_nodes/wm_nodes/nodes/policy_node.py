@@ -127,8 +127,7 @@ class PolicyNode(ManagedNode):
     def _fail(self, result: Rollout.Result, reason: int, text: str) -> None:
         result.termination_reason, result.message = reason, text
         self._last_reply = None
-        self.get_logger().error(text)
-        self.diagnostics.count("failed_rollouts", level=diagnostics.ERROR, text=text)
+        self.say_failed_goal(text)
 
     def _act(self, work: Work, result: Rollout.Result) -> None:
         goal: Rollout.Goal = work.request

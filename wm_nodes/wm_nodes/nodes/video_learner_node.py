@@ -114,8 +114,7 @@ class VideoLearnerNode(ManagedNode):
         except (ValueError, OSError, FloatingPointError) as error:
             result.termination_reason, result.message = TrainVideo.Result.FAILED, str(error)
         if result.message:
-            self.get_logger().error(f"training ended: {result.message}")
-            self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=result.message)
+            self.say_failed_goal(f"training ended: {result.message}")
         return self._fill(result)
 
     def _read(self, uris: Sequence[str]) -> Generator[RolloutBuffer]:

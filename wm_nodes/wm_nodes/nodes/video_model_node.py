@@ -18,7 +18,7 @@ from wm_nodes.learning.video_folder import load_video_folder
 from wm_nodes.learning.weights import WeightsError, load_weights
 from wm_nodes.nodes.policy_holder import read_weights
 from wm_nodes.recording.layout import Tiles
-from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros import convert
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
@@ -104,8 +104,7 @@ class VideoModelNode(ManagedNode):
             self.diagnostics.latency("sample", message.sample_s)
         except (WireError, WeightsError, ValueError, OSError) as error:
             result.termination_reason, result.message = GenerateClips.Result.FAILED, str(error)
-            self.get_logger().error(f"clips of iteration {goal.iteration} failed: {error}")
-            self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=str(error))
+            self.say_failed_goal(f"clips of iteration {goal.iteration} failed: {error}")
         return result
 
     def _follow(self, work: Work, version: int) -> None:

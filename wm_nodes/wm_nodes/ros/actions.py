@@ -142,7 +142,7 @@ class WorkerAction:
         except Exception as error:
             self._node.get_logger().error(traceback.format_exc())
             text = f"{type(error).__name__}: {error}"
-            self._node.diagnostics.count("failed_goals", level=2, text=f"{self._name} failed: {text}")
+            self._node.say_failed_goal(f"{self._name} failed: {text}")
             result, state = self._describe(reasons.FAILED, text), "abort"
 
         def conclude(handle: ServerGoalHandle) -> Any:

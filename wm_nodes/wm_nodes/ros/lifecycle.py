@@ -126,6 +126,11 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.diagnostics.count("refused_parameters", text=f"parameter refused: {result.reason}")
         return result
 
+    def say_failed_goal(self, text: str) -> None:
+        """In the log, and counted in diagnostics."""
+        self.get_logger().error(text)
+        self.diagnostics.count("failed_goals", level=diagnostics.ERROR, text=text)
+
     def publish_on(self, name: str, qos: QoSProfile | None = None) -> StampedPublisher:
         """A numbering publisher for a row of the QoS table (or another profile), destroyed at cleanup."""
         publisher = StampedPublisher(self, name, self.session, qos)
