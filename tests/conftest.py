@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from judge_server import PickyServer, serving
 
 from wm_nodes.ros.domain import DomainLock, first_free
 from wm_nodes.ros.environment import graph_environment
@@ -18,6 +19,13 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 _session_lock: DomainLock | None = None
+
+
+@pytest.fixture
+def server() -> Iterator[PickyServer]:
+    """A judge's server."""
+    with serving(PickyServer()) as server:
+        yield server
 
 
 def pytest_configure() -> None:

@@ -7,9 +7,11 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from chat_server import ChatServer, Fault
+
+Server = TypeVar("Server", bound=ChatServer)
 
 
 @dataclass
@@ -32,7 +34,7 @@ class PickyServer(ChatServer):
 
 
 @contextmanager
-def serving(server: ChatServer) -> Iterator[ChatServer]:
+def serving(server: Server) -> Iterator[Server]:
     """The server on an event loop of its own thread."""
     loop, ready, stop = asyncio.new_event_loop(), threading.Event(), asyncio.Event()
 

@@ -20,7 +20,6 @@ def test_another_judge_takes_the_rounds_of_an_outage_and_each_round_is_scored_ag
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with serving(PickyServer()) as server, serving(PickyServer()) as other, own_domain() as domain:
-        assert isinstance(server, PickyServer)
         fallback = {"endpoints": [other.url], "model": "other"}
         config = settings(**{
             "rewards": {"agent": 1.0}, "judge.endpoints": [server.url], "judge.model": "judge", "judge.tries": 1,

@@ -1,7 +1,6 @@
 """Evidence with calibrated bands makes the agent look closer: measured, refused, written as a pack, and at work."""
 
 import json
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from imagined_clip import STEPS, imagined
-from judge_server import PickyServer, serving
+from judge_server import PickyServer
 from recording_samples import make_episode, make_spec
 from scripted_judge import make_clip, make_task
 
@@ -28,13 +27,6 @@ from wm_nodes.types import UInt8Array
 
 MODEL_DIR = shipped_model("push_cube")
 BANDS = {"still_energy": {"component": "temporal", "low": 1e-3}, "flicker_max": {"component": "temporal", "high": 0.1}}
-
-
-@pytest.fixture
-def server() -> Iterator[PickyServer]:
-    with serving(PickyServer()) as server:
-        assert isinstance(server, PickyServer)
-        yield server
 
 
 def pack(folder: Path, **bands: dict[str, object]) -> Path:

@@ -3,7 +3,6 @@
 import json
 import re
 import time
-from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import replace
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from graph.video_loop import write_contexts
-from judge_server import PickyServer, serving
+from judge_server import PickyServer
 from recording_samples import make_spec
 from rl_toys import toy_policy, toy_ppo, toy_rollout
 from scripted_judge import make_clip, make_task
@@ -43,13 +42,6 @@ from wm_nodes.world_model_job import main
 
 JUDGE = ("--judge", "http://127.0.0.1:9/v1", "--judge-model", "judge")
 SPEC = make_spec(num_envs=2, height=8, width=8)
-
-
-@pytest.fixture
-def server() -> Iterator[PickyServer]:
-    with serving(PickyServer()) as server:
-        assert isinstance(server, PickyServer)
-        yield server
 
 
 def settings(server: PickyServer, **changes: object) -> JudgeConfig:

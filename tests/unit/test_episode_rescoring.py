@@ -1,7 +1,6 @@
 """The reward agent judges the episodes of a recorded run: whole ones, goals at hand, recorded rewards bit by bit."""
 
 import json
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from judge_server import PickyServer, serving
+from judge_server import PickyServer
 from numpy.typing import NDArray
 from recording_graph import NUM_ENVS, Graph, write
 from recording_samples import make_spec
@@ -43,13 +42,6 @@ class AgentGraph(Graph):
             if self.step_id == self.tamper:
                 message.total = np.nextafter(message.total, np.float32(10), dtype=np.float32)
         return message
-
-
-@pytest.fixture
-def server() -> Iterator[PickyServer]:
-    with serving(PickyServer()) as server:
-        assert isinstance(server, PickyServer)
-        yield server
 
 
 def recorded(path: Path, **options: Any) -> Path:
