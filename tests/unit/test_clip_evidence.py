@@ -10,7 +10,7 @@ from pushed_box import HALF_M, draw, push_clip, pushing_states, redrawn
 
 from wm_nodes.reward.adversarial import LabelledClip, SourceClip, apply, edit_states
 from wm_nodes.reward.evidence.definitions import EVIDENCE
-from wm_nodes.reward.evidence.motion import motion_evidence
+from wm_nodes.reward.evidence.motion import motion_evidence, outline_of
 from wm_nodes.reward.evidence.objects import FAR, find_target, object_evidence, scene_of
 from wm_nodes.reward.evidence.pictures import pictures_of
 from wm_nodes.reward.evidence.pixels import pixel_evidence
@@ -39,7 +39,7 @@ def evidence_of(frames: UInt8Array, reference: UInt8Array, masks: UInt8Array) ->
     pictures, scene = pictures_of(frames, reference), scene_of(masks)
     return {
         **pixel_evidence(pictures), **object_evidence(scene, reference, INSTRUCTION),
-        **region_evidence(pictures, masks, INSTRUCTION), **motion_evidence(scene, pictures.colours),
+        **region_evidence(pictures, masks, INSTRUCTION), **motion_evidence(scene, outline_of(scene, pictures.colours)),
     }  # fmt: skip
 
 
@@ -115,7 +115,8 @@ def test_the_colour_at_an_edge_tells_parts_of_a_pixel() -> None:
     masks = np.zeros((3, 96, 96), np.uint8)
     pictures[:, 40:50, 30:40], masks[:, 40:50, 30:40] = blue, OBJECT
     pictures[2, [39, 50], 30:40] = (grey + blue) // 2
-    found = motion_evidence(scene_of(masks), pictures)
+    scene = scene_of(masks)
+    found = motion_evidence(scene, outline_of(scene, pictures))
     assert found["outline_area_seen_last"] == pytest.approx(0, abs=1e-6), "the median of three is a sharp one"
     assert found["outline_area_step"] == pytest.approx(np.log(1.1), abs=0.02)
     assert found["outline_tall_step"] == pytest.approx(np.log(11 / 10), abs=0.02) and found["outline_wide_step"] < 1e-6
@@ -133,7 +134,7 @@ def test_a_late_jump_is_one_that_no_tool_hit_and_a_hit_is_none() -> None:
     masks[0, :, 20:58, 26:30] = ROBOT
     for t in range(9):
         masks[1, t, 20:58, 26 + 8 * (t > 5) : 30 + 8 * (t > 5)] = ROBOT
-    free, hit = (motion_evidence(scene_of(one), pictures) for one in masks)
+    free, hit = (motion_evidence(one, outline_of(one, pictures)) for one in map(scene_of, masks))
     assert free["jump_sudden"] == hit["jump_sudden"] == pytest.approx(0.8, abs=0.01)
     assert free["jump_unhit"] == free["still_jump"] == pytest.approx(0.8, abs=0.01)
     assert hit["jump_unhit"] <= 0.05 and hit["still_jump"] == 0 and hit["jump_sudden_closing"] > 0.7

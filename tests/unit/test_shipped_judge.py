@@ -9,12 +9,14 @@ import pytest
 from wm_nodes.config.load import load_config
 from wm_nodes.learning.adversarial_set import HELD_OUT, ClipSource, instruction_of
 from wm_nodes.learning.judge_fitting import CONFORMAL
+from wm_nodes.learning.judge_reader import FOLDS
 from wm_nodes.reward.adversarial import LabelledClip
 from wm_nodes.reward.adversarial.generator import edited
 from wm_nodes.reward.agent import RewardAgent, load_rubric
 from wm_nodes.reward.agent.types import ClipRef, Stage, Status, TaskSpec, Verdict, clip_ref
 from wm_nodes.reward.evidence.definitions import EVIDENCE
 from wm_nodes.reward.evidence.head import load_head
+from wm_nodes.reward.evidence.sequence import reading_names
 from wm_nodes.reward.judges.embedded import EmbeddedJudge, shipped_head
 from wm_nodes.reward.judges.factory import check_judge, make_judge
 from wm_nodes.simulation.tasks import TASKS
@@ -31,7 +33,8 @@ def test_it_is_small_says_how_it_was_made_and_knows_its_evidence() -> None:
     size = sum(path.stat().st_size for path in shipped_head().iterdir())
     head = load_head(shipped_head())
     assert size < 3_000_000
-    assert set(head.names) == set(EVIDENCE) and set(head.story["tasks"]) == set(TASKS)
+    assert set(head.names) == {*EVIDENCE, *reading_names()} and len(head.readers) == FOLDS
+    assert set(head.story["tasks"]) == set(TASKS)
     assert {"made", "data", "seed", "segmenter", "trees", "validation"} <= head.story.keys()
     assert head.story["made"]["command"].startswith("python -m wm_nodes.learning.train_judge")
     card = EmbeddedJudge(head).card

@@ -54,7 +54,7 @@ def read_clips(folder: Path, count: int, seed: int) -> tuple[float, float]:
     for index in range(count + 1):
         if index == 1:  # the first one pays for what is loaded late
             started = [time.process_time(), time.monotonic()]
-        row = head.row(clip_evidence(head.segmenter, clip, clip[0], INSTRUCTION))
+        row = head.row(clip_evidence(head.segmenter, clip, clip[0], INSTRUCTION, head.readers))
         head.familiarity.distance(row)
         for target in head.questions:
             head.levels(target, row)

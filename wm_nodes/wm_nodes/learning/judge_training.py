@@ -1,7 +1,7 @@
 """Make the embedded judge from adversarial sets: segmenter, evidence, heads, limits. Specification: section 4.3.
 
-Finished stages lie in the folder and are taken up again: segmenter.safetensors, and evidence-*.npz per set and part,
-named by everything they depend on, which labels are not.
+Finished stages lie in the folder and are taken up again: segmenter.safetensors, evidence-*.npz and sequences-*.npz per
+set and part, and reader-*.safetensors, named by everything they depend on; of these, labels for the readers only.
 """
 
 import hashlib
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors.torch import load_file, save
 from tqdm import tqdm
 
@@ -28,15 +29,18 @@ from wm_nodes.learning.judge_fitting import (
     fit_familiarity,
     measured,
 )
+from wm_nodes.learning.judge_reader import cross_fit, reader_data
 from wm_nodes.learning.judge_segmenter import overlaps, segmentation_data, train_segmenter
 from wm_nodes.learning.policy_view import SEEN
 from wm_nodes.reward.adversarial import COMPONENTS, TC, Manifest
 from wm_nodes.reward.adversarial.manifest import Part, Row, to_bytes
-from wm_nodes.reward.evidence.clip import clip_evidence
+from wm_nodes.reward.evidence.clip import measured_clip
 from wm_nodes.reward.evidence.head import JudgeHead
 from wm_nodes.reward.evidence.segmentation import Segmenter
+from wm_nodes.reward.evidence.sequence import ObjectSequence, SequenceReader, reading_names, readings
 from wm_nodes.reward.evidence.trees import TreeSettings
 from wm_nodes.reward.evidence.window import Window
+from wm_nodes.types import FloatArray
 
 SEGMENTER = "segmenter.safetensors"
 Sets = Sequence[tuple[Path, Manifest]]
@@ -44,12 +48,14 @@ Sets = Sequence[tuple[Path, Manifest]]
 
 @dataclass(frozen=True)
 class JudgePlan:
-    """sets: folders of adversarial sets. segmenter_steps: batches. seed: of everything drawn. window: what the clips
-    show of the pictures that will be judged, of sets that were drawn so (policy_view.py).
+    """sets: folders of adversarial sets. segmenter_steps: batches. reader_epochs: times that each network over time
+    sees its clips; 0: none is trained. seed: of everything drawn. window: what the clips show of the pictures that will
+    be judged, of sets that were drawn so (policy_view.py).
     """
 
     sets: tuple[Path, ...]
     segmenter_steps: int = 2800
+    reader_epochs: int = 16
     trees: TreeSettings = field(default_factory=TreeSettings)
     seed: int = 0
     window: Window | None = None
@@ -74,6 +80,12 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     )
     if not len(train.rows) or not len(validation.rows):
         raise ValueError(f"{len(train.rows)} training and {len(validation.rows)} validation clips; build larger sets")
+    readers: tuple[SequenceReader, ...] = ()
+    if plan.reader_epochs:
+        data = reader_data(collect_sequences(folder, sets, "train", segmenter), train.rows)
+        readers, held = cross_fit(folder, data, epochs=plan.reader_epochs, seed=plan.seed, progress=progress)
+        train = with_readings(train, held)
+        validation = _read(folder, sets, "validation", segmenter, readers, validation)
     questions = fit_all(train, validation, plan.trees, plan.seed, progress=progress)
     low, high = np.quantile(train.evidence[train.clean], (0.05, 0.95), axis=0).astype(np.float32)
     recorded = [
@@ -85,7 +97,7 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     story = {
         "data": [_described(path, manifest) for path, manifest in sets], "seed": plan.seed,
         "fitted": {"train": len(train.rows), "validation": len(validation.rows)},
-        "segmenter": segmenter_story, "trees": vars(plan.trees),
+        "segmenter": segmenter_story, "trees": vars(plan.trees), "reader_epochs": plan.reader_epochs,
         "tasks": sorted({row.origin.task for row in train.rows}),
         "cameras": sorted({row.origin.camera.split()[0] for row in train.rows}),
         "validation": {target: measured(questions, target, validation) for target in TARGETS},
@@ -94,34 +106,80 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     known = fit_familiarity(train, validation)
     size = (recorded[0][1], recorded[0][2])
     return JudgeHead(
-        segmenter, train.names, questions, known, low, high, size, lengths, story, window=plan.window
+        segmenter, train.names, questions, known, low, high, size, lengths, story, window=plan.window, readers=readers
     )  # fmt: skip
 
 
 def collect_evidence(
-    folder: Path, sets: Sets, part: Part, segmenter: Segmenter, *, progress: bool = True
-) -> Examples:
-    """Evidence of every clip of a part of all sets, kept in `folder` per set."""
+    folder: Path, sets: Sets, part: Part, segmenter: Segmenter, readers: Sequence[SequenceReader] = (), *,
+    progress: bool = True,
+) -> Examples:  # fmt: skip
+    """Evidence of every clip of a part of all sets, that of readers in the end; kept in `folder` per set."""
     names: tuple[str, ...] = ()
     found, rows = [], []
     for path, manifest in sets:
         chosen = rows_of(manifest, [part])
         if not chosen:
             continue
-        kept = folder / f"evidence-{_key(chosen, segmenter)}.npz"
-        if not kept.exists():
-            name = f"evidence of {path.name} {part}"
-            clips = tqdm(set_clips([(path, manifest)], [part]), name, len(chosen), disable=not progress)
-            numbers = [clip_evidence(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
-            buffer = io.BytesIO()
-            values = np.array([list(evidence.values()) for evidence in numbers], np.float32)
-            np.savez_compressed(buffer, names=np.array(list(numbers[0])), values=values)
-            write_atomic(kept, buffer.getvalue())
-        with np.load(kept, allow_pickle=False) as arrays:
+        with np.load(_measured(folder, path, manifest, part, segmenter, progress)[0], allow_pickle=False) as arrays:
             names = tuple(str(name) for name in arrays["names"])
             found.append(arrays["values"])
         rows += chosen
-    return Examples(names, np.concatenate(found) if found else np.zeros((0, 0), np.float32), rows)
+    examples = Examples(names, np.concatenate(found) if found else np.zeros((0, 0), np.float32), rows)
+    return _read(folder, sets, part, segmenter, readers, examples) if readers and rows else examples
+
+
+def collect_sequences(folder: Path, sets: Sets, part: Part, segmenter: Segmenter) -> list[ObjectSequence]:
+    """What a reader reads of every clip of a part of all sets, whose evidence has been collected."""
+    found = []
+    for path, manifest in sets:
+        if rows_of(manifest, [part]):
+            with np.load(_measured(folder, path, manifest, part, segmenter, False)[1], allow_pickle=False) as arrays:
+                ends = np.cumsum(arrays["lengths"])[:-1]
+                both = (np.split(arrays[name], ends) for name in ("crops", "numbers"))
+                found += [ObjectSequence(*pair) for pair in zip(*both, strict=True)]
+    return found
+
+
+def with_readings(examples: Examples, log_odds: FloatArray) -> Examples:
+    """The examples with what the readers answer, (N, K), as their last numbers."""
+    evidence = np.concatenate([examples.evidence, log_odds], 1)
+    return Examples(examples.names + reading_names(), evidence, examples.rows)
+
+
+def _read(
+    folder: Path, sets: Sets, part: Part, segmenter: Segmenter, readers: Sequence[SequenceReader], examples: Examples
+) -> Examples:
+    sequences = collect_sequences(folder, sets, part, segmenter)
+    answers = [list(readings(readers, sequence).values()) for sequence in sequences]
+    return with_readings(examples, np.array(answers, np.float32))
+
+
+def _measured(
+    folder: Path, path: Path, manifest: Manifest, part: Part, segmenter: Segmenter, progress: bool
+) -> tuple[Path, Path]:
+    """Evidence and sequences of the clips of a part of a set, in files that are made where they are missing."""
+    chosen = rows_of(manifest, [part])
+    key = _key(chosen, segmenter)
+    evidence, sequences = (folder / f"{name}-{key}.npz" for name in ("evidence", "sequences"))
+    if not evidence.exists() or not sequences.exists():
+        name = f"evidence of {path.name} {part}"
+        clips = tqdm(set_clips([(path, manifest)], [part]), name, len(chosen), disable=not progress)
+        found = [measured_clip(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
+        _keep(
+            sequences, lengths=np.array([len(sequence.crops) for _, sequence in found]),
+            crops=np.concatenate([sequence.crops for _, sequence in found]),
+            numbers=np.concatenate([sequence.numbers for _, sequence in found]),
+        )  # fmt: skip
+        values = np.array([list(numbers.values()) for numbers, _ in found], np.float32)
+        _keep(evidence, names=np.array(list(found[0][0])), values=values)
+    return evidence, sequences
+
+
+def _keep(path: Path, **arrays: NDArray[Any]) -> None:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_atomic(path, buffer.getvalue())
 
 
 def _key(rows: Sequence[Row], segmenter: Segmenter) -> str:

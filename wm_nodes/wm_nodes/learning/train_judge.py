@@ -37,6 +37,10 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("sets", type=Path, nargs="+", help="folders made by adversarial_set, of one division")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--segmenter-steps", type=int, default=JudgePlan.segmenter_steps, help="batches of 16 pictures")
+    parser.add_argument(
+        "--reader-epochs", type=int, default=JudgePlan.reader_epochs,
+        help="times that each of two networks over time sees its half of the recordings; 0: none",
+    )  # fmt: skip
     parser.add_argument("--trees", type=int, default=TreeSettings.num_trees, help="per question")
     parser.add_argument("--threads", type=int, default=1, help="cores; other numbers give other last bits")
     parser.add_argument(
@@ -56,8 +60,9 @@ def main(argv: Sequence[str]) -> int:
                 models = load_model_folder(policy_models(arguments.policy_view))
                 window = policy_window(models.simulation, SIDE_PX)
             plan = JudgePlan(
-                tuple(arguments.sets), arguments.segmenter_steps, TreeSettings(arguments.trees), arguments.seed, window
-            )
+                tuple(arguments.sets), arguments.segmenter_steps, arguments.reader_epochs,
+                TreeSettings(arguments.trees), arguments.seed, window,
+            )  # fmt: skip
             made = {
                 "command": "python -m wm_nodes.learning.train_judge " + " ".join(argv), "machine": machine_facts(),
             }  # fmt: skip
@@ -75,7 +80,7 @@ def main(argv: Sequence[str]) -> int:
 def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
     head = load_head(arguments.out)
     part = arguments.measure
-    examples = collect_evidence(arguments.out, load_sets(arguments.sets), part, head.segmenter)
+    examples = collect_evidence(arguments.out, load_sets(arguments.sets), part, head.segmenter, head.readers)
     if not len(examples.rows):
         raise ValueError(f"the sets have no {part} clips; build larger ones")
     found: dict[str, Any] = {t: measured(head.questions, t, examples) for t in TARGETS}

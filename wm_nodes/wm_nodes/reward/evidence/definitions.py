@@ -3,7 +3,8 @@
 "Against the reference" is a ratio to, or a difference from, the reference frame: about 1 or 0 where nothing is wrong.
 Shares lie in [0, 1]; levels are grey levels of 0 to 255; sizes are object sizes, the square root of the object's area
 in the reference frame, and end at 20; steps are from one frame to the next. First and last are frames of the clip;
-in uncovered ones no robot is within 0.15 sizes of the object, its lowest point is its tool.
+in uncovered ones no robot is within 0.15 sizes of the object, its lowest point is its tool. What readers answer
+(sequence.reading_names) comes on top: log-odds, without limits.
 """
 
 from dataclasses import dataclass

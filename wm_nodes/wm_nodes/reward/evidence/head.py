@@ -11,17 +11,19 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
+from torch import nn
 
 from wm_nodes.files import write_atomic
 from wm_nodes.reward.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING
 from wm_nodes.reward.evidence.segmentation import Segmenter
+from wm_nodes.reward.evidence.sequence import SequenceReader
 from wm_nodes.reward.evidence.trees import Trees
 from wm_nodes.reward.evidence.window import Window
 from wm_nodes.types import FloatArray, UInt8Array
@@ -38,6 +40,7 @@ CLIP_AT = 6.0
 """Standardised evidence is cut here, so that one wild number does not make a clip foreign."""
 
 Floats = NDArray[np.float64]
+_Network = TypeVar("_Network", bound=nn.Module)
 
 
 class JudgeFolderError(ValueError):
@@ -85,7 +88,8 @@ class JudgeHead:
     or "is it absent"; for task completion one per level above the lowest; for planning "is it a video" and "is it
     readable", and it is good where no component fails. clean_low, clean_high: (F,), 5 %
     and 95 % quantiles over clips in which nothing fails. size: H, W that evidence is measured at. lengths: fewest and
-    most frames. window: what is read of a picture; None: all of it. story: how it was made and what it measured.
+    most frames. window: what is read of a picture; None: all of it. readers: their mean is among the evidence. story:
+    how it was made and what it measured.
     """
 
     segmenter: Segmenter
@@ -99,6 +103,7 @@ class JudgeHead:
     story: Mapping[str, Any] = field(default_factory=dict)
     sha256: str = ""
     window: Window | None = None
+    readers: tuple[SequenceReader, ...] = ()
 
     @property
     def picture_size(self) -> tuple[int, int]:
@@ -186,7 +191,9 @@ def num_questions(target: str) -> int:
 def save_head(folder: Path, head: JudgeHead) -> Path:
     """Write the folder; equal heads give equal bytes of judge.safetensors."""
     arrays: dict[str, NDArray[Any]] = {
-        f"segmenter.{name}": tensor.numpy().astype(np.float16) for name, tensor in head.segmenter.state_dict().items()
+        f"{part}.{name}": tensor.numpy().astype(np.float16)
+        for part, network in (("segmenter", head.segmenter), *((f"reader{k}", r) for k, r in enumerate(head.readers)))
+        for name, tensor in network.state_dict().items()
     }
     lines: dict[str, list[list[float]]] = {}
     for target, questions in head.questions.items():
@@ -199,7 +206,7 @@ def save_head(folder: Path, head: JudgeHead) -> Path:
     data = save({name: np.ascontiguousarray(array) for name, array in sorted(arrays.items())})
     manifest = {
         "format": FORMAT, "sha256": hashlib.sha256(data).hexdigest(), "evidence": list(head.names), "lines": lines,
-        "limit": known.limit, "size": list(head.size), "lengths": list(head.lengths),
+        "limit": known.limit, "size": list(head.size), "lengths": list(head.lengths), "readers": len(head.readers),
         **({} if head.window is None else {"window": asdict(head.window)}), **head.story,
     }  # fmt: skip
     write_atomic(folder / TENSORS, data)
@@ -225,10 +232,8 @@ def load_head(folder: Path) -> JudgeHead:
         raise JudgeFolderError(f"{folder / TENSORS} is not the file its manifest names; copy the folder again")
     try:
         arrays = load(data)
-        segmenter = Segmenter()
-        segmenter.load_state_dict({
-            name: torch.from_numpy(arrays[f"segmenter.{name}"].astype(np.float32)) for name in segmenter.state_dict()
-        })  # fmt: skip
+        segmenter = _network(Segmenter(), "segmenter", arrays)
+        readers = tuple(_network(SequenceReader(), f"reader{k}", arrays) for k in range(manifest.get("readers", 0)))
         questions = {
             target: tuple(
                 Question(Trees(**{p: arrays[f"{target}.{k}.{p}"] for p in TREE_ARRAYS}, bias=bias), slope, offset)
@@ -245,12 +250,20 @@ def load_head(folder: Path) -> JudgeHead:
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise JudgeFolderError(f"{folder} is of another architecture: {error}; train it anew") from error
     _check(folder, names, questions, known, (clean_low, clean_high))
-    own = {"format", "sha256", "evidence", "lines", "limit", "size", "lengths", "window"}
+    own = {"format", "sha256", "evidence", "lines", "limit", "size", "lengths", "readers", "window"}
     story = {name: value for name, value in manifest.items() if name not in own}
     return JudgeHead(
-        segmenter.eval().requires_grad_(False), names, questions, known, clean_low, clean_high, (height, width),
-        (fewest, most), story, manifest["sha256"], window,
+        segmenter, names, questions, known, clean_low, clean_high, (height, width), (fewest, most), story,
+        manifest["sha256"], window, readers,
     )  # fmt: skip
+
+
+def _network(network: _Network, part: str, arrays: Mapping[str, NDArray[Any]]) -> _Network:
+    """The network with its weights, which are kept as float16."""
+    weights = {name: torch.from_numpy(arrays[f"{part}.{name}"].astype(np.float32)) for name in network.state_dict()}
+    network.load_state_dict(weights)
+    network.eval().requires_grad_(False)
+    return network
 
 
 def _check(

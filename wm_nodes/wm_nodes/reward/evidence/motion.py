@@ -16,7 +16,7 @@ from wm_nodes.reward.evidence.objects import FAR, TOUCH, Floats, Numbers, Scene,
 from wm_nodes.reward.evidence.pictures import TURN
 from wm_nodes.reward.evidence.quantiles import median, quantile
 from wm_nodes.reward.evidence.segmentation import OBJECT, ROBOT
-from wm_nodes.reward.evidence.tracks import SMALLEST_PX, Track
+from wm_nodes.reward.evidence.tracks import SMALLEST_PX
 from wm_nodes.types import BoolArray, UInt8Array
 
 AROUND_PX = 3
@@ -51,14 +51,9 @@ class Outline:
     hollow: Floats
 
 
-def motion_evidence(scene: Scene, pictures: UInt8Array) -> Numbers:
-    """Evidence of one clip.
-
-    Args:
-        pictures: uint8 (1 + T, H, W, 3), the reference frame first.
-    """
+def motion_evidence(scene: Scene, outline: Outline) -> Numbers:
+    """Evidence of one clip."""
     size, gap = scene.size, scene.gap
-    outline = find_outline(scene.masks, pictures, scene.thing)
     known = np.isfinite(outline.area)
     place, hand = filled(outline.centre) / size, filled(scene.tool) / size
     found = {
@@ -69,8 +64,13 @@ def motion_evidence(scene: Scene, pictures: UInt8Array) -> Numbers:
     return dict(zip(found, values.tolist()))
 
 
-def find_outline(masks: UInt8Array, pictures: UInt8Array, thing: Track) -> Outline:
-    """Follow the object's coloured pixels in and around its mask."""
+def outline_of(scene: Scene, pictures: UInt8Array) -> Outline:
+    """Follow the object's coloured pixels in and around its mask.
+
+    Args:
+        pictures: uint8 (1 + T, H, W, 3), the reference frame first.
+    """
+    masks, thing = scene.masks, scene.thing
     count, height, width = masks.shape
     numbers = np.full((count, 7), np.nan)
     ring, hollow = np.zeros(count), np.zeros(count)

@@ -73,8 +73,7 @@ def object_evidence(scene: Scene, reference: UInt8Array, instruction: str) -> Nu
         reference: uint8 (H, W, 3). instruction: names the object's colour first, then the target's.
     """
     masks, thing, size, gap, tool = scene.masks, scene.thing, scene.size, scene.gap, scene.tool
-    colours = [word for word in instruction.lower().replace(",", " ").split() if word in HUES_DEGREES]
-    target = find_target(reference, masks[0], colours[1]) if len(colours) > 1 else None
+    target = target_of(masks[0], reference, instruction)
     place, known = filled(thing.centre), np.isfinite(thing.area)
     return {
         **_shape(thing, gap, known),
@@ -96,6 +95,12 @@ def tool_points(arm: NDArray[np.bool_]) -> Floats:
         low = int(np.flatnonzero(reached[t])[-1])
         points[t] = low, np.nonzero(arm[t, max(0, low - 2) : low + 1])[1].mean()
     return points
+
+
+def target_of(mask: UInt8Array, reference: UInt8Array, instruction: str) -> Target | None:
+    """The disc of the second colour that the instruction names; None where it names none or it is not to be seen."""
+    colours = [word for word in instruction.lower().replace(",", " ").split() if word in HUES_DEGREES]
+    return find_target(reference, mask, colours[1]) if len(colours) > 1 else None
 
 
 def find_target(reference: UInt8Array, mask: UInt8Array, colour: str) -> Target | None:

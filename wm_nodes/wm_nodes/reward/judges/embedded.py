@@ -150,7 +150,7 @@ class EmbeddedJudge:
         if (kept := self._kept.get(key)) is None:
             head = self._head
             frames, reference = head.seen(clip.frames), head.seen(task.reference_frame)
-            kept = MappingProxyType(clip_evidence(head.segmenter, frames, reference, task.instruction))
+            kept = MappingProxyType(clip_evidence(head.segmenter, frames, reference, task.instruction, head.readers))
             with self._lock:
                 self._kept[key] = kept
                 while len(self._kept) > KEPT_CLIPS:
