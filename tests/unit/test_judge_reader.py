@@ -113,10 +113,10 @@ def test_a_reader_tells_faults_from_clean_clips_and_equal_seeds_give_equal_weigh
 
 
 def test_every_training_clip_is_read_by_the_reader_that_has_not_seen_its_recording(tmp_path: Path) -> None:
-    readers, held = cross_fit(tmp_path, data(), epochs=1, seed=0, progress=False)
+    readers, held = cross_fit(tmp_path, data(), count=1, epochs=1, seed=0, progress=False)
     assert len(readers) == FOLDS
     kept = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    _, again = cross_fit(tmp_path, data(), epochs=1, seed=0, progress=False)
+    _, again = cross_fit(tmp_path, data(), count=1, epochs=1, seed=0, progress=False)
     np.testing.assert_array_equal(again, held)
     assert kept == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}, "finished readers were trained again"
     for i, fold in enumerate(data().folds):
@@ -124,7 +124,7 @@ def test_every_training_clip_is_read_by_the_reader_that_has_not_seen_its_recordi
     other = data().answers.copy()
     other[data().folds == 0] = 1 - other[data().folds == 0].clip(0)
     relabelled = ReaderData(data().sequences, other, data().folds)
-    taught, _ = cross_fit(tmp_path, relabelled, epochs=1, seed=0, progress=False)
+    taught, _ = cross_fit(tmp_path, relabelled, count=1, epochs=1, seed=0, progress=False)
     same = [
         all(torch.equal(a, b) for a, b in zip(readers[k].state_dict().values(), taught[k].state_dict().values()))
         for k in range(FOLDS)
@@ -132,7 +132,19 @@ def test_every_training_clip_is_read_by_the_reader_that_has_not_seen_its_recordi
     assert same == [True, False], "the labels of fold 0 teach the other fold's reader only"
 
 
+def test_of_several_readers_per_half_the_mean_counts_and_each_is_another(tmp_path: Path) -> None:
+    one, _ = cross_fit(tmp_path, data(), count=1, epochs=1, seed=0, progress=False)
+    readers, held = cross_fit(tmp_path, data(), count=2, epochs=1, seed=0, progress=False)
+    assert len(readers) == 2 * FOLDS == len(list(tmp_path.iterdir())), "the first of each half was taken up again"
+    weights = [reader.frame.weight for reader in readers]
+    assert torch.equal(weights[0], one[0].frame.weight) and not torch.equal(weights[0], weights[1])
+    for i in (0, 3):
+        fold = data().folds[i]
+        answers = [reader.log_odds(data().sequences[i]) for reader in readers[2 * fold : 2 * fold + 2]]
+        np.testing.assert_allclose(held[i], np.mean(answers, 0), rtol=1e-6)
+
+
 def test_recordings_that_cannot_be_divided_are_refused(tmp_path: Path) -> None:
     few = ReaderData(data().sequences, data().answers, np.zeros_like(data().folds))
     with pytest.raises(ValueError, match="recordings of one parity of seeds only: 72 clips; build larger sets"):
-        cross_fit(tmp_path, few, epochs=1, seed=0, progress=False)
+        cross_fit(tmp_path, few, count=1, epochs=1, seed=0, progress=False)

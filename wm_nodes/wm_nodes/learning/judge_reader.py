@@ -1,8 +1,8 @@
 """Train the networks that see the object over time, each on half of the recordings. Specification: section 4.3.
 
-Trees that read a network's answers must learn how good these are on clips it was not trained on. So there are two, and
-a training clip's numbers come from the one that was trained without its recording; on every other clip it is their mean
-that counts. Shapes: N clips, T frames, K questions, in the order of READS.
+Trees that read a network's answers must learn how good these are on clips it was not trained on. So each is trained on
+half of the recordings, and a training clip's numbers are the mean of those that were trained without its recording; on
+every other clip it is the mean of all that counts. Shapes: N clips, T frames, K questions, in the order of READS.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ from wm_nodes.files import write_atomic
 from wm_nodes.learning.judge_fitting import LAST_FAIL, UNKNOWN, Levels, true_levels
 from wm_nodes.reward.adversarial.manifest import Row
 from wm_nodes.reward.evidence import sequence
-from wm_nodes.reward.evidence.sequence import READS, RIGHTWARD, ObjectSequence, SequenceReader
+from wm_nodes.reward.evidence.sequence import READS, RIGHTWARD, ObjectSequence, SequenceReader, readings
 from wm_nodes.seeding import numpy_stream, stream_seed
 from wm_nodes.types import FloatArray
 from wm_nodes.world_model.precision import compute_context
@@ -59,9 +59,9 @@ def _answers(question: str, rows: Sequence[Row]) -> Levels:
 
 
 def cross_fit(
-    folder: Path, data: ReaderData, *, epochs: int, seed: int, progress: bool = True
+    folder: Path, data: ReaderData, *, count: int, epochs: int, seed: int, progress: bool = True
 ) -> tuple[tuple[SequenceReader, ...], FloatArray]:
-    """The readers, with weights of float16, and log-odds (N, K) of every clip by one that has not seen its recording.
+    """`count` readers per fold, and log-odds (N, K) of every clip, the mean of those that have not seen its recording.
 
     Args:
         folder: of finished readers, which are taken up again: files named by everything they depend on.
@@ -74,18 +74,26 @@ def cross_fit(
         trained = np.flatnonzero(data.folds != fold)
         if not len(trained) or len(trained) == len(data.folds):
             raise ValueError(f"recordings of one parity of seeds only: {len(data.folds)} clips; build larger sets")
-        own = stream_seed(seed, "reader", fold)
-        path = folder / f"reader-{_key(data, trained, epochs, own)}.safetensors"
-        if path.exists():
-            reader = SequenceReader().eval().requires_grad_(False)
-            reader.load_state_dict(load_file(path))
-        else:
-            reader = train_reader(data, trained, epochs=epochs, seed=own, progress=progress)
-            write_atomic(path, save(dict(reader.state_dict())))
-        readers.append(reader)
+        own = [
+            _kept_reader(folder, data, trained, epochs, stream_seed(seed, "reader", fold + FOLDS * number), progress)
+            for number in range(count)
+        ]
         for i in np.flatnonzero(data.folds == fold):
-            held[i] = reader.log_odds(data.sequences[i])
+            held[i] = list(readings(own, data.sequences[i]).values())
+        readers += own
     return tuple(readers), held
+
+
+def _kept_reader(
+    folder: Path, data: ReaderData, trained: Levels, epochs: int, seed: int, progress: bool
+) -> SequenceReader:
+    path = folder / f"reader-{_key(data, trained, epochs, seed)}.safetensors"
+    if not path.exists():
+        reader = train_reader(data, trained, epochs=epochs, seed=seed, progress=progress)
+        write_atomic(path, save(dict(reader.state_dict())))
+    reader = SequenceReader().eval().requires_grad_(False)
+    reader.load_state_dict(load_file(path))
+    return reader
 
 
 def _key(data: ReaderData, chosen: Levels, epochs: int, seed: int) -> str:

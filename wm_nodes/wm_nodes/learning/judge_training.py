@@ -48,13 +48,14 @@ Sets = Sequence[tuple[Path, Manifest]]
 
 @dataclass(frozen=True)
 class JudgePlan:
-    """sets: folders of adversarial sets. segmenter_steps: batches. reader_epochs: times that each network over time
-    sees its clips; 0: none is trained. seed: of everything drawn. window: what the clips show of the pictures that will
-    be judged, of sets that were drawn so (policy_view.py).
+    """sets: folders of adversarial sets. segmenter_steps: batches. readers: networks over time per half of the
+    recordings. reader_epochs: times that each sees its clips. seed: of everything drawn. window: what the clips show of
+    the pictures that will be judged, of sets that were drawn so (policy_view.py).
     """
 
     sets: tuple[Path, ...]
     segmenter_steps: int = 2800
+    readers: int = 1
     reader_epochs: int = 16
     trees: TreeSettings = field(default_factory=TreeSettings)
     seed: int = 0
@@ -81,9 +82,11 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     if not len(train.rows) or not len(validation.rows):
         raise ValueError(f"{len(train.rows)} training and {len(validation.rows)} validation clips; build larger sets")
     readers: tuple[SequenceReader, ...] = ()
-    if plan.reader_epochs:
+    if plan.readers:
         data = reader_data(collect_sequences(folder, sets, "train", segmenter), train.rows)
-        readers, held = cross_fit(folder, data, epochs=plan.reader_epochs, seed=plan.seed, progress=progress)
+        readers, held = cross_fit(
+            folder, data, count=plan.readers, epochs=plan.reader_epochs, seed=plan.seed, progress=progress
+        )
         train = with_readings(train, held)
         validation = _read(folder, sets, "validation", segmenter, readers, validation)
     questions = fit_all(train, validation, plan.trees, plan.seed, progress=progress)

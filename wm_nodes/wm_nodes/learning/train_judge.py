@@ -38,9 +38,9 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--segmenter-steps", type=int, default=JudgePlan.segmenter_steps, help="batches of 16 pictures")
     parser.add_argument(
-        "--reader-epochs", type=int, default=JudgePlan.reader_epochs,
-        help="times that each of two networks over time sees its half of the recordings; 0: none",
-    )  # fmt: skip
+        "--readers", type=int, default=JudgePlan.readers, help="networks over time per half of the recordings; 0: none"
+    )
+    parser.add_argument("--reader-epochs", type=int, default=JudgePlan.reader_epochs, help="times that each sees it")
     parser.add_argument("--trees", type=int, default=TreeSettings.num_trees, help="per question")
     parser.add_argument("--threads", type=int, default=1, help="cores; other numbers give other last bits")
     parser.add_argument(
@@ -49,6 +49,8 @@ def main(argv: Sequence[str]) -> int:
     )  # fmt: skip
     parser.add_argument("--measure", choices=("train", "validation", "test"), help="train nothing, measure this part")
     arguments = parser.parse_args(argv)
+    if arguments.readers < 0 or arguments.reader_epochs < 1:
+        parser.error(f"--readers {arguments.readers}, --reader-epochs {arguments.reader_epochs}: at least 0 and 1")
     keep_freed_memory()
     torch.set_num_threads(arguments.threads)
     try:
@@ -60,7 +62,7 @@ def main(argv: Sequence[str]) -> int:
                 models = load_model_folder(policy_models(arguments.policy_view))
                 window = policy_window(models.simulation, SIDE_PX)
             plan = JudgePlan(
-                tuple(arguments.sets), arguments.segmenter_steps, arguments.reader_epochs,
+                tuple(arguments.sets), arguments.segmenter_steps, arguments.readers, arguments.reader_epochs,
                 TreeSettings(arguments.trees), arguments.seed, window,
             )  # fmt: skip
             made = {

@@ -116,9 +116,9 @@ class SequenceReader(nn.Module):
     def forward(self, crops_BTSS4: Tensor, numbers_BTM: Tensor) -> Tensor:
         """(B, K) of uint8 crops and float32 numbers."""
         batch, frames = crops_BTSS4.shape[:2]
-        classes = crops_BTSS4[..., 3:]
-        masks = torch.cat((classes == ROBOT, classes == OBJECT), -1).float()
-        pixels = torch.cat((crops_BTSS4[..., :3].float() / 127.5 - 1, masks), -1).flatten(0, 1).permute(0, 3, 1, 2)
+        planes = crops_BTSS4.flatten(0, 1).permute(0, 3, 1, 2).contiguous()
+        masks = [(planes[:, 3:] == name).float() for name in (ROBOT, OBJECT)]
+        pixels = torch.cat((planes[:, :3].float() / 127.5 - 1, *masks), 1)
         seen = self.crops(pixels.contiguous(memory_format=torch.channels_last)).view(batch, frames, -1)
         known = (numbers_BTM - self.mean) / self.scale
         hidden = self.frame(torch.cat((seen, seen - seen[:, :1], known), -1)).transpose(1, 2)
