@@ -20,6 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph.forked import ForkedNode, fork_node
 from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import QoSProfile
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
@@ -91,6 +92,17 @@ class Probe:
         row = topic(name)
         self.node.create_subscription(row.type, at or name, self.messages[name].append, row.qos)
         return self.messages[name]
+
+    def feedback(self, kind: type[Any], action: str) -> list[Any]:
+        """Collect the Feedback messages of an action's goals. A client's callback gets those only that come before the
+        result: rclpy drops what arrives with it or after it, and the last of a burst often does."""
+        told = list[Any]()
+        self.node.create_subscription(
+            kind.Impl.FeedbackMessage, f"{action}/_action/feedback", lambda message: told.append(message.feedback),
+            QoSProfile(depth=100),
+        )  # fmt: skip
+        time.sleep(MATCH_S)
+        return told
 
     def links(self) -> LinkBook:
         """A book of what the nodes say of their links from now on; a node restarted before it was reported as lost is

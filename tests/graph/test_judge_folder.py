@@ -44,9 +44,9 @@ class Evaluator:
         self.probe.close()
         assert set(self._graph.stop().values()) == {0}
 
-    def goal(self, feedback: Any = None, **goal: Any) -> Any:
+    def goal(self, **goal: Any) -> Any:
         """A goal's handle."""
-        return self.probe.send(self._client, JudgeClips.Goal(**goal), feedback)
+        return self.probe.send(self._client, JudgeClips.Goal(**goal))
 
     def judge(self, **goal: Any) -> JudgeClips.Result:
         return self.probe.finish(self.goal(**goal))
@@ -72,9 +72,8 @@ def evaluator(running: Evaluator, server: PickyServer) -> Iterator[Evaluator]:
 
 def test_a_folder_is_judged_in_its_order_published_and_audited(evaluator: Evaluator, tmp_path: Path) -> None:
     write_clips(tmp_path)
-    told = list[JudgeClips.Feedback]()
-    handle = evaluator.goal(lambda message: told.append(message.feedback), folder=str(tmp_path))
-    result: JudgeClips.Result = evaluator.probe.finish(handle)
+    told = evaluator.probe.feedback(JudgeClips, "reward/judge_clips")
+    result = evaluator.judge(folder=str(tmp_path))
     assert (result.termination_reason, result.message) == (JudgeClips.Result.FINISHED, "")
     assert result.pause_reason == "" and [verdict.clip_id for verdict in result.verdicts] == ["a", "mine"]
     sha256 = list_sha256(tmp_path)

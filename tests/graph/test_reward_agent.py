@@ -83,13 +83,11 @@ def scores_of(loop: VideoLoop) -> ClipScores:
     return wait_until("scores", lambda: loop.probe.messages["clips/scores"][-1:])[0]
 
 
-def evaluate(loop: VideoLoop, feedback: Any = None, **goal: Any) -> Any:
+def evaluate(loop: VideoLoop, **goal: Any) -> Any:
     """A goal for the newest clips; its handle."""
     clips = wait_until("clips", lambda: loop.probe.messages["clips"][-1:])[0]
     client = loop.probe.action(EvaluateClips, "clips/evaluate")
-    return loop.probe.send(
-        client, EvaluateClips.Goal(buffer_uri=clips.buffer_uri, sha256=clips.sha256, **goal), feedback
-    )
+    return loop.probe.send(client, EvaluateClips.Goal(buffer_uri=clips.buffer_uri, sha256=clips.sha256, **goal))
 
 
 def test_a_round_is_judged_by_the_agent_and_trained_on(judged: VideoLoop, server: PickyServer) -> None:
@@ -149,19 +147,18 @@ def test_a_judge_that_is_down_pauses_training_and_the_same_clips_are_judged_once
 
 
 def test_clips_without_a_verdict_by_the_deadline_have_no_reward(judged: VideoLoop, server: PickyServer) -> None:
-    judged.probe.action(EvaluateClips, "clips/evaluate")  # matched by the time its feedback counts
     forget_reads(judged.graph)
     judged.train(1)
     forget_reads(judged.graph)
+    told = judged.probe.feedback(EvaluateClips, "clips/evaluate")
     server.delay_s = 30.0
-    seen: list[Any] = []
     began = time.monotonic()
-    result = judged.probe.finish(evaluate(judged, seen.append, deadline_s=0.5))
+    result = judged.probe.finish(evaluate(judged, deadline_s=0.5))
     assert time.monotonic() - began < 3.0 and result.termination_reason == EvaluateClips.Result.FINISHED
     assert [verdict.status for verdict in result.verdicts] == [ClipVerdict.ERROR] * 6
     assert [verdict.clip for verdict in result.verdicts] == list(range(6))
     assert all("by the round's deadline" in verdict.reason for verdict in result.verdicts)
-    last = wait_until("feedback", lambda: [m.feedback for m in seen if m.feedback.clips_done == 6])[0]
+    last = wait_until("feedback", lambda: [message for message in told if message.clips_done == 6])[0]
     assert last.clips_invalid == 6 and last.progress == 1 and list(last.stages_passed) == [0] * 4
 
 
