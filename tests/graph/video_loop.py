@@ -158,9 +158,9 @@ class VideoLoop:
     def train(self, iterations: int = 0, **goal: Any) -> TrainVideo.Result:
         return self.probe.finish(self.send(iterations, **goal))
 
-    def send(self, iterations: int = 0, **goal: Any) -> Any:
+    def send(self, iterations: int = 0, feedback: Any = None, **goal: Any) -> Any:
         client = self.probe.action(TrainVideo, "video/train")
-        return self.probe.send(client, TrainVideo.Goal(iterations=iterations, **goal))
+        return self.probe.send(client, TrainVideo.Goal(iterations=iterations, **goal), feedback)
 
     def cancel(self, handle: Any) -> TrainVideo.Result:
         self.probe.run(handle.cancel_goal_async, 5, "cancel")
