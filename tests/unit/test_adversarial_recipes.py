@@ -30,6 +30,8 @@ from wm_nodes.reward.adversarial import (
     failed_physics,
     images,
     recorded,
+    replay,
+    stacks,
     tc_level,
 )
 from wm_nodes.reward.adversarial.clips import TC_PASS_LEVEL
@@ -394,6 +396,24 @@ def test_children_leave_out_what_does_not_apply_and_say_why() -> None:
     hidden = list(children(parent(), 5, redrawn, names=["occlude_patch", "occlude_shadow"]))
     assert [clip.severity for clip in hidden] == ["mild", "fail", "mild", "fail"]
     assert all(failures(clip.labels) & set(PHYSICS) for clip in hidden if clip.severity == "fail")
+
+
+def test_stacks_are_mild_edits_of_different_components_every_other_one_on_a_physical_defect() -> None:
+    made = list(stacks(parent(), 5, redrawn, 12))
+    assert len(made) == len({clip.sha256 for clip in made} - {parent().sha256}) == 12
+    heights = set[int]()
+    for index, clip in enumerate(made):
+        below, above = clip.edits[: index % 2], clip.edits[index % 2 :]
+        heights.add(len(above))
+        assert {edit.severity for edit in below} <= {"fail"} and {edit.severity for edit in above} == {"mild"}
+        assert not {edit.recipe for edit in above} & set(kinds("S")) and {e.recipe for e in below} <= set(kinds("S"))
+        touched = [name for edit in above for name in RECIPES[edit.recipe].fails]
+        assert len(touched) == len(set(touched)), "two slight faults of a component may be a clear one"
+        assert bool(failures(clip.labels) & set(PHYSICS)) == bool(below)
+        assert below or clip.labels == parent().labels
+        assert replay(parent(), clip.edits, redrawn).sha256 == clip.sha256
+    assert heights == {1, 2, 3}
+    assert [clip.sha256 for clip in stacks(parent(), 5, redrawn, 4)] == [clip.sha256 for clip in made[:4]]
 
 
 def test_wrong_calls_name_the_value_and_the_remedy() -> None:

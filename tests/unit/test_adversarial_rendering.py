@@ -127,9 +127,10 @@ def test_edited_states_are_drawn(source: ClipSource) -> None:
 
 
 def test_one_command_builds_a_set_that_can_be_made_again(source: ClipSource, tmp_path: Path) -> None:
-    plan = SetPlan(num_episodes=2, edits_per_clip=8, seed=3)
+    plan = SetPlan(num_episodes=2, edits_per_clip=8, seed=3, stacks_per_clip=2)
     manifest, skipped = build(tmp_path, plan, CONFIG, progress=False)
-    assert load_set(tmp_path) == manifest and 2 + 8 < len(manifest.rows) <= 2 + 2 * 8 - sum(skipped.values())
+    assert load_set(tmp_path) == manifest and 2 + 8 < len(manifest.rows) <= 2 + 2 * (8 + 2) - sum(skipped.values())
+    assert max(len(row.edits) for row in manifest.rows) > 2
     roots = {clip.sha256: clip for clip in (source.clip(3), source.clip(4))}
     for row in manifest.rows:
         clip = regenerate(row, roots[row.root], source.redraw)

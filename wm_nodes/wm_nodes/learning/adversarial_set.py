@@ -49,6 +49,7 @@ from wm_nodes.reward.adversarial import (
     manifest_of,
     recorded,
     rendered,
+    stacks,
     to_bytes,
 )
 from wm_nodes.reward.adversarial.manifest import Part
@@ -94,7 +95,7 @@ class SetPlan:
     that are tried on each, None for all. seed: episode i is reset with seed + i; look and recipes follow from it.
     shapes: besides the cube; rare, and test clips only. Not in "reach", whose end state depends on the height.
     development: episodes that no test part has, num_episodes of them. diverse: scenes of diverse_looks.py. recipes: of
-    the edits. policy: clips of policy_view.py.
+    the edits. policy: clips of policy_view.py. stacks_per_clip: besides the edits, see generator.stacks.
     """
 
     tasks: tuple[str, ...] = ("push_cube",)
@@ -107,6 +108,7 @@ class SetPlan:
     diverse: bool = False
     recipes: tuple[str, ...] = tuple(RECIPES)
     policy: bool = False
+    stacks_per_clip: int = 0
 
     def __post_init__(self) -> None:
         if self.policy and (self.diverse or self.shapes):
@@ -115,8 +117,11 @@ class SetPlan:
             raise ValueError("a diverse set is of the development parts, and of the cube alone; leave out shapes")
         if self.development and (kept := sorted({*self.tasks} & {*self.division.tasks})):
             raise ValueError(f"{', '.join(kept)} is held out, a development set has none of it; take another task")
-        if self.num_episodes < 1 or (self.edits_per_clip is not None and self.edits_per_clip < 0):
-            raise ValueError(f"need at least 1 episode and 0 edits, got {self.num_episodes} and {self.edits_per_clip}")
+        if self.num_episodes < 1 or min(self.edits_per_clip or 0, self.stacks_per_clip) < 0:
+            raise ValueError(
+                f"need at least 1 episode, 0 edits and 0 stacks, got {self.num_episodes}, {self.edits_per_clip} and "
+                f"{self.stacks_per_clip}"
+            )
         if foreign := sorted(set(self.shapes) - set(SHAPES)):
             raise ValueError(f"unknown shapes {foreign}; choose among {', '.join(SHAPES)}")
 
@@ -289,7 +294,8 @@ def build(
                     parent = source.clip(seed)
                     made = children(parent, seed, source.redraw, names=plan.recipes, count=plan.edits_per_clip,
                                     skipped=skipped)  # fmt: skip
-                    for clip in (parent, *made):
+                    stacked = stacks(parent, seed, source.redraw, plan.stacks_per_clip, skipped=skipped)
+                    for clip in (parent, *made, *stacked):
                         write_atomic(clip_path(folder, clip.sha256), to_file(clip))
                         yield clip
             finally:
@@ -356,6 +362,9 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--tasks", nargs="+", choices=sorted(TASKS), default=["push_cube"])
     parser.add_argument("--episodes", type=int, default=8, help="recorded episodes per task")
     parser.add_argument("--edits", type=int, help="edits tried on each; all by default")
+    parser.add_argument(
+        "--stacks", type=int, default=0, help="clips of up to three mild edits, every other one on a physical defect"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--shapes", nargs="+", choices=sorted(SHAPES), default=[], help="besides the cube, held out")
     parser.add_argument("--recipes", nargs="+", choices=sorted(RECIPES), default=tuple(RECIPES), help="all by default")
@@ -378,6 +387,7 @@ def main(argv: Sequence[str]) -> int:
                 tuple(arguments.tasks), arguments.episodes, arguments.edits, arguments.seed, shapes=shapes,
                 development=arguments.development or arguments.diverse, diverse=arguments.diverse,
                 recipes=tuple(arguments.recipes), policy=arguments.policy_view is not None,
+                stacks_per_clip=arguments.stacks,
             )  # fmt: skip
             if arguments.stride < 1 or (arguments.stride > 1 and not plan.policy):
                 raise ValueError(f"--stride is of --policy-view and at least 1, got {arguments.stride}")

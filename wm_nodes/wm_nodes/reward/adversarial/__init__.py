@@ -19,7 +19,7 @@ from wm_nodes.reward.adversarial.clips import (
     SceneStates,
     SourceClip,
 )
-from wm_nodes.reward.adversarial.generator import Redraw, children, replay
+from wm_nodes.reward.adversarial.generator import Redraw, children, replay, stacks
 from wm_nodes.reward.adversarial.manifest import (
     SPLITS,
     Division,
@@ -81,6 +81,7 @@ __all__ = [
     "regenerate",
     "rendered",
     "replay",
+    "stacks",
     "tc_level",
     "to_bytes",
 ]

@@ -1,16 +1,20 @@
-"""From one recorded clip to its edited children: every recipe, mild and failing, wherever it applies. Section 3.1."""
+"""From one recorded clip to its edited children: every recipe, mild and failing, wherever it applies, and mild ones on
+top of each other. Section 3.1.
+"""
 
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
-from wm_nodes.reward.adversarial.clips import Edit, LabelledClip, NotApplicableError, Severity
+from wm_nodes.reward.adversarial.clips import Component, Edit, LabelledClip, NotApplicableError, Severity
 from wm_nodes.reward.adversarial.recipes import RECIPES, StateEdit, apply, edit_states, get_recipe
 from wm_nodes.seeding import numpy_stream
 
 Redraw = Callable[[LabelledClip, StateEdit], LabelledClip]
 """Renders edited states of a clip and labels the result: recipes.rendered with a simulator, or a toy, behind it."""
 SEVERITIES: tuple[Severity, ...] = ("mild", "fail")
+MOST_STACKED = 3
+"""Mild edits of a stack."""
 
 
 def children(
@@ -53,6 +57,41 @@ def children(
         if child.sha256 not in seen:
             seen.add(child.sha256)
             yield child
+
+
+def stacks(
+    parent: LabelledClip, seed: int, redraw: Redraw, count: int, *, skipped: Counter[str] | None = None
+) -> Iterator[LabelledClip]:
+    """Yield edited clips with one to MOST_STACKED mild edits of pixels and time on top of each other, no picture twice.
+
+    Every other one has a failing physical defect below them. No two edits of a stack touch the same component, since
+    two slight faults may be a clear one. A search that climbs a judge's reward makes such clips (reward_hacking).
+
+    Args:
+        count: stacks that are tried. skipped: see children.
+    """
+    gentle = [recipe for recipe in RECIPES.values() if recipe.kind != "S"]
+    seen = {parent.sha256}
+    for index in range(count):
+        rng = numpy_stream(seed, f"adversarial_stack/{parent.sha256}/{index}")
+        try:
+            clip = _defective(parent, int(rng.integers(2**31)), redraw) if index % 2 else parent
+        except NotApplicableError as reason:
+            if skipped is not None:
+                skipped[f"stack: {reason}"] += 1
+            continue
+        wanted, touched = 1 + rng.integers(MOST_STACKED), set[Component]()
+        for place in rng.permutation(len(gentle)):
+            if wanted and touched.isdisjoint(gentle[place].fails):
+                try:
+                    clip = apply(clip, gentle[place].name, "mild", int(rng.integers(2**31)))
+                except NotApplicableError:
+                    continue
+                wanted -= 1
+                touched.update(gentle[place].fails)
+        if clip.sha256 not in seen:
+            seen.add(clip.sha256)
+            yield clip
 
 
 def edited(
