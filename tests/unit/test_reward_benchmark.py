@@ -325,11 +325,11 @@ def test_the_looks_behind_the_published_tables_count_wherever_the_set_is_built(
     again = replace(manifest, rows=tuple(rows))
     able = EmbeddedJudge(load_head(shipped_head())).capabilities
     earlier = look(tmp_path, again, able, RUBRIC.version, "")
-    assert len(earlier) == 11 and not (tmp_path / LEDGER).exists(), "the judge that ships, with its rubric, has looked"
+    assert len(earlier) == 13 and not (tmp_path / LEDGER).exists(), "the judge that ships, with its rubric, has looked"
     with pytest.raises(ValueError, match=f"already seen by {looks(tmp_path)[-1].judge}"):
         look(tmp_path, again, replace(able, judge_id="another"), RUBRIC.version, "")
     new_rubric = look(tmp_path, again, able, "robot-2-x", "other thresholds")
-    assert len(new_rubric) == 12 and (tmp_path / LEDGER).read_text().count("\n") == 1
+    assert len(new_rubric) == 14 and (tmp_path / LEDGER).read_text().count("\n") == 1
     (tmp_path / LEDGER).write_text(json.dumps(vars(earlier[0])) + "\n")
     assert looks(tmp_path).count(earlier[0]) == 1, "what is published and in the ledger, too, is one look"
 
