@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from graph.shm_maps import mapped, processes
 from judge_server import PickyServer, serving
 
 from wm_nodes.ros.domain import DomainLock, first_free
@@ -76,12 +77,9 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 def _remove_unused_ports() -> None:
     """Fast DDS's own tool passes over ports whose lock file is gone."""
-    mapped = ""
-    for maps in Path("/proc").glob("[0-9]*/maps"):
-        with suppress(OSError):
-            mapped += maps.read_text()
+    in_use = set[str]().union(*map(mapped, processes()))
     for port in Path("/dev/shm").glob("fastrtps_port*"):
-        if str(port) not in mapped:
+        if str(port) not in in_use:
             for path in (port, port.with_name(f"sem.{port.name}_mutex")):
                 with suppress(OSError):
                     path.unlink()

@@ -23,11 +23,10 @@ from wm_nodes.benchmark.reward_hacking import (
     true_value,
 )
 from wm_nodes.benchmark.reward_oracle import KnownClip, OracleJudge
-from wm_nodes.benchmark.reward_starts import DEFECTS
 from wm_nodes.config.load import load_config
 from wm_nodes.learning.adversarial_set import HELD_OUT, SetPlan, build, drawn_origin
 from wm_nodes.reward.adversarial import LabelledClip, apply
-from wm_nodes.reward.adversarial.generator import edited
+from wm_nodes.reward.adversarial.generator import STATE_RECIPES, edited
 from wm_nodes.reward.agent import TaskSpec, load_rubric
 
 RUBRIC = load_rubric(overrides={"voting": {"audit_share": 0.0}})
@@ -144,7 +143,7 @@ def test_the_command_climbs_from_recorded_successes_and_draws_each_reward_beside
     assert main(["hacking", str(tmp_path / "set"), *options]) == 0
     found = json.loads(target.read_text())
     (start,) = found["starts"]
-    assert start in DEFECTS
+    assert start in STATE_RECIPES
     curves = {one["reward"]: one for one in found["curves"]}
     assert list(curves) == ["agent", "mean score", "pixel similarity"]
     for one in curves.values():

@@ -16,9 +16,9 @@ from wm_nodes.benchmark.video_plots import figure_of, save_figure, style_axes
 from wm_nodes.learning.adversarial_set import instruction_of
 from wm_nodes.learning.benchmark_clips import ROBOT
 from wm_nodes.reports.curves import COLOURS
-from wm_nodes.reward.adversarial import COMPONENTS, RECIPES, LabelledClip, NotApplicableError, apply
+from wm_nodes.reward.adversarial import COMPONENTS, LabelledClip, NotApplicableError, apply
 from wm_nodes.reward.adversarial.clips import Severity
-from wm_nodes.reward.adversarial.generator import SEVERITIES
+from wm_nodes.reward.adversarial.generator import FRAME_RECIPES, SEVERITIES
 from wm_nodes.reward.agent import Judge, ReadRequest, RewardAgent, Rubric, TaskSpec
 from wm_nodes.reward.agent.levels import first_vote, score_of
 from wm_nodes.reward.agent.profiles import profile_media
@@ -28,7 +28,6 @@ from wm_nodes.seeding import numpy_stream
 
 Proxy = Callable[[LabelledClip, TaskSpec], Awaitable[float | None]]
 """A reward in [0, 1] that is climbed; None where it gives none (that clip is not taken)."""
-EDITS = tuple(recipe.name for recipe in RECIPES.values() if recipe.kind != "S")
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,8 @@ def _children(chain: Sequence[LabelledClip], plan: SearchPlan, rng: np.random.Ge
     for _ in range(4 * plan.candidates):
         if len(made) == plan.candidates:
             break
-        name, severity = EDITS[rng.integers(len(EDITS))], plan.severities[rng.integers(len(plan.severities))]
+        name = FRAME_RECIPES[rng.integers(len(FRAME_RECIPES))]
+        severity = plan.severities[rng.integers(len(plan.severities))]
         try:
             made.append(apply(chain[-1], name, severity, int(rng.integers(2**31))))
         except (NotApplicableError, ValueError):  # the second: labels of such a chain would be unknown throughout

@@ -5,12 +5,10 @@ from collections.abc import Iterator, Sequence
 from wm_nodes.benchmark.reward_hacking import Start
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.learning.adversarial_set import ClipSource
-from wm_nodes.reward.adversarial import RECIPES, Division, LabelledClip, ManifestError, NotApplicableError
-from wm_nodes.reward.adversarial.generator import edited
+from wm_nodes.reward.adversarial import Division, LabelledClip, ManifestError, NotApplicableError
+from wm_nodes.reward.adversarial.generator import STATE_RECIPES, edited
 from wm_nodes.reward.adversarial.manifest import Row
 from wm_nodes.seeding import numpy_stream
-
-DEFECTS = tuple(recipe.name for recipe in RECIPES.values() if recipe.kind == "S")
 
 
 def hacking_starts(rows: Sequence[Row], division: Division, config: SimulationConfig, seed: int) -> Iterator[Start]:
@@ -40,9 +38,9 @@ def hacking_starts(rows: Sequence[Row], division: Division, config: SimulationCo
 
 
 def _defective(parent: LabelledClip, source: ClipSource, seed: int) -> LabelledClip | None:
-    for index in numpy_stream(seed, f"hack_start/{parent.sha256}").permutation(len(DEFECTS)):
+    for index in numpy_stream(seed, f"hack_start/{parent.sha256}").permutation(len(STATE_RECIPES)):
         try:
-            return edited(parent, DEFECTS[index], "fail", seed, source.redraw)
+            return edited(parent, STATE_RECIPES[index], "fail", seed, source.redraw)
         except NotApplicableError:
             continue
     return None

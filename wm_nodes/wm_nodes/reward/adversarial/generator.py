@@ -5,6 +5,9 @@ top of each other. Section 3.1.
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+
+import numpy as np
 
 from wm_nodes.reward.adversarial.clips import Component, Edit, LabelledClip, NotApplicableError, Severity
 from wm_nodes.reward.adversarial.recipes import RECIPES, StateEdit, apply, edit_states, get_recipe
@@ -13,6 +16,9 @@ from wm_nodes.seeding import numpy_stream
 Redraw = Callable[[LabelledClip, StateEdit], LabelledClip]
 """Renders edited states of a clip and labels the result: recipes.rendered with a simulator, or a toy, behind it."""
 SEVERITIES: tuple[Severity, ...] = ("mild", "fail")
+STATE_RECIPES = tuple(recipe.name for recipe in RECIPES.values() if recipe.kind == "S")
+FRAME_RECIPES = tuple(recipe.name for recipe in RECIPES.values() if recipe.kind != "S")
+"""Those on states, which must be drawn again; those on pixels and time."""
 MOST_STACKED = 3
 """Mild edits of a stack."""
 
@@ -70,7 +76,6 @@ def stacks(
     Args:
         count: stacks that are tried. skipped: see children.
     """
-    gentle = [recipe for recipe in RECIPES.values() if recipe.kind != "S"]
     seen = {parent.sha256}
     for index in range(count):
         rng = numpy_stream(seed, f"adversarial_stack/{parent.sha256}/{index}")
@@ -80,18 +85,26 @@ def stacks(
             if skipped is not None:
                 skipped[f"stack: {reason}"] += 1
             continue
-        wanted, touched = 1 + rng.integers(MOST_STACKED), set[Component]()
-        for place in rng.permutation(len(gentle)):
-            if wanted and touched.isdisjoint(gentle[place].fails):
-                try:
-                    clip = apply(clip, gentle[place].name, "mild", int(rng.integers(2**31)))
-                except NotApplicableError:
-                    continue
-                wanted -= 1
-                touched.update(gentle[place].fails)
+        clip = _stacked(clip, rng)
         if clip.sha256 not in seen:
             seen.add(clip.sha256)
             yield clip
+
+
+def _stacked(clip: LabelledClip, rng: np.random.Generator) -> LabelledClip:
+    """The clip with as many mild edits as `rng` draws, or as apply to it."""
+    missing, touched = 1 + rng.integers(MOST_STACKED), set[Component]()
+    for place in rng.permutation(len(FRAME_RECIPES)):
+        recipe = get_recipe(FRAME_RECIPES[place])
+        if not touched.isdisjoint(recipe.fails):
+            continue
+        with suppress(NotApplicableError):
+            clip = apply(clip, recipe.name, "mild", int(rng.integers(2**31)))
+            touched.update(recipe.fails)
+            missing -= 1
+        if not missing:
+            break
+    return clip
 
 
 def edited(
@@ -119,10 +132,9 @@ def replay(root: LabelledClip, edits: Sequence[Edit], redraw: Redraw | None) -> 
 
 def _defective(parent: LabelledClip, seed: int, redraw: Redraw | None) -> LabelledClip:
     """A child in which physics fails, by a recipe drawn by the seed."""
-    names = [recipe.name for recipe in RECIPES.values() if recipe.kind == "S"]
-    for index in numpy_stream(seed, f"adversarial_defect/{parent.sha256}").permutation(len(names)):
+    for index in numpy_stream(seed, f"adversarial_defect/{parent.sha256}").permutation(len(STATE_RECIPES)):
         try:
-            return edited(parent, names[index], "fail", seed, redraw)
+            return edited(parent, STATE_RECIPES[index], "fail", seed, redraw)
         except NotApplicableError:
             continue
     raise NotApplicableError("no state recipe makes a physical defect of this clip, so there is none to hide")
