@@ -27,7 +27,13 @@ from wm_nodes.reward.evidence.head import (
     num_questions,
 )
 from wm_nodes.reward.evidence.trees import TreeSettings, fit_trees
-from wm_nodes.reward.statistics import auroc, balanced_accuracy, expected_calibration_error
+from wm_nodes.reward.statistics import (
+    auroc,
+    balanced_accuracy,
+    expected_calibration_error,
+    recall_at,
+    wilson_of_share,
+)
 from wm_nodes.seeding import numpy_stream
 from wm_nodes.types import BoolArray, FloatArray
 
@@ -223,7 +229,8 @@ def measured(
     questions: Mapping[str, tuple[Question, ...]], target: str, examples: Examples
 ) -> dict[str, Any]:
     """n, prevalence of fails, accuracy, balanced accuracy, AUROC and ECE of a target; of task completion's pass is
-    meant from "nearly" on; planning also says how often the likeliest level is the true one.
+    meant from "nearly" on; planning also says how often the likeliest level is the true one, and a hacking pattern
+    which share of it and of the other clips is flagged, and which could be at 5 % false flags.
     """
     levels = true_levels(target, examples.rows)
     known = levels != UNKNOWN
@@ -238,4 +245,10 @@ def measured(
     if len(above) > 1:
         full = np.concatenate([np.ones((1, len(p))), above, np.zeros((1, len(p)))])
         found["level_accuracy"] = float(((full[:-1] - full[1:]).argmax(0) == levels[known]).mean())
+    if target.startswith(HACK):
+        flagged = 1 - p >= FLAG
+        found |= {
+            "flagged": wilson_of_share(flagged[~truth])[0], "false_flags": wilson_of_share(flagged[truth])[0],
+            "recall_at_5": recall_at(~truth, 1 - p, 0.05),
+        }  # fmt: skip
     return {name: round(value, 4) if isinstance(value, float) else value for name, value in found.items()}

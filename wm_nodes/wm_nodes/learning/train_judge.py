@@ -103,14 +103,20 @@ def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """One line per target; then how many clips of each split are too foreign to judge."""
-    lines = [f"{'target':16} {'n':>6} {'fails':>6} {'acc':>6} {'bal.':>6} {'AUROC':>6} {'ECE':>6} {'level':>6}"]
+    """One line per target; of hacking patterns the share flagged (of clips with it, of others) and what could be
+    flagged at 5 % of the others; then how many clips of each split are too foreign to judge.
+    """
+    columns = ("n", "fails", "acc", "bal.", "AUROC", "ECE", "level", "flag", "false", "at 5 %")
+    lines = [f"{'target':16} " + " ".join(f"{name:>6}" for name in columns)]
     for name in TARGETS:
         found = report[name]
-        level = f"{100 * found['level_accuracy']:6.1f}" if "level_accuracy" in found else ""
+        more = " ".join(
+            f"{100 * found[key]:6.1f}" if key in found else " " * 6
+            for key in ("level_accuracy", "flagged", "false_flags", "recall_at_5")
+        )
         lines.append(
             f"{name:16} {found['n']:6} {found['fails']:6} {100 * found['accuracy']:6.1f} "
-            f"{100 * found['balanced_accuracy']:6.1f} {found['auroc']:6.3f} {found['ece']:6.3f} {level}"
+            f"{100 * found['balanced_accuracy']:6.1f} {found['auroc']:6.3f} {found['ece']:6.3f} {more}".rstrip()
         )
     for coverage, at in report.get("conformal", {}).items():
         lines.append(f"abstaining at conformal coverage {coverage}: {100 * at['answered']:.1f} % of the clips answered")

@@ -17,6 +17,7 @@ __all__ = [
     "effective_size",
     "expected_calibration_error",
     "kappa",
+    "recall_at",
     "wilson_interval",
     "wilson_of_share",
 ]
@@ -104,6 +105,19 @@ def auroc(labels: ArrayLike, scores: ArrayLike) -> float:
     _, index, counts = np.unique(values, return_inverse=True, return_counts=True)
     ranks = (np.cumsum(counts) - (counts - 1) / 2)[index]
     return float((ranks[truth].sum() - passes * (passes + 1) / 2) / (passes * fails))
+
+
+def recall_at(present: ArrayLike, scores: ArrayLike, false_positives: float) -> float:
+    """The largest share of present ones above a threshold that at most a share of the others exceeds; NaN without both.
+
+    Args:
+        present: bool (N,). scores: (N,), higher where something is thought to be there. false_positives: in [0, 1).
+    """
+    there, values = np.asarray(present, np.bool_), np.asarray(scores, np.float64)
+    mine, others = values[there], np.sort(values[~there])[::-1]
+    if not len(mine) or not len(others):
+        return NAN
+    return float((mine > others[int(false_positives * len(others))]).mean())
 
 
 def effective_size(weights: ArrayLike) -> float:
