@@ -7,7 +7,7 @@ import wm_setup
 
 wm_setup.ensure()
 
-from wm_nodes.learning.rescoring import main  # noqa: E402
+from wm_nodes.apps.rescore_rewards import main  # noqa: E402
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -9,6 +9,6 @@ import wm_setup
 
 if __name__ == "__main__":
     wm_setup.ensure()
-    from wm_nodes.benchmark.cli import main
+    from benchmarks.speed.cli import main
 
     raise SystemExit(main(sys.argv[1:]))

@@ -10,6 +10,6 @@ import wm_setup
 
 if __name__ == "__main__":
     wm_setup.ensure()
-    from wm_nodes.benchmark.video_cli import main
+    from benchmarks.video_rl.cli import main
 
     raise SystemExit(main(sys.argv[1:]))

@@ -2,7 +2,7 @@
 
 
 def generate_launch_description():
-    from wm_nodes.ros.launch_face import launch_description
+    from wm_nodes.launching.launch_description import launch_description
 
     return launch_description("judge_clips")
 
@@ -11,6 +11,6 @@ if __name__ == "__main__":
     import wm_setup
 
     wm_setup.ensure()
-    from wm_nodes.ros.runner import main
+    from wm_nodes.launching.runner import main
 
     raise SystemExit(main("judge_clips"))

@@ -9,6 +9,6 @@ import wm_setup
 
 if __name__ == "__main__":
     wm_setup.ensure()
-    from wm_nodes.learning.adversarial_set import main
+    from wm_nodes.judge.dataset.build import main
 
     raise SystemExit(main(sys.argv[1:]))

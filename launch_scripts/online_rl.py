@@ -9,6 +9,6 @@ import wm_setup
 
 if __name__ == "__main__":
     wm_setup.ensure()
-    from wm_nodes.main_job import main
+    from wm_nodes.apps.train_policy import main
 
     raise SystemExit(main(sys.argv[1:]))

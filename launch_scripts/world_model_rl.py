@@ -11,6 +11,6 @@ import wm_setup
 
 if __name__ == "__main__":
     wm_setup.ensure()
-    from wm_nodes.world_model_job import main
+    from wm_nodes.apps.train_video_model import main
 
     raise SystemExit(main(sys.argv[1:]))

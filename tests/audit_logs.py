@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scripted_judge import ScriptedJudge, make_clip, make_task
 
-from wm_nodes.reward.agent.rubric import Rubric, load_rubric
-from wm_nodes.reward.agent.types import (
+from wm_nodes.judge.agent.rubric import Rubric, load_rubric
+from wm_nodes.judge.agent.types import (
     Capabilities,
     ClipRef,
     Evidence,
@@ -21,8 +21,8 @@ from wm_nodes.reward.agent.types import (
     Verdict,
     clip_ref,
 )
-from wm_nodes.reward.audit.log import AuditLog
-from wm_nodes.reward.audit.recording import AuditedAgent
+from wm_nodes.judge.audit.log import AuditLog
+from wm_nodes.judge.audit.recording import AuditedAgent
 
 Job = tuple[ClipRef, TaskSpec]
 
@@ -69,7 +69,7 @@ class JudgeByClip:
 def judge_all(
     folder: Path, judge: Judge, jobs: Sequence[Job], *, rubric: Rubric | None = None,
     evidence: Mapping[str, Evidence] | None = None, **settings: Any,
-) -> list[Verdict]:  # fmt: skip
+) -> list[Verdict]:
     """Judge clips at the same time into a log, which may be there already. evidence: by clip id."""
 
     async def run() -> list[Verdict]:

@@ -19,7 +19,7 @@ from typing import Any
 
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
          "--disable-background-networking", "--disable-component-update", "--remote-debugging-pipe",
-         "--window-size=1300,1000")  # fmt: skip
+         "--window-size=1300,1000")
 TIMEOUT_S = 60.0
 CODES = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Enter": 13}
 # The browser reads commands from descriptor 3 and writes answers to 4.
@@ -124,7 +124,7 @@ def browser(program: str, profile: Path) -> Iterator[Page]:
     process = subprocess.Popen(
         [sys.executable, "-I", "-S", "-c", ON_3_AND_4, *given], pass_fds=(read_commands, write_answers),
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    )
     os.close(read_commands)
     os.close(write_answers)
     try:

@@ -151,9 +151,9 @@ class ChatServer:
         usage = {
             "prompt_tokens": len(prompt) // CHARS_PER_TOKEN, "completion_tokens": 1, "total_tokens": 0,
             "prompt_tokens_details": {"cached_tokens": hit // CHARS_PER_TOKEN},
-        }  # fmt: skip
+        }
         return json.dumps({"id": "1", "object": "chat.completion", "created": 0, "model": body["model"],
-                           "choices": [choice], "usage": usage})  # fmt: skip
+                           "choices": [choice], "usage": usage})
 
     def _instance(self, schema: dict[str, Any], root: dict[str, Any], index: int) -> Any:
         """The value of the schema that a model would give which always says `level`."""

@@ -22,6 +22,6 @@ def write_clips(folder: Path, **changed: Any) -> list[dict[str, Any]]:
         {"file": "a.mp4", "instruction": task.instruction},
         {"file": "b.npy", "instruction": task.instruction, "clip_id": "mine", "fps": 10, "reference": "start.png",
          "sha256": second.sha256, **changed},
-    ]  # fmt: skip
+    ]
     (folder / "clips.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return lines

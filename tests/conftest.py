@@ -9,8 +9,8 @@ import pytest
 from graph.shm_maps import mapped, processes
 from judge_server import PickyServer, serving
 
-from wm_nodes.ros.domain import DomainLock, first_free
-from wm_nodes.ros.environment import graph_environment
+from wm_nodes.launching.domain_lock import DomainLock, first_free
+from wm_nodes.launching.environment import graph_environment
 
 ROOT = Path(__file__).resolve().parents[1]
 DOMAINS = range(91, 102)
@@ -68,7 +68,7 @@ def repository() -> Path:
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Remove what killed processes left in /dev/shm; files of living processes are locked or mapped and stay."""
-    from wm_nodes.ros.runner import clean_shared_memory
+    from wm_nodes.launching.runner import clean_shared_memory
 
     clean_shared_memory(graph_environment())
     if not hasattr(session.config, "workerinput"):

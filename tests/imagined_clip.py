@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.learning.model_evidence import commanded_states
-from wm_nodes.types import FloatArray, UInt8Array
+from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.judge.evidence.world_model import commanded_states
 from wm_nodes.world_model import WorldModels, load_model_folder
 
 STEPS = 12

@@ -6,8 +6,8 @@ import torch
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.learning.policies import ACTION_DIM, STATE_DIM
-from wm_nodes.learning.pretraining import MODEL_TASKS
+from wm_nodes.policy_rl.factories import ACTION_DIM, STATE_DIM
+from wm_nodes.policy_rl.pretraining import MODEL_TASKS
 from wm_nodes.world_model import Tokenizer, save_model_folder
 from wm_nodes.world_model.folder import action_model_class
 
@@ -22,8 +22,8 @@ def make_model_folder(folder: Path, config: RunConfig | None = None) -> Path:
         action = action_model_class(config.tokenizer.kind)(
             config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
             action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),
-        )  # fmt: skip
+        )
     return save_model_folder(
         folder, tokenizer, action, None, tokenizer_config=config.tokenizer, world_model_config=config.world_model,
         simulation=config.simulation, tasks=tasks, story={"made": {"seed": 0}},
-    )  # fmt: skip
+    )

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.reward.adversarial import (
+from wm_nodes.core.types import FloatArray
+from wm_nodes.judge.dataset.edits import (
     BACKGROUND,
     DISTRACTOR,
     OBJECT,
@@ -21,7 +22,6 @@ from wm_nodes.reward.adversarial import (
     recorded,
     rendered,
 )
-from wm_nodes.types import FloatArray
 
 FRAMES, SIDE = 20, 96
 PX_PER_M = 300
@@ -50,7 +50,7 @@ def pushing_states(behaviour: str = "expert", frames: int = FRAMES) -> SceneStat
         scales=np.ones((frames, 1, 3), np.float32), half_sizes_m=np.full((1, 3), HALF_M, np.float32),
         contact=(times >= TOUCH) & (times <= RELEASE) & (behaviour != "idle"),
         goal=np.tile(np.array([0.2, 0, np.nan], np.float32), (frames, 1)),
-    )  # fmt: skip
+    )
 
 
 def draw(states: SceneStates, origin: Origin) -> SourceClip:
@@ -104,4 +104,3 @@ def _table(scene: str, seed: int) -> NDArray[np.float64]:
 
 def _pixel(point: FloatArray) -> tuple[float, float]:
     return TABLE_ROW - PX_PER_M * float(point[2]) + 150 * float(point[1]), 36 + PX_PER_M * float(point[0])
-

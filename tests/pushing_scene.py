@@ -6,8 +6,8 @@ when the square's centre has moved DONE_AT_M along x.
 
 import numpy as np
 
-from wm_nodes.specs import GROUND_TRUTH_NAMES
-from wm_nodes.types import BoolArray, Episode, FloatArray, UInt8Array
+from wm_nodes.core.specs import GROUND_TRUTH_NAMES
+from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
 
 MAX_ACTION_M, DONE_AT_M, HALF_M = 0.08, 0.15, 0.07
 _INDEX = {name: i for i, name in enumerate(GROUND_TRUTH_NAMES)}
@@ -44,9 +44,17 @@ def episode(seed: int, *, num_steps: int = 12, size: int = 32) -> Episode:
         images.append(render(tool, cube, size))
         states.append(tool.copy())
         truth = np.zeros(len(GROUND_TRUTH_NAMES), np.float32)
-        values = {"cube_x": cube[0], "cube_y": cube[1], "tool_x": tool[0], "tool_y": tool[1], "tool_z": tool[2],
-                  "goal_x": start[0] + DONE_AT_M, "goal_y": start[1], "cube_start_x": start[0],
-                  "cube_start_y": start[1]}
+        values = {
+            "cube_x": cube[0],
+            "cube_y": cube[1],
+            "tool_x": tool[0],
+            "tool_y": tool[1],
+            "tool_z": tool[2],
+            "goal_x": start[0] + DONE_AT_M,
+            "goal_y": start[1],
+            "cube_start_x": start[0],
+            "cube_start_y": start[1],
+        }
         for name, value in values.items():
             truth[_INDEX[name]] = value
         truths.append(truth)
@@ -65,7 +73,7 @@ def episode(seed: int, *, num_steps: int = 12, size: int = 32) -> Episode:
         images=np.stack(images), states=np.stack(states), actions=np.stack(actions), ground_truth=truth,
         success=success("push_cube", truth), rewards=np.zeros(num_steps, np.float32), terminated=False, truncated=True,
         task="push_cube", instruction="push the square", behaviour="noisy", seed=seed, episode_id=seed, source=1,
-    )  # fmt: skip
+    )
 
 
 def pushed(before: FloatArray, after: FloatArray, cube: FloatArray) -> FloatArray:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import Rollout
 from wm_nodes.recording import RawBagWriter, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.recording.layout import Tiles
-from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import Rollout
 
 PERIOD_NS = 100_000_000
 NUM_ENVS = 3
@@ -28,7 +28,7 @@ class Graph:
     spec: EnvironmentSpec
     session: int = 7
     reward_lag: int = 3
-    published: list[tuple[topics.Topic, Any, int]] = field(default_factory=list)
+    published: list[tuple[topics.RecordedTopic, Any, int]] = field(default_factory=list)
     rollouts: list[Rollout] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -41,7 +41,7 @@ class Graph:
         self.next_id = 1
         self.publish(topics.SPEC, m.spec_message(self.spec, 0, self.session))
 
-    def publish(self, topic: topics.Topic, message: Any) -> None:
+    def publish(self, topic: topics.RecordedTopic, message: Any) -> None:
         self.clock_ns += 1_000_000
         if topic.sequenced:
             message.session, message.seq = self.session, self.sequence.get(topic.name, 0)
@@ -63,7 +63,7 @@ class Graph:
             episode_id=int(self.episode_id[index]), seed=500 + int(self.episode_id[index]), task="push_cube",
             instruction="push", behaviour="policy", length=int(self.episode_step[index]), outcome=0,
             termination_reason=reason, policy_version_first=0, policy_version_last=0, source=1,
-        )  # fmt: skip
+        )
         self.publish(topics.EPISODE, message)
 
     def start(self, mask: NDArray[np.bool_]) -> None:
@@ -82,7 +82,7 @@ class Graph:
             "episode_step": self.episode_step.copy(), "policy_version": np.zeros(NUM_ENVS, np.uint64),
             "success_probability": zeros, "model_uncertainty": zeros, "ground_truth": self.truth.reshape(-1),
             "source": 1,
-        }  # fmt: skip
+        }
         return m.message_type(topics.TRANSITION.msgtype)(**{**fields, **changes})
 
     def reset(self) -> None:
@@ -116,7 +116,7 @@ class Graph:
             log_prob=row["logprobs"], value=row["values"], truncated=row["truncated"].astype(np.uint8),
             valid=(~reset).astype(np.uint8), policy_version=np.full(NUM_ENVS, version, np.uint64),
             success_probability=success, episode_id=old_id, episode_step=old_step,
-        )  # fmt: skip
+        )
         self.publish(topics.TRANSITION, message)
         self.rewards.append((self.step_id + self.reward_lag, self.reward(row, stamp_ns)))
         self.flush_rewards(self.step_id)
@@ -134,7 +134,7 @@ class Graph:
             num_envs=NUM_ENVS, total=row["rewards"], dense=zeros, sparse=zeros, component_names=["total"],
             components=row["rewards"], weights=np.ones(1, np.float32), success=np.zeros(NUM_ENVS, np.uint8),
             valid=row["valid"].astype(np.uint8), invalid_reason="", reward_version=1, reward_name="rule", eval_ms=1.0,
-        )  # fmt: skip
+        )
 
     def flush_rewards(self, step_id: int) -> None:
         while self.rewards and self.rewards[0][0] <= step_id:
@@ -148,7 +148,9 @@ class Graph:
         self.rollouts.append(Rollout(**arrays, policy_version=version))
 
 
-def write(path: Path, *graphs: Graph, drop: Callable[[topics.Topic, Any], bool] = lambda topic, message: False) -> Path:
+def write(
+    path: Path, *graphs: Graph, drop: Callable[[topics.RecordedTopic, Any], bool] = lambda topic, message: False
+) -> Path:
     offset = 0
     with RawBagWriter(path, chunk_bytes=4096) as bag:
         for topic in topics.ALL_TOPICS:

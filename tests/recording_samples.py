@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from wm_nodes.specs import GROUND_TRUTH_NAMES, EnvironmentSpec
-from wm_nodes.types import Episode
+from wm_nodes.core.specs import GROUND_TRUTH_NAMES, EnvironmentSpec
+from wm_nodes.core.types import Episode
 
 
 def make_spec(num_envs: int = 1, height: int = 8, width: int = 12, **changes: Any) -> EnvironmentSpec:

@@ -10,13 +10,13 @@ from graph.toy import ReachToy, make_policy
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import PpoConfig
-from wm_nodes.learning.distributed import Ranks, broadcast_rollout
-from wm_nodes.learning.ppo import PpoLearner
-from wm_nodes.learning.rollouts import collect_rollout
-from wm_nodes.learning.weights import save_weights
-from wm_nodes.policy import ImagePolicy
+from wm_nodes.core.types import Rollout
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.ppo import PpoLearner
+from wm_nodes.policy_rl.rollouts import collect_rollout
 from wm_nodes.reward import RuleReward
-from wm_nodes.types import Rollout
+from wm_nodes.training.ranks import Ranks, broadcast_rollout
+from wm_nodes.training.weights import save_weights
 
 NUM_ENVS, STEPS = 6, 10
 

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from wm_nodes.reward.agent.levels import map_back, one_hot, option_order
-from wm_nodes.reward.agent.rubric import Rubric
-from wm_nodes.reward.agent.types import (
+from wm_nodes.judge.agent.levels import map_back, one_hot, option_order
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import (
     PLANNING,
     Capabilities,
     ClipRef,
@@ -107,7 +107,7 @@ class ScriptedJudge:
             label_mass=self.label_mass.get(name, 1.0) if vote.kind == "label" else 1.0,
             evidence_text=f"{name} looks so", frames_cited=self.cited, focus=self.focus,
             cost=Cost(calls=1, prompt_tokens=10),
-        )  # fmt: skip
+        )
 
     def asked(self, stage: Stage) -> list[tuple[tuple[Component, ...], int]]:
         """Components and vote index of every request of a stage."""

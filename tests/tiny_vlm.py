@@ -44,7 +44,7 @@ def save_tiny_vlm(folder: Path, answer: str) -> None:
     tokenizer = FastTokenizer(
         tokenizer_object=tokens, pad_token="<pad>", bos_token="<s>", eos_token="</s>",
         extra_special_tokens={"image_token": "<image>"},
-    )  # fmt: skip
+    )
     pad, bos, eos, image, ask, said = tokenizer.convert_tokens_to_ids([*special, answer])
     processor = LlavaProcessor(
         image_processor=CLIPImageProcessorPil(
@@ -52,17 +52,17 @@ def save_tiny_vlm(folder: Path, answer: str) -> None:
         ),
         tokenizer=tokenizer, patch_size=PATCH_PX, vision_feature_select_strategy="default", chat_template=TEMPLATE,
         num_additional_image_tokens=1,
-    )  # fmt: skip
+    )
     torch.manual_seed(0)
     vision = CLIPVisionConfig(
         hidden_size=16, intermediate_size=32, num_hidden_layers=2, num_attention_heads=2, image_size=IMAGE_PX,
         patch_size=PATCH_PX, projection_dim=16,
-    )  # fmt: skip
+    )
     text = LlamaConfig(
         vocab_size=len(tokenizer), hidden_size=32, intermediate_size=64, num_hidden_layers=2, num_attention_heads=2,
         num_key_value_heads=2, max_position_embeddings=16384, bos_token_id=bos, eos_token_id=eos, pad_token_id=pad,
         tie_word_embeddings=False,
-    )  # fmt: skip
+    )
     model = LlavaForConditionalGeneration(
         LlavaConfig(vision_config=vision, text_config=text, image_token_index=image, tie_word_embeddings=False)
     )
@@ -90,7 +90,7 @@ def transformers_serve(model: Path) -> Iterator[str]:
     command = [
         sys.executable, "-m", "transformers.cli.transformers", "serve", str(model), "--host", "127.0.0.1",
         "--port", str(port), "--device", "cpu", "--dtype", "float32",
-    ]  # fmt: skip
+    ]
     settings = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HUB_CACHE": str(hub), "OMP_NUM_THREADS": "1"}
     with log.open("w") as out:
         server = subprocess.Popen(command, env=settings, stdout=out, stderr=out)

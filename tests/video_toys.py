@@ -9,9 +9,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from wm_nodes.learning.distributed import Ranks
-from wm_nodes.learning.grpo_settings import GrpoSettings
-from wm_nodes.learning.video_grpo import GrpoLearner
+from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import (
     Condition,
     NetworkSettings,
@@ -23,6 +21,8 @@ from wm_nodes.video_model import (
     initial_noise,
     sample_videos,
 )
+from wm_nodes.video_rl.grpo import GrpoLearner
+from wm_nodes.video_rl.grpo_settings import GrpoSettings
 
 ACTION_DIM = 2
 SHAPE = (3, 4, 5, 7)

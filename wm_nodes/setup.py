@@ -5,7 +5,7 @@ from setuptools import find_packages, setup
 NODES = (
     "environment", "policy", "reward_evaluator", "learner", "recorder", "player", "evaluation",
     "video_model", "clip_evaluator", "video_learner",
-)  # fmt: skip
+)
 
 setup(
     name="wm_nodes",

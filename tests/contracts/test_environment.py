@@ -1,4 +1,4 @@
-"""The contract of wm_nodes.types.Environment, kept by the simulator, the imagined environment and the benchmark's."""
+"""The contract of core.types.Environment, kept by the simulator, the imagined environment and the benchmark's."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from model_folders import make_model_folder
 
-from wm_nodes.benchmark.still import StillEnvironment
+from benchmarks.speed.noop_environment import NoopEnvironment
 from wm_nodes.config.load import load_config
-from wm_nodes.seeding import numpy_stream
-from wm_nodes.specs import simulation_spec
-from wm_nodes.types import Environment, FloatArray, Observation, StepResult
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.specs import simulation_spec
+from wm_nodes.core.types import Environment, FloatArray, Observation, StepResult
 from wm_nodes.world_model import ImaginedEnvironment, WorldModels, load_model_folder
 
 N, LIMIT = 2, 3
@@ -23,7 +23,7 @@ Make = Callable[[int], Environment]
 
 
 def make_simulator(seed: int) -> Environment:
-    from wm_nodes.simulation.environment import ManiSkillEnvironment
+    from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
     return ManiSkillEnvironment(CONFIG.task, CONFIG.simulation, num_envs=N, seed=seed)
 
@@ -48,7 +48,7 @@ def make(request: pytest.FixtureRequest, models: WorldModels) -> Iterator[Make]:
             reward = CONFIG.reward.model_copy(update={"success_threshold": 1.0, "uncertainty_limit": 0.0})
             environment = ImaginedEnvironment(models, SPEC, (images, states), reward, num_envs=N, seed=seed)
         else:
-            environment = StillEnvironment(SPEC)
+            environment = NoopEnvironment(SPEC)
         built.append(environment)
         return environment
 
@@ -59,7 +59,7 @@ def make(request: pytest.FixtureRequest, models: WorldModels) -> Iterator[Make]:
 
 def ends(environment: Environment) -> bool:
     """Whether episodes end; the benchmark's never do."""
-    return not isinstance(environment, StillEnvironment)
+    return not isinstance(environment, NoopEnvironment)
 
 
 def actions(step: int) -> FloatArray:
@@ -72,7 +72,7 @@ def assert_observation(observation: Observation, environment: Environment) -> No
     assert found == {
         "image": (np.uint8, (N, spec.height, spec.width, 3)), "state": (np.float32, (N, spec.state_dim)),
         "episode_id": (np.uint64, (N,)), "episode_step": (np.uint32, (N,)),
-    }  # fmt: skip
+    }
     assert np.isfinite(observation.state).all()
 
 

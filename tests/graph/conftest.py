@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="the graph tests need rclpy")
 from graph.harness import Graph, Probe, own_domain
 from judge_server import PickyServer, serving
 
-from wm_nodes.ros.runner import clean_shared_memory
+from wm_nodes.launching.runner import clean_shared_memory
 
 LOG_LINES = 25
 

@@ -9,7 +9,7 @@ import sys
 from concurrent.futures import Future
 from pathlib import Path
 
-from wm_nodes.ros.forks import ForkServer
+from wm_nodes.launching.fork_server import ForkServer
 
 PRELOADED = (
     *(
@@ -19,8 +19,8 @@ PRELOADED = (
             "reward_evaluator", "video_learner", "video_model",
         )
     ),
-    "wm_nodes.simulation.environment",
-)  # fmt: skip
+    "wm_nodes.environments.maniskill.environment",
+)
 
 
 class ForkedNode:

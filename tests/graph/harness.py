@@ -24,10 +24,10 @@ from rclpy.qos import QoSProfile
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.launching.runner import clean_shared_memory
 from wm_nodes.ros.clients import goal_result
-from wm_nodes.ros.links import LinkBook
+from wm_nodes.ros.endpoint_matching import EndpointTable
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.runner import clean_shared_memory
 
 DOMAINS = range(20, 90)
 TOY_FOLDER = Path(__file__).parent
@@ -100,14 +100,14 @@ class Probe:
         self.node.create_subscription(
             kind.Impl.FeedbackMessage, f"{action}/_action/feedback", lambda message: told.append(message.feedback),
             QoSProfile(depth=100),
-        )  # fmt: skip
+        )
         time.sleep(MATCH_S)
         return told
 
-    def links(self) -> LinkBook:
+    def links(self) -> EndpointTable:
         """A book of what the nodes say of their links from now on; a node restarted before it was reported as lost is
         in use again only when the others have matched its new session."""
-        book, row = LinkBook(self.node.get_fully_qualified_name(), 0), topic("run/links")
+        book, row = EndpointTable(self.node.get_fully_qualified_name(), 0), topic("run/links")
         self.node.create_subscription(row.type, row.name, book.note, row.reader_qos)
         return book
 
@@ -226,7 +226,7 @@ class Graph:
         return {
             **os.environ, "PYTHONPATH": path, "ROS_DOMAIN_ID": str(self.domain), "OMP_NUM_THREADS": "1",
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(self.folder / "ros_log"),
-        }  # fmt: skip
+        }
 
     def start_environment(self, factory: str = "toy:make_environment", num_envs: int = 4, **params: Any) -> Any:
         return self.start("environment", backend="factory", backend_factory=factory, num_envs=num_envs, **params)
@@ -263,7 +263,7 @@ class Graph:
         self.processes[name].kill()
         self.processes[name].wait(10)
 
-    def restart(self, start: Callable[[], Any], book: LinkBook, *names: str, process: str = "") -> None:
+    def restart(self, start: Callable[[], Any], book: EndpointTable, *names: str, process: str = "") -> None:
         """Start the killed node names[0] again; return when it and the other names have matched each other.
 
         A new process may stay deaf under load (3 of some 350 kills on two busy cores): Fast DDS 2.14 gives it the port

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from graph.harness import wait_until
 
-PROGRAM = "import sys; from wm_nodes.ros.runner import main; sys.exit(main(sys.argv[1], sys.argv[2:]))"
+PROGRAM = "import sys; from wm_nodes.launching.runner import main; sys.exit(main(sys.argv[1], sys.argv[2:]))"
 
 
 @contextmanager

@@ -15,9 +15,9 @@ from rclpy.parameter import Parameter
 from wm_msgs.action import Train
 from wm_msgs.msg import ErrorCode, PolicyVersion, RewardBatch, TransitionBatch
 from wm_msgs.srv import EvaluateReward, InferAction, LoadPolicy
-from wm_nodes.nodes.policy_holder import weights_uri
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.policy_rl.training_run import weights_uri
 from wm_nodes.ros import convert
-from wm_nodes.specs import EnvironmentSpec
 
 pytestmark = pytest.mark.graph
 
@@ -55,7 +55,7 @@ BAD_MESSAGES: list[tuple[str, Callable[[EnvironmentSpec, int], Any], tuple[str, 
      "refused_transitions", ("transition of 3 environments", "env/spec says 4; send a row for each")),
     ("reward", lambda spec, session: RewardBatch(transition_session=session, num_envs=4), (LEARNER,),
      "refused_rewards", ("total has 0 values, expected (4,)", "compare with env/spec")),
-]  # fmt: skip
+]
 """Topic, message, who reads it, their counter, and what their status says."""
 
 
@@ -101,7 +101,7 @@ BAD_REQUESTS: list[tuple[Callable[[Client, bool], tuple[Any, str, Any]], str, st
     (load, POLICY, "refused_loads", ErrorCode.IO_ERROR, ("cannot read weights", "nowhere.safetensors")),
     (evaluate, EVALUATOR, "refused_evaluations", ErrorCode.BAD_SHAPE,
      ("encoding is 'mono8', not 'rgb8'", "send 4 tiles of 16 x 16 px")),
-]  # fmt: skip
+]
 
 
 def test_a_bad_request_is_answered_and_counted_a_good_one_served_and_training_goes_on(

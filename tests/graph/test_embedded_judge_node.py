@@ -13,9 +13,9 @@ from recording_samples import make_spec
 
 from wm_msgs.action import TrainVideo
 from wm_msgs.msg import ClipVerdict
-from wm_nodes.reward.audit import read_record
-from wm_nodes.reward.evidence.head import load_head, save_head
-from wm_nodes.reward.judges.embedded import shipped_heads
+from wm_nodes.judge.audit import read_record
+from wm_nodes.judge.backends.embedded import shipped_heads
+from wm_nodes.judge.evidence.head import load_head, save_head
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
@@ -40,7 +40,7 @@ def test_a_round_is_judged_in_the_node_without_any_server_and_with_the_evidence_
     config = settings(**{
         "rewards": {"agent": 1.0}, "judge.kind": "embedded", "judge.folder": str(far_sighted_judge(tmp_path / "judge")),
         "judge.rubric": str(rubric),
-    })  # fmt: skip
+    })
     with own_domain() as domain:
         graph, probe = Graph(domain, tmp_path / "graph"), Probe(domain)
         try:

@@ -13,8 +13,8 @@ from graph.harness import Graph, Probe, wait_until
 
 from wm_msgs.action import Evaluate, Rollout, Train
 from wm_nodes.config.load import load_config
-from wm_nodes.learning.evaluation import evaluate
-from wm_nodes.learning.weights import save_weights
+from wm_nodes.policy_rl.evaluation import evaluate
+from wm_nodes.training.weights import save_weights
 
 pytestmark = pytest.mark.graph
 
@@ -66,7 +66,7 @@ def test_a_composed_process_steps_by_direct_call_and_trains_to_the_same_weights(
         sys.executable, "-m", "wm_nodes.nodes.compose", "environment", "policy", "reward_evaluator", "learner",
         "--ros-args", "-r", "__ns:=/wm", "-p", f"config_file:={graph.folder / 'config.yaml'}",
         "-p", f"run_dir:={graph.folder}", "--params-file", str(graph.folder / "nodes.yaml"),
-    ]  # fmt: skip
+    ]
     params: dict[str, dict[str, Any]] = {
         "environment": {"backend": "factory", "backend_factory": "toy:make_environment", "num_envs": 4},
         "policy": {"policy_factory": "toy:make_policy"},

@@ -12,8 +12,8 @@ from graph.harness import Graph, Probe, shm_files, wait_until
 
 from wm_msgs.action import Train
 from wm_msgs.msg import Credit, TransitionBatch
-from wm_nodes.learning.weights import save_weights
 from wm_nodes.ros.wire import WireError
+from wm_nodes.training.weights import save_weights
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 HELD_UP_S = 2.8
@@ -31,7 +31,7 @@ def test_each_killed_node_is_reported_within_5_s_and_training_goes_on_after_its_
     restart = {
         "/wm/policy": graph.start_policy, "/wm/environment": graph.start_environment,
         "/wm/reward_evaluator": graph.start_reward,
-    }  # fmt: skip
+    }
     for name, start in restart.items():
         count = len(updates)
         wait_until(f"an update before {name} dies", lambda c=count: len(updates) > c, 60)
@@ -114,9 +114,7 @@ def test_a_consumer_without_credit_holds_the_environment_up_until_it_is_dropped(
     start = client.reset()
     credit = probe.publisher("flow/credit")
     wait_until("matching", lambda: credit.get_subscription_count())
-    credit.publish(
-        Credit(consumer="/wm/slow", topic="env/transition", stream_session=client.session, granted_seq=0)
-    )
+    credit.publish(Credit(consumer="/wm/slow", topic="env/transition", stream_session=client.session, granted_seq=0))
     wait_until("the credit", lambda: "/wm/slow" in (probe.value("/wm/environment", "credit_consumers") or ""))
     began = time.monotonic()
     refusals: list[str] = []
@@ -224,7 +222,7 @@ def test_fifty_start_stop_cycles_leave_no_shared_memory(graph: Graph) -> None:
     given = {
         "config_file": graph.folder / "config.yaml", "run_dir": graph.folder, "backend": "factory",
         "backend_factory": "toy:make_environment", "num_envs": 4,
-    }  # fmt: skip
+    }
     parameters = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
     command = [sys.executable, "-c", cycle, "--ros-args", *parameters]
     done = subprocess.run(command, env=graph.environment(), capture_output=True, text=True, timeout=240)

@@ -18,9 +18,9 @@ from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.learning.clip_files import AT_ONCE, LIST, list_sha256
-from wm_nodes.reward.agent import clip_ref
-from wm_nodes.reward.audit import read_record
+from wm_nodes.judge.agent import clip_ref
+from wm_nodes.judge.audit import read_record
+from wm_nodes.judge.clip_files import AT_ONCE, LIST, list_sha256
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
@@ -91,7 +91,7 @@ def test_a_folder_is_judged_in_its_order_published_and_audited(evaluator: Evalua
 
 
 def test_a_folder_may_be_named_from_the_run_folder_and_a_longer_list_than_is_held_at_once_keeps_its_order(
-    evaluator: Evaluator
+    evaluator: Evaluator,
 ) -> None:
     folder = evaluator.folder / "own clips"
     folder.mkdir()
@@ -180,7 +180,7 @@ def test_the_embedded_judge_needs_no_server_no_model_and_no_other_node(tmp_path:
     (clips / LIST).write_text(
         json.dumps({"file": "still.npy", "instruction": words, "task_id": "push_cube"}) + "\n"
         + json.dumps({"file": "b.npy", "instruction": words, "task_id": "push_cube"}) + "\n"
-    )  # fmt: skip
+    )
     with own_domain() as domain:
         evaluator = Evaluator(domain, tmp_path / "run")
         try:

@@ -10,8 +10,8 @@ from judge_server import PickyServer, serving
 
 from wm_msgs.action import TrainVideo
 from wm_msgs.srv import StopRecording
-from wm_nodes.ros.scenarios import VIDEO_TOPICS
-from wm_nodes.world_model_job import main
+from wm_nodes.apps.train_video_model import main
+from wm_nodes.launching.scenarios import VIDEO_TOPICS
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
@@ -24,7 +24,7 @@ def test_another_judge_takes_the_rounds_of_an_outage_and_each_round_is_scored_ag
         config = settings(**{
             "rewards": {"agent": 1.0}, "judge.endpoints": [server.url], "judge.model": "judge", "judge.tries": 1,
             "judge.fallbacks": [fallback],
-        })  # fmt: skip
+        })
         graph, probe = Graph(domain, tmp_path / "graph"), Probe(domain)
         try:
             loop = VideoLoop(graph, probe, config)

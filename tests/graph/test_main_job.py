@@ -13,15 +13,15 @@ from judge_server import PickyServer, serving
 from model_folders import make_model_folder
 from safetensors.numpy import save_file
 
-from wm_nodes.learning.metrics import read_metrics
-from wm_nodes.learning.rescoring import main as rescore
+from wm_nodes.apps.rescore_rewards import main as rescore
 from wm_nodes.recording import Bag, read_episodes
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports import read_summary
+from wm_nodes.training.metrics import read_metrics
 from wm_nodes.world_model import load_model_folder
 
 pytestmark = pytest.mark.graph
-PROGRAM = "import sys; from wm_nodes.main_job import main; sys.exit(main(sys.argv[1:]))"
+PROGRAM = "import sys; from wm_nodes.apps.train_policy import main; sys.exit(main(sys.argv[1:]))"
 RATES = ("real_before", "real_after", "imagined_before", "imagined_after")
 
 
@@ -74,7 +74,7 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
     model = make_model_folder(tmp_path / "model")
     write_some_starts(run_dir / "starts.safetensors")
     arguments = ["--preset", "smoke", "--force", "--rounds", "2", "--model-dir", str(model), "--run-dir", str(run_dir),
-                 "--set", "evaluation.episodes=2", "--set", "data.num_workers=1", "--compose"]  # fmt: skip
+                 "--set", "evaluation.episodes=2", "--set", "data.num_workers=1", "--compose"]
     done = start(arguments, ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     first, last = read_summary(run_dir)["rounds"]
@@ -107,7 +107,7 @@ def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(ros
     write_some_starts(run_dir / "starts.safetensors")
     arguments = ["--preset", "smoke", "--force", "--model-dir", str(make_model_folder(tmp_path / "model")),
                  "--run-dir", str(run_dir), "--set", "evaluation.episodes=2", "--set", "data.num_workers=1",
-                 "--set", "ppo.num_steps=16", "--set", "ppo.num_envs=3", "--compose"]  # fmt: skip
+                 "--set", "ppo.num_steps=16", "--set", "ppo.num_envs=3", "--compose"]
     with serving(PickyServer()) as server:
         agent = ["--reward", "agent", "--judge", server.url, "--judge-model", "judge"]
         done = start([*arguments, *agent], ros_domain)

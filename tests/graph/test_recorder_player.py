@@ -27,11 +27,11 @@ from std_srvs.srv import Trigger
 from wm_msgs.action import Replay
 from wm_msgs.msg import Credit, ErrorCode, TransitionBatch
 from wm_msgs.srv import PlayNext, Seek, SetRate, StartRecording, StopRecording
-from wm_nodes.nodes.bag_qos import message_class
+from wm_nodes.launching.runner import clean_shared_memory
+from wm_nodes.nodes.recorder.qos import message_class
 from wm_nodes.recording import Bag, read_episodes, read_rollouts, recover, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.ros import qos as table
-from wm_nodes.ros.runner import clean_shared_memory
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 

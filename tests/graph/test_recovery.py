@@ -15,9 +15,9 @@ from recording_graph import Graph as Recorded
 from recording_samples import make_spec
 
 from wm_msgs.action import Evaluate, Replay, Train
-from wm_nodes.learning.weights import save_weights
+from wm_nodes.launching.scenarios import ENVIRONMENT_TOPICS, GRAPH_TOPICS
 from wm_nodes.recording import BagReport, read_episodes, read_rollouts, recover
-from wm_nodes.ros.scenarios import ENVIRONMENT_TOPICS, GRAPH_TOPICS
+from wm_nodes.training.weights import save_weights
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
@@ -165,6 +165,6 @@ def test_a_parameter_file_wins_over_values_on_the_command_line(graph: Graph) -> 
         "def show(node): print(node.param('peer_timeout_s')); node.failed = True\n"
         "class N(ManagedNode):\n    activate = show\nrun_node(lambda: N('n'))\n",
         "--ros-args", "-r", "__ns:=/wm", "-r", "__node:=n", "-p", "peer_timeout_s:=5.0", "--params-file", str(file),
-    ]  # fmt: skip
+    ]
     done = subprocess.run(command, env={**os.environ, **graph.environment()}, capture_output=True, text=True)
     assert done.stdout.strip() == "9.0", done.stderr

@@ -20,14 +20,14 @@ from judge_server import PickyServer
 from wm_msgs.action import EvaluateClips, Train, TrainVideo
 from wm_msgs.msg import ClipScores, ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric, StartRecording, StopRecording
+from wm_nodes.apps.train_video_model import main
 from wm_nodes.config.load import load_config
-from wm_nodes.learning.clip_archive import read_clips
-from wm_nodes.learning.clip_judging import READS, ClipJudge
-from wm_nodes.learning.episode_rescoring import judge_bag
-from wm_nodes.reward.agent import load_rubric
-from wm_nodes.reward.audit import read_record, verify
-from wm_nodes.ros.scenarios import GRAPH_TOPICS, VERDICT_TOPIC, VIDEO_TOPICS
-from wm_nodes.world_model_job import main
+from wm_nodes.judge.agent import load_rubric
+from wm_nodes.judge.audit import read_record, verify
+from wm_nodes.judge.rejudge import judge_bag
+from wm_nodes.judge.service import READS, JudgeService
+from wm_nodes.launching.scenarios import GRAPH_TOPICS, VERDICT_TOPIC, VIDEO_TOPICS
+from wm_nodes.video_rl.recorded_buffers import read_clips
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
@@ -43,7 +43,7 @@ def loop(server: PickyServer, tmp_path_factory: pytest.TempPathFactory) -> Itera
     config = settings(**{
         "rewards": {"agent": 1.0}, "judge.endpoints": [server.url], "judge.model": "judge", "judge.tries": 1,
         "judge.api_key_env": "WM_TEST_JUDGE_KEY",
-    })  # fmt: skip
+    })
     with own_domain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv("WM_TEST_JUDGE_KEY", KEY)
         graph, probe = Graph(domain, tmp_path_factory.mktemp("agent") / "run"), Probe(domain)
@@ -209,7 +209,7 @@ def test_the_rubric_is_told_and_set_but_not_while_clips_are_judged(judged: Video
 def test_recorded_verdicts_are_given_again_bit_for_bit_without_asking_the_judge(
     judged: VideoLoop, server: PickyServer, tmp_path: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     probe, folder, run = judged.probe, judged.graph.folder, tmp_path / "run"
     started = probe.call(StartRecording, "recorder/start", StartRecording.Request(bag_uri="bags/round"))
     assert started.error_code == ErrorCode.OK
@@ -246,10 +246,10 @@ def test_recorded_verdicts_are_given_again_bit_for_bit_without_asking_the_judge(
     silent = replace(clips, audit_ids=("", *clips.audit_ids[1:]), valid=clips.valid.clone(), total=clips.total.clone())
     silent.valid[0], silent.total[0] = False, math.nan
     other = replace(clips, audit_ids=("0" * 64, *clips.audit_ids[1:]))
-    monkeypatch.setattr("wm_nodes.world_model_offline.read_clips", lambda bag, pictures: [silent])
+    monkeypatch.setattr("wm_nodes.apps.rescore.read_clips", lambda bag, pictures: [silent])
     assert main(["rescore", str(run), *agent]) == 0
     assert "1 clips that got no answer then are not compared" in said(capsys)
-    monkeypatch.setattr("wm_nodes.world_model_offline.read_clips", lambda bag, pictures: [other])
+    monkeypatch.setattr("wm_nodes.apps.rescore.read_clips", lambda bag, pictures: [other])
     assert main(["rescore", str(run), *agent]) == 1
     assert json.loads((run / "rescored.json").read_text())["buffers"][0]["different"] == ["verdicts"]
 
@@ -309,7 +309,7 @@ def test_a_policys_episodes_are_judged_at_their_end_and_a_judge_that_is_down_pau
             again = probe.finish(probe.send(client, Train.Goal(updates=1)))
             assert (again.termination_reason, again.updates) == (Train.Result.FINISHED, 2)
             bag = probe.call(StopRecording, "recorder/stop", StopRecording.Request()).bag_uri
-            with closing(ClipJudge(config.judge, seed=config.seed, reads=graph.folder / READS)) as again:
+            with closing(JudgeService(config.judge, seed=config.seed, reads=graph.folder / READS)) as again:
                 offline = judge_bag(graph.folder / bag, again)
             assert offline.compared and offline.unanswered and not offline.different
             _assert_same_weights_from(graph, graph.folder / bag)

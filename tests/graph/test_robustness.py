@@ -19,8 +19,8 @@ from lifecycle_msgs.srv import ChangeState
 from wm_msgs.action import Train
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_msgs.srv import ResetBatch, StartRecording, StopRecording
-from wm_nodes.learning.ppo import PpoLearner
-from wm_nodes.nodes.training import restore
+from wm_nodes.policy_rl.ppo import PpoLearner
+from wm_nodes.policy_rl.training_run import restore
 from wm_nodes.recording import BagError, recover
 from wm_nodes.ros import calls
 from wm_nodes.ros.wire import ResetCommand, WireError
@@ -216,7 +216,7 @@ def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpo
 
 
 def test_the_main_job_without_a_renderer_ends_with_one_line(tmp_path: Path) -> None:
-    code = "import sys; from wm_nodes.main_job import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from wm_nodes.apps.train_policy import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "--preset", "smoke", "--run-dir", str(tmp_path / "run")]
     command += ["--set", "simulation.render_device=cuda:77"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=180)

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from graph.harness import removed_ports
 
-from wm_nodes.ros import readiness
-from wm_nodes.ros.domain import DomainInUseError
-from wm_nodes.ros.graph import Graph, NodeSpec
-from wm_nodes.ros.readiness import NotReadyError
-from wm_nodes.ros.runner import NodeDiedError, Runner
+from wm_nodes.launching import readiness
+from wm_nodes.launching.domain_lock import DomainInUseError
+from wm_nodes.launching.graph import Graph, NodeSpec
+from wm_nodes.launching.readiness import NotReadyError
+from wm_nodes.launching.runner import NodeDiedError, Runner
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 TESTS = Path(__file__).resolve().parents[1]
@@ -162,7 +162,7 @@ def test_ctrl_c_ends_all_nodes_and_the_starter_with_code_0(ros_domain: int, tmp_
     script.write_text(
         "import sys; from pathlib import Path\n"
         "from graph.test_runner import graph, tiny\n"
-        "from wm_nodes.ros.runner import run\n"
+        "from wm_nodes.launching.runner import run\n"
         "sys.exit(run(graph(tiny('a'), tiny('b')), Path(sys.argv[1])))\n"
     )
     env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])}
@@ -185,7 +185,7 @@ def test_nodes_do_not_outlive_a_killed_starter(ros_domain: int, tmp_path: Path) 
     script = tmp_path / "start.py"
     script.write_text(
         "import time; from graph.test_runner import graph, tiny\n"
-        "from wm_nodes.ros.runner import Runner\n"
+        "from wm_nodes.launching.runner import Runner\n"
         "with Runner(graph(tiny('a'), tiny('b')), log=None) as runner:\n"
         "    runner.wait_ready(30); print(runner.pid('a'), flush=True); time.sleep(60)\n"
     )

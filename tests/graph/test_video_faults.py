@@ -18,13 +18,13 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
-from wm_nodes.learning.clip_archive import read_clips
-from wm_nodes.learning.video_folder import load_video_folder
-from wm_nodes.learning.video_grpo import GrpoLearner
-from wm_nodes.learning.video_run import CHECKPOINT, rewarded
+from wm_nodes.launching.scenarios import VIDEO_TOPICS
 from wm_nodes.recording import recover
-from wm_nodes.ros.scenarios import VIDEO_TOPICS
 from wm_nodes.video_model.buffer import concatenate_buffers
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.grpo import GrpoLearner
+from wm_nodes.video_rl.recorded_buffers import read_clips
+from wm_nodes.video_rl.training_run import CHECKPOINT, rewarded
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
@@ -110,7 +110,7 @@ def _of_other_settings(loop: VideoLoop) -> Any:
     ],
     ids=["judge_missing", "judge_other", "judge_cut", "sample_unknown", "train_nothing", "train_missing",
          "train_other_settings", "train_stale", "train_without_rewards"],
-)  # fmt: skip
+)
 def test_a_goal_of_garbage_fails_by_name_and_changes_nothing(loop: VideoLoop, goal: Any, words: str) -> None:
     probe, message = loop.probe, goal(loop)
     before = loop.train(0)

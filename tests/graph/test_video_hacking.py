@@ -9,7 +9,7 @@ from graph.harness import Graph, Probe, wait_until
 from graph.video_loop import MODEL_DIR, VideoLoop, settings
 
 from wm_msgs.action import TrainVideo
-from wm_nodes.learning.metrics import read_metrics
+from wm_nodes.training.metrics import read_metrics
 
 pytestmark = pytest.mark.graph
 
@@ -42,7 +42,7 @@ def test_a_reward_for_bad_pictures_is_named_in_log_diagnostics_and_metrics_until
     assert last["hacked"] == len(worse) >= 1 and last["reward_slope"] == pytest.approx(1.0)
     assert all(last[f"hacked_{name}"] < 0 for name in worse)
     status = wait_until("the warning", lambda: probe.diagnostics["/wm/learner"].level == DiagnosticStatus.WARN
-                        and probe.diagnostics["/wm/learner"])  # fmt: skip
+                        and probe.diagnostics["/wm/learner"])
     assert "the training reward rises by 1 per evaluation" in status.message and f"{worse[0]} by" in status.message
     assert f"reward hacking: {status.message}" in graph.log("/wm/video_learner")
     result = loop.train(from_buffers=write_buffers(loop, [-1, -2, -3, -4]))

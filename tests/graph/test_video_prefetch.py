@@ -11,9 +11,9 @@ from graph.harness import Graph, Probe, own_domain, wait_until
 from graph.video_loop import VideoLoop, settings
 
 from wm_msgs.action import GenerateClips, TrainVideo
-from wm_nodes.learning.metrics import read_metrics
-from wm_nodes.learning.weights import unpack_weights
 from wm_nodes.ros.convert import time_ns
+from wm_nodes.training.metrics import read_metrics
+from wm_nodes.training.weights import unpack_weights
 
 pytestmark = pytest.mark.graph
 

@@ -19,26 +19,26 @@ from graph.launched import launched
 from metric_docs import documented, written
 
 from wm_msgs.action import TrainVideo
+from wm_nodes.apps.train_video_model import main
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.learning.clip_archive import RecordedClips, read_clips, rescore
-from wm_nodes.learning.clip_generation import ClipGenerator
-from wm_nodes.learning.clip_scores import ClipScores, load_probe, mixed, score_clips
-from wm_nodes.learning.heldout import context_scores
-from wm_nodes.learning.metrics import read_metrics
-from wm_nodes.learning.video_config import VideoRlConfig, load_video_config
-from wm_nodes.learning.video_data import Clips, load_clips
-from wm_nodes.learning.video_folder import load_video_folder
-from wm_nodes.learning.video_run import CHECKPOINT, VideoRun, evaluated_uri, rewarded, version_uri
-from wm_nodes.learning.weights import load_weights
 from wm_nodes.nodes.video_model_node import film_strip
 from wm_nodes.recording import BagError
 from wm_nodes.recording.bag import Bag
 from wm_nodes.reports import read_summary
+from wm_nodes.training.metrics import read_metrics
+from wm_nodes.training.weights import load_weights
+from wm_nodes.video_model.clips import Clips, load_clips
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescore
+from wm_nodes.video_rl.reference_reward import ClipScores, load_probe, mixed, score_clips
+from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.settings import VideoRlConfig, load_video_config
+from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, evaluated_uri, rewarded, version_uri
+from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
-from wm_nodes.world_model_job import main
 
 pytestmark = pytest.mark.graph
-PROGRAM = "import sys; from wm_nodes.world_model_job import main; sys.exit(main(sys.argv[1:]))"
+PROGRAM = "import sys; from wm_nodes.apps.train_video_model import main; sys.exit(main(sys.argv[1:]))"
 SETTINGS = {"grpo.ema_decay": 0.5}
 ARGUMENTS = ["--preset", "smoke", *(f"--set={name}={value}" for name, value in SETTINGS.items())]
 
@@ -150,7 +150,7 @@ def test_the_report_holds_table_pictures_command_and_settings(run_dir: Path) -> 
     text = (run_dir / "report.html").read_text()
     assert text.count("data:image/png;base64") == 4
     for part in ("object error, cm", "averaged weights", "No alarm in 2 held-out evaluations", "world_model_rl.py",
-                 "ema_decay: 0.5", "rescore"):  # fmt: skip
+                 "ema_decay: 0.5", "rescore"):
         assert part in text
 
 
@@ -277,9 +277,7 @@ def test_recordings_that_cannot_be_used_end_with_one_clear_line(
     assert words in " ".join(capsys.readouterr().out.split())
 
 
-def test_no_kept_buffer_is_refused_before_anything_is_made(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_kept_buffer_is_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--preset", "smoke", "--keep-buffers", "0", "--run-dir", str(tmp_path / "run")]) == 2
     assert "--keep-buffers must be at least 1, got 0" in capsys.readouterr().out and not (tmp_path / "run").exists()
 
@@ -306,7 +304,7 @@ def test_the_launch_file_trains_a_given_model_on_given_recordings_and_records_it
     given = [
         "video_preset:=smoke", f"video_model_dir:={run_dir / 'video_model'}", f"context_bags:={bags}",
         f"run_dir:={tmp_path / 'run'}", f"domain_id:={domain}",
-    ]  # fmt: skip
+    ]
     operator = Probe(domain)
     try:
         with launched("world_model_rl", given, tmp_path / "starter.log"):

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import PolicyConfig, RunConfig
-from wm_nodes.control import check_actions, next_state
-from wm_nodes.learning.ppo import PpoLearner
-from wm_nodes.learning.rollouts import collect_rollout
-from wm_nodes.learning.weights import pack_weights, unpack_weights
-from wm_nodes.policy import ImageEncoder, ImagePolicy
+from wm_nodes.core.specs import SOURCE_SIMULATOR, EnvironmentSpec
+from wm_nodes.core.tool_control import check_actions, next_state
+from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
+from wm_nodes.policy_rl.ppo import PpoLearner
+from wm_nodes.policy_rl.rollouts import collect_rollout
 from wm_nodes.reward import RuleReward
-from wm_nodes.specs import SOURCE_SIMULATOR, EnvironmentSpec
-from wm_nodes.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.training.weights import pack_weights, unpack_weights
 
 SIDE_PX = 16
 GOAL_M = np.array([0.6, 0.0, 0.1], np.float32)
@@ -32,7 +32,7 @@ class ReachToy:
             action_units=("m", "m", "m"), action_scale=(0.03, 0.03, 0.03), state_names=("x", "y", "z"),
             state_units=("m", "m", "m"), ground_truth_names=("tool_x", "tool_y"), control_period_s=0.1,
             max_episode_steps=max_episode_steps, state_low=(0.4, -0.2, 0.0), state_high=(0.8, 0.2, 0.3),
-        )  # fmt: skip
+        )
         self._seed = seed
         self._resets = 0
         self._states = np.tile(GOAL_M, (num_envs, 1))
@@ -65,7 +65,7 @@ class ReachToy:
         return StepResult(
             self._observation(), terminated, truncated, near.astype(np.float32),
             np.zeros(self.spec.num_envs, np.float32), self.ground_truth, valid,
-        )  # fmt: skip
+        )
 
     def goals(self) -> tuple[UInt8Array, BoolArray] | None:
         return None

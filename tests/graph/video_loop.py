@@ -12,17 +12,17 @@ from recording_samples import make_episode, make_spec
 
 from wm_msgs.action import TrainVideo
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.learning.clip_generation import ClipGenerator
-from wm_nodes.learning.clip_scores import load_probe, mixed, score_clips
-from wm_nodes.learning.video_config import VideoRlConfig, dump_video_config, load_video_config
-from wm_nodes.learning.video_data import Clips, load_clips
-from wm_nodes.learning.video_folder import load_video_folder, save_video_folder
-from wm_nodes.learning.video_grpo import GrpoLearner
-from wm_nodes.learning.video_run import rewarded, version_uri
-from wm_nodes.learning.weights import load_weights, pack_weights
 from wm_nodes.recording import EpisodeBagWriter
+from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.video_model import NetworkSettings, RolloutBuffer, VideoNetwork
+from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.codec import PatchCodec
+from wm_nodes.video_model.folder import load_video_folder, save_video_folder
+from wm_nodes.video_rl.grpo import GrpoLearner
+from wm_nodes.video_rl.reference_reward import load_probe, mixed, score_clips
+from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.settings import VideoRlConfig, dump_video_config, load_video_config
+from wm_nodes.video_rl.training_run import rewarded, version_uri
 
 EPISODES, STEPS, STRIDE = 4, 4, 2
 BLIND = 3
@@ -38,7 +38,7 @@ def settings(**overrides: Any) -> VideoRlConfig:
         "groups.contexts": 2, "groups.group_size": 3, "rollout.num_steps": 16, "rollout.micro_batch": 1,
         "window.strategy": "random", "window.size": 3, "grpo.learning_rate": 1e-3, "evaluation.every": 0,
         "rewards": {"tracking": 1.0, "psnr_db": 0.1},
-    }  # fmt: skip
+    }
     return load_video_config("smoke", {**values, **overrides})
 
 
@@ -125,7 +125,7 @@ class VideoLoop:
         """Start one of NAMES; its parameters may be replaced."""
         values: dict[str, Any] = {
             "config_file": self.graph.folder / "video_config.yaml", "video_model_dir": self.model
-        }  # fmt: skip
+        }
         if node != "video_learner":
             values["context_bags"] = f"['{self.bag}']"
         if node == "clip_evaluator":

@@ -61,7 +61,7 @@ def test_the_embedded_definition_is_our_file_with_its_comments() -> None:
 
 
 @pytest.mark.parametrize("topic", topics.ALL_TOPICS, ids=lambda topic: topic.name)
-def test_recorded_qos_and_type_are_those_of_the_graph(topic: topics.Topic) -> None:
+def test_recorded_qos_and_type_are_those_of_the_graph(topic: topics.RecordedTopic) -> None:
     qos = pytest.importorskip("wm_nodes.ros.qos")
     row = qos.topic(topic.name)
     live = row.qos
@@ -97,7 +97,7 @@ def test_stock_rosbags_opens_the_bag_with_the_definitions_inside_it(tmp_path: Pa
     with AnyReader([path]) as reader:
         assert {c.topic for c in reader.connections} == {
             "/wm/env/spec", "/wm/env/image", "/wm/env/transition", "/wm/reward", "/wm/episode",
-        }  # fmt: skip
+        }
         assert reader.message_count == sum(connection.msgcount for connection in reader.connections)
         images = [c for c in reader.connections if c.topic == "/wm/env/image"]
         _, _, data = next(reader.messages(images))

@@ -57,7 +57,7 @@ def _problems(node: ast.AST, full_names: dict[str, str]) -> Iterator[str]:
         "import numpy\nnumpy.load(path, allow_pickle=flag)", "import yaml\nyaml.load(text)",
         "import yaml\nyaml.load(text, Loader=yaml.Loader)", "import yaml\nyaml.unsafe_load(text)",
     ],
-)  # fmt: skip
+)
 def test_each_way_to_run_code_out_of_data_is_found(source: str) -> None:
     assert len(findings(source)) == 1
 
@@ -68,7 +68,7 @@ def test_each_way_to_run_code_out_of_data_is_found(source: str) -> None:
         "import torch\ntorch.load(path, weights_only=True)\nmodel.eval()", "import numpy as np\nnp.load(path)",
         "import yaml\nyaml.safe_load(text)\nyaml.load(text, Loader=yaml.CSafeLoader)",
     ],
-)  # fmt: skip
+)
 def test_safe_calls_are_not_reported(source: str) -> None:
     assert findings(source) == []
 

@@ -1,6 +1,6 @@
 """Presets: base.yaml holds every number; task, preset and command line override some of them, in this order.
 
-Reading presets and laying values over one another serve the settings of loop 2 too (learning/video_config.py).
+Reading presets and laying values over one another serve the settings of loop 2 too (video_rl/settings.py).
 """
 
 from collections.abc import Collection
@@ -50,7 +50,7 @@ def load_config(preset: str = "cpu", overrides: dict[str, Any] | None = None) ->
 
 
 def default_judge() -> JudgeConfig:
-    """The judge's settings of base.yaml, which loop 2 has too (learning/video_config.py)."""
+    """The judge's settings of base.yaml, which loop 2 has too (video_rl/settings.py)."""
     return JudgeConfig.model_validate(read_preset("base")["judge"])
 
 

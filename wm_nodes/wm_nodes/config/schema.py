@@ -10,16 +10,19 @@ PositiveFloat = Annotated[float, Field(gt=0)]
 NonNegativeFloat = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
+AGENT = "agent"
+"""Name of the reward agent among the rewards of both loops."""
+
 TaskName = Literal["reach", "push_cube", "pull_cube"]
 
 
-class Section(BaseModel):
+class SettingsSection(BaseModel):
     """Frozen, and every unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class SimulationConfig(Section):
+class SimulationConfig(SettingsSection):
     cameras: list[Literal["side", "wrist"]]
     """Rendered side by side, left to right, in every observation."""
     image_size: PositiveInt
@@ -37,7 +40,7 @@ class SimulationConfig(Section):
     """SAPIEN render device; `auto` takes a GPU when there is one, else the software device."""
 
 
-class DataConfig(Section):
+class DataConfig(SettingsSection):
     num_episodes: PositiveInt
     """Simulator episodes to collect for the world model."""
     num_heldout: PositiveInt
@@ -47,10 +50,10 @@ class DataConfig(Section):
     num_workers: PositiveInt
     """Collecting processes."""
     policy_episodes: NonNegativeInt
-    """Episodes of each weak cloned policy (learning/pretraining.py) added to the world model's data; 0: none."""
+    """Episodes of each weak cloned policy (policy_rl/pretraining.py) added to the world model's data; 0: none."""
 
 
-class TokenizerConfig(Section):
+class TokenizerConfig(SettingsSection):
     kind: Literal["continuous", "lfq"]
     """continuous: real-valued latent tokens; lfq: lookup-free quantised tokens (MAGVIT-2)."""
     patch_px: PositiveInt
@@ -70,7 +73,7 @@ class TokenizerConfig(Section):
     """Extra weight of pixels that differ from the episode-independent background."""
 
 
-class WorldModelConfig(Section):
+class WorldModelConfig(SettingsSection):
     width: PositiveInt
     depth: PositiveInt
     num_heads: PositiveInt
@@ -95,7 +98,7 @@ class WorldModelConfig(Section):
     """Weight of the losses on predicted frames after decoding, and after encoding them again (0: off)."""
 
 
-class RewardConfig(Section):
+class RewardConfig(SettingsSection):
     mode: Literal["delta", "abs", "progress"]
     """Dense reward (E5): change of the goal distance, its level, or progress along the golden trajectory."""
     dense_weight: NonNegativeFloat
@@ -110,7 +113,7 @@ class RewardConfig(Section):
     """An imagined step above it pays no sparse reward and truncates the episode; 0: off."""
 
 
-class OtherJudge(Section):
+class OtherJudge(SettingsSection):
     """A further judge; as in JudgeConfig, whose other values it shares."""
 
     kind: Literal["openai", "embedded"] = "openai"
@@ -126,7 +129,7 @@ class StageJudge(OtherJudge):
     stages: Annotated[list[Literal["PLAN", "VQ", "IF", "TC", "PC", "HACK"]], Field(min_length=1)]
 
 
-class JudgeConfig(Section):
+class JudgeConfig(SettingsSection):
     """The reward agent: who judges, by which rubric, and how much it may take (reward/agent, reward/judges)."""
 
     kind: Literal["openai", "embedded"]
@@ -185,7 +188,7 @@ class JudgeConfig(Section):
     first again. Empty: an outage pauses training."""
 
 
-class PolicyConfig(Section):
+class PolicyConfig(SettingsSection):
     width: PositiveInt
     depth: PositiveInt
     """Hidden width and layers of the actor, and of the critic."""
@@ -195,14 +198,14 @@ class PolicyConfig(Section):
     """Initial log standard deviation of the Gaussian, normalised action units."""
 
 
-class SftConfig(Section):
+class SftConfig(SettingsSection):
     num_demonstrations: PositiveInt
     num_iterations: PositiveInt
     batch_size: PositiveInt
     learning_rate: PositiveFloat
 
 
-class PpoConfig(Section):
+class PpoConfig(SettingsSection):
     updates: NonNegativeInt
     num_envs: PositiveInt
     num_steps: PositiveInt
@@ -227,7 +230,7 @@ class PpoConfig(Section):
     """First updates that train the critic only."""
 
 
-class GateConfig(Section):
+class AcceptanceConfig(SettingsSection):
     num_episodes: PositiveInt
     """Held-out real episodes the model is judged on."""
     object_error_ratio: PositiveFloat
@@ -240,7 +243,7 @@ class GateConfig(Section):
     """The SFT policy's imagined success must agree with its real success within the joint 95 % interval."""
 
 
-class RoundsConfig(Section):
+class RoundsConfig(SettingsSection):
     """Online rounds: train in the model, collect with the policy in the simulator, refresh the model, go on."""
 
     num_rounds: Annotated[int, Field(ge=1, le=20)]
@@ -259,14 +262,14 @@ class RoundsConfig(Section):
     by more than this."""
 
 
-class EvaluationConfig(Section):
+class EvaluationConfig(SettingsSection):
     episodes: PositiveInt
     first_seed: NonNegativeInt
     """Reset seed of the first evaluation episode; training never uses seeds from here on."""
     deterministic: bool
 
 
-class RunConfig(Section):
+class RunConfig(SettingsSection):
     seed: NonNegativeInt
     task: TaskName
     simulation: SimulationConfig
@@ -278,6 +281,6 @@ class RunConfig(Section):
     policy: PolicyConfig
     sft: SftConfig
     ppo: PpoConfig
-    gate: GateConfig
+    gate: AcceptanceConfig
     rounds: RoundsConfig
     evaluation: EvaluationConfig

@@ -14,23 +14,24 @@ import torch
 from wm_msgs.action import EvaluateClips
 from wm_msgs.msg import ClipScores, ClipVerdict
 from wm_nodes.config.load import judge_or_embedded
-from wm_nodes.learning.clip_generation import ClipGenerator
-from wm_nodes.learning.clip_judging import agent_scores, buffer_jobs, clip_fps
-from wm_nodes.learning.clip_scores import mixed, score_clips
-from wm_nodes.learning.video_config import AGENT, load_video_config
-from wm_nodes.learning.video_data import load_clips
-from wm_nodes.learning.video_folder import load_video_folder
-from wm_nodes.nodes import agent_face
-from wm_nodes.nodes.agent_face import AgentFace, deadline_of
-from wm_nodes.reward.agent import Verdict, check_one_judge
-from wm_nodes.reward.agent.types import GATED
-from wm_nodes.reward.judges.factory import check_clips, for_clips
+from wm_nodes.config.schema import AGENT
+from wm_nodes.judge.agent import Verdict, check_one_judge
+from wm_nodes.judge.agent.types import GATED
+from wm_nodes.judge.backends.factory import check_clips, for_clips
+from wm_nodes.judge.service import agent_scores, buffer_jobs, clip_fps
+from wm_nodes.nodes.judge import services
+from wm_nodes.nodes.judge.services import JudgeServices, deadline_of
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.spin import run_node
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
+from wm_nodes.video_model.clips import load_clips
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.reference_reward import mixed, score_clips
+from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.settings import load_video_config
 from wm_nodes.world_model import load_model_folder
 
 PARAMS = (
@@ -38,18 +39,18 @@ PARAMS = (
     Param("context_bags", [""], "Bags of the contexts, the same and in the same order as the video_model node's",
           read_only=True),
     Param("model_dir", "", "World-model folder; its position probe reads the pictures", read_only=True),
-    *agent_face.PARAMS,
-)  # fmt: skip
+    *services.PARAMS,
+)
 
 REWARD_NAME = "reference"
 
 
 class ClipEvaluatorNode(ManagedNode):
-    """Action clips/evaluate; publishes clips/scores. With the agent also what AgentFace has."""
+    """Action clips/evaluate; publishes clips/scores. With the agent also what JudgeServices has."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("reward_evaluator", PARAMS, **node_arguments)
-        self._agent: AgentFace | None = None
+        self._agent: JudgeServices | None = None
 
     def configure(self) -> None:
         self._config = load_video_config(str(self.param("config_file")))
@@ -67,7 +68,7 @@ class ClipEvaluatorNode(ManagedNode):
             shape = tuple(contexts.frames.shape[1:])
             judge = for_clips(judge_or_embedded(self._config.judge), shape)
             check_clips(judge, shape)
-            self._agent = AgentFace(self, judge, self._config.seed, lambda: self._action.busy)
+            self._agent = JudgeServices(self, judge, self._config.seed, lambda: self._action.busy)
         self._scores = self.publish_on("clips/scores")
         self._action = WorkerAction(self, EvaluateClips, "clips/evaluate", self._evaluate, self._describe)
         self.own(self._action.destroy)
@@ -102,19 +103,24 @@ class ClipEvaluatorNode(ManagedNode):
         return result
 
     def _judged(
-        self, agent: AgentFace, work: Work, buffer: RolloutBuffer, frames: torch.Tensor
+        self, agent: JudgeServices, work: Work, buffer: RolloutBuffer, frames: torch.Tensor
     ) -> tuple[list[Verdict], list[ClipVerdict]]:
         """The verdict of every clip, published as it is given; all by one judge and rubric."""
         goal: EvaluateClips.Goal = work.request
         references = self._generator.references(self._generator.request(buffer.iteration, buffer.policy_version))
         jobs = buffer_jobs(
-            frames, references, goal.sha256, given=self._config.model.num_conditioning, fps=self._fps,
-            task=self._config.task, robot=self._config.judge.robot,
+            frames,
+            references,
+            goal.sha256,
+            given=self._config.model.num_conditioning,
+            fps=self._fps,
+            task=self._config.task,
+            robot=self._config.judge.robot,
         )
         verdicts, told = agent.judge_round(
             work, jobs, EvaluateClips.Feedback(stages_passed=[0] * len(GATED)), of=len(jobs), sha256=goal.sha256,
             deadline=deadline_of(goal.deadline_s), iteration=buffer.iteration,
-        )  # fmt: skip
+        )
         check_one_judge(verdicts, buffer.group_ids.tolist())
         return verdicts, told
 
@@ -134,7 +140,7 @@ class ClipEvaluatorNode(ManagedNode):
             reward_name=REWARD_NAME if self._agent is None else AGENT,
             invalid_reason="" if bool(valid.all()) else _why_invalid(verdicts),
             pause_reason="" if self._agent is None else self._agent.pause(verdicts),
-        )  # fmt: skip
+        )
         message.header = convert.header(self.get_clock().now().nanoseconds, "")
         message.total = convert.to_field(np.where(valid.numpy(), total.numpy(), np.nan))
         message.values = convert.to_field(torch.stack(list(found.values())).double().numpy())

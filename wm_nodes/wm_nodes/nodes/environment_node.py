@@ -19,20 +19,20 @@ from std_msgs.msg import Bool
 
 from wm_msgs.msg import ActionBatch, Credit, EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
-from wm_nodes.nodes.asynchronous import AsynchronousEnvironment
-from wm_nodes.nodes.backends import BACKENDS, make_environment
-from wm_nodes.nodes.lockstep import LockstepEnvironment
-from wm_nodes.nodes.views import PARAMS as VIEW_PARAMS
-from wm_nodes.nodes.views import Views
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
+from wm_nodes.nodes.environment.image_views import PARAMS as VIEW_PARAMS
+from wm_nodes.nodes.environment.image_views import ImageViews
+from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
+from wm_nodes.nodes.factories import BACKENDS, make_environment
 from wm_nodes.ros import calls, convert, diagnostics
-from wm_nodes.ros.credit import CreditLedger
+from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import EpisodeNote, Goals, Transition, WireError
-from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import UInt8Array
 
 MODES = ("lockstep", "asynchronous")
 
@@ -55,7 +55,7 @@ PARAMS = (
           "than this; then the environment holds", "s", minimum=0.001, maximum=60.0),
     Param("publish_clock", False, "Publish /clock: the stamp of each observation", read_only=True),
     *VIEW_PARAMS,
-)  # fmt: skip
+)
 
 
 class EnvironmentNode(ManagedNode):
@@ -77,7 +77,7 @@ class EnvironmentNode(ManagedNode):
             str(self.param("backend")), self.run_config(), num_envs=int(self.param("num_envs")),
             seed=int(self.param("seed")), model_dir=str(self.param("model_dir")),
             starts_file=str(self.param("starts_file")), factory=str(self.param("backend_factory")),
-        )  # fmt: skip
+        )
         if (size := mosaic_bytes(environment.spec)) > MAX_MOSAIC_BYTES:
             environment.close()
             raise ValueError(
@@ -92,12 +92,12 @@ class EnvironmentNode(ManagedNode):
         row = topic("env/image")
         self._images = self.create_publisher(Image, row.name, row.qos)
         self.own(self.destroy_publisher, self._images)
-        self._views = Views(self)
+        self._views = ImageViews(self)
         self._clock_publisher = self._make_clock()
         self._transitions = self.publish_on("env/transition")
         self._episodes = self.publish_on("episode")
         self._goals = self.publish_on("env/goal")
-        self._ledger = CreditLedger("env/transition", self.session)
+        self._ledger = ProducerCredits("env/transition", self.session)
         self.listen("flow/credit", self._on_credit)
         self.listen("safety/estop", self._on_estop)
         self.serve(StepBatch, "env/step", self._on_step)

@@ -5,10 +5,11 @@ from typing import Any
 
 from wm_msgs.action import Evaluate
 from wm_msgs.msg import PolicyVersion
-from wm_nodes.learning.evaluation import EvaluationResult, evaluate
-from wm_nodes.nodes.backends import existing, make_policy
-from wm_nodes.nodes.policy_holder import PolicyHolder, read_weights, weights_uri
-from wm_nodes.nodes.remote_environment import RemoteEnvironment
+from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
+from wm_nodes.nodes.factories import existing, make_policy
+from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
+from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
+from wm_nodes.policy_rl.training_run import weights_uri
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import RosEnvironmentClient
@@ -27,7 +28,7 @@ PARAMS = (
     Param("step_timeout_s", 20.0, "Deadline of one env/step or env/reset", "s", minimum=0.1, maximum=600.0),
     Param("handshake_timeout_s", 20.0, "Deadline for the environment to answer env/get_spec", "s",
           minimum=0.1, maximum=600.0),
-)  # fmt: skip
+)
 
 
 class EvaluationNode(ManagedNode):
@@ -63,7 +64,7 @@ class EvaluationNode(ManagedNode):
             environment = RemoteEnvironment(
                 self._environment, work.check, timeout_s=float(self.param("handshake_timeout_s")),
                 behaviour=goal.behaviour or "policy", policy_version=result.policy_version,
-            )  # fmt: skip
+            )
 
             def report(done: int, successes: int) -> None:
                 work.feedback(Evaluate.Feedback(episodes_done=done, success_rate=successes / max(done, 1)))
@@ -71,7 +72,7 @@ class EvaluationNode(ManagedNode):
             found = evaluate(
                 self._holder.policy, environment, int(goal.episodes), int(goal.seed), goal.deterministic,
                 on_progress=report,
-            )  # fmt: skip
+            )
             self._fill(result, found, self._config.reward.sparse_weight)
         except PeerLost as error:
             result.termination_reason, result.message = Evaluate.Result.PEER_LOST, f"the environment is lost: {error}"

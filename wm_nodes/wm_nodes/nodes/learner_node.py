@@ -16,19 +16,18 @@ from wm_msgs.action import Rollout as RolloutAction
 from wm_msgs.msg import EnvSpec, ErrorCode, PolicyVersion, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
-from wm_nodes.learning.clip_judging import TrainingPaused
-from wm_nodes.learning.distributed import Ranks, join
-from wm_nodes.learning.episode_reward import check_horizon, unjudged
-from wm_nodes.learning.rollouts import Canceled
-from wm_nodes.learning.video_config import AGENT
-from wm_nodes.learning.weights import INLINE_LIMIT_BYTES, WeightsError, load_weights
-from wm_nodes.nodes.backends import existing, expected_spec, make_learner, make_policy, refuse_other
-from wm_nodes.nodes.joiner import Dropped, RolloutJoiner
-from wm_nodes.nodes.learner_report import LearnerReport
-from wm_nodes.nodes.policy_holder import weights_uri
-from wm_nodes.nodes.replayed import ReplayJoiner
-from wm_nodes.nodes.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
-from wm_nodes.nodes.training import PolicyTraining, follow
+from wm_nodes.config.schema import AGENT
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import Rollout
+from wm_nodes.judge.episode_reward import check_horizon, unjudged
+from wm_nodes.judge.service import TrainingPaused
+from wm_nodes.nodes.factories import existing, expected_spec, make_learner, make_policy, refuse_other
+from wm_nodes.nodes.learner.replay_assembler import ReplayAssembler
+from wm_nodes.nodes.learner.report import LearnerReport
+from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
+from wm_nodes.nodes.learner.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
+from wm_nodes.policy_rl.rollouts import Canceled
+from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining, follow, weights_uri
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
@@ -37,8 +36,8 @@ from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, WireError
-from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import Rollout
+from wm_nodes.training.ranks import Ranks, join
+from wm_nodes.training.weights import INLINE_LIMIT_BYTES, WeightsError, load_weights
 
 MAX_CHUNK_BYTES = 4 << 20
 
@@ -46,7 +45,7 @@ PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
     Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
           read_only=True),
-    Param("learner_factory", "", "module:callable(policy, config) -> Learner instead of PPO (nodes/training.py)",
+    Param("learner_factory", "", "module:callable(policy, config) -> Learner instead of PPO, policy_rl.training_run",
           read_only=True),
     Param("initial_policy", "", "Weights (safetensors) to start from, where the run folder has no checkpoint",
           read_only=True),
@@ -61,7 +60,8 @@ PARAMS = (
     Param("replay_rate", 1.0, "Rate asked of the player: recorded seconds per second", minimum=1e-3, maximum=1e6),
     Param("recovery_timeout_s", 60.0, "How long a lost node may take to come back before training ends", "s",
           minimum=0.0, maximum=3600.0),
-)  # fmt: skip
+)
+
 
 class LearnerNode(ManagedNode):
     """Action train; services learner/save, learner/get_weights; publishes policy/version, learner/metrics."""
@@ -84,7 +84,7 @@ class LearnerNode(ManagedNode):
             policy, learner, self.run_dir, resume=bool(self.param("resume")),
             keep_versions=int(self.param("keep_versions")), metadata={"tokenizer_sha256": policy.encoder.sha256},
             ranks=self._ranks,
-        )  # fmt: skip
+        )
         self._report = LearnerReport(self, tensorboard=bool(self.param("tensorboard")))
         self.own(self._report.close)
         self._spec: EnvironmentSpec | None = None
@@ -93,8 +93,8 @@ class LearnerNode(ManagedNode):
         self._expected_spec = expected_spec(
             self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
         )
-        self._joiner, self._reward_name, self._max_episode_steps = RolloutJoiner(), "", 0
-        self._replayed = ReplayJoiner(self._withhold)
+        self._joiner, self._reward_name, self._max_episode_steps = RolloutAssembler(), "", 0
+        self._replayed = ReplayAssembler(self._withhold)
         self._versions = self.publish_on("policy/version")
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("env/image", self._on_image)
@@ -185,7 +185,7 @@ class LearnerNode(ManagedNode):
             self.get_logger().info(f"training ended after update {self._training.progress.updates}")
         return self._fill(result)
 
-    def _next(self, source: RolloutSource, *, live: bool) -> tuple[Rollout, Dropped] | None:
+    def _next(self, source: RolloutSource, *, live: bool) -> tuple[Rollout, DroppedTransitions] | None:
         """The next rollout to train on. One whose episodes the agent could not judge pauses live training, which then
         repeats it; in a recording it is passed over. Raises as RolloutSource.next, check_horizon; TrainingPaused.
         """
@@ -235,7 +235,7 @@ class LearnerNode(ManagedNode):
         more = f", and {len(left_out) - 3} more" if len(left_out) > 3 else ""
         return text + (f"; left out: {'; '.join(left_out[:3])}{more}" if left_out else "")
 
-    def _count_dropped(self, dropped: Dropped) -> None:
+    def _count_dropped(self, dropped: DroppedTransitions) -> None:
         for key, number in (("invalid", dropped.invalid), ("gap", dropped.gap), ("stale", dropped.stale)):
             if number:
                 self.diagnostics.count(f"dropped_{key}", number, text=f"{number} transitions dropped: {key}")
@@ -247,7 +247,7 @@ class LearnerNode(ManagedNode):
             goal.max_minutes and minutes >= goal.max_minutes
         )
 
-    def _update(self, work: Work, goal: Train.Goal, update: int, rollout: Rollout, dropped: Dropped) -> None:
+    def _update(self, work: Work, goal: Train.Goal, update: int, rollout: Rollout, dropped: DroppedTransitions) -> None:
         began = time.perf_counter()
         try:
             metrics = self._training.update(
@@ -263,9 +263,14 @@ class LearnerNode(ManagedNode):
         self._report.updated(progress, metrics, samples_per_s)
         work.feedback(
             Train.Feedback(
-                update=update + 1, samples=progress.samples, mean_return=progress.mean_return,
-                success_rate=progress.success_rate, loss=metrics.get("loss_policy", float("nan")),
-                samples_per_s=samples_per_s, policy_version=progress.version, progress=(update + 1) / goal.updates,
+                update=update + 1,
+                samples=progress.samples,
+                mean_return=progress.mean_return,
+                success_rate=progress.success_rate,
+                loss=metrics.get("loss_policy", float("nan")),
+                samples_per_s=samples_per_s,
+                policy_version=progress.version,
+                progress=(update + 1) / goal.updates,
             )
         )
 
@@ -286,7 +291,7 @@ class LearnerNode(ManagedNode):
         message = PolicyVersion(
             version=progress.version, train_step=progress.updates, uri=weights_uri(progress.version),
             sha256=packed.sha256, size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
-        )  # fmt: skip
+        )
         message.header.stamp = self.get_clock().now().to_msg()
         if len(packed.data) <= INLINE_LIMIT_BYTES:
             message.inline_data = convert.bytes_field(packed.data)
@@ -299,7 +304,7 @@ class LearnerNode(ManagedNode):
             self._credit.withhold(withheld)
 
     @property
-    def _collecting(self) -> RolloutJoiner | ReplayJoiner | None:
+    def _collecting(self) -> RolloutAssembler | ReplayAssembler | None:
         """Where messages go now: the source that the running goal trains from; None between goals and with bags."""
         return next((joiner for joiner in (self._joiner, self._replayed) if joiner.collecting), None)
 

@@ -15,14 +15,14 @@ from std_srvs.srv import Trigger
 from wm_msgs.action import Replay
 from wm_msgs.msg import Credit, ErrorCode
 from wm_msgs.srv import PlayNext, Seek, SetRate
-from wm_nodes.nodes.bag_qos import message_class, offered_qos
+from wm_nodes.nodes.recorder.qos import message_class, offered_qos
 from wm_nodes.recording import Bag, BagError
 from wm_nodes.recording.cdr import session_and_seq
 from wm_nodes.recording.playback import Playback
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.convert import time_msg
-from wm_nodes.ros.credit import CreditLedger
+from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import topic
@@ -50,7 +50,7 @@ PARAMS = (
     Param("publish_clock", True, "Publish the bag's time on /clock"),
     Param("topics", [""], "Topics to play, relative or absolute; empty: all but signs of life (run/state, flow/credit, "
           "/clock, /diagnostics)"),
-)  # fmt: skip
+)
 
 
 class PlayerNode(ManagedNode):
@@ -67,7 +67,7 @@ class PlayerNode(ManagedNode):
         row = topic("/clock")
         self._clock_publisher = self.create_publisher(Clock, row.name, row.qos)
         self.own(self.destroy_publisher, self._clock_publisher)
-        self._ledgers: dict[int, CreditLedger] = {}
+        self._ledgers: dict[int, ProducerCredits] = {}
         self.listen("flow/credit", self._on_credit)
         self.serve(Trigger, "player/pause", self._on_pause)
         self.serve(Trigger, "player/resume", self._on_resume)
@@ -85,7 +85,7 @@ class PlayerNode(ManagedNode):
             bag_uri=uri, rate=float(self.param("rate")), start_offset=float(self.param("start_offset")),
             loop=bool(self.param("loop")), publish_clock=bool(self.param("publish_clock")),
             topics=[name for name in self.param("topics") if name],
-        )  # fmt: skip
+        )
         playback = self._open(request)
         self._thread = threading.Thread(target=self._play_alone, args=(playback, request), name="player")
         self._thread.start()
@@ -129,7 +129,7 @@ class PlayerNode(ManagedNode):
             playback = Playback(
                 path, names=names, rate=request.rate, start_offset_s=request.start_offset, loop=request.loop,
                 paused=bool(self.param("start_paused")),
-            )  # fmt: skip
+            )
             self._playback = playback
         try:
             for name, connection in playback.topics.items():
@@ -203,7 +203,7 @@ class PlayerNode(ManagedNode):
     def _wait_for_credit(self, playback: Playback, data: bytes, check: Callable[[], None]) -> None:
         """Hold a transition back until every consumer has granted it, as the environment does."""
         session, seq = session_and_seq(data)
-        ledger = self._ledgers.setdefault(session, CreditLedger(CREDITED, session))
+        ledger = self._ledgers.setdefault(session, ProducerCredits(CREDITED, session))
         while ledger.holding(seq):
             for name in ledger.drop_silent(seq):
                 self.diagnostics.count("silent_consumers", text=f"{name} granted nothing for 5 s and is not waited for")

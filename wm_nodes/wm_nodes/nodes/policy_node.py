@@ -13,22 +13,22 @@ from rclpy.duration import Duration
 from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
 from wm_msgs.srv import InferAction, LoadPolicy
-from wm_nodes.learning.rollouts import action_noise, reset_seeds
-from wm_nodes.nodes.backends import existing, expected_spec, make_policy, refuse_other
-from wm_nodes.nodes.pilot import Pilot
-from wm_nodes.nodes.policy_holder import PolicyHolder, read_weights
-from wm_nodes.policy import PolicyOutput
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.nodes.factories import existing, expected_spec, make_policy, refuse_other
+from wm_nodes.nodes.policy.asynchronous import AsynchronousPolicy
+from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
+from wm_nodes.policy_rl.image_policy import PolicyOutput
+from wm_nodes.policy_rl.rollouts import action_noise, reset_seeds
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
+from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.links import FirstMessages
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
-from wm_nodes.specs import EnvironmentSpec
 
 FEEDBACK_S = 0.5
 HOLD_ARRIVES = Duration(seconds=1)
@@ -51,7 +51,7 @@ PARAMS = (
           "before a rollout begins; whoever else is active is waited for too", read_only=True),
     Param("match_timeout_s", 20.0, "Deadline for that; then the rollout goes on, and is reported as incomplete", "s",
           minimum=0.0, maximum=600.0),
-)  # fmt: skip
+)
 
 
 class PolicyNode(ManagedNode):
@@ -78,15 +78,15 @@ class PolicyNode(ManagedNode):
         self._spec: EnvironmentSpec | None = None
         self._announced: PolicyVersion | None = None
         self._last_reply: Reply | None = None
-        self._first_messages = FirstMessages(self)
+        self._first_messages = StartBarrier(self)
         timeout_s = float(self.param("step_timeout_s"))
         self._environment: EnvironmentClient = (
             RosEnvironmentClient(self, timeout_s=timeout_s) if self._local_environment is None
             else LocalEnvironmentClient(self._local_environment, timeout_s)
-        )  # fmt: skip
-        self._pilot: Pilot | None = None
+        )
+        self._pilot: AsynchronousPolicy | None = None
         if self.param("mode") == "asynchronous":
-            self._pilot = Pilot(self, self._holder, self._publish_actions)
+            self._pilot = AsynchronousPolicy(self, self._holder, self._publish_actions)
         self._actions = self.publish_on("action", LIVE_ACTION if self._pilot else None)
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("policy/version", self._on_version, while_inactive=True)
@@ -169,7 +169,7 @@ class PolicyNode(ManagedNode):
                     reset_seeds=reset_seeds(goal.seed, version, step, spec.num_envs) if ended.any() else None,
                 ),
                 work.check,
-            )  # fmt: skip
+            )
             self.diagnostics.latency("infer", infer_s)
             self.diagnostics.latency("step", time.perf_counter() - began)
             self._last_reply = reply
@@ -227,7 +227,7 @@ class PolicyNode(ManagedNode):
         message = ActionBatch(
             num_envs=count, action_dim=action_dim, chunk_length=1, policy_version=version, infer_ms=infer_s * 1e3,
             mode=ActionBatch.MODE_POLICY,
-        )  # fmt: skip
+        )
         message.action = convert.to_field(output.actions)
         message.log_prob = convert.to_field(output.logprobs)
         message.value = convert.to_field(output.values)
@@ -272,7 +272,7 @@ class PolicyNode(ManagedNode):
             )
             noise = None if request.deterministic else np.random.default_rng().standard_normal(
                 (spec.num_envs, spec.action_dim), np.float32
-            )  # fmt: skip
+            )
             began = time.perf_counter()
             output, version = self._holder.act(images, states, noise)
             response.action = self._action_message(output, version, time.perf_counter() - began)

@@ -14,17 +14,17 @@ from std_srvs.srv import Trigger
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import StartRecording, StopRecording
-from wm_nodes.nodes.bag_qos import recorded_qos
+from wm_nodes.nodes.recorder.qos import recorded_qos
 from wm_nodes.recording import BagError, RawBagWriter, RecordingError, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.recording.cdr import session_and_seq
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.ros import diagnostics
-from wm_nodes.ros.credit import CreditGrantor
+from wm_nodes.ros.flow_control import ConsumerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
-from wm_nodes.ros.qos import TOPICS, Topic
-from wm_nodes.ros.sequence import GapTracker
+from wm_nodes.ros.qos import TOPICS, GraphTopic
+from wm_nodes.ros.sequence_numbers import GapTracker
 from wm_nodes.ros.spin import run_node
 
 FLUSH_S = 0.25
@@ -41,7 +41,7 @@ PARAMS = (
     Param("split_mib", 256, "Start a new .mcap file after this much", "MiB", read_only=True, minimum=1, maximum=65536),
     Param("split_s", 600.0, "Start a new .mcap file after this time; 0: never", "s", read_only=True, minimum=0.0),
     Param("min_free_mib", 512, "Stop, with the bag complete, when the disk has less left", "MiB", minimum=16),
-)  # fmt: skip
+)
 
 
 class RecorderNode(ManagedNode):
@@ -65,7 +65,7 @@ class RecorderNode(ManagedNode):
             grantor = None
             if row.qos.history == HistoryPolicy.KEEP_ALL:
                 base = _base(name)
-                grantor = CreditGrantor(self, base, below=name.removesuffix(base))
+                grantor = ConsumerCredits(self, base, below=name.removesuffix(base))
                 self.own(grantor.close)
             subscription = self.create_subscription(
                 row.type, name, partial(self._on_message, name, grantor), _lossless(row.qos), raw=True
@@ -101,7 +101,7 @@ class RecorderNode(ManagedNode):
 
     # Recording.
 
-    def _on_message(self, name: str, grantor: CreditGrantor | None, data: bytes) -> None:
+    def _on_message(self, name: str, grantor: ConsumerCredits | None, data: bytes) -> None:
         self._last_message_s = time.monotonic()
         tracker = self._gaps.get(name)
         if tracker is not None:
@@ -137,7 +137,7 @@ class RecorderNode(ManagedNode):
         self._bag = RawBagWriter(
             path, custom={"wm.run_id": self.run_dir.name}, split_bytes=int(self.param("split_mib")) * MIB,
             split_s=float(self.param("split_s")),
-        )  # fmt: skip
+        )
         self._paused, self._time_ns, self._versions = False, 0, set()
         self._gaps = {name: GapTracker() for name in self._gaps}
         for name, row in self._rows.items():
@@ -288,7 +288,7 @@ def _base(name: str) -> str:
     return max(fitting, key=len, default=name)
 
 
-def _row(name: str) -> Topic:
+def _row(name: str) -> GraphTopic:
     base = _base(name)
     if base not in TOPICS:
         raise ValueError(f"cannot record {name!r}; the graph's topics are {', '.join(sorted(TOPICS))}")

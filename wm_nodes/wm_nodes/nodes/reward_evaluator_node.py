@@ -12,13 +12,15 @@ from sensor_msgs.msg import Image
 
 from wm_msgs.msg import EnvSpec, ErrorCode, RewardSummary, TaskGoal, TransitionBatch
 from wm_msgs.srv import EvaluateReward
-from wm_nodes.learning.episode_reward import EpisodeReward, EpisodeStep, PendingReward, episode_judge
-from wm_nodes.learning.video_config import AGENT
-from wm_nodes.nodes import agent_face
-from wm_nodes.nodes.agent_face import AgentFace
-from wm_nodes.nodes.backends import REWARDS, make_reward
-from wm_nodes.nodes.joiner import ImageCache
-from wm_nodes.nodes.reward_summary import SummaryWindow
+from wm_nodes.config.schema import AGENT
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import BoolArray, UInt8Array
+from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward, episode_judge
+from wm_nodes.nodes.factories import REWARDS, make_reward
+from wm_nodes.nodes.judge import services
+from wm_nodes.nodes.judge.services import JudgeServices
+from wm_nodes.nodes.learner.rollout_assembler import ImageCache
+from wm_nodes.nodes.reward.summary import SummaryWindow
 from wm_nodes.reward import RewardInput, RewardModel, RewardResult
 from wm_nodes.reward.base import SUCCESS_UNKNOWN
 from wm_nodes.ros import convert, diagnostics
@@ -27,8 +29,6 @@ from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import CREDIT_WINDOW
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import Transition, WireError
-from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import BoolArray, UInt8Array
 
 PARAMS = (
     Param("reward", "endogenous", "Reward model", read_only=True, choices=REWARDS),
@@ -37,19 +37,19 @@ PARAMS = (
     Param("image_wait_s", 1.0, "A transition waits for its images and goals at most so long", "s",
           minimum=0.0, maximum=60.0),
     Param("summary_period_s", 1.0, "Time between two reward/summary", "s", minimum=0.1, maximum=60.0),
-    *agent_face.PARAMS,
-)  # fmt: skip
+    *services.PARAMS,
+)
 
 GOALS_KEPT_PER_ENV = 2 * CREDIT_WINDOW
 
 
 class RewardEvaluatorNode(ManagedNode):
     """Listens to env/spec, env/image, env/transition, env/goal; publishes reward, reward/summary; with the agent also
-    what AgentFace has."""
+    what JudgeServices has."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("reward_evaluator", PARAMS, **node_arguments)
-        self._agent: AgentFace | None = None
+        self._agent: JudgeServices | None = None
 
     def configure(self) -> None:
         config, kind, factory = self.run_config(), str(self.param("reward")), str(self.param("reward_factory"))
@@ -57,7 +57,7 @@ class RewardEvaluatorNode(ManagedNode):
         self._undecided: deque[tuple[float, Transition, PendingReward]] = deque()
         self._model: RewardModel | EpisodeReward
         if kind == AGENT and not factory:
-            agent = AgentFace(self, episode_judge(config), config.seed, lambda: bool(self._undecided))
+            agent = JudgeServices(self, episode_judge(config), config.seed, lambda: bool(self._undecided))
             self._model = EpisodeReward(agent.judge)
             self._agent = agent
         else:
@@ -196,7 +196,7 @@ class RewardEvaluatorNode(ManagedNode):
             images, next_images, transition.actions, transition.episode_ids, transition.episode_steps,
             transition.terminated | transition.truncated, transition.valid,
             {n: goal[0] for n, goal in goals.items() if goal is not None and goal[0] is not None and goal[1]},
-        )  # fmt: skip
+        )
         pending = model.add(step, self._spec, transition.session)
         self._undecided.append((time.perf_counter(), transition, pending))
         self._publish_decided()
@@ -221,9 +221,7 @@ class RewardEvaluatorNode(ManagedNode):
         judged = transition.episode_ids[transition.valid]
         return not self._goals_expected or all(int(episode_id) in self._goals for episode_id in judged)
 
-    def _goals_of(
-        self, transition: Transition, images: UInt8Array
-    ) -> tuple[UInt8Array | None, BoolArray | None]:
+    def _goals_of(self, transition: Transition, images: UInt8Array) -> tuple[UInt8Array | None, BoolArray | None]:
         found = [self._goals.get(int(episode_id)) for episode_id in transition.episode_ids]
         if all(goal is None or goal[0] is None for goal in found):
             return None, None
@@ -237,7 +235,7 @@ class RewardEvaluatorNode(ManagedNode):
     def _judge(
         self, transition: Transition, images: UInt8Array, next_images: UInt8Array, goals: UInt8Array | None,
         goal_found: BoolArray | None,
-    ) -> RewardResult:  # fmt: skip
+    ) -> RewardResult:
         model = self._model
         if isinstance(model, EpisodeReward):
             return _unjudged(transition, "the reward agent judges whole episodes, not single steps")
@@ -245,7 +243,7 @@ class RewardEvaluatorNode(ManagedNode):
             step = RewardInput(
                 images=images, next_images=next_images, success_probability=transition.success_probability,
                 valid=transition.valid, uncertainty=transition.uncertainty, goals=goals, goal_found=goal_found,
-            )  # fmt: skip
+            )
             return model.evaluate(step)
         except (ValueError, RuntimeError) as error:
             self.get_logger().error(f"reward of step {transition.step_id} failed: {error}")
@@ -304,7 +302,7 @@ def _unjudged(transition: Transition, reason: str) -> RewardResult:
     return RewardResult(
         total=nan, dense=nan, sparse=nan, valid=np.zeros(count, bool),
         success=np.full(count, SUCCESS_UNKNOWN, np.uint8), invalid_reason=reason,
-    )  # fmt: skip
+    )
 
 
 def main() -> int:

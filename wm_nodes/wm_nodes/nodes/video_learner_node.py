@@ -15,23 +15,23 @@ from rclpy.action import ActionClient
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
 from wm_msgs.msg import ClipScores, PolicyVersion
-from wm_nodes.learning.clip_judging import TrainingPaused
-from wm_nodes.learning.distributed import Ranks, join
-from wm_nodes.learning.heldout import alarm_text, heldout_scores
-from wm_nodes.learning.video_config import load_video_config
-from wm_nodes.learning.video_folder import load_video_folder
-from wm_nodes.learning.video_grpo import BufferReport
-from wm_nodes.learning.video_run import CHECKPOINT, VideoRun, rewarded, version_uri
+from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import run_goal, same_process
+from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.links import FirstMessages
 from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import Cancelled, PeerLost
+from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.grpo import BufferReport
+from wm_nodes.video_rl.settings import load_video_config
+from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, rewarded, version_uri
+from wm_nodes.video_rl.validation import alarm_text, validation_scores
 
 PARAMS = (
     Param("video_model_dir", "", "Folder of the video model that training starts from", read_only=True),
@@ -48,7 +48,7 @@ PARAMS = (
           minimum=0.0, maximum=600.0),
     Param("round_deadline_s", 0.0, "Clips without a verdict so long after asking have no reward; 0: no deadline", "s",
           minimum=0.0, maximum=86400.0),
-)  # fmt: skip
+)
 
 
 class VideoLearnerNode(ManagedNode):
@@ -64,7 +64,7 @@ class VideoLearnerNode(ManagedNode):
         self.own(self._run.close)
         self._watched = self._run.hacked
         self._versions = self.publish_on("video/version")
-        self._first_messages = FirstMessages(self)
+        self._first_messages = StartBarrier(self)
         self._generate = ActionClient(self, GenerateClips, "video/generate")
         self._evaluate = ActionClient(self, EvaluateClips, "clips/evaluate")
         self.own(self._generate.destroy)
@@ -165,9 +165,7 @@ class VideoLearnerNode(ManagedNode):
         name = self.get_namespace().rstrip("/") + peer
         alive = same_process(self.peers, name)
         try:
-            result = run_goal(
-                client, goal, accept_s=float(self.param("accept_timeout_s")), check=check, alive=alive
-            )
+            result = run_goal(client, goal, accept_s=float(self.param("accept_timeout_s")), check=check, alive=alive)
         except PeerLost as error:
             raise PeerLost(str(error) if name in str(error) else f"{name}: {error}") from None
         if result.termination_reason != type(result).FINISHED:
@@ -180,7 +178,7 @@ class VideoLearnerNode(ManagedNode):
                 iteration=done, policy_version=self._run.version, reward_mean=report.reward_mean,
                 zero_std_ratio=report.zero_std_ratio, kl=report.updates[-1].kl, progress=done / count,
             )
-        )  # fmt: skip
+        )
 
     def _warn(self) -> None:
         """Say what a new held-out evaluation says of reward hacking."""
@@ -199,7 +197,7 @@ class VideoLearnerNode(ManagedNode):
         message = PolicyVersion(
             version=version, train_step=self._run.iterations - (not newest), uri=version_uri(version),
             sha256=packed.sha256, size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
-        )  # fmt: skip
+        )
         message.header.stamp = self.get_clock().now().to_msg()
         self._versions.publish(message)
         self._announced = version
@@ -237,8 +235,8 @@ def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun
     return VideoRun(
         folder.network, config, run_dir, keep_versions=int(values["keep_versions"]),
         tensorboard=bool(values["tensorboard"]), ranks=ranks,
-        heldout=heldout_scores(folder, bags, Path(str(values["model_dir"])), config) if watched else None,
-    )  # fmt: skip
+        heldout=validation_scores(folder, bags, Path(str(values["model_dir"])), config) if watched else None,
+    )
 
 
 def follow_rank_0(ranks: Ranks) -> int:

@@ -10,13 +10,9 @@ import torch
 
 from wm_msgs.action import GenerateClips
 from wm_msgs.msg import ClipBatch, PolicyVersion
-from wm_nodes.files import write_atomic
-from wm_nodes.learning.clip_generation import ClipGenerator
-from wm_nodes.learning.video_config import load_video_config
-from wm_nodes.learning.video_data import load_clips
-from wm_nodes.learning.video_folder import load_video_folder
-from wm_nodes.learning.weights import WeightsError, load_weights
-from wm_nodes.nodes.policy_holder import read_weights
+from wm_nodes.core.files import write_atomic
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.nodes.policy.weights import read_weights
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import Work, WorkerAction
@@ -25,7 +21,11 @@ from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import WireError
-from wm_nodes.types import UInt8Array
+from wm_nodes.training.weights import WeightsError, load_weights
+from wm_nodes.video_model.clips import load_clips
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.settings import load_video_config
 
 PARAMS = (
     Param("video_model_dir", "", "Folder of the trained video model", read_only=True),
@@ -33,7 +33,7 @@ PARAMS = (
     Param("keep_buffers", 4, "Rollout buffers kept in run_dir/buffers", minimum=1, maximum=100000),
     Param("version_timeout_s", 20.0, "How long the asked version may take to be announced", "s",
           minimum=0.1, maximum=600.0),
-)  # fmt: skip
+)
 
 
 VERSIONS_KNOWN = 20
@@ -99,7 +99,7 @@ class VideoModelNode(ManagedNode):
                 group_size=request.group_size, num_frames=buffer.rollout.latents.shape[2],
                 buffer_uri=result.buffer_uri, sha256=result.sha256, sample_s=time.perf_counter() - began,
                 noise_share=buffer.rollout.spent_noise,
-            )  # fmt: skip
+            )
             self._publish(message, film_strip(self._generator.folder.codec.decode(buffer.rollout.latents)))
             self.diagnostics.latency("sample", message.sample_s)
         except (WireError, WeightsError, ValueError, OSError) as error:

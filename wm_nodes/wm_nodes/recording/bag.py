@@ -9,13 +9,13 @@ from typing import Any
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.recording import topics
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.messages import deserialize, spec_from_json, spec_of
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.recording.typestore import type_hash
-from wm_nodes.specs import EnvironmentSpec
 
 
 class Bag:

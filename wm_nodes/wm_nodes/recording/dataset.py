@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
 from wm_nodes.recording import topics
 from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.messages import single
 from wm_nodes.recording.reader import BagReport, check_spec, read_episodes
-from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import BoolArray, Episode, FloatArray, UInt8Array
 
 IntArray = NDArray[np.int64]
 

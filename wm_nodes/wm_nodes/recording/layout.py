@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wm_nodes.types import UInt8Array
+from wm_nodes.core.types import UInt8Array
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array, UInt64Array
 from wm_nodes.recording import topics
 from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.messages import KIND_END, mosaic_of, stamp_ns
-from wm_nodes.types import BoolArray, FloatArray, UInt8Array, UInt64Array
 
 MAX_LAG = 64
 """Lock-steps that may pass before an image or reward counts as missing."""

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.core.specs import EnvironmentSpec, as_sent
+from wm_nodes.core.types import UInt8Array
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.typestore import typestore
-from wm_nodes.specs import EnvironmentSpec, as_sent
-from wm_nodes.types import UInt8Array
 
 NS_PER_S = 1_000_000_000
 BASE_FRAME, CAMERA_FRAME = "wm_base", "wm_camera_optical"

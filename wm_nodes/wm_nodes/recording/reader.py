@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.core.specs import POLICY_FIELDS, EnvironmentSpec, differences
+from wm_nodes.core.types import Episode, FloatArray, UInt8Array
 from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.lockstep import MAX_LAG, LockSteps, RecordedStep
 from wm_nodes.recording.messages import KIND_END
-from wm_nodes.specs import POLICY_FIELDS, EnvironmentSpec, differences
-from wm_nodes.types import Episode, FloatArray, UInt8Array
 
 EPISODE_FIELDS = (*POLICY_FIELDS, "ground_truth_names")
 """What training a world model depends on."""

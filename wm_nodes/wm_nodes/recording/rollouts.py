@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.core.specs import POLICY_FIELDS, EnvironmentSpec
+from wm_nodes.core.types import Rollout
 from wm_nodes.recording import topics
 from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.lockstep import LockSteps, RecordedStep
 from wm_nodes.recording.reader import BagReport, check_spec
-from wm_nodes.specs import POLICY_FIELDS, EnvironmentSpec
-from wm_nodes.types import Rollout
 
 
 def read_rollouts(

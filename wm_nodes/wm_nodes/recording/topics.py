@@ -62,7 +62,7 @@ METRICS = _qos(depth=10)
 
 
 @dataclass(frozen=True)
-class Topic:
+class RecordedTopic:
     """name: relative to the namespace. sequenced: the message carries (session, seq), so that losses can be counted."""
 
     name: str
@@ -71,27 +71,27 @@ class Topic:
     sequenced: bool = True
 
 
-SPEC = Topic("env/spec", "wm_msgs/msg/EnvSpec", LATCHED)
-IMAGES = Topic("env/image", "sensor_msgs/msg/Image", IMAGE, sequenced=False)
-TRANSITION = Topic("env/transition", "wm_msgs/msg/TransitionBatch", KEEP_ALL)
-GOAL = Topic("env/goal", "wm_msgs/msg/TaskGoal", GOALS)
-REWARD = Topic("reward", "wm_msgs/msg/RewardBatch", KEEP_ALL)
-EPISODE = Topic("episode", "wm_msgs/msg/EpisodeEvent", KEEP_ALL)
-ACTION = Topic("action", "wm_msgs/msg/ActionBatch", NEWEST)
-POLICY_VERSION = Topic("policy/version", "wm_msgs/msg/PolicyVersion", POLICY)
-REWARD_SUMMARY = Topic("reward/summary", "wm_msgs/msg/RewardSummary", METRICS)
-LEARNER_METRICS = Topic("learner/metrics", "wm_msgs/msg/LearnerMetrics", METRICS)
-RUN_STATE = Topic("run/state", "wm_msgs/msg/RunState", LATCHED, sequenced=False)
+SPEC = RecordedTopic("env/spec", "wm_msgs/msg/EnvSpec", LATCHED)
+IMAGES = RecordedTopic("env/image", "sensor_msgs/msg/Image", IMAGE, sequenced=False)
+TRANSITION = RecordedTopic("env/transition", "wm_msgs/msg/TransitionBatch", KEEP_ALL)
+GOAL = RecordedTopic("env/goal", "wm_msgs/msg/TaskGoal", GOALS)
+REWARD = RecordedTopic("reward", "wm_msgs/msg/RewardBatch", KEEP_ALL)
+EPISODE = RecordedTopic("episode", "wm_msgs/msg/EpisodeEvent", KEEP_ALL)
+ACTION = RecordedTopic("action", "wm_msgs/msg/ActionBatch", NEWEST)
+POLICY_VERSION = RecordedTopic("policy/version", "wm_msgs/msg/PolicyVersion", POLICY)
+REWARD_SUMMARY = RecordedTopic("reward/summary", "wm_msgs/msg/RewardSummary", METRICS)
+LEARNER_METRICS = RecordedTopic("learner/metrics", "wm_msgs/msg/LearnerMetrics", METRICS)
+RUN_STATE = RecordedTopic("run/state", "wm_msgs/msg/RunState", LATCHED, sequenced=False)
 
 ALL_TOPICS = (
     SPEC, IMAGES, TRANSITION, GOAL, REWARD, EPISODE, ACTION, POLICY_VERSION, REWARD_SUMMARY, LEARNER_METRICS, RUN_STATE,
-)  # fmt: skip
+)
 
-CLIPS = Topic("clips", "wm_msgs/msg/ClipBatch", METRICS)
-CLIP_IMAGES = Topic("clips/image", "sensor_msgs/msg/Image", METRICS, sequenced=False)
-CLIP_SCORES = Topic("clips/scores", "wm_msgs/msg/ClipScores", METRICS)
-VERDICT = Topic("reward/verdict", "wm_msgs/msg/ClipVerdict", VERDICTS)
-VIDEO_VERSION = Topic("video/version", "wm_msgs/msg/PolicyVersion", VERSIONS)
+CLIPS = RecordedTopic("clips", "wm_msgs/msg/ClipBatch", METRICS)
+CLIP_IMAGES = RecordedTopic("clips/image", "sensor_msgs/msg/Image", METRICS, sequenced=False)
+CLIP_SCORES = RecordedTopic("clips/scores", "wm_msgs/msg/ClipScores", METRICS)
+VERDICT = RecordedTopic("reward/verdict", "wm_msgs/msg/ClipVerdict", VERDICTS)
+VIDEO_VERSION = RecordedTopic("video/version", "wm_msgs/msg/PolicyVersion", VERSIONS)
 
 VIDEO_TOPICS = (CLIPS, CLIP_IMAGES, CLIP_SCORES, VIDEO_VERSION, VERDICT, RUN_STATE)
 """Loop 2: clips come every few seconds, asked for one buffer at a time, so a depth of ten holds every unread one."""
@@ -99,5 +99,5 @@ VIDEO_TOPICS = (CLIPS, CLIP_IMAGES, CLIP_SCORES, VIDEO_VERSION, VERDICT, RUN_STA
 DEFAULT_NAMESPACE = "/wm"
 
 
-def absolute(namespace: str, topic: Topic) -> str:
+def absolute(namespace: str, topic: RecordedTopic) -> str:
     return f"{namespace.rstrip('/')}/{topic.name}"

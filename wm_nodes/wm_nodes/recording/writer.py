@@ -24,16 +24,16 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import Episode
 from wm_nodes.recording import messages as m
 from wm_nodes.recording import topics
 from wm_nodes.recording.raw import RawBagWriter
-from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import Episode
 
 TABLE_COLUMNS = (
     "episode_id", "first_stamp_ns", "length", "seed", "task", "instruction", "behaviour", "source", "policy_version",
     "success", "terminated", "truncated", "return_total", "extra",
-)  # fmt: skip
+)
 
 
 class EpisodeBagWriter:
@@ -128,10 +128,10 @@ class EpisodeBagWriter:
         else:
             self._bag.abort(remove=self.num_episodes == 0)
 
-    def _write(self, topic: topics.Topic, message: Any, time_ns: int) -> None:
+    def _write(self, topic: topics.RecordedTopic, message: Any, time_ns: int) -> None:
         self._bag.write(self._names[topic], m.serialize(message), time_ns)
 
-    def _seq(self, topic: topics.Topic) -> int:
+    def _seq(self, topic: topics.RecordedTopic) -> int:
         number = self._sequence.get(topic.name, 0)
         self._sequence[topic.name] = number + 1
         return number
@@ -233,7 +233,7 @@ class EpisodeBagWriter:
             int(episode.episode_id), first_ns, episode.num_steps, int(episode.seed), episode.task, episode.instruction,
             episode.behaviour, int(episode.source), int(episode.policy_version), bool(episode.success[-1]),
             bool(episode.terminated), bool(episode.truncated), None if np.isnan(total) else total, extra,
-        ]  # fmt: skip
+        ]
 
     def _check(self, episode: Episode) -> None:
         spec, frames = self.spec, episode.num_steps + 1

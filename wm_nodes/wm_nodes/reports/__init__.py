@@ -16,11 +16,27 @@ from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.gains import mean_gain
 from wm_nodes.reports.html import Picture, write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.summary import Rate, Summary, read_summary, write_summary
+from wm_nodes.reports.summary import SuccessRate, Summary, read_summary, write_summary
 from wm_nodes.reports.tables import results_table, rounds_table
 
 __all__ = [
-    "ClipSummary", "Panel", "Picture", "Rate", "ScoreChange", "Summary", "clip_panels", "curves", "film_strip",
-    "machine_facts", "mean_gain", "read_summary", "results_table", "rounds_table", "scores_table", "write_clip_report",
-    "write_clip_summary", "write_report", "write_summary",
-]  # fmt: skip
+    "ClipSummary",
+    "Panel",
+    "Picture",
+    "ScoreChange",
+    "SuccessRate",
+    "Summary",
+    "clip_panels",
+    "curves",
+    "film_strip",
+    "machine_facts",
+    "mean_gain",
+    "read_summary",
+    "results_table",
+    "rounds_table",
+    "scores_table",
+    "write_clip_report",
+    "write_clip_summary",
+    "write_report",
+    "write_summary",
+]

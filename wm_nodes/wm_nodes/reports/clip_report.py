@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
-from wm_nodes.files import write_atomic
+from wm_nodes.core.files import write_atomic
 from wm_nodes.reports.curves import Panel
 from wm_nodes.reports.html import Picture, figures, made_on, number_cell, write_page
 from wm_nodes.reports.summary import FILE_NAME, plain
@@ -17,7 +17,7 @@ from wm_nodes.reports.summary import FILE_NAME, plain
 TITLES = {
     "tracking": "tracking score", "object_cm": "object error, cm", "tool_cm": "tool error, cm", "psnr_db": "PSNR, dB",
     "scenery": "scenery error", "motion": "motion share",
-}  # fmt: skip
+}
 """Score to its name for people, in the order of the tables; see docs/metrics.md."""
 
 
@@ -107,7 +107,7 @@ def clip_panels(updates: int) -> tuple[Panel, ...]:
         ),
         Panel("groups without spread (share)", {"grpo/zero_std_ratio": ""}, (0.0, 1.0)),
         Panel("gradient norm before clipping", {f"grpo/grad_norm_{k}": f"update {k}" for k in range(1, updates + 1)}),
-    )  # fmt: skip
+    )
 
 
 def write_clip_report(
@@ -129,7 +129,7 @@ def write_clip_report(
         *figures(pictures),
         "<h2>Look closer, do it again</h2>", *_again(run_dir, summary),
         *made_on(summary.machine, config_text),
-    ]  # fmt: skip
+    ]
     return write_page(run_dir, title, body)
 
 

@@ -76,9 +76,7 @@ def read_series(metrics_file: Path, name: str) -> list[tuple[int, float]]:
     return sorted(values.items())
 
 
-def _panel(
-    axes: Any, panel: Panel, series: Mapping[str, Sequence[tuple[int, float]]], step: str, index: int
-) -> None:
+def _panel(axes: Any, panel: Panel, series: Mapping[str, Sequence[tuple[int, float]]], step: str, index: int) -> None:
     axes.set_title(panel.title, fontsize=10, loc="left")
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)

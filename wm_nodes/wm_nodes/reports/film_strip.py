@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from wm_nodes.types import UInt8Array
+from wm_nodes.core.types import UInt8Array
 
 INK, FAINT, PAPER = (32, 32, 36), (120, 120, 128), 255
 GAP_PX, HEADER_PX, FONT = 6, 26, cv2.FONT_HERSHEY_SIMPLEX

@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.files import write_atomic
+from wm_nodes.core.files import write_atomic
 from wm_nodes.reports.summary import Summary
 from wm_nodes.reports.tables import ROUND_COLUMNS, result_rows, round_rows, verdict
 
@@ -64,7 +64,7 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
         *figures(pictures),
         "<h2>Look closer, do it again</h2>", _again(run_dir, summary),
         *made_on(summary.machine, config_text),
-    ]  # fmt: skip
+    ]
     return write_page(run_dir, title, body)
 
 

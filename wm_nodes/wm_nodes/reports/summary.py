@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.files import write_atomic
+from wm_nodes.core.files import write_atomic
 
 FILE_NAME = "summary.json"
 
 
 @dataclass(frozen=True)
-class Rate:
+class SuccessRate:
     """Successes of `episodes` episodes; low, high: 95 % interval of the rate."""
 
     successes: int
@@ -49,10 +49,10 @@ class Summary:
     task: str
     preset: str
     seed: int
-    real_before: Rate
-    real_after: Rate
-    imagined_before: Rate
-    imagined_after: Rate
+    real_before: SuccessRate
+    real_after: SuccessRate
+    imagined_before: SuccessRate
+    imagined_after: SuccessRate
     imagined_steps_per_s: float
     bag: str
     paired: Mapping[str, Any] = field(default_factory=dict)

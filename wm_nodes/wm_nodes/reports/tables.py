@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from wm_nodes.reports.summary import Rate, Summary
+from wm_nodes.reports.summary import SuccessRate, Summary
 
 
 @dataclass(frozen=True)
@@ -20,18 +20,18 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Row:
+class ResultRow:
     label: str
     real: Cell
     imagined: Cell
 
 
-def result_rows(summary: Summary) -> list[Row]:
+def result_rows(summary: Summary) -> list[ResultRow]:
     """Before, after, and the difference on the same seeds."""
     return [
-        Row("before (SFT policy)", _rate(summary.real_before), _rate(summary.imagined_before)),
-        Row("after (RL in the world model)", _rate(summary.real_after), _rate(summary.imagined_after)),
-        Row(
+        ResultRow("before (SFT policy)", _rate(summary.real_before), _rate(summary.imagined_before)),
+        ResultRow("after (RL in the world model)", _rate(summary.real_after), _rate(summary.imagined_after)),
+        ResultRow(
             "difference",
             _difference(summary.real_before, summary.real_after, summary.paired),
             _difference(summary.imagined_before, summary.imagined_after, summary.imagined_paired),
@@ -62,7 +62,7 @@ def results_table(summary: Summary) -> Table:
     for row in result_rows(summary):
         style = "bold" if row.label == "difference" else ""
         table.add_row(row.label, *(f"{c.percent}   {c.count}\n[dim]{c.interval}" for c in (row.real, row.imagined)),
-                      style=style, end_section=True)  # fmt: skip
+                      style=style, end_section=True)
     return table
 
 
@@ -94,14 +94,14 @@ def _share(rate: Mapping[str, Any]) -> str:
     return f"{100 * rate['rate']:.1f} % ({rate['successes']}/{rate['episodes']})"
 
 
-def _rate(rate: Rate) -> Cell:
+def _rate(rate: SuccessRate) -> Cell:
     return Cell(
         f"{rate.successes} / {rate.episodes}", f"{100 * rate.rate:.1f} %",
         f"95 %: {100 * rate.low:.1f} to {100 * rate.high:.1f} %",
-    )  # fmt: skip
+    )
 
 
-def _difference(before: Rate, after: Rate, paired: Mapping[str, Any]) -> Cell:
+def _difference(before: SuccessRate, after: SuccessRate, paired: Mapping[str, Any]) -> Cell:
     points = f"{100 * (after.rate - before.rate):+.1f} points"
     if "low" not in paired or not math.isfinite(float(paired["low"])):
         return Cell("", points, "not paired")
@@ -109,4 +109,4 @@ def _difference(before: Rate, after: Rate, paired: Mapping[str, Any]) -> Cell:
     return Cell(
         count, f"{100 * float(paired['difference']):+.1f} points",
         f"95 %: {100 * float(paired['low']):+.1f} to {100 * float(paired['high']):+.1f}",
-    )  # fmt: skip
+    )

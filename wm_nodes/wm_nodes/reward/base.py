@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.types import BoolArray, FloatArray, UInt8Array
+from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 
 SUCCESS_NO, SUCCESS_YES, SUCCESS_UNKNOWN = 0, 1, 2
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wm_nodes.types import FloatArray, UInt8Array
+from wm_nodes.core.types import FloatArray, UInt8Array
 
 CACHED_IMAGES = 1024
 BATCH = 32

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.config.schema import RewardConfig
+from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.reward.base import (
     SUCCESS_NO,
     SUCCESS_UNKNOWN,
@@ -18,7 +19,6 @@ from wm_nodes.reward.base import (
     version_of,
 )
 from wm_nodes.reward.distances import Distance
-from wm_nodes.types import BoolArray, FloatArray
 
 
 class EndogenousReward:

@@ -14,8 +14,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.reward.distances import check_pair
-from wm_nodes.types import FloatArray, UInt8Array
 
 Backbone = Literal["alex", "vgg"]
 
@@ -65,7 +65,7 @@ def alexnet_layers() -> nn.ModuleList:
             10: nn.Conv2d(256, 256, 3, padding=1), 11: nn.ReLU(),
         },
         ends=(1, 4, 7, 9, 11),
-    )  # fmt: skip
+    )
 
 
 def vgg16_layers() -> nn.ModuleList:

@@ -75,7 +75,7 @@ class WorkerAction:
     def __init__(
         self, node: "ManagedNode", action_type: type[Any], name: str, run: Callable[[Work], Any],
         describe: Callable[[int, str], Any],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._node, self._type, self._name, self._run, self._describe = node, action_type, name, run, describe
         self._lock = threading.Lock()
         self._work: Work | None = None
@@ -83,7 +83,7 @@ class WorkerAction:
         self._server = _ThreadedServer(
             node, action_type, name, execute_callback=lambda goal: None, goal_callback=self._on_goal,
             cancel_callback=self._on_cancel,
-        )  # fmt: skip
+        )
         self._server.begin = self._begin
 
     @property

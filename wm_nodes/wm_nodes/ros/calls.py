@@ -8,6 +8,8 @@ from sensor_msgs.msg import Image
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import ResetBatch, StepBatch
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import UInt64Array
 from wm_nodes.ros.convert import (
     flags,
     floats,
@@ -21,18 +23,16 @@ from wm_nodes.ros.convert import (
     to_field,
 )
 from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand, WireError
-from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import UInt64Array
 
 
 def step_request(command: StepCommand) -> StepBatch.Request:
     request = StepBatch.Request(
         session=command.session, step_id=command.step_id, spec_hash=command.spec_hash,
         policy_version=command.policy_version, observation=int(command.with_image),
-    )  # fmt: skip
+    )
     request.action = to_field(command.actions)
     set_optional(request, log_prob=command.logprobs, value=command.values, reset_mask=command.reset_mask,
-                  reset_seed=command.reset_seeds)  # fmt: skip
+                  reset_seed=command.reset_seeds)
     return request
 
 

@@ -25,11 +25,11 @@ from wm_msgs.msg import (
     TileLayout,
     TransitionBatch,
 )
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.messages import BASE_FRAME, CAMERA_FRAME, spec_of
 from wm_nodes.ros.wire import EpisodeNote, Goals, Rewards, TimedAction, Transition, WireError
-from wm_nodes.specs import EnvironmentSpec
-from wm_nodes.types import BoolArray, FloatArray, UInt8Array
 
 if TYPE_CHECKING:  # a player needs no torch
     from wm_nodes.reward.base import RewardResult
@@ -130,7 +130,7 @@ def images_of(message: Image, spec: EnvironmentSpec, tiles: Tiles | None = None)
     step = width * spec.channels
     expected = {"encoding": spec.encoding, "height": height, "width": width, "step": step}
     wrong = [f"{key} is {getattr(message, key)!r}, not {value!r}" for key, value in expected.items()
-             if getattr(message, key) != value]  # fmt: skip
+             if getattr(message, key) != value]
     if not wrong and len(message.data) != height * step:
         wrong = [f"data has {len(message.data)} bytes, not {height * step}"]
     if wrong:
@@ -165,7 +165,7 @@ def spec_msg(spec: EnvironmentSpec, stamp_ns: int) -> EnvSpec:
         state_names=list(spec.state_names), state_units=list(spec.state_units),
         ground_truth_names=list(spec.ground_truth_names), control_period=float(np.float32(spec.control_period_s)),
         max_episode_steps=spec.max_episode_steps, world_model_sha256=spec.world_model_sha256, spec_hash=spec.spec_hash,
-    )  # fmt: skip
+    )
     message.action_low, message.action_high = to_field(-ones), to_field(ones)
     message.action_scale = to_field(np.asarray(spec.action_scale, np.float32))
     message.state_low = to_field(np.asarray(spec.state_low, np.float32))
@@ -197,7 +197,7 @@ def transition_msg(transition: Transition) -> TransitionBatch:
     message = TransitionBatch(
         header=header(transition.stamp_ns), next_stamp=time_msg(transition.next_stamp_ns), step_id=transition.step_id,
         num_envs=len(transition.valid), source=transition.source,
-    )  # fmt: skip
+    )
     set_optional(
         message, action=transition.actions, state=transition.states, next_state=transition.next_states,
         log_prob=transition.logprobs, value=transition.values, terminated=transition.terminated,
@@ -205,7 +205,7 @@ def transition_msg(transition: Transition) -> TransitionBatch:
         episode_step=transition.episode_steps, policy_version=transition.policy_versions,
         success_probability=transition.success_probability, model_uncertainty=transition.uncertainty,
         ground_truth=transition.ground_truth,
-    )  # fmt: skip
+    )
     return message
 
 
@@ -277,7 +277,7 @@ def episode_msg(note: EpisodeNote, spec: EnvironmentSpec) -> EpisodeEvent:
         seed=note.seed, task=spec.task, instruction=spec.instruction, behaviour=note.behaviour, length=note.length,
         outcome=note.outcome, termination_reason=note.reason, policy_version_first=note.policy_version_first,
         policy_version_last=note.policy_version_last, source=spec.source,
-    )  # fmt: skip
+    )
 
 
 def reward_msg(
@@ -289,9 +289,9 @@ def reward_msg(
         header=header(transition.stamp_ns), transition_session=transition.session, step_id=transition.step_id,
         num_envs=len(result.total), component_names=components, invalid_reason=result.invalid_reason,
         reward_version=version, reward_name=name, eval_ms=eval_s * 1e3,
-    )  # fmt: skip
+    )
     set_optional(message, total=result.total, dense=result.dense, sparse=result.sparse, success=result.success,
-                  valid=result.valid)  # fmt: skip
+                  valid=result.valid)
     if components:
         message.components = to_field(np.stack([result.components[key] for key in components], axis=1))
         message.weights = to_field(np.asarray([result.weights.get(key, 1.0) for key in components], np.float32))

@@ -92,7 +92,7 @@ class Diagnostics:
         status = DiagnosticStatus(
             level=_LEVELS[level], name=f"{self._name}: status", message=text, hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=value) for key, value in self._values().items()],
-        )  # fmt: skip
+        )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._now()
         self._publish(message)

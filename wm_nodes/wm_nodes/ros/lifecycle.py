@@ -21,15 +21,15 @@ from wm_msgs.msg import RunState
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.ros import diagnostics
-from wm_nodes.ros.credit import CreditGrantor
 from wm_nodes.ros.diagnostics import Diagnostics
+from wm_nodes.ros.endpoint_matching import Links
+from wm_nodes.ros.flow_control import ConsumerCredits
 from wm_nodes.ros.introspection import introspect
-from wm_nodes.ros.links import Links
+from wm_nodes.ros.liveliness import HEARTBEAT_S, PeerWatch
 from wm_nodes.ros.params import COMMON, Param, declare, refusal
-from wm_nodes.ros.peers import HEARTBEAT_S, PeerWatch
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.sequence import GapTracker, new_session
+from wm_nodes.ros.sequence_numbers import GapTracker, new_session
 
 REFUSALS = (ConfigError, ValueError, OSError, KeyError, ImportError)
 """What a bad setting raises: reported as one line, the node stays where it was. Anything else is a bug: with trace."""
@@ -64,7 +64,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.diagnostics = Diagnostics(
             self.get_fully_qualified_name(), run_dir.name if run_dir else "", self._publish_diagnostics,
             lambda: self.get_clock().now().to_msg(), run_dir,
-        )  # fmt: skip
+        )
         self.peers = PeerWatch(self.get_fully_qualified_name(), float(self.param("peer_timeout_s")))
         row = topic("run/state")
         self._state_publisher = self.create_publisher(RunState, row.name, row.qos)
@@ -146,7 +146,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def listen(
         self, name: str, callback: Callable[[Any], None], *, credit: bool = False, while_inactive: bool = False
-    ) -> CreditGrantor | None:
+    ) -> ConsumerCredits | None:
         """Subscribe to a row of the QoS table until cleanup. Messages with (session, seq) are checked for gaps.
 
         credit: grant the producer messages as they are consumed (see ros.credit); for keep-all streams. The grantor is
@@ -154,7 +154,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         while_inactive: latched topics, whose message must not be missed before activation.
         """
         row = topic(name)
-        grantor = CreditGrantor(self, name) if credit else None
+        grantor = ConsumerCredits(self, name) if credit else None
         tracker = self._trackers.setdefault(name, GapTracker())
 
         def observe(message: Any) -> None:

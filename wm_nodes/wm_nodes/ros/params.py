@@ -79,7 +79,7 @@ COMMON = (
           minimum=1.0, maximum=60.0),
     Param("service_introspection", "off", "Publish the node's service calls on <service>/_service_event",
           choices=("off", "metadata", "contents")),
-)  # fmt: skip
+)
 """Parameters that every node of the graph has."""
 
 

@@ -6,7 +6,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.sequence import Stamper
+from wm_nodes.ros.sequence_numbers import Stamper
 
 
 class StampedPublisher:

@@ -40,7 +40,7 @@ EVERY_NODE_DEPTH = 64
 
 
 @dataclass(frozen=True)
-class Topic:
+class GraphTopic:
     """One row of the table. name is relative (below the graph's namespace) unless it starts with '/'."""
 
     name: str
@@ -63,14 +63,14 @@ def profile_of(qos: Qos) -> QoSProfile:
     profile = QoSProfile(
         reliability=ReliabilityPolicy[qos.reliability.name], durability=DurabilityPolicy[qos.durability.name],
         history=HistoryPolicy[qos.history.name], depth=qos.depth, liveliness=LivelinessPolicy[qos.liveliness.name],
-    )  # fmt: skip
+    )
     if qos.liveliness_lease_duration.sec:
         profile.liveliness_lease_duration = Duration(seconds=qos.liveliness_lease_duration.sec)
     return profile
 
 
-def _recorded(topic: recorded.Topic, message: type[Any]) -> Topic:
-    return Topic(topic.name, message, profile_of(topic.qos))
+def _recorded(topic: recorded.RecordedTopic, message: type[Any]) -> GraphTopic:
+    return GraphTopic(topic.name, message, profile_of(topic.qos))
 
 
 LATCHED = profile_of(recorded.LATCHED)
@@ -88,10 +88,10 @@ ACTION_LIFESPAN_S = 1.0
 LIVE_ACTION = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1,
     lifespan=Duration(seconds=ACTION_LIFESPAN_S),
-)  # fmt: skip
+)
 """Actions that are carried out when they arrive (asynchronous mode): a stale one is worthless and is not delivered."""
 
-TOPICS: dict[str, Topic] = {
+TOPICS: dict[str, GraphTopic] = {
     topic.name: topic
     for topic in (
         _recorded(recorded.IMAGES, Image),
@@ -110,17 +110,17 @@ TOPICS: dict[str, Topic] = {
         _recorded(recorded.CLIP_SCORES, ClipScores),
         _recorded(recorded.VIDEO_VERSION, PolicyVersion),
         _recorded(recorded.VERDICT, ClipVerdict),
-        Topic("env/image/compressed", CompressedImage, COMPRESSED),
-        Topic("flow/credit", Credit, CREDIT),
-        Topic("run/links", NodeLinks, LATCHED),
-        Topic("safety/estop", Bool, LATCHED),
-        Topic("/diagnostics", DiagnosticArray, METRICS),
-        Topic("/clock", Clock, CLOCK),
+        GraphTopic("env/image/compressed", CompressedImage, COMPRESSED),
+        GraphTopic("flow/credit", Credit, CREDIT),
+        GraphTopic("run/links", NodeLinks, LATCHED),
+        GraphTopic("safety/estop", Bool, LATCHED),
+        GraphTopic("/diagnostics", DiagnosticArray, METRICS),
+        GraphTopic("/clock", Clock, CLOCK),
     )
 }
 
 
-def topic(name: str) -> Topic:
+def topic(name: str) -> GraphTopic:
     """Return the row of a topic by its relative name.
 
     Raises:

@@ -19,8 +19,8 @@ from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedEx
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from wm_nodes.allocator import keep_freed_memory
-from wm_nodes.ros.environment import set_node_defaults
+from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.ros.middleware import set_node_defaults
 
 EXECUTORS = ("events", "single", "multi")
 SPIN_ONCE_S = 0.1

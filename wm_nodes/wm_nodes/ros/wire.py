@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.types import BoolArray, FloatArray, UInt8Array, UInt64Array
+from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array, UInt64Array
 
 
 class WireError(Exception):

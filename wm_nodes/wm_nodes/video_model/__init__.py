@@ -8,10 +8,11 @@ from wm_nodes.video_model.network import NetworkSettings, VelocityModel, VideoNe
 from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout, initial_noise, sample_videos, step_noise
 from wm_nodes.video_model.schedule import flow_times
 from wm_nodes.video_model.step_window import WindowSettings, select_steps, stochastic_steps
-from wm_nodes.video_model.transitions import Transition, transition
+from wm_nodes.video_model.transitions import GaussianTransition, transition
 
 __all__ = [
     "Condition",
+    "GaussianTransition",
     "MaskSettings",
     "NetworkSettings",
     "RolloutBuffer",
@@ -20,7 +21,6 @@ __all__ = [
     "SamplerSettings",
     "Step",
     "StepContext",
-    "Transition",
     "VelocityModel",
     "VideoNetwork",
     "VideoRollout",

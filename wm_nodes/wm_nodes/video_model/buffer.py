@@ -148,7 +148,7 @@ def concatenate_buffers(parts: list[RolloutBuffer]) -> RolloutBuffer:
     for part in parts[1:]:
         if (part.config_hash, part.policy_version, part.iteration, part.rollout.steps) != (
             first.config_hash, first.policy_version, first.iteration, first.rollout.steps
-        ):  # fmt: skip
+        ):
             raise RolloutBufferError(
                 f"buffers of versions {first.policy_version} and {part.policy_version}, iterations {first.iteration} "
                 f"and {part.iteration}, settings {first.config_hash[:12]} and {part.config_hash[:12]} do not belong "

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from wm_nodes.seeding import torch_stream
+from wm_nodes.core.seeding import torch_stream
 
 
 @dataclass(frozen=True)

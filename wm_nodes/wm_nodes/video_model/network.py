@@ -61,7 +61,7 @@ class VideoNetwork(nn.Module):
         self.action = nn.Linear(2 * settings.action_dim + 1, width)
         self.text = nn.Linear(max(1, settings.text_dim), width)
         self.time = nn.Sequential(nn.Linear(TIME_FEATURES, width), nn.SiLU(), nn.Linear(width, width))
-        self.blocks = nn.ModuleList(Block(width) for _ in range(settings.depth))
+        self.blocks = nn.ModuleList(VideoBlock(width) for _ in range(settings.depth))
         self.norm = nn.GroupNorm(min(8, width), width)
         outputs = settings.channels * (2 if settings.change_std else 1)
         self.head = nn.ConvTranspose3d(width, outputs, (1, patch, patch), (1, patch, patch))
@@ -118,7 +118,7 @@ class VideoNetwork(nn.Module):
             raise ValueError(f"text must have {self.settings.text_dim} values, got {condition.text.shape[-1]}")
 
 
-class Block(nn.Module):
+class VideoBlock(nn.Module):
     """norm, scale and shift, spatial convolution, temporal convolution, residual."""
 
     def __init__(self, width: int) -> None:

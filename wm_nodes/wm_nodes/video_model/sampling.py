@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from wm_nodes.seeding import torch_stream
+from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import SamplerSettings, Step, StepContext, ode_step, step, with_conditioning
 from wm_nodes.video_model.network import VelocityModel, guided_velocity

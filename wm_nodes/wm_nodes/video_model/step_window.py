@@ -10,7 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from wm_nodes.seeding import numpy_stream, torch_stream
+from wm_nodes.core.seeding import numpy_stream, torch_stream
 
 DECAY_FROM = 13
 DECAY_RATE = 0.1

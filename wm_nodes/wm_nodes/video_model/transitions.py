@@ -15,7 +15,7 @@ from wm_nodes.video_model.sampling import RolloutSettings, normalised_noise
 MaskSource = Literal["cached", "recompute"]
 
 
-class Transition(NamedTuple):
+class GaussianTransition(NamedTuple):
     """zeta: (x_s - mean) / std under the weights given, (M, U), carries the gradient. std, slope (d mean / d v) and
     mask: (M, U), constants. sigma_base: (M,).
     """
@@ -38,7 +38,7 @@ def transition(
     settings: RolloutSettings,
     *,
     cfg: float,
-) -> Transition:
+) -> GaussianTransition:
     """Return the normalised noise that leads from x_t to x_s under `model`.
 
     Args:
@@ -53,7 +53,7 @@ def transition(
     law = step(x, v, t, s, context, settings.sampler)
     zeta = normalised_noise(x_s.float(), law, K)
     std, slope, mask_used = (_elements(value, zeta, K) for value in (law.std, law.slope, law.mask))
-    return Transition(zeta.flatten(1), std, slope, mask_used, law.sigma_base)
+    return GaussianTransition(zeta.flatten(1), std, slope, mask_used, law.sigma_base)
 
 
 def _elements(value: Tensor, like: Tensor, num_conditioning: int) -> Tensor:

@@ -36,7 +36,7 @@ def decided_after(num_passes: int, num_tokens: int) -> list[int]:
     """Tokens decided after each of K passes: S - ceil(S cos(pi k / 2 K)), at least one more per pass while any is left,
     and all of them after the last."""
     counts = [num_tokens - math.ceil(num_tokens * math.cos(math.pi * k / (2 * num_passes)) - 1e-9)
-              for k in range(1, num_passes + 1)]  # fmt: skip
+              for k in range(1, num_passes + 1)]
     counts[-1] = num_tokens
     for k in range(len(counts)):
         counts[k] = min(num_tokens, max(counts[k], (counts[k - 1] if k else 0) + 1))

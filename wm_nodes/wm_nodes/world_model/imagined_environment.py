@@ -12,10 +12,10 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
-from wm_nodes.control import check_actions, next_state
-from wm_nodes.seeding import numpy_stream, stream_seed
-from wm_nodes.specs import SOURCE_IMAGINED, EnvironmentSpec
-from wm_nodes.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.core.seeding import numpy_stream, stream_seed
+from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
+from wm_nodes.core.tool_control import check_actions, next_state
+from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.world_model.dynamics import done_signal
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.parts import in_parallel, parts_of
@@ -57,11 +57,11 @@ class ImaginedEnvironment:
     def __init__(
         self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
         *, num_envs: int, seed: int = 0, with_goals: bool = True, exact: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.spec = replace(
             spec, env_id=f"wm/{spec.task}", source=SOURCE_IMAGINED, num_envs=num_envs, ground_truth_names=(),
             world_model_sha256=models.sha256,
-        )  # fmt: skip
+        )
         self._models, self._reward, self._exact = models, reward, exact
         self._task = models.task_index(spec.task)
         self._images, self._start_states = starts
@@ -124,9 +124,7 @@ class ImaginedEnvironment:
         )
 
     def current(self) -> Observation:
-        return Observation(
-            self._shown.copy(), self._states.copy(), self._episode_ids.copy(), self._steps.copy()
-        )
+        return Observation(self._shown.copy(), self._states.copy(), self._episode_ids.copy(), self._steps.copy())
 
     def goals(self) -> tuple[UInt8Array, BoolArray] | None:
         if self._goals is None:
@@ -169,5 +167,5 @@ class ImaginedEnvironment:
                 self._task, horizon=self.spec.max_episode_steps, threshold=self._reward.goal_threshold,
             )
             for i in range(0, len(self._images), GOAL_BATCH)
-        ]  # fmt: skip
+        ]
         return np.concatenate([part.goals for part in parts]), np.concatenate([part.found for part in parts])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from wm_nodes.types import FloatArray, UInt8Array
+from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
 
 CHANNELS = (24, 48, 64, 64)
@@ -58,9 +58,7 @@ class PositionProbe(nn.Module):
                 "probe was trained for another camera set-up, see the model folder's manifest.json"
             )
         flat = tensor.reshape(-1, H, W, 3)
-        parts = [
-            self(self._pixels(flat[i : i + BATCH])) * self.std + self.mean for i in range(0, len(flat), BATCH)
-        ]
+        parts = [self(self._pixels(flat[i : i + BATCH])) * self.std + self.mean for i in range(0, len(flat), BATCH)]
         positions: FloatArray = torch.cat(parts).cpu().numpy().reshape(*tensor.shape[:-3], -1).astype(np.float32)
         return positions
 

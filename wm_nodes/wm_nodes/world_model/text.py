@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from wm_nodes.config.schema import WorldModelConfig
-from wm_nodes.types import BoolArray, UInt8Array
+from wm_nodes.core.types import BoolArray, UInt8Array
 from wm_nodes.world_model.dynamics import FrameModel, Prediction, done_signal
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.tokenizer import Tokenizer
@@ -88,7 +88,7 @@ class ImaginedGoals:
 def imagine_goals(
     model: TextModel, tokenizer: Tokenizer, images: UInt8Array, instruction: str, task: int, *, horizon: int,
     threshold: float,
-) -> ImaginedGoals:  # fmt: skip
+) -> ImaginedGoals:
     """Roll the text model out from first frames (B, H, W, 3); the goal is the first frame whose done signal is above
     `threshold` (E6: t* = min{t : d_t > tau_goal}), else the frame of the highest signal, with found=False."""
     current = tokenizer.encode(images).unsqueeze(1)

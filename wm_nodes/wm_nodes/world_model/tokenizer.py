@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wm_nodes.config.schema import TokenizerConfig
-from wm_nodes.types import UInt8Array
+from wm_nodes.core.types import UInt8Array
 from wm_nodes.world_model.parts import in_parts
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.quantizer import quantize
@@ -59,7 +59,7 @@ class Tokenizer(nn.Module):
             raise ValueError(f"tokenizer.patch_px must be a power of two >= 4, got {patch}")
         self.kind, self.latent_dim, self.height, self.width, self.patch_px = (
             config.kind, config.latent_dim, height, width, patch,
-        )  # fmt: skip
+        )
         self.grid = (height // patch, width // patch)
         levels = (patch // 4).bit_length()
         channels = [max(16, int(config.width * factor)) for factor in (0.375, 0.75, 1.0, 1.0, 1.0)][:levels]

@@ -1,8 +1,8 @@
 """Spatio-temporal transformer over frames of tokens, with a temporal key/value cache.
 
 Shapes: B batch, T frames given, W frames remembered, S tokens per frame, D width, N condition tokens per frame,
-H heads, E values per head. Block order: spatial self-attention (within a frame, bidirectional), temporal self-attention
-(one position, causal), cross-attention to the frame's condition tokens, MLP.
+H heads, E values per head. Order in a block: spatial self-attention (within a frame, bidirectional), temporal
+self-attention (one position, causal), cross-attention to the frame's condition tokens, MLP.
 
 Attention is plain matrix products: the fused kernels' backward pass is slow on a CPU.
 """
@@ -157,7 +157,7 @@ class CrossAttention(Attention):
         return out
 
 
-class Block(nn.Module):
+class SpatioTemporalBlock(nn.Module):
     def __init__(self, width: int, num_heads: int) -> None:
         super().__init__()
         self.spatial = SpatialAttention(width, num_heads)
@@ -183,7 +183,7 @@ class SpatioTemporalTransformer(nn.Module):
         if width % num_heads or (width // num_heads) % 2:
             raise ValueError(f"world_model.width {width} must be an even multiple of world_model.num_heads {num_heads}")
         self.window = window
-        self.blocks = nn.ModuleList(Block(width, num_heads) for _ in range(depth))
+        self.blocks = nn.ModuleList(SpatioTemporalBlock(width, num_heads) for _ in range(depth))
         self.norm = nn.LayerNorm(width)
 
     def new_caches(self) -> list[TemporalCache]:

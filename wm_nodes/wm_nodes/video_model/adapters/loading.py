@@ -104,7 +104,7 @@ def _text(files: ModelFolder, settings: LoadSettings, dtype: torch.dtype) -> Tex
     return TextEncoder(
         files.text_encoder(dtype), files.tokenizer(), style, device=settings.device, offload=settings.offload,
         max_tokens=settings.max_tokens,
-    )  # fmt: skip
+    )
 
 
 def _wan(
@@ -123,7 +123,7 @@ def _wan(
         transformer, null_text, frames=frames, continuation=codec.continuation, low_noise=low_noise,
         boundary=float(boundary or 0.0), time_scale=float(scheduler.get("num_train_timesteps", 1000)),
         action_dim=settings.action_dim, autocast=_autocast(settings),
-    )  # fmt: skip
+    )
 
 
 def _cosmos(files: ModelFolder, settings: LoadSettings, null_text: Tensor | None) -> CosmosVelocity:
@@ -132,7 +132,7 @@ def _cosmos(files: ModelFolder, settings: LoadSettings, null_text: Tensor | None
         files.model("transformer", "CosmosTransformer3DModel", getattr(torch, settings.dtype)), null_text,
         version=version, fps=COSMOS2_FPS if version == "2" else None, action_dim=settings.action_dim,
         autocast=_autocast(settings),
-    )  # fmt: skip
+    )
 
 
 def _autocast(settings: LoadSettings) -> torch.dtype | None:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from wm_nodes.seeding import torch_stream
+from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model.adapters.velocity import CfgConvention, PublicVelocity, num_cells
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import with_conditioning

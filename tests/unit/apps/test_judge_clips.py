@@ -1,0 +1,86 @@
+"""The command that judges a folder of one's own clips, by a server over HTTP and by the embedded judge."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from clip_folders import write_clips
+from judge_server import PickyServer, serving
+
+from wm_nodes.apps.judge_clips import VERDICTS, main
+from wm_nodes.judge.agent import clip_ref
+from wm_nodes.judge.audit import read_record
+
+
+def rows_of(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / VERDICTS).read_text().splitlines()]
+
+
+def test_a_servers_verdicts_are_kept_audited_and_gone_on_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_clips(tmp_path)
+    with serving(PickyServer()) as server:
+        command = [str(tmp_path), "--judge", server.url, "--judge-model", "judge"]
+        assert main([*command, "--audit", str(tmp_path / "audit")]) == 0
+        assert "2 clips (2 OK), mean reward 0." in capsys.readouterr().out
+        rows, asked = rows_of(tmp_path), len(server.requests)
+        assert [row["clip_id"] for row in rows] == ["a", "mine"] and all(0 < row["reward"] <= 1 for row in rows)
+        record = read_record(tmp_path / "audit")
+        assert [e.verdict.audit_id for e in record.judged() if e.verdict] == [row["audit_id"] for row in rows]
+        with (tmp_path / VERDICTS).open("a") as file:
+            file.write('{"torn')
+        assert main(command) == 0 and len(server.requests) == asked, "judged before, so nobody is asked"
+        server.down = True
+        assert main([*command, "--mode", "benchmark"]) == 1 and "ERROR" in capsys.readouterr().out
+        server.down = False
+        assert main([*command, "--mode", "benchmark"]) == 0, "what the judge failed on is asked again"
+    lines = (tmp_path / VERDICTS).read_text().splitlines()
+    kept = [json.loads(line) for number, line in enumerate(lines) if number != 2]
+    assert lines[2] == '{"torn' and [(row["mode"], row["status"]) for row in kept] == [
+        ("reward", "OK"), ("reward", "OK"), *[("benchmark", "ERROR")] * 2, *[("benchmark", "OK")] * 2,
+    ]
+
+
+def test_the_embedded_judge_abstains_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_clips(tmp_path)
+    assert main([str(tmp_path), "--judge", "embedded"]) == 0
+    out = capsys.readouterr().out
+    foreign, unknown = "planning: unlike all training clips: distance", "task_completion: not trained on task ''"
+    assert "2 clips (2 ABSTAIN)" in out and re.search(f"a: ABSTAIN, ({foreign}|{unknown})", out), out
+    assert [row["reward"] for row in rows_of(tmp_path)] == [None, None]
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"file": "gone.mp4"}, "gone.mp4 is no readable video: 0 frames"),
+        ({"file": "clips.jsonl"}, "clips.jsonl is no readable video"),
+        ({"sha256": "0" * 64}, "b.npy has content "),
+        ({"reference": "gone.png"}, "gone.png is no readable picture"),
+        ({"fps": 0}, "clips.jsonl:2: fps: Input should be greater than 0"),
+        ({"speed": 2}, "clips.jsonl:2: speed: Extra inputs are not permitted"),
+    ],
+)
+def test_what_cannot_be_read_is_one_error_that_names_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], changed: dict[str, Any], said: str
+) -> None:
+    write_clips(tmp_path, **changed)
+    assert main([str(tmp_path), "--judge", "embedded"]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_folder_without_a_list_says_what_a_line_is_and_bad_frames_are_an_error_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(tmp_path), "--judge", "embedded"]) == 2
+    assert 'one line per clip, e.g. {"file": "a.mp4"' in capsys.readouterr().err
+    bad = np.full((17, 96, 96, 3), np.nan, np.float32)
+    np.save(tmp_path / "bad.npy", bad)
+    line = {"file": "bad.npy", "instruction": "push", "sha256": clip_ref("", bad, 5.0).sha256}
+    (tmp_path / "clips.jsonl").write_text(json.dumps(line) + "\n")
+    assert main([str(tmp_path), "--judge", "embedded"]) == 1
+    assert "pixels that are not finite" in capsys.readouterr().out

@@ -1,0 +1,109 @@
+"""Claims A and B on clips of recorded contexts: the commands, on episodes of noise and the shipped video model."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recording_samples import make_episode, make_spec
+
+from benchmarks.video_rl.cli import main
+from benchmarks.video_rl.clip_resolution import CODEC, COPY, ENLARGED, MODEL
+from wm_nodes.recording import EpisodeBagWriter
+
+STEPS = 4
+CPS, DYNDIFF = "CPS 0.4", "DynDiff 0.6 gated, rms"
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Contexts to train on and held-out ones: five episodes each."""
+    folder, spec = tmp_path_factory.mktemp("clips"), make_spec(height=64, width=128)
+    paths = folder / "contexts", folder / "heldout"
+    for first, path in zip((0, 5), paths, strict=True):
+        with EpisodeBagWriter(path, spec, run_id=path.name, start_ns=1) as bag:
+            for index in range(first, first + 5):
+                episode = make_episode(spec, index, STEPS)
+                bag.write(replace(episode, ground_truth=np.full_like(episode.ground_truth, 0.1)))
+    return paths
+
+
+def test_clips_of_one_noise_by_ode_are_one_clip_and_arms_are_paired_within_their_regime(
+    bags: tuple[Path, Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "clips.json"
+    arms = ["--arms", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"]
+    size = ["--contexts", "2", "--group-size", "2", "--features", "pixels"]
+    assert main(["clips", "--context-bags", str(bags[1]), *size, *arms, "--json", str(path)]) == 0
+    assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads(path.read_text())
+    rows = {(row["arm"], row["shared_noise"]): row for row in found["rows"]}
+    assert len(rows) == 6 and all(len(row["diversity"]) == len(row["tracking"]) == 2 for row in rows.values())
+    assert rows["ODE", True]["diversity"] == pytest.approx([0, 0], abs=1e-6)
+    assert rows["ODE", True]["reward_std"] == [0, 0] and rows["ODE", True]["object_spread_cm"] == [0, 0]
+    assert all(min(row["diversity"]) > 1e-4 for key, row in rows.items() if key != ("ODE", True))
+    pairs = [(row["arm"], row["base"], row["shared_noise"]) for row in found["comparisons"]]
+    assert pairs == [("DynDiff 0.2 sparse, rms", "CPS 0.2", shared) for shared in (False, True)]
+    noise = [row["noise_share"] for row in found["comparisons"]]
+    assert all(arm == pytest.approx(base, rel=0.02) for arm, base in noise), "not at one noise budget"
+
+
+@pytest.fixture(scope="module")
+def learning(bags: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], Path]:
+    """A call of clip-learning without its number of buffers, and its file."""
+    path = tmp_path_factory.mktemp("clip_learning") / "found.json"
+    given = ["--context-bags", str(bags[0]), "--heldout-bags", str(bags[1]), "--eval-contexts", "3"]
+    call = ["clip-learning", *given, "--seeds", "0", "1", "--arms", CPS, DYNDIFF, "--json", str(path)]
+    assert main([*call, "--iterations", "1"]) == 0
+    return call, path
+
+
+def test_arms_train_from_the_same_start_with_the_same_calls_and_end_apart(learning: tuple[list[str], Path]) -> None:
+    _, path = learning
+    found = json.loads(path.read_text())
+    rows: dict[tuple[str, int], dict[str, Any]] = {(row["arm"], row["seed"]): row for row in found["rows"]}
+    assert set(rows) == {(arm, seed) for arm in (CPS, DYNDIFF) for seed in (0, 1)}
+    for seed in (0, 1):
+        cps, dyndiff = rows[CPS, seed], rows[DYNDIFF, seed]
+        assert cps["before"] == dyndiff["before"] and cps["after"] != dyndiff["after"]
+        assert cps["after"]["psnr_db"] != cps["before"]["psnr_db"] and len(cps["after"]["psnr_db"]) == 3
+        assert cps["evaluations"][-1]["psnr_db"] == pytest.approx(np.mean(cps["after"]["psnr_db"]), rel=1e-4)
+        assert cps["buffers"]["kept"] == dyndiff["buffers"]["kept"]
+    assert rows[CPS, 0]["before"] != rows[CPS, 1]["before"], "seeds have their own evaluation noise"
+    settings = {arm["name"]: arm for arm in found["arms"]}
+    assert settings[CPS]["grpo"] == settings[DYNDIFF]["grpo"]
+    steps = {name: arm["rollout"].pop("sampler") for name, arm in settings.items()}
+    assert settings[CPS]["rollout"] == settings[DYNDIFF]["rollout"] and steps[CPS] != steps[DYNDIFF]
+    assert [(row["arm"], row["base"]) for row in found["comparisons"]] == [(DYNDIFF, CPS)]
+    assert set(found["sha256"]) == {"codec.safetensors", "network.safetensors"}
+    assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_trainings_in_the_file_are_not_made_again_and_another_plan_is_refused(
+    learning: tuple[list[str], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    call, path = learning
+    rows = json.loads(path.read_text())["rows"]
+    assert main([*call, "--iterations", "1"]) == 0
+    assert json.loads(path.read_text())["rows"] == rows, "their seconds would differ"
+    assert main([*call, "--iterations", "2"]) == 2
+    assert "take another file" in " ".join(capsys.readouterr().out.split())
+
+
+def test_sizes_are_shown_beside_the_own_one_enlarged_and_the_own_one_is_the_same_there(tmp_path: Path) -> None:
+    paths = []
+    for side in (64, 96):
+        paths.append(tmp_path / f"side_{side}")
+        spec = make_spec(height=side, width=2 * side)
+        with EpisodeBagWriter(paths[-1], spec, run_id="sizes", start_ns=1) as bag:
+            episode = make_episode(spec, 0, STEPS)
+            bag.write(replace(episode, ground_truth=np.full_like(episode.ground_truth, 0.1)))
+    path = tmp_path / "found.json"
+    assert main(["resolution", "--context-bags", *map(str, paths), "--contexts", "1", "--json", str(path)]) == 0
+    rows = {(row["side_px"], row["shown"]): row for row in json.loads(path.read_text())["rows"]}
+    assert set(rows) == {(side, shown) for side in (64, 96) for shown in (MODEL, ENLARGED, CODEC, COPY)}
+    assert rows[64, MODEL]["psnr_db"] == rows[64, ENLARGED]["psnr_db"]
+    assert rows[96, MODEL]["psnr_db"] != rows[96, ENLARGED]["psnr_db"]
+    assert rows[96, COPY]["psnr_db"] != rows[96, CODEC]["psnr_db"]

@@ -1,0 +1,77 @@
+"""The benchmark's own parts: what it counts and how it alternates."""
+
+import itertools
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from benchmarks.speed import cli
+from benchmarks.speed.inputs import actions_of, interleave, seeds_of
+from benchmarks.speed.noop_environment import make_noop_environment
+from benchmarks.speed.simulator import rate_episode
+from benchmarks.speed.stages import fresh_pictures
+from wm_nodes.config.load import load_config
+from wm_nodes.reward import RuleReward
+
+
+def test_contenders_alternate_and_the_first_block_does_not_count() -> None:
+    order: list[str] = []
+
+    def contender(name: str, block: int) -> int:
+        order.append(f"{name}{block}")
+        return block
+
+    found = interleave([lambda block: contender("a", block), lambda block: contender("b", block)], 2)
+    assert order == ["a0", "b0", "a1", "b1", "a2", "b2"]
+    assert found == [[1, 2], [1, 2]]
+
+
+def test_pictures_of_the_reward_stage_are_never_seen_twice() -> None:
+    images = np.zeros((2, 8, 8, 3), np.uint8)
+    seen = [pictures.tobytes() for pictures in itertools.islice(fresh_pictures(images), 600)]
+    assert len(set(seen)) == len(seen)
+    assert not images.any()
+
+
+def test_the_costless_environment_never_ends_so_that_every_step_counts() -> None:
+    env = make_noop_environment(load_config("cpu", {}), 4, 0)
+    env.reset(None, seeds_of(env.spec, 0))
+    for actions in actions_of(env.spec, 0, 3 * env.spec.max_episode_steps):
+        assert env.step(actions).valid.all()
+    assert rate_episode(env, RuleReward(), 1).steps_per_s > 0
+
+
+def test_a_simulator_that_was_not_measured_is_shown_with_the_reason_and_no_number(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "console", Console(width=200))
+    times = ("dds_step", "in_process_step", "growth_first", "growth_last", "growth_first_p10", "growth_last_p10")
+    graph = {"num_envs": 16, "image": "64x128", "threads_each": 1, "overhead_95": (1.0, 1.1), "pairs": 3,
+             "growth_steps": 9, **{f"{name}_ms": 1.0 for name in times}}
+    found = {
+        "machine": {"processor": "one", "cores": 2}, "date": "today", "model": "small", "graph": graph,
+        "graph_overhead": 1.0, "step_growth": 1.0, "imagined_steps_per_s": 640.0, "imagined_over_simulator": 6.4,
+        "imagined_over_stock_simulator": None, "stages": {},
+        "simulator": {"missing": "", "simulator_processes": 2, "simulator_steps_per_s": 100.0, "imagined_envs": 64,
+                      "reward": "endogenous"},
+    }
+    cli.show(found)
+    ours, stock = (line for line in capsys.readouterr().out.splitlines() if "imagined_over" in line)
+    assert "6.4" in ours and "2 processes: 100.0 steps/s" in ours
+    assert "-" in stock and "ManiSkill has no such task" in stock
+    simulator = found["simulator"] | {"missing": "no Vulkan device"}
+    cli.show(found | {"imagined_over_simulator": None, "simulator": simulator})
+    assert capsys.readouterr().out.count("no Vulkan device") == 2
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [("world_model.width=7", "world_model.width 7"), ("world_model.widht=96", "widht"), ("width", "section.key=value")],
+)
+def test_an_untrained_model_of_an_impossible_size_is_refused_before_anything_is_measured(
+    value: str, words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cli, "console", Console(width=200))
+    assert cli.main(["--preset", "smoke", "--untrained", value]) == 2
+    assert words in capsys.readouterr().out

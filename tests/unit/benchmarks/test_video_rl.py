@@ -1,0 +1,245 @@
+"""The DynDiff benchmark: fair plans, honest intervals, an alarm that a hacked reward raises, and its command."""
+
+import hashlib
+import json
+import shlex
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.video_rl import cost
+from benchmarks.video_rl.cli import LEARNER, main
+from benchmarks.video_rl.comparison import compare_samplers, paired_interval, value
+from benchmarks.video_rl.cost import ANCHORS, clocked, toy_rollout
+from benchmarks.video_rl.learning import (
+    LearningPlan,
+    alarms,
+    evaluate,
+    group_spread,
+    hacked,
+    sample_groups,
+    train_sampler,
+)
+from benchmarks.video_rl.plots import family_of
+from benchmarks.video_rl.samplers import dyndiff, learning_samplers, sampler_setup
+from benchmarks.video_rl.trials import ablation_trials, hacking_trials
+from wm_nodes.config.shipped import PRETRAINED
+from wm_nodes.video_rl.toy_scene import BASE, draw_scenes, load_base
+
+SHORT = LearningPlan(iterations=2, scenes=1, eval_scenes=4, eval_every=1)
+
+
+def training(arm: str, seed: int, *rewards: float) -> dict[str, Any]:
+    points = [{"iteration": i, "reward": value, "obeyed": 0.5, "background": 0.001} for i, value in enumerate(rewards)]
+    return {"arm": arm, "seed": seed, "evaluations": points}
+
+
+# intervals
+
+
+def test_the_interval_of_three_pairs_is_the_one_worked_by_hand() -> None:
+    """Differences 1, 2, 3: mean 2, standard deviation 1, t(2) = 4.303."""
+    found = paired_interval([1.0, 2.0, 3.0])
+    assert (found.mean, found.low, found.high) == pytest.approx((2.0, 2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5))
+    assert not found.separable and paired_interval([1.0, 1.1, 0.9]).separable
+    with pytest.raises(ValueError, match="got 1"):
+        paired_interval([1.0])
+
+
+def test_the_interval_of_noise_covers_its_mean_in_19_cases_of_20() -> None:
+    generator = np.random.default_rng(0)
+    for pairs in (3, 8, 12):
+        covered = sum(not paired_interval(generator.normal(size=pairs).tolist()).separable for _ in range(2000))
+        assert covered / 2000 == pytest.approx(0.95, abs=0.017)
+
+
+def test_arms_are_compared_on_their_common_seeds_over_the_path_and_at_the_end() -> None:
+    rows = [
+        training("CPS", 0, 0.1, 0.3, 0.5), training("CPS", 1, 0.2, 0.2, 0.4), training("CPS", 2, 0, 0, 9),
+        training("new", 1, 0.2, 0.4, 0.5), training("new", 0, 0.1, 0.5, 0.6), training("new", 7, 0, 9, 9),
+    ]
+    found = compare_samplers(rows, "new", "CPS")
+    assert found is not None and found.seeds == (0, 1)
+    assert found.differences["reward"].mean == pytest.approx(0.1)
+    assert found.differences["reward_path"].mean == pytest.approx((0.15 + 0.15) / 2)
+    assert value(rows[0], "reward_path") == pytest.approx(0.4), "what every arm starts from does not count"
+    assert compare_samplers(rows, "new", "other") is None
+
+
+# plans
+
+
+def test_every_training_of_an_ablation_makes_the_model_calls_of_its_base() -> None:
+    trials, pairs = ablation_trials(LEARNER, LearningPlan(iterations=20))
+    calls = {}
+    for trial in trials:
+        videos = trial.plan.iterations * trial.plan.scenes * trial.plan.group_size
+        calls[trial.arm.name] = videos * (1 if trial.arm.rollout.cfg == 1 else 2)
+    assert all(calls[name] == calls[base] for name, base in pairs) and len(pairs) == 5
+    by_name = {trial.arm.name: trial for trial in trials}
+    guided = by_name["guidance 2"].arm
+    assert guided.rollout.cfg == guided.grpo.cfg == 2, "another guidance in training than in sampling is another policy"
+    for name, base in pairs:
+        assert by_name[name] != replace(by_name[base], arm=replace(by_name[base].arm, name=name)), "nothing is compared"
+
+
+def test_a_window_makes_its_own_steps_stochastic_and_trains_as_many_as_the_others() -> None:
+    arms = {arm.name: arm for arm in learning_samplers(LEARNER)}
+    assert len(arms) == len(learning_samplers(LEARNER)), "names are unique"
+    mix, flow = arms["Mix-GRPO 0.7"], arms["Flow-GRPO 0.7"]
+    scenes, model = draw_scenes(1, 0, "test"), load_base()
+    windows = [sample_groups(model, mix, scenes, 2, 0, i, 0)[0].rollout.steps for i in (0, 7, 39)]
+    assert windows == [(0, 1, 2, 3), (1, 2, 3, 4), (5, 6, 7, 8)]
+    assert int(mix.grpo.step_fraction * 4) == int(flow.grpo.step_fraction * 9)
+
+
+def test_guidance_and_resolution_of_an_evaluation_are_those_of_its_arm_and_plan() -> None:
+    model, arm = load_base(), sampler_setup("CPS", dyndiff(0.6))
+    guided = replace(arm, rollout=replace(arm.rollout, cfg=2.0))
+    plan = LearningPlan(eval_scenes=32)
+    plain, strong = evaluate(model, arm, plan, 0), evaluate(model, guided, plan, 0)
+    assert strong["obeyed"] > plain["obeyed"] + 0.05, "guidance follows the command more often"
+    assert evaluate(model, arm, replace(plan, eval_side=20), 0)["background"] != plain["background"]
+
+
+@pytest.mark.parametrize(
+    ("arm", "family"),
+    [
+        ("CPS 0.6", "CPS"), ("ODE", "ODE"), ("DynDiff 0.6 gated", "DynDiff literal"),
+        ("DynDiff 0.6 sparse", "DynDiff literal"), ("DynDiff 0.2 sparse, rms", "DynDiff sparse, rms"),
+    ],
+)
+def test_arms_of_one_kind_share_a_line_in_the_picture(arm: str, family: str) -> None:
+    assert family_of(arm) == family
+
+
+# hacking
+
+
+def test_a_reward_that_is_bought_with_too_much_mass_is_named_and_mass_that_becomes_right_is_not() -> None:
+    def rising(*masses: float) -> list[dict[str, float]]:
+        return [
+            {"reward": 0.1 * i, "mass": mass, "obeyed": 0.5 + 0.01 * i, "background": 0.001}
+            for i, mass in enumerate(masses)
+        ]
+
+    assert hacked(rising(1.02, 1.2, 1.38, 1.55), "reward") == ["mass"]
+    assert hacked(rising(0.8, 0.87, 0.94, 1.0), "reward") == []
+    assert hacked(rising(1.5, 1.3, 1.2, 1.1), "reward") == []
+
+
+def test_the_detector_names_what_a_hackable_reward_destroys_and_nothing_under_the_honest_one() -> None:
+    """Temporal consistency rises because the disc fades: it obeys less and has less mass."""
+    plan = LearningPlan(iterations=8, scenes=3, eval_scenes=32, eval_every=2)
+    honest, hackable, _ = hacking_trials(LEARNER, plan)
+    trained = [
+        train_sampler(load_base(), replace(t.arm, grpo=replace(t.arm.grpo, learning_rate=3e-4)), t.plan, seed=0)
+        for t in (honest, hackable)
+    ]
+    assert [alarms(row) for row in trained] == [[], ["obeyed", "mass"]]
+    first, last = trained[1]["evaluations"][0], trained[1]["evaluations"][-1]
+    assert last["consistency"] > first["consistency"] + 0.05 and last["mass"] < first["mass"] - 0.2
+
+
+# command
+
+
+def test_ablations_go_on_where_their_file_stops_and_refuse_another_plan(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "ablations.json"
+    short = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--json", str(path)]
+    assert main(["ablations", "--seeds", "0", *short]) == 0
+    first = json.loads(path.read_text())
+    assert main(["ablations", "--seeds", "0", "1", *short]) == 0
+    both = json.loads(path.read_text())
+    assert both["rows"][: len(first["rows"])] == first["rows"] and len(both["rows"]) == 2 * len(first["rows"])
+    assert [row["base"] for row in both["comparisons"]].count("base") == 3 and not first["comparisons"]
+    assert main(["ablations", "--seeds", "0", *short, "--iterations", "2"]) == 2
+    assert "take another file" in capsys.readouterr().out.replace("\n", " ")
+
+
+SHORT_CALL = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--seeds", "0", "1"]
+CALLS = {
+    "diversity": ["--contexts", "2", "--group-size", "2", "--arms", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"],
+    "learning": [*SHORT_CALL, "--arms", "CPS 0.6", "DynDiff 0.6 gated"],
+    "ablations": [*SHORT_CALL, "--arms", "base", "no KL"],
+    "hacking": [*SHORT_CALL, "--arms", "honest reward"],
+    "cost": ["--repeats", "1"],
+}
+
+
+@pytest.mark.parametrize("claim", CALLS)
+def test_every_file_says_how_it_was_made_and_lies_beside_its_picture(
+    claim: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cost, "SCENES", 1)
+    monkeypatch.setattr(cost, "GROUP", 4)
+    path = tmp_path / f"{claim}.json"
+    assert main([claim, *CALLS[claim], "--json", str(path)]) == 0
+    assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads(path.read_text())
+    assert found["command"] == shlex.join(["benchmark_dyndiff.py", claim, *CALLS[claim], "--json", str(path)])
+    assert found["sha256"]["base"] == hashlib.sha256(BASE.read_bytes()).hexdigest()
+    if claim == "cost":
+        assert {(row["model"], row["anchor"]) for row in found["rows"]} == {
+            (model, anchor) for model in ("moving disc", "PushCube") for anchor in ANCHORS
+        }
+        assert found["learner"]["kl"]["beta"] == LEARNER.kl.beta
+        kl = {(row["model"], row["anchor"]): row["kl_s"] / row["forward_s"] for row in found["rows"]}
+        assert all(kl[model, "buffer"] < 0.1 < kl[model, "frozen"] for model in ("moving disc", "PushCube"))
+    else:
+        assert {arm["name"] for arm in found["arms"]} == {row["arm"] for row in found["rows"]}
+        assert all(arm["rollout"]["num_steps"] == 10 and arm["grpo"]["kl"] for arm in found["arms"])
+
+
+def test_a_training_keeps_the_spread_of_its_rollouts_and_the_noise_of_steps_that_a_window_leaves() -> None:
+    arm = {arm.name: arm for arm in learning_samplers(LEARNER)}["CPS 0.6, window"]
+    moving = replace(arm, window=replace(arm.window, period=1))
+    found = train_sampler(load_base(), moving, SHORT, seed=0)["buffers"]
+    assert found["noise_share_step_0"][0] == pytest.approx(0.809, abs=1e-3) and found["noise_share_step_0"][1] is None
+    assert found["noise_share_step_4"][0] is None and found["noise_share_step_4"][1] == pytest.approx(0.809, abs=1e-3)
+    assert all(0 < value < 2 for value in found["rollout_diversity"])
+    buffer, _ = sample_groups(load_base(), moving, draw_scenes(2, 0, "test"), 3, 0, 0, 0)
+    rewards = torch.tensor([1.0, 2, 3, 5, 5, 5], dtype=torch.float64)
+    spread = group_spread(buffer.with_rewards({"total": rewards}), 3)
+    assert spread["rollout_reward_std"] == pytest.approx((2 / 3) ** 0.5 / 2) and spread["rollout_diversity"] > 0.01
+    alike = replace(buffer.rollout, latents=buffer.rollout.latents[::3].repeat_interleave(3, 0))
+    equal = replace(buffer, rollout=alike).with_rewards({"total": rewards})
+    assert group_spread(equal, 3)["rollout_diversity"] == pytest.approx(0, abs=1e-6)
+
+
+def test_a_clock_counts_the_time_inside_the_functions_it_names_and_leaves_them_as_they_were() -> None:
+    module = ModuleType("module")
+    module.slow = slow = lambda seconds: time.sleep(seconds)  # type: ignore[attr-defined]
+    with clocked(module, "slow") as spent:
+        module.slow(0.02)
+        module.slow(0.01)
+        time.sleep(0.2)
+    assert 0.03 <= spent[0] < 0.2 and module.slow is slow
+
+
+def test_a_rollout_reports_the_share_of_its_mask_and_of_its_caching() -> None:
+    found = toy_rollout(load_base(), repeats=1, seed=0)
+    assert 0.005 < found["mask_share"] < 0.3 and 0.001 < found["cache_share"] < 0.1
+    assert found["over_cps"] == pytest.approx(found["rollout_s"] / found["cps_s"])
+
+
+def test_an_unknown_arm_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["learning", "--arms", "CPS 7"]) == 2
+    assert "unknown arms CPS 7" in capsys.readouterr().out
+
+
+def test_a_base_of_another_architecture_and_a_count_of_zero_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    other = PRETRAINED / "table_top_cube" / "video_model" / "network.safetensors"
+    assert main(["diversity", "--base", str(other)]) == 2
+    assert "of another architecture" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(SystemExit):
+        main(["diversity", "--contexts", "0"])
+    assert "'0' is no whole number from 1 on" in capsys.readouterr().err

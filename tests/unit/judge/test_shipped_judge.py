@@ -1,0 +1,118 @@
+"""The judge in the package on clips that the simulator draws now, of seeds that it was not trained on."""
+
+import asyncio
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from wm_nodes.config.load import load_config
+from wm_nodes.environments.maniskill.tasks import TASKS
+from wm_nodes.judge.agent import RewardAgent, load_rubric
+from wm_nodes.judge.agent.types import ClipRef, Stage, Status, TaskSpec, Verdict, clip_ref
+from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
+from wm_nodes.judge.backends.factory import check_judge, make_judge
+from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, instruction_of
+from wm_nodes.judge.dataset.edits import LabelledClip
+from wm_nodes.judge.dataset.edits.generator import edited
+from wm_nodes.judge.evidence.definitions import EVIDENCE
+from wm_nodes.judge.evidence.head import load_head
+from wm_nodes.judge.evidence.sequence import reading_names
+from wm_nodes.judge.training.heads import CONFORMAL
+from wm_nodes.judge.training.temporal_networks import FOLDS
+
+FIRST_SEED = 70_000
+
+
+def judged(clip: ClipRef, task: TaskSpec) -> Verdict:
+    agent = RewardAgent(EmbeddedJudge(load_head(shipped_head())), load_rubric(), mode="benchmark")
+    return asyncio.run(agent.evaluate(clip, task))
+
+
+def test_it_is_small_says_how_it_was_made_and_knows_its_evidence() -> None:
+    size = sum(path.stat().st_size for path in shipped_head().iterdir())
+    head = load_head(shipped_head())
+    assert size < 3_000_000
+    assert set(head.names) == {*EVIDENCE, *reading_names()} and len(head.readers) == FOLDS
+    assert set(head.story["tasks"]) == set(TASKS)
+    assert {"made", "data", "seed", "segmenter", "trees", "validation"} <= head.story.keys()
+    assert head.story["made"]["command"].startswith("python -m wm_nodes.learning.train_judge"), "of the commit that made it"
+    card = EmbeddedJudge(head).card
+    assert "96 x 96 px" in card and all(name in card for name in head.questions)
+
+
+def test_the_settings_name_it_by_its_kind_alone() -> None:
+    settings = load_config("smoke", {"judge.kind": "embedded"}).judge
+    shipped = EmbeddedJudge(load_head(shipped_head()))
+    assert make_judge(settings, load_rubric()).judge.capabilities == shipped.capabilities
+
+
+def test_it_abstains_at_every_coverage_that_it_says_and_a_run_refuses_others_at_once() -> None:
+    for coverage in CONFORMAL:
+        settings = load_config("smoke", {"judge.kind": "embedded", "judge.conformal": coverage}).judge
+        check_judge(settings)
+        assert make_judge(settings, load_rubric()).judge.capabilities.judge_id.endswith(f"@{coverage:g}")
+    with pytest.raises(ValueError, match=r"conformal coverage 0\.5 was not calibrated .* 0\.8, 0\.9, 0\.95, 0\.98"):
+        check_judge(load_config("smoke", {"judge.kind": "embedded", "judge.conformal": 0.5}).judge)
+
+
+def test_noise_and_another_size_are_not_judged() -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (17, 96, 96, 3), np.uint8)
+    small = rng.integers(0, 256, (17, 64, 64, 3), np.uint8)
+    for frames, reason in ((noise, "unlike all training clips"), (small, "64 x 64 px, judged are 96 x 96 px")):
+        task = TaskSpec("push the blue cube into the red target", "push_cube", "panda", frames[0])
+        verdict = judged(clip_ref("c", frames, 5.0), task)
+        assert verdict.status is Status.ABSTAIN and reason in verdict.reason and np.isnan(verdict.reward)
+
+
+@pytest.fixture(scope="module")
+def source() -> Iterator[ClipSource]:
+    made = ClipSource("push_cube", load_config("cpu").simulation)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def recording(source: ClipSource) -> LabelledClip:
+    """The first successful push of a scene that is not held out."""
+    for seed in range(FIRST_SEED, FIRST_SEED + 100):
+        origin = source.origin(seed)
+        if origin.behaviour == "expert" and HELD_OUT.held_out(origin) is None:
+            clip = source.clip(seed)
+            if clip.labels.overall:
+                return clip
+    raise AssertionError("no expert succeeds")
+
+
+@pytest.mark.rendering
+def test_a_clean_success_is_accepted_and_each_hacking_pattern_is_worth_less_and_refused(
+    source: ClipSource, recording: LabelledClip
+) -> None:
+    task = TaskSpec(instruction_of(recording.clip.origin), "push_cube", "panda", recording.clip.frames[0])
+    clean = judged(recording.ref, task)
+    assert clean.valid and clean.reward > 0.7 and all(stage.passed for stage in clean.stages), clean.reason
+    defect = edited(recording, "ghost_motion", "fail", 0, source.redraw)
+    hacked = {
+        "occlusion": edited(defect, "occlude_patch", "fail", 0, None),
+        "motion": edited(recording, "freeze", "fail", 0, None),
+        "background": edited(recording, "flatten", "fail", 0, None),
+        "physics": defect,
+    }
+    for pattern, clip in hacked.items():
+        verdict = judged(clip.ref, task)
+        flags = {flag.pattern: flag.p_present for flag in verdict.hack_flags}
+        assert verdict.valid and verdict.reward < clean.reward - 0.1, (pattern, verdict.reward, verdict.reason)
+        assert flags[pattern] > 0.5, (pattern, flags)
+        assert not all(stage.passed for stage in verdict.stages), pattern
+
+
+@pytest.mark.rendering
+def test_equal_clips_get_equal_verdicts_and_a_mild_edit_does_not_close_a_gate(
+    source: ClipSource, recording: LabelledClip
+) -> None:
+    task = TaskSpec(instruction_of(recording.clip.origin), "push_cube", "panda", recording.clip.frames[0])
+    first, again = judged(recording.ref, task), judged(recording.ref, task)
+    assert first.audit_id == again.audit_id
+    mild = judged(edited(recording, "dark", "mild", 0, None).ref, task)
+    assert mild.valid and {s.stage for s in mild.stages if not s.passed} <= {Stage.TC}

@@ -1,0 +1,86 @@
+"""What `ros2 launch` imports under the system's Python, and the arguments that plug things in."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from wm_nodes.launching import arguments as launch_arguments
+from wm_nodes.launching.graph import Graph, GraphError
+from wm_nodes.launching.launch_description import prepared
+from wm_nodes.launching.scenarios import GRAPH_TOPICS
+from wm_nodes.recording import topics
+
+BLOCKED = "pydantic", "yaml", "numpy", "torch", "rclpy", "wm_msgs", "rosbags", "mcap"
+IMPORT = """
+import sys
+
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {blocked}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Block())
+sys.path.insert(0, {package!r})
+from wm_nodes.launching import launch_description
+print(len(launch_description.argument_table("online_training")))
+"""
+
+
+@pytest.fixture
+def given(tmp_path: Path) -> dict[str, str]:
+    (tmp_path / "manifest.json").write_text("{}")
+    return {"run_dir": str(tmp_path / "run"), "model_dir": str(tmp_path), "preset": "smoke", "domain_id": "7"}
+
+
+def test_the_launch_face_needs_nothing_but_the_standard_library(repository: Path) -> None:
+    code = IMPORT.format(blocked=BLOCKED, package=str(repository / "wm_nodes"))
+    done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 20
+
+
+@pytest.mark.parametrize("scenario", ["online_training", "composed"])
+def test_the_graph_that_the_nodes_interpreter_makes_is_the_same(scenario: str, given: dict[str, str]) -> None:
+    graph, _ = launch_arguments.prepare(scenario, given)
+    assert prepared(scenario, given, sys.executable) == graph
+    assert Graph.from_json(graph.to_json()) == graph
+
+
+def test_a_wrong_argument_reaches_the_user_of_ros2_launch_as_one_line(given: dict[str, str]) -> None:
+    with pytest.raises(RuntimeError, match=r"^num_envs must be a whole number, got 'many'$"):
+        prepared("online_training", {**given, "num_envs": "many"}, sys.executable)
+    with pytest.raises(RuntimeError, match="set WM_PYTHON"):
+        prepared("online_training", given, "/bin/false")
+
+
+def test_both_recording_scenarios_record_the_episodes_of_the_simulator(given: dict[str, str]) -> None:
+    assert tuple(GRAPH_TOPICS) and set(GRAPH_TOPICS) == {topic.name for topic in topics.ALL_TOPICS}
+    for scenario in ("online_training", "evaluate"):
+        graph, _ = launch_arguments.prepare(scenario, given)
+        recorded = graph.node("recorder").parameters["topics"]
+        assert isinstance(recorded, list)
+        assert {"sim/env/spec", "sim/env/image", "sim/env/transition", "sim/env/goal", "sim/episode"} <= set(recorded)
+    graph, _ = launch_arguments.prepare("online_training", {**given, "simulator": "false"})
+    assert graph.node("recorder").parameters["topics"] == list(GRAPH_TOPICS)
+
+
+def test_plug_ins_and_a_parameter_file_reach_the_nodes(given: dict[str, str], tmp_path: Path) -> None:
+    file = tmp_path / "more.yaml"
+    file.write_text("/**:\n  ros__parameters:\n    peer_timeout_s: 9.0\n")
+    more = {
+        "backend": "factory", "backend_factory": "robot:make", "policy_factory": "mine:policy",
+        "reward_factory": "mine:reward", "params_file": str(file),
+    }
+    graph, _ = launch_arguments.prepare("rollout_record", {**given, **more})
+    assert graph.node("environment").parameters["backend_factory"] == "robot:make"
+    assert graph.node("policy").parameters["policy_factory"] == "mine:policy"
+    assert graph.node("reward_evaluator").parameters["reward_factory"] == "mine:reward"
+    assert all(node.ros_arguments()[-2:] == ["--params-file", str(file)] for node in graph.nodes)
+    graph, _ = launch_arguments.prepare("evaluate", {**given, "initial_policy": "/weights.safetensors"})
+    assert graph.node("evaluation").parameters["initial_policy"] == "/weights.safetensors"
+    with pytest.raises(GraphError, match="needs backend_factory"):
+        launch_arguments.prepare("rollout_record", {**given, "backend": "factory"})
+    with pytest.raises(GraphError, match=r"params_file '/no\.yaml' does not exist"):
+        launch_arguments.prepare("rollout_record", {**given, "params_file": "/no.yaml"})

@@ -1,0 +1,132 @@
+"""The environment's own clock: which action a step takes, when it holds, what it refuses."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
+
+from graph.toy import ReachToy
+
+from wm_msgs.msg import ErrorCode
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
+from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
+from wm_nodes.ros.wire import EpisodeNote, Goals, ResetCommand, TimedAction, Transition, WireError
+
+N = 2
+
+
+class Published:
+    """A sink that keeps what the environment publishes."""
+
+    def __init__(self) -> None:
+        self.transitions: list[Transition] = []
+        self.stamps: list[int] = []
+        self.notes: list[EpisodeNote] = []
+
+    def image(self, images: UInt8Array, stamp_ns: int) -> None:
+        self.stamps.append(stamp_ns)
+
+    def goals(self, goals: Goals) -> None: ...
+
+    def transition(self, transition: Transition) -> None:
+        self.transitions.append(transition)
+
+    def episode(self, note: EpisodeNote) -> None:
+        self.notes.append(note)
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.published = Published()
+        self.served = LockstepEnvironment(ReachToy(N, seed=1), 7, self.published)
+        self.environment = AsynchronousEnvironment(self.served, lambda: 0.25, lambda: self.now)
+        self.environment.start()
+
+    def tick(self) -> bool:
+        self.now += 0.1
+        return self.environment.tick()
+
+    def offer(self, value: float, stamp_ns: int | None = None) -> None:
+        stamp = self.published.stamps[-1] if stamp_ns is None else stamp_ns
+        self.environment.offer(TimedAction(np.full(3 * N, value, np.float32), stamp, policy_version=5))
+
+    @property
+    def last(self) -> Transition:
+        return self.published.transitions[-1]
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_an_action_is_used_until_its_observation_is_too_old_then_the_tool_is_held(bench: Bench) -> None:
+    assert not bench.tick()
+    assert not bench.last.actions.any()
+    bench.offer(0.5)
+    assert [bench.tick() for _ in range(3)] == [True, True, False]
+    used = [float(step.actions[0, 0]) for step in bench.published.transitions[-3:]]
+    assert used == [0.5, 0.5, 0.0]
+    assert [int(step.policy_versions[0]) for step in bench.published.transitions[-3:]] == [5, 5, 0]
+
+
+def test_an_action_on_an_old_or_unknown_observation_is_refused_and_the_newer_one_stays(bench: Bench) -> None:
+    old = bench.published.stamps[-1]
+    for _ in range(4):
+        bench.tick()
+    bench.offer(0.5)
+    with pytest.raises(WireError, match=r"0\.400 s old, max_action_age_s is 0\.25") as refused:
+        bench.offer(0.1, old)
+    assert refused.value.code == ErrorCode.TIMEOUT
+    with pytest.raises(WireError, match="unknown"):
+        bench.offer(0.1, 12345)
+    assert bench.tick()
+    assert bench.last.actions[0, 0] == 0.5
+
+
+@pytest.mark.parametrize(("value", "code"), [(np.nan, ErrorCode.NAN_INPUT), (1.5, ErrorCode.OUT_OF_RANGE)])
+def test_a_bad_action_is_refused_when_it_arrives(bench: Bench, value: float, code: int) -> None:
+    with pytest.raises(WireError) as refused:
+        bench.offer(value)
+    assert refused.value.code == code
+    assert not bench.tick()
+
+
+def test_a_persons_action_ages_from_its_arrival_and_hold_ends_it_at_once(bench: Bench) -> None:
+    bench.offer(0.5, stamp_ns=0)
+    assert bench.tick()
+    bench.environment.hold()
+    assert not bench.tick()
+
+
+def test_ended_environments_are_reset_in_the_next_step(bench: Bench) -> None:
+    for _ in range(12):
+        bench.tick()
+    assert bench.last.truncated.all()
+    bench.tick()
+    assert not bench.last.valid.any()
+    bench.tick()
+    assert bench.last.valid.all()
+    assert (bench.last.episode_steps == 0).all()
+
+
+def test_a_reset_by_request_takes_the_place_of_the_one_that_was_due(bench: Bench) -> None:
+    for _ in range(12):
+        bench.tick()
+    bench.environment.reset(ResetCommand())
+    bench.offer(0.5)
+    assert bench.tick()
+    assert bench.last.valid.all()
+
+
+def test_the_emergency_stop_and_missing_credit_leave_the_environment_as_it_is(bench: Bench) -> None:
+    count = len(bench.published.transitions)
+    bench.served.estop = True
+    with pytest.raises(WireError, match="emergency stop"):
+        bench.tick()
+    assert len(bench.published.transitions) == count
+    bench.served.estop = False
+    bench.tick()
+    assert len(bench.published.transitions) == count + 1

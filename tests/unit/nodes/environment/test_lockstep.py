@@ -1,0 +1,167 @@
+"""Lock-step rules where things go wrong: NaN of the model, an environment that raises, the emergency stop."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
+
+from graph.toy import ReachToy
+
+from wm_msgs.msg import EpisodeEvent, ErrorCode
+from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
+from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
+from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
+from wm_nodes.ros.clients import LocalEnvironmentClient
+from wm_nodes.ros.wire import EpisodeNote, Goals, PeerLost, ResetCommand, StepCommand, Transition, WireError
+
+N = 2
+
+
+class Fragile(ReachToy):
+    """Raises `error` in the next step, or gives NaN in environment 0, when told to."""
+
+    error: Exception | None = None
+    nan = False
+
+    def step(self, actions: FloatArray) -> StepResult:
+        error, self.error = self.error, None
+        if error is not None:
+            raise error
+        result = super().step(actions)
+        if self.nan:
+            result.observation.state[0] = np.nan
+        return result
+
+
+class Bench:
+    """A lock-step environment over Fragile; it is also the sink."""
+
+    def __init__(self) -> None:
+        self.transitions: list[Transition] = []
+        self.notes: list[EpisodeNote] = []
+        self.environment = Fragile(N, seed=0, max_episode_steps=50)
+        self.served = LockstepEnvironment(self.environment, 1, self)
+        self.served.reset(ResetCommand(seeds=np.full(N, 3, np.uint64)))
+
+    def image(self, images: UInt8Array, stamp_ns: int) -> None: ...
+
+    def goals(self, goals: Goals) -> None: ...
+
+    def transition(self, transition: Transition) -> None:
+        self.transitions.append(transition)
+
+    def episode(self, note: EpisodeNote) -> None:
+        self.notes.append(note)
+
+    def command(self) -> StepCommand:
+        zeros = np.zeros(N * 3, np.float32)
+        return StepCommand(1, self.served.next_step_id, self.environment.spec.spec_hash, zeros)
+
+    def ends(self) -> list[tuple[int, int]]:
+        """(environment, reason) of the END events."""
+        return [(note.env_index, note.reason) for note in self.notes if note.kind == EpisodeEvent.KIND_END]
+
+
+def test_an_episode_reset_without_a_seed_names_the_seed_that_makes_it_again() -> None:
+    bench = Bench()
+    bench.served.reset(ResetCommand())
+    drawn = bench.transitions[-1].states.copy()
+    seeds = np.array([note.seed for note in bench.notes if note.kind == EpisodeEvent.KIND_START][-N:], np.uint64)
+    assert len(set(seeds.tolist())) == N
+    bench.served.reset(ResetCommand(seeds=seeds))
+    assert (bench.transitions[-1].states == drawn).all()
+    other = Bench()
+    other.served.reset(ResetCommand())
+    assert (other.transitions[-1].states == drawn).all()
+
+
+def test_a_log_prob_or_value_that_nobody_named_is_nan() -> None:
+    bench = Bench()
+    bench.served.step(bench.command())
+    assert np.isnan(bench.transitions[-1].logprobs).all()
+    assert np.isnan(bench.transitions[-1].values).all()
+
+
+def test_nan_of_the_model_is_an_error_again_on_retry_and_nothing_of_it_is_valid_until_the_reset() -> None:
+    bench = Bench()
+    bench.environment.nan = True
+    command = bench.command()
+    for _ in range(2):
+        with pytest.raises(WireError, match=r"environments \[0\]") as refused:
+            bench.served.step(command)
+        assert refused.value.code == ErrorCode.NAN_MODEL
+    assert len(bench.transitions) == 2
+    assert bench.transitions[-1].valid.tolist() == [False, True]
+    assert bench.ends() == [(0, EpisodeEvent.REASON_ERROR)]
+    bench.environment.nan = False
+    reply = bench.served.step(bench.command())
+    assert bench.transitions[-1].valid.tolist() == [False, True]
+    assert reply.truncated.tolist() == [True, False]
+    reply = bench.served.step(replace(bench.command(), reset_mask=reply.truncated))
+    assert reply.truncated.tolist() == [False, False]
+    bench.served.step(bench.command())
+    assert bench.transitions[-1].valid.all()
+    assert bench.ends() == [(0, EpisodeEvent.REASON_ERROR)]
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(FloatingPointError("predicted NaN"), ErrorCode.NAN_MODEL), (KeyError("cube"), ErrorCode.INTERNAL)],
+)
+def test_an_environment_that_raises_ends_all_episodes_and_serves_again_after_a_reset(
+    error: Exception, code: int
+) -> None:
+    bench = Bench()
+    bench.environment.error = error
+    with pytest.raises(WireError, match=f"{type(error).__name__}.*reset them") as refused:
+        bench.served.step(bench.command())
+    assert refused.value.code == code
+    assert refused.value.__cause__ is error
+    assert bench.ends() == [(i, EpisodeEvent.REASON_ERROR) for i in range(N)]
+    bench.served.step(bench.command())
+    assert not bench.transitions[-1].valid.any()
+    bench.served.reset(ResetCommand())
+    bench.served.step(bench.command())
+    assert bench.transitions[-1].valid.all()
+
+
+@pytest.mark.parametrize("reason", [EpisodeEvent.REASON_ESTOP, EpisodeEvent.REASON_DEACTIVATED])
+def test_an_episode_ended_from_outside_stays_ended_until_it_is_reset(reason: int) -> None:
+    bench = Bench()
+    bench.served.step(bench.command())
+    bench.served.end_episodes(reason)
+    reply = bench.served.step(bench.command())
+    assert reply.truncated.all()
+    assert not bench.transitions[-1].valid.any()
+    assert not bench.transitions[-1].truncated.any()
+    assert bench.ends() == [(i, reason) for i in range(N)]
+    bench.served.step(replace(bench.command(), reset_mask=np.ones(N, bool)))
+    bench.served.step(bench.command())
+    assert bench.transitions[-1].valid.all()
+    assert sum(note.kind == EpisodeEvent.KIND_START for note in bench.notes) == 2 * N
+
+
+def test_the_asynchronous_environment_resets_after_an_error_of_the_environment() -> None:
+    bench = Bench()
+    clocked = AsynchronousEnvironment(bench.served, lambda: 1.0)
+    clocked.start()
+    bench.environment.error = OSError("camera unplugged")
+    with pytest.raises(WireError, match="camera unplugged"):
+        clocked.tick()
+    clocked.tick()
+    clocked.tick()
+    assert bench.transitions[-1].valid.all()
+
+
+def test_a_local_client_names_a_missing_environment_and_hides_no_fault_of_one() -> None:
+    with pytest.raises(PeerLost, match="cleaned up"):
+        LocalEnvironmentClient(lambda: None).reset(ResetCommand(), lambda: None)
+
+    class Faulty:
+        def reset(self, command: ResetCommand) -> None:
+            raise AttributeError("a fault")
+
+    with pytest.raises(AttributeError, match="a fault"):
+        LocalEnvironmentClient(Faulty).reset(ResetCommand(), lambda: None)

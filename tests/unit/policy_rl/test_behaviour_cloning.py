@@ -1,0 +1,107 @@
+"""Behaviour cloning of a scripted expert in the toy: learns it, exactly repeatable, expert data only."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from graph.toy import GOAL_M, ReachToy
+from rl_toys import toy_policy
+
+from wm_nodes.config.load import load_config
+from wm_nodes.config.schema import SftConfig
+from wm_nodes.core.types import Episode, UInt8Array
+from wm_nodes.policy_rl.behaviour_cloning import demonstrations, train_sft
+from wm_nodes.policy_rl.evaluation import evaluate
+from wm_nodes.policy_rl.rollouts import Canceled
+
+
+def settings(**changes: float) -> SftConfig:
+    return load_config("base").sft.model_copy(update={"num_iterations": 300, "batch_size": 64, **changes})
+
+
+def expert_episode(seed: int, extra_steps: int = 0) -> Episode:
+    env = ReachToy(1, 0)
+    observation = env.reset(None, np.array([seed], np.uint64))
+    images, states, actions, success = [observation.image[0]], [observation.state[0]], [], [False]
+    while not success[-1]:
+        action = np.clip((GOAL_M - states[-1]) / 0.03, -1, 1).astype(np.float32)
+        result = env.step(action[None])
+        images.append(result.observation.image[0])
+        states.append(result.observation.state[0])
+        actions.append(action)
+        success.append(bool(result.terminated[0]))
+    for _ in range(extra_steps):
+        images.append(images[-1])
+        states.append(states[-1])
+        actions.append(np.full(3, -1, np.float32))
+        success.append(True)
+    steps = len(actions)
+    return Episode(
+        images=np.stack(images), states=np.stack(states), actions=np.stack(actions),
+        ground_truth=np.zeros((steps + 1, 2), np.float32), success=np.array(success),
+        rewards=np.zeros(steps, np.float32), terminated=True, truncated=False, task="reach",
+        instruction="reach the dot", behaviour="expert", seed=seed, episode_id=seed, source=1,
+    )
+
+
+DEMOS = [expert_episode(seed) for seed in range(100, 130)]
+
+
+def test_cloning_raises_success_and_leaves_critic_and_log_std_alone() -> None:
+    policy = toy_policy()
+    before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
+    start = evaluate(policy, ReachToy(10, 0), 40, 1_000_000).success_rate
+    result = train_sft(policy, DEMOS, settings(), 0)
+    assert evaluate(policy, ReachToy(10, 0), 40, 1_000_000).success_rate > start + 0.4
+    assert result.final_loss < 0.3 * float(result.losses[0])
+    after = policy.state_dict()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert all(name.startswith(("actor.", "feature_")) for name in changed)
+    assert any(name.startswith("actor.") for name in changed)
+
+
+def test_one_seed_gives_the_same_weights_bit_for_bit() -> None:
+    policies = [toy_policy() for _ in range(3)]
+    for policy, seed in zip(policies, (0, 0, 1), strict=True):
+        train_sft(policy, DEMOS[:4], settings(num_iterations=20), seed)
+    same, equal, other = (policy.state_dict() for policy in policies)
+    assert all(torch.equal(same[name], equal[name]) for name in same)
+    assert not torch.equal(same["actor.output.weight"], other["actor.output.weight"])
+
+
+def test_reconstructed_frames_are_trained_on_beside_the_raw_ones() -> None:
+    seen: list[int] = []
+
+    def darker(images: UInt8Array) -> UInt8Array:
+        seen.append(len(images))
+        return images // 2
+
+    plain = train_sft(toy_policy(), DEMOS[:4], settings(num_iterations=2), 0)
+    both = train_sft(toy_policy(), DEMOS[:4], settings(num_iterations=2), 0, reconstruct=darker)
+    assert seen == [plain.num_samples] and both.num_samples == 2 * plain.num_samples
+
+
+def test_steps_after_the_first_success_are_left_out() -> None:
+    short, long = ([expert_episode(7, extra), expert_episode(8, extra)] for extra in (0, 5))
+    results = [train_sft(toy_policy(), demos, settings(num_iterations=5), 0) for demos in (short, long)]
+    assert results[0].num_samples == results[1].num_samples
+    np.testing.assert_array_equal(results[0].losses, results[1].losses)
+
+
+def test_only_successful_expert_episodes_are_demonstrations() -> None:
+    failed = replace(DEMOS[0], success=np.zeros_like(DEMOS[0].success))
+    noisy = replace(DEMOS[1], behaviour="noisy")
+    found = demonstrations([failed, noisy, *DEMOS[2:6]], 3)
+    assert [episode.seed for episode in found] == [102, 103, 104]
+    with pytest.raises(ValueError, match=r"sft\.num_demonstrations is 3, but the data hold 1"):
+        demonstrations([failed, noisy, DEMOS[2]], 3)
+
+
+def test_other_data_and_a_stop_are_refused_and_heard() -> None:
+    with pytest.raises(ValueError, match="noisy"):
+        train_sft(toy_policy(), [replace(DEMOS[0], behaviour="noisy")], settings(), 0)
+    with pytest.raises(ValueError, match="got 0"):
+        train_sft(toy_policy(), [], settings(), 0)
+    with pytest.raises(Canceled, match="iteration 0"):
+        train_sft(toy_policy(), DEMOS[:2], settings(), 0, should_stop=lambda: True)

@@ -1,0 +1,136 @@
+"""The Gaussian in closed form, and the image policy: sizes, determinism, normalisation, clear errors. E10d."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from wm_nodes.config.load import load_config
+from wm_nodes.policy_rl.gaussian import DiagonalGaussian
+from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
+
+SIDE_PX = 8
+IMAGES = np.random.default_rng(0).integers(0, 256, (5, SIDE_PX, SIDE_PX, 3), dtype=np.uint8)
+STATES = np.tile(np.array([[0.6, 0.0, 0.15]], np.float32), (5, 1))
+
+
+def encoder(feature_dim: int = SIDE_PX * SIDE_PX * 3) -> ImageEncoder:
+    return ImageEncoder(lambda images: images.float().flatten(1) / 255, feature_dim, "abc")
+
+
+def make_policy(seed: int = 0) -> ImagePolicy:
+    small = load_config("base").policy.model_copy(update={"width": 16, "projection": 8})
+    return ImagePolicy(encoder(), 3, 3, small, seed=seed)
+
+
+def test_logprob_entropy_and_kl_match_numbers_worked_by_hand() -> None:
+    unit = DiagonalGaussian(torch.zeros(1, 2), torch.zeros(2))
+    log_sqrt_2pi = 0.5 * math.log(2 * math.pi)
+    assert_close(unit.logprob(torch.tensor([[1.0, 0.0]])), torch.tensor([-0.5 - 2 * log_sqrt_2pi]))
+    assert_close(unit.entropy(), torch.tensor([2 * (0.5 + log_sqrt_2pi)]))
+    other = DiagonalGaussian(torch.tensor([[1.0, 0.0]]), torch.tensor([math.log(2), 0.0]))
+    assert_close(unit.kl(other), torch.tensor([math.log(2) + (1 + 1) / 8 - 0.5]))
+    assert_close(other.kl(unit), torch.tensor([-math.log(2) + (4 + 1) / 2 - 0.5]))
+    assert_close(unit.kl(unit), torch.zeros(1))
+
+
+def test_closed_forms_agree_with_torch_distributions() -> None:
+    generator = torch.Generator().manual_seed(3)
+    means, stds = torch.randn(2, 6, 3, generator=generator), torch.rand(2, 3, generator=generator) + 0.1
+    actions = torch.randn(6, 3, generator=generator)
+    ours = [DiagonalGaussian(means[i], stds[i].log()) for i in range(2)]
+    theirs = [torch.distributions.Normal(means[i], stds[i].expand(6, 3)) for i in range(2)]
+    assert_close(ours[0].logprob(actions), theirs[0].log_prob(actions).sum(-1))
+    assert_close(ours[0].entropy(), theirs[0].entropy().sum(-1))
+    assert_close(ours[0].kl(ours[1]), torch.distributions.kl_divergence(theirs[0], theirs[1]).sum(-1))
+
+
+def test_executed_action_is_the_clamped_sample() -> None:
+    gaussian = DiagonalGaussian(torch.tensor([[0.5, -3.0]]), torch.tensor([0.0, 0.0]))
+    assert_close(gaussian.executed(torch.tensor([[2.0, 0.0]])), torch.tensor([[1.0, -1.0]]))
+    assert_close(gaussian.executed(None), torch.tensor([[0.5, -1.0]]))
+
+
+def test_acting_stores_the_density_at_the_executed_action() -> None:
+    policy = make_policy()
+    output = policy.act(IMAGES, STATES, noise=np.full((5, 3), 40.0, np.float32))
+    assert (output.actions == 1.0).all()
+    distribution = policy.distribution(policy.features(IMAGES), torch.from_numpy(STATES))
+    assert_close(torch.from_numpy(output.logprobs), distribution.logprob(torch.ones(5, 3)).detach())
+
+
+def test_generator_and_the_same_noise_give_the_same_action_and_none_is_deterministic() -> None:
+    policy = make_policy()
+    drawn = policy.act(IMAGES, STATES, torch.Generator().manual_seed(7))
+    noise = torch.randn(5, 3, generator=torch.Generator().manual_seed(7)).numpy()
+    np.testing.assert_array_equal(drawn.actions, policy.act(IMAGES, STATES, noise=noise).actions)
+    first, second = policy.act(IMAGES, STATES), policy.act(IMAGES, STATES)
+    np.testing.assert_array_equal(first.actions, second.actions)
+    assert np.abs(drawn.actions - first.actions).max() > 0.01
+
+
+def test_equal_seeds_give_equal_weights_and_leave_the_global_generator_alone() -> None:
+    before = torch.get_rng_state()
+    first, second, other = make_policy(1), make_policy(1), make_policy(2)
+    assert torch.equal(before, torch.get_rng_state())
+    for name, tensor in first.state_dict().items():
+        assert torch.equal(tensor, second.state_dict()[name])
+    assert not torch.equal(first.actor.output.weight, other.actor.output.weight)
+
+
+def test_default_policy_travels_inline_and_holds_no_encoder() -> None:
+    tokens, latent_dim = 16 * 2, load_config("base").tokenizer.latent_dim
+    network = torch.nn.Linear(1, 1)
+    with_module = ImageEncoder(lambda images: network(torch.zeros(len(images), 1)), tokens * latent_dim)
+    policy = ImagePolicy(with_module, 3, 3, load_config("base").policy)
+    assert sum(tensor.numel() for tensor in policy.state_dict().values()) * 4 < 1_000_000
+    assert not [name for name in policy.state_dict() if "encoder" in name]
+
+
+def test_actor_and_critic_share_no_parameter() -> None:
+    policy = make_policy()
+    policy.value(policy.features(IMAGES), torch.from_numpy(STATES)).sum().backward()
+    assert all(parameter.grad is None for parameter in [*policy.actor.parameters(), policy.log_std_A])
+
+
+def test_clone_keeps_its_weights_while_the_original_changes() -> None:
+    policy = make_policy()
+    copy = policy.clone()
+    with torch.no_grad():
+        policy.actor.output.bias += 1
+    assert_close(copy.actor.output.bias, torch.zeros(3))
+    assert not any(parameter.requires_grad for parameter in copy.parameters())
+    assert copy.encoder is policy.encoder
+
+
+def test_features_do_not_depend_on_the_chunk_size() -> None:
+    policy = make_policy()
+    assert_close(policy.features(IMAGES, batch_size=2), policy.features(IMAGES))
+    assert policy.features(IMAGES[:0]).shape == (0, SIDE_PX * SIDE_PX * 3)
+
+
+def test_static_features_are_not_blown_up_by_the_normaliser() -> None:
+    policy = make_policy()
+    features = policy.features(IMAGES)
+    features[:, 0] = 0.5
+    policy.fit_normaliser(features)
+    shift, scale = policy.feature_shift_F, policy.feature_scale_F
+    assert_close(shift, features.mean(0))
+    assert float(scale[0]) == pytest.approx(0.1 * float(features.std(0, correction=0).mean()), rel=1e-5)
+    assert_close(scale[1:], features.std(0, correction=0)[1:].clamp(min=float(scale[0])))
+
+
+def test_wrong_input_is_named() -> None:
+    policy = make_policy()
+    with pytest.raises(ValueError, match="uint8"):
+        policy.features(IMAGES.astype(np.float32))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"states must be \(5, 3\)"):
+        policy.act(IMAGES, STATES[:, :2])
+    with pytest.raises(ValueError, match="finite, got nan"):
+        policy.act(IMAGES, np.full((5, 3), np.nan, np.float32))
+    with pytest.raises(ValueError, match="camera differs"):
+        encoder(7)(torch.from_numpy(IMAGES))
+    with pytest.raises(ValueError, match="at least 2 frames"):
+        policy.fit_normaliser(policy.features(IMAGES[:1]))

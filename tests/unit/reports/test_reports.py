@@ -1,0 +1,263 @@
+"""What a run leaves for people: pictures, tables, report.html and summary.json."""
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from wm_nodes.reports import (
+    ClipSummary,
+    Panel,
+    Picture,
+    ScoreChange,
+    SuccessRate,
+    Summary,
+    clip_panels,
+    curves,
+    film_strip,
+    machine_facts,
+    read_summary,
+    write_clip_report,
+    write_clip_summary,
+    write_report,
+    write_summary,
+)
+from wm_nodes.reports.clip_report import TITLES, clip_verdict
+from wm_nodes.reports.curves import read_series
+from wm_nodes.reports.tables import result_rows, verdict
+
+PAIRED = {"difference": 0.25, "low": 0.157, "high": 0.348, "gained": 79, "lost": 28}
+SUMMARY = Summary(
+    task="push_cube", preset="cpu", seed=3, imagined_steps_per_s=412.3,
+    real_before=SuccessRate(64, 200, 0.259, 0.388), real_after=SuccessRate(114, 200, 0.5, 0.64),
+    imagined_before=SuccessRate(90, 256, 0.296, 0.412), imagined_after=SuccessRate(201, 256, 0.731, 0.831),
+    bag="/runs/a/bags/training", paired=PAIRED, samples=40960, minutes=9.7, command="python3 online_rl.py --task <x>",
+    machine={"processor": "P & Q"},
+    gate={
+        "passed": False, "episodes": 96, "notes": ["a note"], "metrics": {"tool_ratio_h16": 0.1, "auc": None},
+        "criteria": [
+            {"name": "tool error", "value": 0.1, "threshold": 0.3, "rule": "<=", "passed": True, "remedy": "nothing"},
+            {"name": "recall", "value": None, "threshold": 0.6, "rule": ">=", "passed": False, "remedy": "more data"},
+        ],
+    },
+)
+
+
+def frames(count: int, value: int = 0, height: int = 8, width: int = 10) -> np.ndarray:
+    """Frame t of one colour: (value + t, value, value)."""
+    images = np.full((count, height, width, 3), value, np.uint8)
+    images[..., 0] += np.arange(count, dtype=np.uint8)[:, None, None]
+    return images
+
+
+def blocks_of(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
+    return int((picture == np.array(colour, np.uint8)).all(-1).sum())
+
+
+def test_a_film_strip_enlarges_each_shown_frame_as_it_is(tmp_path: Path) -> None:
+    picture = film_strip({"real": frames(4, 40)}, tmp_path / "strip.png", scale=3)
+    for t in range(4):
+        assert blocks_of(picture, (40 + t, 40, 40)) == 8 * 10 * 9
+    on_disk = cv2.cvtColor(cv2.imread(str(tmp_path / "strip.png")), cv2.COLOR_BGR2RGB)
+    np.testing.assert_array_equal(on_disk, picture)
+
+
+def test_a_long_film_strip_shows_first_and_last_frame_and_even_steps_between() -> None:
+    picture = film_strip({"real": frames(17, 40)}, scale=1, max_columns=5)
+    shown = [t for t in range(17) if blocks_of(picture, (40 + t, 40, 40))]
+    assert shown == [0, 4, 8, 12, 16]
+
+
+def test_a_marked_step_is_shown_and_framed_in_green() -> None:
+    picture = film_strip({"real": frames(17, 40)}, scale=4, max_columns=5, marks={"real": 7})
+    assert blocks_of(picture, (47, 40, 40)) and blocks_of(picture, (30, 170, 80))
+
+
+def test_a_goal_of_one_frame_stands_under_the_last_column_and_short_rows_stay_empty() -> None:
+    picture = film_strip({"real": frames(3, 40), "short": frames(2, 90), "goal": frames(1, 140)}, scale=1)
+    columns = {name: np.flatnonzero((picture == np.array(c, np.uint8)).all(-1).any(0)) for name, c in
+               (("last", (42, 40, 40)), ("goal", (140, 140, 140)))}
+    np.testing.assert_array_equal(columns["last"], columns["goal"])
+    assert not blocks_of(picture, (92, 90, 90))
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ({}, "at least one row"),
+        ({"real": frames(2).astype(np.float32)}, "row 'real' must be uint8"),
+        ({"real": frames(2)[0]}, "row 'real' must be uint8"),
+        ({"real": frames(2), "imagined": frames(2, height=4)}, "one image size"),
+    ],
+)
+def test_a_film_strip_of_unfit_frames_is_refused(rows: dict[str, np.ndarray], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        film_strip(rows)
+
+
+def metrics_file(folder: Path, lines: list[object]) -> Path:
+    path = folder / "metrics.jsonl"
+    path.write_text("\n".join(line if isinstance(line, str) else json.dumps(line) for line in lines))
+    return path
+
+
+def test_a_series_keeps_the_last_value_of_a_repeated_step_and_survives_a_cut_line(tmp_path: Path) -> None:
+    path = metrics_file(tmp_path, [
+        {"section": "ppo", "step": 1, "success_rate": 0.2}, {"section": "sft", "step": 1, "loss": 3.0},
+        {"section": "ppo", "step": 2, "success_rate": None}, {"section": "ppo", "step": 1, "success_rate": 0.3},
+        '{"section": "ppo", "st',
+    ])
+    series = read_series(path, "success_rate")
+    assert series[0] == (1, 0.3) and series[1][0] == 2 and np.isnan(series[1][1])
+
+
+def test_curves_are_drawn_from_what_is_there_and_not_at_all_from_nothing(tmp_path: Path) -> None:
+    path = metrics_file(tmp_path, [{"section": "ppo", "step": i, "success_rate": i / 4} for i in range(4)])
+    drawn = curves(path, tmp_path / "curves.png")
+    assert drawn is not None and cv2.imread(str(drawn)).shape[1] > 800
+    assert curves(metrics_file(tmp_path, []), tmp_path / "none.png") is None
+    assert curves(tmp_path / "missing.jsonl", tmp_path / "none.png") is None
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_a_metric_that_was_never_a_number_is_not_in_the_legend(tmp_path: Path) -> None:
+    def drawn(lines: dict[str, str], name: str) -> np.ndarray:
+        rows = [{"section": "grpo", "step": i, "reward": i / 4, "held": None} for i in range(4)]
+        picture = curves(metrics_file(tmp_path, rows), tmp_path / name, (Panel("reward", lines),))
+        return cv2.imread(str(picture))
+
+    both = drawn({"reward": "trained on", "held": "held out"}, "both.png")
+    assert np.array_equal(both, drawn({"reward": "trained on"}, "one.png"))
+    assert not np.array_equal(both, drawn({"reward": "held out"}, "other.png"))
+
+
+def test_the_table_holds_counts_percent_intervals_and_the_paired_difference() -> None:
+    before, after, difference = result_rows(SUMMARY)
+    assert (before.real.count, before.real.percent) == ("64 / 200", "32.0 %")
+    assert before.real.interval == "95 %: 25.9 to 38.8 %"
+    assert (after.imagined.count, after.imagined.percent) == ("201 / 256", "78.5 %")
+    assert (difference.real.percent, difference.real.interval) == ("+25.0 points", "95 %: +15.7 to +34.8")
+    assert difference.imagined.interval == "not paired"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "words"),
+    [(0.01, 0.3, "got better"), (-0.3, -0.01, "got worse"), (-0.1, 0.3, "chance"), (0.0, 0.3, "chance")],
+)
+def test_the_verdict_follows_the_interval_and_not_the_difference(low: float, high: float, words: str) -> None:
+    assert words in verdict(replace(SUMMARY, paired=PAIRED | {"low": low, "high": high}))
+
+
+def test_a_rate_without_episodes_is_refused() -> None:
+    with pytest.raises(ValueError, match="got 3 of 2"):
+        SuccessRate(3, 2)
+
+
+def test_summary_json_has_the_promised_keys_and_no_nan(tmp_path: Path) -> None:
+    write_summary(tmp_path, replace(SUMMARY, minutes=float("nan")))
+    values = read_summary(tmp_path)
+    assert (values["task"], values["preset"], values["seed"], values["bag"]) == ("push_cube", "cpu", 3, SUMMARY.bag)
+    assert values["real_before"]["successes"] == 64 and values["real_after"]["episodes"] == 200
+    assert values["imagined_before"]["episodes"] == 256 and values["imagined_after"]["successes"] == 201
+    assert values["imagined_steps_per_s"] == 412.3 and values["minutes"] is None
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
+
+
+def test_an_unfinished_run_has_no_summary_and_the_error_says_so(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"summary.json does not exist: the run has not come to its end"):
+        read_summary(tmp_path)
+
+
+class _Page(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.sources += [value or "" for name, value in attributes if name in ("src", "href")]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_report_is_one_file_with_its_pictures_inside(tmp_path: Path) -> None:
+    film_strip({"real": frames(3)}, tmp_path / "strip.png")
+    path = write_report(tmp_path, SUMMARY, [Picture("Strip", "what", tmp_path / "strip.png")], config_text="seed: 3")
+    text = path.read_text()
+    page = _Page()
+    page.feed(text)
+    assert not page.open
+    assert len(page.sources) == 1 and page.sources[0].startswith("data:image/png;base64,")
+    assert not re.search(r"https?://|<script", text)
+    for part in ("got better", "64 / 200", "recall", "more data", "undefined", SUMMARY.bag, "seed: 3",
+                 "--task &lt;x&gt;", "P &amp; Q", "a note"):
+        assert part in text
+    assert "nothing" not in text
+
+
+def test_a_report_of_a_missing_picture_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"gone.png"):
+        write_report(tmp_path, SUMMARY, [Picture("Strip", "", tmp_path / "gone.png")])
+    assert not (tmp_path / "report.html").exists()
+
+
+SAME = ScoreChange(0.5, 0.5, 0.0, -0.1, 0.1, "")
+CLIPS = ClipSummary(
+    "push_cube", "smoke", 3, iterations=6, version=12, weights="averaged", contexts=48, evaluations=3,
+    scores=dict.fromkeys(TITLES, SAME) | {"tracking": ScoreChange(0.5, 0.6, 0.1, 0.05, 0.15, "better")},
+    hacked=[{"step": 6, "reward_slope": 0.1, "slopes": {"scenery": -0.2}, "text": "scenery gets <worse>"}],
+    bag="/runs/b/bags/x", machine={"processor": "P & Q"},
+)
+
+
+def test_the_report_of_loop_2_shows_scores_alarms_and_how_to_do_it_again(tmp_path: Path) -> None:
+    film_strip({"before": frames(3)}, tmp_path / "strip.png")
+    pictures = [Picture("Strip", "what", tmp_path / "strip.png")]
+    text = write_clip_report(tmp_path, CLIPS, pictures, config_text="seed: 3").read_text()
+    page = _Page()
+    page.feed(text)
+    assert not page.open and len(page.sources) == 1
+    for part in ("Better: tracking score (n = 48 held-out contexts).", "+0.1000 (+0.0500 to +0.1500)",
+                 "averaged weights", "scenery gets &lt;worse&gt;", f"retrain {tmp_path}", "P &amp; Q"):
+        assert part in text
+    write_clip_summary(tmp_path, CLIPS)
+    values = read_summary(tmp_path)
+    assert values["scores"]["tracking"]["after"] == 0.6 and values["minutes"] is None
+    quiet = write_clip_report(tmp_path, replace(CLIPS, hacked=())).read_text()
+    assert "No alarm in 3 held-out evaluations" in quiet
+    assert "Not watched" in write_clip_report(tmp_path, replace(CLIPS, hacked=(), evaluations=0)).read_text()
+
+
+def test_scores_that_got_better_and_worse_are_named_apart() -> None:
+    worse = {"scenery": replace(SAME, verdict="worse")}
+    both = clip_verdict(replace(CLIPS, scores={**CLIPS.scores, **worse}))
+    assert both == "Better: tracking score. Worse: scenery error (n = 48 held-out contexts)."
+    none = clip_verdict(replace(CLIPS, scores=dict.fromkeys(TITLES, SAME)))
+    assert none.startswith("No difference that chance does not explain")
+
+
+def test_a_series_of_a_section_leaves_out_the_others_and_an_odd_panel_is_drawn(tmp_path: Path) -> None:
+    path = metrics_file(tmp_path, [
+        {"section": "grpo", "step": 1, "reward": 3.0}, {"section": "heldout", "step": 1, "reward": 0.2},
+        {"section": "heldout", "step": 2, "reward": None},
+    ])
+    assert read_series(path, "grpo/reward") == [(1, 3.0)]
+    assert [step for step, _ in read_series(path, "heldout/reward")] == [1, 2]
+    panels = (Panel("reward", {"grpo/reward": "a", "heldout/reward": "b"}), *clip_panels(2)[:2])
+    drawn = curves(path, tmp_path / "curves.png", panels, step="buffers")
+    assert drawn is not None and cv2.imread(str(drawn)).shape[0] > 500
+    assert curves(path, tmp_path / "none.png", clip_panels(2)[4:]) is None
+
+
+def test_machine_facts_name_date_processor_and_versions() -> None:
+    facts = machine_facts()
+    assert {"date", "processor", "cores", "memory", "system", "python", "torch"} <= facts.keys()
+    assert all(facts.values())

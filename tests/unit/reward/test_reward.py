@@ -1,0 +1,253 @@
+"""Rewards against numbers worked by hand; missing is missing. Equations: E5, E7, E8."""
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from wm_nodes.config.load import load_config
+from wm_nodes.config.schema import RewardConfig
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.reward import (
+    SUCCESS_NO,
+    SUCCESS_UNKNOWN,
+    SUCCESS_YES,
+    Distance,
+    EncoderDistance,
+    EndogenousReward,
+    RewardInput,
+    RuleReward,
+    load_lpips,
+    pixel_l1,
+)
+from wm_nodes.reward.lpips import alexnet_layers, vgg16_layers
+
+SIDE_PX = 8
+RANDOM = np.random.default_rng(0)
+
+
+def grey(*levels: int) -> UInt8Array:
+    return np.stack([np.full((SIDE_PX, SIDE_PX, 3), level, np.uint8) for level in levels])
+
+
+def step(before: UInt8Array, after: UInt8Array, probability: float = 0.0, **more: Any) -> RewardInput:
+    count = len(before)
+    return RewardInput(
+        images=before, next_images=after, success_probability=np.full(count, probability, np.float32),
+        valid=np.ones(count, bool), uncertainty=np.zeros(count, np.float32), **more,
+    )
+
+
+def settings(**changes: Any) -> RewardConfig:
+    values = {"mode": "delta", "dense_weight": 0.5, "sparse_weight": 2.0, "success_threshold": 0.7, "dense_clip": 0.2,
+              "uncertainty_limit": 0.0, **changes}
+    return load_config("base").reward.model_copy(update=values)
+
+
+def test_delta_pays_for_coming_closer_charges_for_going_away_and_not_for_staying() -> None:
+    judged = EndogenousReward(settings(), pixel_l1).evaluate(
+        step(grey(100, 100, 100), grey(125, 75, 100), goals=grey(200, 200, 200))
+    )
+    np.testing.assert_allclose(judged.dense, [0.5 * 25 / 255, -0.5 * 25 / 255, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(judged.total, judged.dense + judged.sparse)
+    assert judged.valid.all() and judged.invalid_reason == ""
+    assert judged.weights == {"dense": 0.5, "sparse": 2.0}
+
+
+def test_delta_is_clipped_before_it_is_weighted() -> None:
+    judged = EndogenousReward(settings(), pixel_l1).evaluate(step(grey(0, 255), grey(255, 0), goals=grey(255, 255)))
+    np.testing.assert_allclose(judged.dense, [0.1, -0.1])
+
+
+def test_abs_is_the_weighted_similarity_and_not_clipped() -> None:
+    judged = EndogenousReward(settings(mode="abs"), pixel_l1).evaluate(step(grey(0), grey(51), goals=grey(255)))
+    np.testing.assert_allclose(judged.dense, [0.5 * 0.2], atol=1e-6)
+
+
+def test_progress_counts_steps_along_the_golden_trajectory_and_ignores_its_padding() -> None:
+    golden = grey(0, 50, 100, 150, 200, 200)[None].repeat(3, 0)
+    lengths = np.array([5, 5, 3])
+    judged = EndogenousReward(settings(mode="progress", dense_clip=1.0, dense_weight=1.0), pixel_l1).evaluate(
+        step(grey(0, 110, 0), grey(55, 40, 255), golden=golden, golden_lengths=lengths)
+    )
+    np.testing.assert_allclose(judged.dense, [1 / 4, -1 / 4, 1.0])
+
+
+def test_sparse_is_paid_strictly_above_the_threshold() -> None:
+    before = grey(0, 0, 0)
+    threshold = np.float32(0.7)
+    probability = np.array([np.nextafter(threshold, np.float32(0)), threshold, 0.8], np.float32)
+    judged = EndogenousReward(settings(dense_weight=0.0, success_threshold=float(threshold)), pixel_l1).evaluate(
+        replace(step(before, before), success_probability=probability)
+    )
+    np.testing.assert_array_equal(judged.sparse, [0.0, 0.0, 2.0])
+    np.testing.assert_array_equal(judged.success, [SUCCESS_NO, SUCCESS_NO, SUCCESS_YES])
+
+
+def test_sparse_is_not_paid_above_the_uncertainty_limit_and_zero_switches_the_limit_off() -> None:
+    given = replace(step(grey(0, 0), grey(0, 0), 1.0), uncertainty=np.array([0.1, 0.3], np.float32))
+    limited = EndogenousReward(settings(dense_weight=0.0, uncertainty_limit=0.2), pixel_l1).evaluate(given)
+    np.testing.assert_array_equal(limited.sparse, [2.0, 0.0])
+    free = EndogenousReward(settings(dense_weight=0.0), pixel_l1).evaluate(given)
+    np.testing.assert_array_equal(free.sparse, [2.0, 2.0])
+
+
+def test_a_missing_goal_is_invalid_with_its_reason_and_nan_never_zero() -> None:
+    model = EndogenousReward(settings(), pixel_l1)
+    some = model.evaluate(step(grey(0, 0), grey(9, 9), goals=grey(9, 9), goal_found=np.array([True, False])))
+    np.testing.assert_array_equal(some.valid, [True, False])
+    assert np.isnan(some.total[1]) and np.isnan(some.dense[1]) and np.isnan(some.sparse[1])
+    assert some.invalid_reason == "no goal (environments [1])"
+    none = model.evaluate(step(grey(0), grey(9)))
+    assert not none.valid.any() and np.isnan(none.total).all()
+    assert EndogenousReward(settings(dense_weight=0.0), pixel_l1).evaluate(step(grey(0), grey(9))).valid.all()
+
+
+@pytest.mark.parametrize("model", [EndogenousReward(settings(dense_weight=0.0), pixel_l1), RuleReward()])
+def test_a_done_signal_that_is_not_finite_stays_missing(model: EndogenousReward | RuleReward) -> None:
+    judged = model.evaluate(step(grey(0), grey(0), float("nan")))
+    assert not judged.valid.any() and np.isnan(judged.total).all()
+    assert judged.success[0] == SUCCESS_UNKNOWN and "not finite" in judged.invalid_reason
+
+
+def test_a_distance_that_is_not_finite_stays_missing() -> None:
+    class Broken:
+        name = "broken"
+
+        def __call__(self, images: UInt8Array, others: UInt8Array) -> np.ndarray[Any, np.dtype[np.float32]]:
+            return np.full(len(images), np.nan, np.float32)
+
+    judged = EndogenousReward(settings(), Broken()).evaluate(step(grey(0), grey(9), goals=grey(9)))
+    assert not judged.valid.any() and np.isnan(judged.total).all() and "not finite" in judged.invalid_reason
+
+
+def test_a_step_that_was_not_made_has_no_reward_and_needs_no_reason() -> None:
+    given = replace(step(grey(0, 0), grey(9, 9), 1.0, goals=grey(9, 9)), valid=np.array([False, True]))
+    for model in (EndogenousReward(settings(), pixel_l1), RuleReward()):
+        judged = model.evaluate(given)
+        np.testing.assert_array_equal(judged.valid, [False, True])
+        assert np.isnan(judged.total[0]) and judged.success[0] == SUCCESS_UNKNOWN and judged.invalid_reason == ""
+
+
+def test_components_sum_to_the_total_and_scoring_again_is_bit_equal() -> None:
+    images = RANDOM.integers(0, 256, (3, 6, SIDE_PX, SIDE_PX, 3), dtype=np.uint8)
+    given = step(images[0], images[1], 0.9, goals=images[2])
+    model = EndogenousReward(settings(), pixel_l1)
+    first, second = model.evaluate(given), model.evaluate(given)
+    assert first.total.tobytes() == second.total.tobytes()
+    np.testing.assert_array_equal(sum(first.components.values()), first.total)
+
+
+def test_rule_pays_the_simulators_success() -> None:
+    given = replace(step(grey(0, 0), grey(0, 0)), success_probability=np.array([0, 1], np.float32))
+    np.testing.assert_array_equal(RuleReward(3.0).evaluate(given).total, [0.0, 3.0])
+    with pytest.raises(ValueError, match="sparse_weight"):
+        RuleReward(float("nan"))
+
+
+def test_the_version_changes_with_every_setting_and_distance() -> None:
+    versions = {
+        EndogenousReward(settings(), pixel_l1).version,
+        EndogenousReward(settings(dense_clip=0.3), pixel_l1).version,
+        EndogenousReward(settings(), EncoderDistance(lambda images: images.float().flatten(1), 2.0)).version,
+        RuleReward().version,
+        RuleReward(2.0).version,
+    }
+    assert len(versions) == 5 and all(0 <= version < 2**64 for version in versions)
+    assert EndogenousReward(settings(), pixel_l1).version == EndogenousReward(settings(), pixel_l1).version
+
+
+def test_wrong_input_is_named() -> None:
+    with pytest.raises(ValueError, match="goals must be uint8"):
+        step(grey(0), grey(0), goals=grey(0, 0))
+    with pytest.raises(ValueError, match="images must be uint8"):
+        step(grey(0).astype(np.float32), grey(0))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"valid must have shape \(1,\)"):
+        replace(step(grey(0), grey(0)), valid=np.ones(2, bool))
+    with pytest.raises(ValueError, match=r"golden_lengths must lie in 2\.\.3"):
+        step(grey(0), grey(0), golden=grey(0, 1, 2)[None], golden_lengths=np.array([4]))
+    with pytest.raises(ValueError, match="two uint8"):
+        pixel_l1(grey(0), grey(0, 0))
+
+
+@pytest.fixture(scope="module")
+def lpips_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random weights under torchvision's and lpips' names: safetensors backbone, .pth linear weights."""
+    folder = tmp_path_factory.mktemp("lpips")
+    torch.manual_seed(0)
+    layers = alexnet_layers()
+    save_file(
+        {f"features.{name}": tensor for layer in layers for name, tensor in layer.state_dict().items()},
+        folder / "alexnet-random.safetensors",
+    )
+    channels = (64, 192, 384, 256, 256)
+    linear = {f"lin{i}.model.1.weight": torch.rand(1, size, 1, 1) for i, size in enumerate(channels)}
+    torch.save(linear, folder / "alex.pth")
+    return folder
+
+
+def distances(lpips_folder: Path) -> list[Distance]:
+    mean = EncoderDistance(lambda images: images.float().mean((1, 2)), scale=10.0)
+    return [pixel_l1, mean, load_lpips(lpips_folder, "alex")]
+
+
+def test_every_distance_is_zero_for_equal_images_symmetric_and_positive_otherwise(lpips_folder: Path) -> None:
+    images, others = RANDOM.integers(0, 256, (2, 3, 64, 64, 3), dtype=np.uint8)
+    for distance in distances(lpips_folder):
+        np.testing.assert_array_equal(distance(images, images), np.zeros(3), err_msg=distance.name)
+        np.testing.assert_allclose(distance(images, others), distance(others, images), rtol=1e-5)
+        assert (distance(images, others) > 0).all() and distance(images, others).dtype == np.float32
+
+
+def test_pixel_and_encoder_distances_match_numbers_worked_by_hand() -> None:
+    np.testing.assert_allclose(pixel_l1(grey(0, 100), grey(255, 151)), [1.0, 0.2], rtol=1e-6)
+    encode = EncoderDistance(lambda images: images.float().mean((1, 2)), scale=10.0)
+    np.testing.assert_allclose(encode(grey(0), grey(25)), [2.5])
+
+
+def test_a_calibrated_distance_is_one_on_average_between_starts_and_goals() -> None:
+    def encode(images: torch.Tensor) -> torch.Tensor:
+        return images.float().mean((1, 2))
+
+    calibrated = EncoderDistance.calibrated(encode, grey(0, 0), grey(10, 30))
+    np.testing.assert_allclose(calibrated(grey(0, 0), grey(10, 30)), [0.5, 1.5])
+    with pytest.raises(ValueError, match="scale must be finite and > 0, got 0"):
+        EncoderDistance.calibrated(encode, grey(0), grey(0))
+
+
+def test_lpips_is_the_formula_of_the_paper_on_the_first_layer(lpips_folder: Path) -> None:
+    images, others = RANDOM.integers(0, 256, (2, 2, 64, 64, 3), dtype=np.uint8)
+    model = load_lpips(lpips_folder, "alex")
+    linear = torch.load(lpips_folder / "alex.pth", weights_only=True)["lin0.model.1.weight"].reshape(-1)
+    model._weights = [linear, *(torch.zeros_like(weight) for weight in model._weights[1:])]
+    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+    features = []
+    for batch in (images, others):
+        scaled = ((batch / 127.5 - 1 - shift) / scale).transpose(0, 3, 1, 2)
+        maps = model._layers[0](torch.from_numpy(scaled).float()).detach().numpy()
+        features.append(maps / (np.sqrt((maps**2).sum(1, keepdims=True)) + 1e-10))
+    expected = ((features[0] - features[1]) ** 2 * linear.numpy()[None, :, None, None]).sum(1).mean((1, 2))
+    np.testing.assert_allclose(model(images, others), expected, rtol=1e-4)
+
+
+def test_vgg_layers_carry_torchvisions_parameter_names() -> None:
+    names = [name for layer in vgg16_layers() for name, _ in layer.named_parameters() if name.endswith("weight")]
+    assert names == [f"{i}.weight" for i in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)]
+
+
+def test_missing_wrong_and_unsafe_lpips_files_are_refused(lpips_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="vgg16"):
+        load_lpips(lpips_folder, "vgg")
+    save_file({"features.0.weight": torch.zeros(1)}, tmp_path / "alexnet.safetensors")
+    save_file({"lin0.model.1.weight": torch.zeros(1)}, tmp_path / "lin_alex.safetensors")
+    with pytest.raises(ValueError, match=r"features\.0\.weight in .* has shape \(1,\), expected \(64, 3, 11, 11\)"):
+        load_lpips(tmp_path, "alex")
+    (tmp_path / "alexnet.safetensors").unlink()
+    (tmp_path / "alexnet.pth").write_bytes(pickle.dumps(Path("runs code when read")))
+    with pytest.raises(pickle.UnpicklingError):
+        load_lpips(tmp_path, "alex")

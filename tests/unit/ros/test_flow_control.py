@@ -1,0 +1,215 @@
+"""Sequence numbers, credit, peers and the joiner, without DDS."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
+
+from rclpy.clock import Clock
+
+from wm_msgs.msg import Credit
+from wm_nodes.nodes.learner.rollout_assembler import ImageCache, RolloutAssembler
+from wm_nodes.ros.flow_control import SILENT_S, ConsumerCredits, ProducerCredits
+from wm_nodes.ros.liveliness import PeerWatch
+from wm_nodes.ros.sequence_numbers import GapTracker
+from wm_nodes.ros.wire import Rewards, Transition
+
+N = 2
+
+
+def test_gaps_are_counted_exactly_and_a_late_start_is_none() -> None:
+    tracker = GapTracker()
+    assert [tracker.observe(1, seq) for seq in (5, 6, 9, 9, 8, 10)] == [0, 0, 2, 0, 0, 0]
+    assert (tracker.lost, tracker.repeated, tracker.sessions) == (2, 2, 1)
+    assert tracker.gaps == [(1, 7, 2)]
+
+
+def test_a_session_that_began_while_listening_is_expected_from_its_first_message() -> None:
+    tracker = GapTracker()
+    assert [tracker.observe(2, 40), tracker.observe(3, 0), tracker.observe(4, 2), tracker.observe(4, 3)] == [0, 0, 2, 0]
+    assert tracker.observe(1, 7) == 0, "it began before this consumer joined"
+    assert (tracker.lost, tracker.sessions, tracker.gaps) == (2, 4, [(4, 0, 2)])
+
+
+def test_publishers_that_take_turns_lose_nothing_and_a_gap_in_one_of_them_is_counted_once() -> None:
+    tracker = GapTracker()
+    turns = [(1, 5), (2, 0), (1, 6), (2, 1), (1, 8), (2, 2)]
+    assert [tracker.observe(*turn) for turn in turns] == [0, 0, 0, 0, 1, 0]
+    assert (tracker.session, tracker.last_seq, tracker.sessions) == (2, 2, 2)
+
+
+def test_the_producer_waits_for_every_consumer_and_drops_the_silent_one() -> None:
+    ledger = ProducerCredits("env/transition", session=7)
+    assert ledger.holding(1000) == []
+    for name, granted in (("fast", 20), ("slow", 10)):
+        grant = Credit(consumer=name, topic="env/transition", stream_session=7, granted_seq=granted)
+        ledger.note(grant, now=100.0)
+    ledger.note(Credit(consumer="other", topic="reward", stream_session=7), now=100.0)
+    ledger.note(Credit(consumer="old", topic="env/transition", stream_session=6), now=100.0)
+    assert ledger.holding(10) == []
+    assert ledger.holding(11) == ["slow"]
+    assert ledger.drop_silent(11, now=100.0 + SILENT_S) == []
+    assert ledger.drop_silent(11, now=100.1 + SILENT_S) == ["slow"]
+    assert ledger.holding(20) == []
+
+
+class GrantingNode:
+    """What a ConsumerCredits asks of a node."""
+
+    def __init__(self) -> None:
+        self.sent: list[Credit] = []
+        self.publish = self.sent.append
+
+    def create_publisher(self, *arguments: object) -> "GrantingNode":
+        return self
+
+    def create_timer(self, *arguments: object, **named: object) -> None: ...
+
+    def get_fully_qualified_name(self) -> str:
+        return "/wm/learner"
+
+    def get_clock(self) -> Clock:
+        return Clock()
+
+
+def test_a_withheld_grant_is_repeated_but_does_not_grow_until_it_is_given_again() -> None:
+    node = GrantingNode()
+    grantor, tracker = ConsumerCredits(node, "env/transition", window=8), GapTracker()  # type: ignore[arg-type]
+
+    def consume(session: int, *seqs: int) -> None:
+        for seq in seqs:
+            tracker.observe(session, seq)
+            grantor.consumed(tracker)
+
+    consume(1, 0)
+    grantor.withhold(True)
+    consume(1, 1, 2, 3, 4)
+    assert {credit.granted_seq for credit in node.sent} == {8}
+    assert node.sent[-1].received_seq == 4
+    consume(2, 0, 1)
+    assert (node.sent[-1].stream_session, node.sent[-1].granted_seq) == (2, 9)
+    consume(2, 2, 3)
+    assert node.sent[-1].granted_seq == 9
+    grantor.withhold(False)
+    assert node.sent[-1].granted_seq == 11
+
+
+def test_a_silent_peer_is_lost_once_and_a_leaving_one_is_not() -> None:
+    peers = PeerWatch("/wm/me", timeout_s=3.0)
+    for name in ("/wm/me", "/wm/a", "/wm/b"):
+        peers.heard(name, now=0.0)
+    peers.left("/wm/b")
+    assert peers.check(now=3.0) == []
+    assert peers.check(now=3.1) == ["/wm/a"]
+    assert peers.check(now=4.0) == []
+    assert peers.is_lost("/wm/a")
+    assert [peers.silence_s(name, now=4.5) for name in ("/wm/a", "/wm/b", "/wm/never")] == [4.5, 0.0, 0.0]
+    assert peers.heard("/wm/a", now=5.0)
+    assert peers.lost == [] and peers.silence_s("/wm/a", now=5.5) == 0.5
+
+
+def test_time_in_which_a_process_stood_still_makes_no_peer_lost() -> None:
+    peers = PeerWatch("/wm/me", timeout_s=3.0)
+    peers.heard("/wm/a", now=0.0)
+    assert peers.check(now=0.5) == []
+    assert peers.check(now=20.5) == [], "it was this process that slept for 20 s"
+    assert [peers.check(now=20.5 + 0.5 * k) for k in range(1, 4)] == [[], [], ["/wm/a"]], "1 s in which it is awake"
+
+
+def test_a_peer_whose_death_holds_this_process_up_is_reported_in_time() -> None:
+    peers = PeerWatch("/wm/me", timeout_s=3.0)
+    peers.check(now=0.0)
+    peers.heard("/wm/dead", now=0.1)
+    peers.heard("/wm/alive", now=0.1)
+    assert peers.check(now=2.5) == [], "the middleware held the process for 2.5 s"
+    peers.heard("/wm/alive", now=2.5)
+    assert [peers.check(now=2.5 + 0.5 * k) for k in range(1, 4)] == [[], [], ["/wm/dead"]]
+
+
+def test_a_process_that_is_always_late_still_finds_out_who_is_lost() -> None:
+    peers = PeerWatch("/wm/me", timeout_s=3.0)
+    peers.heard("/wm/a", now=0.0)
+    assert [now for now in range(0, 30, 2) if peers.check(now=float(now))] == [8]
+
+
+def test_the_image_cache_keeps_the_newest() -> None:
+    cache = ImageCache(2)
+    for stamp in (1, 2, 3):
+        cache.put(stamp, np.zeros((1, 1, 1, 3), np.uint8))
+    assert cache.get(1) is None
+    assert cache.get(3) is not None
+    cache.drop_before(3)
+    assert len(cache) == 1
+
+
+def step(step_id: int, *, version: int = 3, valid: bool = True, session: int = 1) -> Transition:
+    zeros, flags = np.zeros(N, np.float32), np.zeros(N, bool)
+    return Transition(
+        stamp_ns=10 * step_id, next_stamp_ns=10 * (step_id + 1), step_id=step_id, actions=np.zeros((N, 3), np.float32),
+        states=np.full((N, 3), step_id, np.float32), next_states=np.full((N, 3), step_id + 1, np.float32),
+        logprobs=zeros, values=zeros, terminated=flags, truncated=flags, valid=np.full(N, valid),
+        episode_ids=np.zeros(N, np.uint64), episode_steps=np.zeros(N, np.uint32),
+        policy_versions=np.full(N, version, np.uint64), success_probability=zeros, uncertainty=zeros,
+        ground_truth=np.zeros((N, 0), np.float32), source=0, session=session,
+    )
+
+
+def rewards(step_id: int, valid: bool = True) -> Rewards:
+    return Rewards(1, step_id, np.full(N, step_id, np.float32), np.array([valid, True]), np.zeros(N, np.uint8), "")
+
+
+def images(value: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    return np.full((N, 2, 2, 3), value, np.uint8)
+
+
+def full_joiner(left_out: tuple[str, int] = ("", 0)) -> RolloutAssembler:
+    joiner = RolloutAssembler()
+    joiner.begin()
+    for step_id in (1, 2, 3):
+        if left_out != ("transition", step_id):
+            joiner.put_transition(step(step_id))
+        if left_out != ("reward", step_id):
+            joiner.put_rewards(rewards(step_id))
+    for step_id in (1, 2, 3, 4):
+        if left_out != ("image", step_id):
+            joiner.put_image(10 * step_id, images(step_id))
+    return joiner
+
+
+def test_a_complete_rollout_is_joined_by_stamp_and_step_id() -> None:
+    joiner = full_joiner()
+    assert joiner.missing(1, 1, 3) == []
+    assert joiner.missing(2, 1, 3) == [1, 2, 3]
+    rollout, dropped = joiner.take(1, 3, policy_version=3)
+    assert rollout.images_TN[:, 0, 0, 0, 0].tolist() == [1, 2, 3]
+    assert rollout.next_images_TN[:, 0, 0, 0, 0].tolist() == [2, 3, 4]
+    assert rollout.rewards_TN[:, 0].tolist() == [1, 2, 3]
+    assert rollout.valid_TN.all()
+    assert (dropped.invalid, dropped.gap, dropped.stale) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "missing"), [(("transition", 2), [2]), (("reward", 3), [3]), (("image", 2), [1, 2])]
+)
+def test_what_is_missing_is_invalid_and_counted_never_zero(left_out: tuple[str, int], missing: list[int]) -> None:
+    joiner = full_joiner(left_out)
+    assert joiner.missing(1, 1, 3) == missing
+    rollout, dropped = joiner.take(1, 3, policy_version=3)
+    assert [t + 1 for t in range(3) if not rollout.valid_TN[t].any()] == missing
+    assert dropped.gap == N * len(missing)
+
+
+def test_invalid_rewards_and_other_versions_are_left_out_by_reason() -> None:
+    joiner = full_joiner()
+    joiner.put_rewards(rewards(2, valid=False))
+    joiner.put_transition(step(3, version=2))
+    rollout, dropped = joiner.take(1, 3, policy_version=3)
+    assert rollout.valid_TN.tolist() == [[True, True], [False, True], [False, False]]
+    assert (dropped.invalid, dropped.gap, dropped.stale) == (1, 0, 2)
+
+
+def test_a_new_session_makes_everything_before_worthless() -> None:
+    joiner = full_joiner()
+    joiner.put_transition(step(1, session=2))
+    assert joiner.missing(2, 1, 1) == [1]
+    assert joiner.missing(1, 1, 3) == [1, 2, 3]

@@ -1,0 +1,219 @@
+"""The set-up's decisions, on temporary trees: nothing is installed here."""
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import run_tests
+
+import wm_setup
+from setup_steps import interpreter, messages, packages, stamp
+from setup_steps.console import SetupError, isolated_environment, run
+
+
+def test_cmake_repair_replaces_the_wheel_builders_folders_and_nothing_else(tmp_path: Path) -> None:
+    old = "/opt/python/cp312-cp312/include/python3.12;/opt/python/cp312-cp312/lib/python3.12/site-packages"
+    broken = tmp_path / "std_msgs" / "cmake" / "export.cmake"
+    broken.parent.mkdir(parents=True)
+    broken.write_text(f'set(dirs "{old}/numpy/_core/include;/opt/python/other")\n')
+    healthy = tmp_path / "fine.cmake"
+    healthy.write_text("set(dirs /usr/include)\n")
+    before = healthy.stat().st_mtime_ns
+    assert messages.repair_cmake(tmp_path, "/py/include", "/np/include") == 1
+    assert broken.read_text() == 'set(dirs "/py/include;/np/include;/opt/python/other")\n'
+    assert healthy.stat().st_mtime_ns == before
+    assert messages.repair_cmake(tmp_path, "/py/include", "/np/include") == 0
+
+
+def test_live_environment_has_no_unrepaired_cmake_file() -> None:
+    share = Path(sys.prefix) / "share"
+    left = [path for path in share.rglob("*.cmake") if "/opt/python/cp3" in path.read_text(errors="replace")]
+    assert not left
+
+
+def test_fingerprint_changes_with_content_name_and_extra(tmp_path: Path) -> None:
+    file = tmp_path / "a.msg"
+    file.write_text("uint8 a\n")
+    first = stamp.fingerprint([file], "x")
+    assert stamp.fingerprint([file], "x") == first
+    assert stamp.fingerprint([file], "y") != first
+    file.write_text("uint8 b\n")
+    assert stamp.fingerprint([file], "x") != first
+    file.write_text("uint8 a\n")
+    assert stamp.fingerprint([file.rename(tmp_path / "b.msg")], "x") != first
+
+
+def test_stamp_that_is_torn_or_foreign_counts_as_absent(tmp_path: Path) -> None:
+    file = tmp_path / "stamp.json"
+    assert stamp.read_stamp(file) == {}
+    file.write_text('{"packages": "12')
+    assert stamp.read_stamp(file) == {}
+    file.write_text("[1]")
+    assert stamp.read_stamp(file) == {}
+    stamp.write_stamp(file, {"packages": "12"})
+    assert stamp.read_stamp(file)["packages"] == "12"
+
+
+def test_python_version_is_the_environments_not_the_running_one(tmp_path: Path) -> None:
+    (tmp_path / "pyvenv.cfg").write_text("home = /usr/bin\nversion = 3.12.9\n")
+    assert stamp.python_version(tmp_path) == "3.12.9"
+
+
+@pytest.fixture
+def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A repository with one requirement and one message, and a finished set-up."""
+    root = tmp_path / "repo"
+    for name, text in {
+        "requirements/core.txt": "numpy\n", "msgs_schema/CMakeLists.txt": "", "msgs_schema/package.xml": "",
+        "msgs_schema/msg/A.msg": "uint8 a\n", "wm_nodes/setup.py": "", "wm_nodes/setup.cfg": "",
+        "wm_nodes/pyproject.toml": "", "launch_scripts/setup_steps/system.py": "", ".venv/bin/python": "",
+        "ros2_ws/install/wm_msgs/share/wm_msgs/package.xml": "",
+    }.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    monkeypatch.setattr(wm_setup, "ROOT", root)
+    monkeypatch.setattr(wm_setup, "REQUIREMENTS", root / "requirements")
+    monkeypatch.setattr(wm_setup, "MESSAGES", root / "msgs_schema")
+    monkeypatch.setattr(wm_setup, "PACKAGE", root / "wm_nodes")
+    monkeypatch.setattr(wm_setup, "WORKSPACE", root / "ros2_ws")
+    venv = root / ".venv"
+    stamp.write_stamp(venv / "wm_setup_stamp.json", wm_setup._wanted(venv))
+    assert wm_setup.pending(venv) == []
+    return root
+
+
+def test_new_message_rebuilds_messages_only(tree: Path) -> None:
+    (tree / "msgs_schema/msg/B.msg").write_text("uint8 b\n")
+    assert wm_setup.pending(tree / ".venv") == ["messages"]
+
+
+def test_new_requirement_redoes_all_that_stands_on_it(tree: Path) -> None:
+    (tree / "requirements/core.txt").write_text("numpy\nscipy\n")
+    assert wm_setup.pending(tree / ".venv") == ["packages", "messages", "wm_nodes"]
+
+
+def test_lost_build_is_noticed_despite_the_stamp(tree: Path) -> None:
+    (tree / "ros2_ws/install/wm_msgs/share/wm_msgs/package.xml").unlink()
+    assert wm_setup.pending(tree / ".venv") == ["messages"]
+
+
+def test_absent_renderer_is_not_tried_again_at_every_start(tree: Path) -> None:
+    file = tree / ".venv/wm_setup_stamp.json"
+    values = json.loads(file.read_text())
+    file.write_text(json.dumps({**values, "renderer": values["renderer"] + wm_setup.MISSING}))
+    assert wm_setup.pending(tree / ".venv") == []
+
+
+def test_unsupported_python_is_named_with_the_remedy() -> None:
+    assert not interpreter.supported((3, 10, 4)) and not interpreter.supported((3, 13, 0))
+    text = interpreter.unsupported_message((3, 13, 1))
+    assert "3.13.1" in text and "apt-get install python3" in text
+
+
+def fake_python(path: Path, version: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\necho {version}\n" if version else "#!/bin/sh\nexit 127\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+
+
+def test_a_pyenv_version_is_found_where_the_shim_on_path_does_not_work(tmp_path: Path) -> None:
+    fake_python(tmp_path / "shims/python3.12", "")
+    assert interpreter.find_supported(str(tmp_path / "shims"), str(tmp_path / "none")) is None
+    fake_python(tmp_path / "pyenv/versions/3.12.4/bin/python3.12", "3 12")
+    found = interpreter.find_supported(str(tmp_path / "shims"), str(tmp_path / "pyenv"))
+    assert found == str(tmp_path / "pyenv/versions/3.12.4/bin/python3.12")
+
+
+def test_entry_points_are_readable_for_old_pythons(repository: Path) -> None:
+    import ast
+
+    for name in ("wm_setup.py", "online_rl.py", "run_tests.py", "benchmark.py", "setup_steps/interpreter.py"):
+        ast.parse((repository / "launch_scripts" / name).read_text(), feature_version=(3, 8))
+
+
+def test_a_graph_test_that_failed_beside_another_has_to_pass_by_itself_and_others_are_not_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run_tests, "ROOT", tmp_path)
+    for folder in ("graph", "unit"):
+        (tmp_path / "tests" / folder).mkdir(parents=True)
+    body = """
+from pathlib import Path
+
+def test_one():
+    with Path("{0}").open("a+") as runs:
+        assert runs.write(".") and runs.tell() > {1}
+"""
+    second, never, unit = (tmp_path / "tests" / name for name in (
+        "graph/test_second.py", "graph/test_never.py", "unit/test_unit.py"
+    ))
+    for path, passes_after in ((second, 1), (never, 99), (unit, 1)):
+        path.write_text(body.format(tmp_path / path.stem, passes_after))
+
+    def first(*paths: Path) -> None:
+        names = [str(path.relative_to(tmp_path)) for path in paths]
+        assert run_tests._pytest(["-q", "-p", "no:xdist", "--cache-clear", *names]) == 1
+
+    first(second)
+    capfd.readouterr()
+    assert run_tests.repeated() == 0
+    assert "once more, by themselves:\n  tests/graph/test_second.py::test_one" in capfd.readouterr().out
+    first(never)
+    assert run_tests.repeated() == 1
+    first(unit)
+    assert run_tests.repeated() == 1 and (tmp_path / "test_unit").read_text() == "."
+
+
+def test_sourced_ros_and_other_environments_do_not_leak_into_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other"
+    (other / "lib").mkdir(parents=True)
+    (other / "pyvenv.cfg").write_text("")
+    monkeypatch.setenv("LD_LIBRARY_PATH", f"/opt/ros/jazzy/lib:{other}/lib:/usr/local/cuda/lib64")
+    monkeypatch.setenv("PYTHONPATH", "/opt/ros/jazzy/lib/python3.12/site-packages")
+    monkeypatch.setenv("PATH", f"/opt/ros/jazzy/bin:{other}/bin:/usr/bin")
+    monkeypatch.setenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "1")
+    env = isolated_environment(tmp_path / "repo" / ".venv")
+    assert env["LD_LIBRARY_PATH"] == "/usr/local/cuda/lib64"
+    assert "PYTHONPATH" not in env and "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in env
+    assert env["PATH"].split(os.pathsep) == [str(tmp_path / "repo/.venv/bin"), "/usr/bin"]
+
+
+def test_failed_command_shows_its_last_lines_and_the_log(tmp_path: Path) -> None:
+    with pytest.raises(SetupError, match=r"(?s)drawing failed \(exit code 3\).*no ink.*setup\.log"):
+        run(["sh", "-c", "echo no ink; exit 3"], log=tmp_path / "setup.log", why="drawing")
+
+
+@pytest.mark.parametrize(("text", "expected"), [("2.13.0+cpu\n", (2, 13)), ("2.8.0a0+git1", (2, 8)), ("2.7.1", (2, 7))])
+def test_torch_version_is_compared_as_numbers(text: str, expected: tuple[int, int]) -> None:
+    assert packages.parse_version(text) == expected
+    assert (expected >= packages.MIN_TORCH) == (expected != (2, 7))
+
+
+def test_check_of_the_live_tree_answers_quickly_and_changes_nothing(repository: Path) -> None:
+    command = [sys.executable, str(repository / "launch_scripts/wm_setup.py"), "--check"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.strip(), done.stderr
+    assert "missing" in done.stdout or done.stdout.strip() == "complete"
+
+
+@pytest.mark.slow
+def test_installed_package_brings_every_data_file(repository: Path, tmp_path: Path) -> None:
+    """colcon and a plain pip install copy; what is missing there is not missed in an editable install."""
+    source = tmp_path / "wm_nodes"
+    ignored = shutil.ignore_patterns("build", "*.egg-info", "__pycache__")
+    shutil.copytree(repository / "wm_nodes", source, ignore=ignored)
+    command = [sys.executable, "setup.py", "-q", "build", "--build-base", str(tmp_path / "build")]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    built = tmp_path / "build" / "lib"
+    kinds = {".yaml", ".xml", ".json", ".safetensors", ".py", ".typed"}
+    files = [path for path in (source / "wm_nodes").rglob("*") if path.suffix in kinds]
+    absent = [str(path.relative_to(source)) for path in files if not (built / path.relative_to(source)).exists()]
+    assert not absent

@@ -1,0 +1,350 @@
+"""What a rollout keeps: exact means from small storage, one file, refusals. Ids: spec 4.1."""
+
+import json
+import math
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from safetensors.torch import save
+from torch import Tensor
+from torch.testing import assert_close
+from video_toys import (
+    SHAPE,
+    Analytic,
+    randn,
+    swirl,
+    times,
+    tiny_network,
+    toy_buffer,
+    toy_condition,
+    toy_rollout_settings,
+)
+
+from wm_nodes.video_model import (
+    Condition,
+    MaskSettings,
+    RolloutBuffer,
+    RolloutBufferError,
+    RolloutSettings,
+    SamplerSettings,
+    StepContext,
+    concatenate_buffers,
+    config_hash,
+    step,
+    step_noise,
+    transition,
+)
+from wm_nodes.video_model.sampling import normalised_noise
+from wm_nodes.video_rl.grpo_math import log_ratio, mean_kl
+
+WIDE = (8, 5, 16, 16)
+"""D = 8192 with one given frame."""
+
+
+def assert_same(first: RolloutBuffer, second: RolloutBuffer) -> None:
+    """Bit for bit, types and shapes included."""
+    parts: list[tuple[object, object]] = [
+        (first, second),
+        (first.rollout, second.rollout),
+        (first.condition, second.condition),
+    ]
+    for one, two in parts:
+        for f in fields(one):  # type: ignore[arg-type]
+            a, b = getattr(one, f.name), getattr(two, f.name)
+            if isinstance(a, Tensor):
+                assert a.dtype == b.dtype and torch.equal(a.nan_to_num(7.5), b.nan_to_num(7.5)), f.name
+            elif f.name == "rewards":
+                assert sorted(a) == sorted(b)
+                assert all(torch.equal(a[name].nan_to_num(7.5), b[name].nan_to_num(7.5)) for name in a)
+            elif f.name not in ("rollout", "condition"):
+                assert a == b, f.name
+
+
+def first_transition(buffer: RolloutBuffer, settings: RolloutSettings, position: int, model: object):  # type: ignore[no-untyped-def]
+    """What `model` says about stored step `position` of every video."""
+    k, count = buffer.rollout.steps[position], len(buffer)
+    return transition(
+        model, buffer.condition, buffer.rollout.state(k), buffer.rollout.state(k + 1),  # type: ignore[arg-type]
+        settings.times[k].expand(count), settings.times[k + 1].expand(count), buffer.rollout.mask[:, position],
+        settings, cfg=settings.cfg,
+    )
+
+
+# T22: what gives the mean back
+
+
+@pytest.mark.parametrize("arm", ["cps", "dyndiff"])
+@pytest.mark.parametrize("store", ["zeta", "seed"])
+def test_the_stored_noise_or_its_seed_gives_the_mean_of_every_step_back(arm: str, store: str) -> None:
+    """T22. x_s - sigma zeta = mean; from the seed it holds for float32 states."""
+    settings, model = toy_rollout_settings(arm=arm, noise_store=store), Analytic(swirl)
+    buffer = toy_buffer(model, settings, groups=1, size=2, shape=WIDE)
+    for position, k in enumerate(buffer.rollout.steps):
+        x_t, x_s = buffer.rollout.state(k), buffer.rollout.state(k + 1)
+        t, s = settings.times[k].expand(2), settings.times[k + 1].expand(2)
+        context = StepContext(buffer.condition.frames, float(settings.times[1]), buffer.rollout.mask[:, position])
+        law = step(x_t, model(x_t, t, buffer.condition).detach(), t, s, context, settings.sampler)
+        zeta = (
+            step_noise(WIDE, buffer.rollout.seeds, k)[:, :, 1:] if store == "seed" else buffer.rollout.zeta[:, position]
+        )  # type: ignore[index]
+        found = x_s[:, :, 1:] - law.std[:, :, 1:] * zeta
+        assert_close(found, law.mean[:, :, 1:], atol=5e-7 * float(x_s.abs().max().clamp_min(1)), rtol=0)
+        assert (buffer.rollout.zeta is None) == (store == "seed")
+
+
+@pytest.mark.parametrize("t", [0.9, 0.5, 0.2])
+def test_noise_kept_in_bfloat16_costs_a_kl_below_3e_6_and_a_mean_kept_so_more_than_ten_times_that(t: float) -> None:
+    """T22. The noise is that of a step whose end was rounded to bfloat16 first."""
+    x, v, z = (randn(1, 8, 4, 16, 16, seed=seed) for seed in (2, 3, 1))
+    law = step(x, v, times(t), times(0.8 * t), StepContext(x[:, :, :0], 0.9), SamplerSettings())
+    zeta = normalised_noise((law.mean + law.std * z).bfloat16().float(), law, 0).flatten(1)
+    assert float((zeta - z.flatten(1)).abs().max()) > 1e-4, "rounding the state has changed its noise"
+    assert float(mean_kl(zeta, zeta.bfloat16().float())) < 3e-6
+    off = (law.mean - law.mean.bfloat16().float()) / law.std
+    assert float(off.square().mean() / 2) > 3e-5
+
+
+def test_a_rollout_keeps_its_noise_in_bfloat16_where_asked_and_nothing_else_of_it_changes() -> None:
+    """T22; the default for large models."""
+    model = Analytic(swirl)
+    exact, rounded = (
+        toy_buffer(model, toy_rollout_settings(storage_dtype="bfloat16", noise_store=store), groups=1, size=2)
+        for store in ("zeta", "zeta_bfloat16")
+    )
+    assert exact.rollout.zeta is not None and rounded.rollout.zeta is not None
+    assert torch.equal(rounded.rollout.zeta, exact.rollout.zeta.bfloat16())
+    assert 2 * rounded.rollout.zeta.nbytes == exact.rollout.zeta.nbytes
+    assert torch.equal(rounded.rollout.states, exact.rollout.states)
+    assert_same(RolloutBuffer.from_bytes(rounded.to_bytes()), rounded)
+
+
+def test_a_mask_and_seeds_take_less_than_a_tenth_of_a_mask_and_the_noise_at_16_channels() -> None:
+    """T22, in bytes."""
+    small, large = (
+        toy_buffer(
+            Analytic(swirl), toy_rollout_settings(noise_store=store), groups=1, size=2, shape=(16, 3, 4, 4), given=0
+        )
+        for store in ("seed", "zeta")
+    )
+    assert large.rollout.zeta is not None
+    seeds, noise, mask = small.rollout.seeds.nbytes, large.rollout.zeta.nbytes, small.rollout.mask.nbytes
+    assert mask + seeds < 0.1 * (mask + noise)
+    assert large.num_bytes - small.num_bytes == noise
+
+
+def test_seeds_cannot_stand_for_noise_that_was_rounded_to_bfloat16() -> None:
+    with pytest.raises(ValueError, match="noise_store seed needs storage_dtype float32"):
+        toy_rollout_settings(noise_store="seed", storage_dtype="bfloat16")
+
+
+# T27: bf16 storage
+
+
+@pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow"])
+@pytest.mark.parametrize("mask_dtype", ["float32", "float16"])
+def test_what_is_stored_in_bfloat16_has_the_log_probability_it_had_at_rollout(arm: str, mask_dtype: str) -> None:
+    """T27: the state is rounded before its density is taken, so training sees the same numbers."""
+    settings = toy_rollout_settings(arm=arm, storage_dtype="bfloat16", mask_dtype=mask_dtype)
+    model = tiny_network()
+    buffer = toy_buffer(model, settings)
+    assert buffer.rollout.states.dtype == torch.bfloat16 and buffer.rollout.latents.dtype == torch.float32
+    buffer = RolloutBuffer.from_bytes(buffer.to_bytes())
+    assert buffer.rollout.zeta is not None
+    for position in range(len(buffer.rollout.steps)):
+        with torch.no_grad():
+            new = first_transition(buffer, settings, position, model)
+        old = buffer.rollout.zeta[:, position].flatten(1)
+        assert float(log_ratio(new.zeta, old).abs().max()) < 1e-6
+        unrounded = old + 2**-9 * randn(*old.shape)
+        assert float(log_ratio(unrounded, old).abs().max()) > 1e-6, "or the check could not fail"
+
+
+# T34: reproducible
+
+
+def test_the_same_seeds_give_the_same_buffer_bit_for_bit_and_others_another() -> None:
+    """T34."""
+    settings, model = toy_rollout_settings(), tiny_network()
+    first, second = toy_buffer(model, settings), toy_buffer(model, settings)
+    assert_same(first, second)
+    assert first.to_bytes() == second.to_bytes()
+    assert not torch.equal(first.rollout.latents, toy_buffer(model, settings, iteration=1).rollout.latents)
+
+
+# files
+
+
+@pytest.mark.parametrize("storage", ["float32", "bfloat16"])
+@pytest.mark.parametrize("given", [0, 1, 4])
+def test_a_buffer_survives_its_bytes_bit_for_bit(storage: str, given: int) -> None:
+    settings = toy_rollout_settings(storage_dtype=storage)
+    buffer = toy_buffer(Analytic(swirl), settings, given=given, version=3, iteration=2)
+    rewards = torch.arange(8, dtype=torch.float64)
+    rewards[5] = math.nan
+    buffer = buffer.with_rewards({"task": rewards, "smooth/ness": -rewards, "total": 2 * rewards})
+    again = RolloutBuffer.from_bytes(buffer.to_bytes())
+    assert_same(buffer, again)
+    assert list(again.rewards) == sorted(again.rewards), "in one order on every rank"
+    assert again.valid.tolist() == [True] * 5 + [False] + [True] * 2
+    assert (again.policy_version, again.iteration, again.rollout.steps) == (3, 2, (0, 1, 2, 3, 4))
+    assert torch.equal(again.rollout.times, settings.times), "readable without the settings of its run"
+
+
+@pytest.mark.parametrize("changes", [{"noise_store": "seed"}, {"arm": "ode"}, {"num_steps": 1}, {"arm": "cps"}])
+def test_a_buffer_of_seeds_or_without_any_step_survives_its_bytes(changes: dict[str, object]) -> None:
+    buffer = toy_buffer(Analytic(swirl), toy_rollout_settings(**changes))
+    again = RolloutBuffer.from_bytes(buffer.to_bytes())
+    assert_same(buffer, again)
+    assert (again.rollout.zeta is None) == ("noise_store" in changes)
+
+
+def test_one_tensor_under_two_names_can_be_written() -> None:
+    """A total of one reward is often that reward itself."""
+    buffer = toy_buffer(Analytic(swirl), toy_rollout_settings())
+    reward = torch.arange(8, dtype=torch.float64)
+    again = RolloutBuffer.from_bytes(buffer.with_rewards({"task": reward, "total": reward}).to_bytes())
+    assert torch.equal(again.rewards["task"], reward) and torch.equal(again.rewards["total"], reward)
+    same = replace(buffer, sample_ids=buffer.group_ids)
+    assert torch.equal(RolloutBuffer.from_bytes(same.to_bytes()).sample_ids, buffer.group_ids)
+
+
+def test_bytes_cut_short_anywhere_are_refused() -> None:
+    data = toy_buffer(Analytic(swirl), toy_rollout_settings()).to_bytes()
+    for length in (0, 1, 7, 8, 100, len(data) // 2, len(data) - 1):
+        with pytest.raises(RolloutBufferError, match=f"these {length} bytes are no complete rollout buffer"):
+            RolloutBuffer.from_bytes(data[:length])
+
+
+def test_other_bytes_and_files_that_lack_a_part_are_refused() -> None:
+    for data in (b"x" * 5000, save({"a": torch.zeros(2)}), save({"a": torch.zeros(2)}, {"rollout_buffer": "{}"})):
+        with pytest.raises(RolloutBufferError, match="no complete rollout buffer"):
+            RolloutBuffer.from_bytes(data)
+
+
+@pytest.mark.parametrize("name", ["rollout.latents", "rollout.states", "condition.text", "group_ids", "rollout.seeds"])
+def test_a_file_that_lacks_one_tensor_is_refused_by_its_name(name: str) -> None:
+    buffer = toy_buffer(Analytic(swirl), toy_rollout_settings())
+    data = buffer.to_bytes()
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
+    tensors = {key: value.clone() for key, value in buffer._tensors().items() if key != name}
+    with pytest.raises(RolloutBufferError, match=name.split(".")[-1]):
+        RolloutBuffer.from_bytes(save(tensors, header))
+
+
+# T33: refusals
+
+
+CHANGES = [
+    {"num_steps": 7}, {"shift": 5.0}, {"cfg": 2.0}, {"eta": 0.5}, {"arm": "cps"}, {"sigma_map": "linear"},
+    {"mask_on": "var"}, {"mask_dtype": "float16"}, {"mask": MaskSettings(m_min=0.3)},
+    {"mask": MaskSettings(budget="rms")},
+]
+
+
+@pytest.mark.parametrize("changes", CHANGES)
+def test_a_buffer_of_another_sampler_is_refused(changes: dict[str, object]) -> None:
+    """T33."""
+    settings, other = toy_rollout_settings(), toy_rollout_settings(**changes)
+    buffer = toy_buffer(Analytic(swirl), settings)
+    buffer.check(settings, 0, 0)
+    assert config_hash(settings) != config_hash(other)
+    with pytest.raises(
+        RolloutBufferError, match=f"settings {config_hash(settings)[:12]}, .* has {config_hash(other)[:12]}"
+    ):
+        buffer.check(other, 0, 0)
+
+
+def test_how_a_rollout_is_batched_or_its_noise_is_kept_does_not_make_it_another_one() -> None:
+    plain = config_hash(toy_rollout_settings())
+    assert (
+        config_hash(toy_rollout_settings(micro_batch=3))
+        == config_hash(toy_rollout_settings(noise_store="seed"))
+        == config_hash(toy_rollout_settings(noise_store="zeta_bfloat16"))
+        == plain
+    )
+
+
+@pytest.mark.parametrize(("made", "now", "limit", "staleness"), [(0, 1, 0, 1), (2, 5, 2, 3), (4, 3, 5, -1)])
+def test_a_buffer_that_is_too_old_or_from_the_future_is_refused(
+    made: int, now: int, limit: int, staleness: int
+) -> None:
+    """T33."""
+    settings = toy_rollout_settings()
+    buffer = toy_buffer(Analytic(swirl), settings, version=made)
+    with pytest.raises(RolloutBufferError, match=f"staleness {staleness} is outside 0 to {limit}"):
+        buffer.check(settings, now, limit)
+    buffer.check(settings, made + limit, limit)
+
+
+# rewards and parts
+
+
+def test_a_video_is_valid_while_all_of_its_rewards_are_finite() -> None:
+    buffer = toy_buffer(Analytic(swirl), toy_rollout_settings(), groups=1, size=4)
+    rewards = {"a": torch.tensor([1.0, math.nan, 3, 4]), "b": torch.tensor([1.0, 2, math.inf, 4])}
+    assert buffer.with_rewards(rewards).valid.tolist() == [True, False, False, True]
+    with pytest.raises(RolloutBufferError, match=r"reward a has shape \(3,\), the buffer 4 videos"):
+        buffer.with_rewards({"a": torch.zeros(3)})
+
+
+def test_two_halves_make_the_whole_buffer() -> None:
+    settings, model = toy_rollout_settings(), Analytic(swirl)
+    first, second = (
+        toy_buffer(model, settings, groups=1, iteration=0),
+        toy_buffer(model, settings, groups=1, iteration=0),
+    )
+    second = replace(second, group_ids=second.group_ids + 1)
+    whole = concatenate_buffers([first, second])
+    assert len(whole) == 8 and whole.group_ids.tolist() == [0] * 4 + [1] * 4
+    assert whole.rollout.zeta is not None and whole.rollout.zeta.shape[0] == len(whole.rewards["brightness"]) == 8
+    assert torch.equal(whole.rollout.latents[4:], second.rollout.latents)
+    assert_close(whole.rollout.noise_share, first.rollout.noise_share)
+
+
+@pytest.mark.parametrize("changes", [{"policy_version": 9}, {"config_hash": "x" * 64}, {"iteration": 7}])
+def test_parts_of_different_runs_do_not_make_a_buffer(changes: dict[str, object]) -> None:
+    part = toy_buffer(Analytic(swirl), toy_rollout_settings(), groups=1)
+    with pytest.raises(RolloutBufferError, match="do not belong together"):
+        concatenate_buffers([part, replace(part, **changes)])  # type: ignore[arg-type]
+
+
+def test_rows_of_a_condition_are_repeated_in_groups() -> None:
+    condition = toy_condition(2)
+    repeated = condition.repeat_interleave(3)
+    assert isinstance(repeated, Condition) and len(repeated.frames) == 6
+    assert torch.equal(repeated.frames[:3], condition.frames[:1].expand(3, -1, -1, -1, -1))
+    assert torch.equal(repeated.rows(slice(3, 4)).actions, condition.actions[1:])
+    assert repeated.frames.shape[1] == SHAPE[0]
+
+
+# the transition
+
+
+def test_a_transition_carries_gradient_in_its_noise_only() -> None:
+    """T16."""
+    settings, model = toy_rollout_settings(), tiny_network()
+    buffer = toy_buffer(model, settings)
+    new = first_transition(buffer, settings, 1, model)
+    assert new.zeta.requires_grad and new.zeta.shape == (8, 3 * 3 * 5 * 7)
+    assert not any(getattr(new, name).requires_grad for name in ("std", "slope", "mask", "sigma_base"))
+    assert new.std.shape == new.slope.shape == new.mask.shape == new.zeta.shape and new.sigma_base.shape == (8,)
+    assert not buffer.rollout.states.requires_grad and not buffer.rollout.mask.requires_grad
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 1, 1), (1, 1, 5, 7), (3, 5, 3, 7)])
+@pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow", "dance", "sage"])
+def test_odd_and_single_sizes_have_a_ratio_of_one_before_any_update(shape: tuple[int, int, int, int], arm: str) -> None:
+    settings, model = toy_rollout_settings(arm=arm), tiny_network(shape[0])
+    buffer = toy_buffer(model, settings, shape=shape, given=0)
+    assert buffer.rollout.zeta is not None
+    new = first_transition(buffer, settings, 2, model)
+    assert torch.equal(log_ratio(new.zeta, buffer.rollout.zeta[:, 2].flatten(1)), torch.zeros(8))
+
+
+def test_a_stored_mask_of_another_shape_is_refused() -> None:
+    settings, model = toy_rollout_settings(), Analytic(swirl)
+    buffer = toy_buffer(model, settings)
+    wrong = replace(buffer, rollout=replace(buffer.rollout, mask=buffer.rollout.mask[..., :-1]))
+    with pytest.raises(ValueError, match="mask must be"):
+        first_transition(wrong, settings, 0, model)

@@ -1,0 +1,127 @@
+"""What the doctor finds on a model that is well, and on settings or models that would spoil a training."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from video_toys import Analytic, toy_condition
+
+from wm_nodes.apps.check_video_model import main
+from wm_nodes.video_model import Condition, RolloutSettings, SamplerSettings, Step, VideoNetwork
+from wm_nodes.video_rl import checks
+from wm_nodes.video_rl.checks import CheckResult, examine
+from wm_nodes.video_rl.grpo_settings import GrpoSettings, KlSettings
+from wm_nodes.video_rl.settings import load_video_config
+from wm_nodes.video_rl.toy_scene import draw_scenes, load_base
+
+SHAPE = (2, 6, 16, 16)
+ROLLOUT = RolloutSettings(num_steps=4, shift=3.0)
+RATIO, KL, ODE, MEMORY = (
+    "ratio is 1 on the first update", "KL is 0 at the anchor", "eta = 0 is the Euler ODE step",
+    "memory of the KL anchors",
+)
+
+
+def findings(
+    rollout: RolloutSettings = ROLLOUT, grpo: GrpoSettings | None = None, model: Any = None, **more: int
+) -> dict[str, CheckResult]:
+    condition = draw_scenes(4, 0, "doctor").condition()
+    return {f.name: f for f in examine(model or load_base(), condition, SHAPE, rollout, grpo or GrpoSettings(), **more)}
+
+
+@pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow", "dance", "sage"])
+@pytest.mark.parametrize("anchor", ["buffer", "frozen", "moving", "dual"])
+def test_a_sound_model_passes_with_every_sampler_and_anchor(arm: Any, anchor: Any) -> None:
+    found = findings(replace(ROLLOUT, sampler=SamplerSettings(arm, 0.6)), GrpoSettings(kl=KlSettings(anchor=anchor)))
+    assert [name for name, finding in found.items() if not finding.passed] == []
+    assert anchor in found[KL].value and arm in found[ODE].value
+
+
+def test_guidance_in_the_rollout_alone_is_named_though_the_mean_ratio_hardly_moves() -> None:
+    config = load_video_config("recommended")
+    guided = replace(config.rollout, cfg=2.0)
+    ratio = findings(guided, config.grpo)[RATIO]
+    assert not ratio.passed and "rollout.cfg and grpo.cfg" in ratio.remedy
+    assert float(ratio.value.split(" by ")[1].split(",")[0]) < checks.RATIO_LIMIT
+    assert findings(guided, replace(config.grpo, cfg=2.0))[RATIO].passed
+
+
+@pytest.mark.parametrize("changes", [{"mean": 1.01}, {"std": 0.1}])
+def test_a_step_that_is_not_the_ode_s_without_noise_is_named(
+    changes: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wrong(*arguments: Any) -> Step:
+        law = step(*arguments)
+        return law._replace(mean=law.mean * changes.get("mean", 1), std=law.std + changes.get("std", 0))
+
+    step = checks.step
+    monkeypatch.setattr(checks, "step", wrong)
+    assert not findings()[ODE].passed
+
+
+def test_an_image_is_explored_everywhere_and_passes() -> None:
+    rows = Condition(torch.zeros(4, 2, 0, 8, 8), torch.zeros(4, 0, 4), torch.zeros(4, 1, 0))
+    found = {f.name: f for f in examine(load_base(), rows, (2, 1, 8, 8), ROLLOUT, GrpoSettings())}
+    assert all(finding.passed for finding in found.values()) and "single frame" in found["the mask is not flat"].value
+
+
+def test_a_model_whose_output_is_not_finite_is_the_only_finding() -> None:
+    ((name, finding),) = findings(model=Analytic(lambda x, t: x / 0)).items()
+    assert name == "sampled videos are finite" and not finding.passed and finding.value == "4 of 4 are not"
+
+
+def test_the_memory_is_that_of_what_trains_and_of_a_whole_buffer() -> None:
+    model = load_base()
+    model.head.requires_grad_(False)
+    asked = [p.requires_grad for p in model.parameters()]
+
+    def memory(trains: Any, **more: int) -> str:
+        return findings(grpo=GrpoSettings(trains=trains), model=model, **more)[MEMORY].value
+
+    assert f"{size(model, model.parameters()):.2f} MiB of weights that train" in memory("all")
+    assert f"{size(model, model.condition_parameters()):.2f} MiB of weights that train" in memory("condition")
+    assert [p.requires_grad for p in model.parameters()] == asked and all(p.grad is None for p in model.parameters())
+    zeta = 4 * 3 * 2 * 5 * 16 * 16 * 4 / 2**20  # videos x steps x C x generated frames x H x W, float32
+    assert f"{zeta:.2f} MiB of noise" in memory("all")
+    assert f"{64 * zeta:.2f} MiB of noise" in memory("all", buffer_videos=256)
+    seeds = findings(replace(ROLLOUT, noise_store="seed"))[MEMORY].value
+    assert "only seeds" in seeds
+
+
+def size(model: VideoNetwork, parameters: Any) -> float:
+    return float(sum(p.nbytes for p in parameters if p.requires_grad) / 2**20)
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("grpo.kl.anchor=lora_off", "needs a model with a LoRA adapter"),
+        ("rollout.num_steps=1", "no step can train"),
+        ("rollout.sampler.arm=ode", "has no likelihood to train on"),
+        ("rollout.sampler.eta=1.5", "got 1.5"),
+    ],
+)
+def test_settings_that_cannot_train_are_one_clear_error(
+    setting: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--set", setting]) == 2
+    assert words in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_doctor_passes_the_shipped_toy_model_and_leaves_it_as_it_was() -> None:
+    model, config = load_base(), load_video_config("recommended")
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    findings = examine(model, draw_scenes(4, 0, "doctor").condition(), (2, 6, 16, 16), config.rollout, config.grpo)
+    assert [finding.name for finding in findings if not finding.passed] == []
+    assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
+
+
+def test_the_doctor_names_a_flat_mask_and_a_ratio_that_is_not_1() -> None:
+    config = load_video_config("recommended")
+    condition = toy_condition(3, (2, 5, 8, 8))
+    restless = Analytic(lambda x, t: x + 0.3 * torch.randn_like(x))  # other noise on every call, as dropout would give
+    findings = {f.name: f for f in examine(restless, condition, (2, 5, 8, 8), config.rollout, config.grpo)}
+    assert not findings["ratio is 1 on the first update"].passed
+    assert "dropout" in findings["ratio is 1 on the first update"].remedy
+    assert not findings["eta = 0 is the Euler ODE step"].passed

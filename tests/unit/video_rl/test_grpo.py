@@ -1,0 +1,838 @@
+"""The GRPO learner on a tiny network: exact ratios and gradients, anchors, ranks, resume, refusals. Ids: spec 4.1."""
+
+import copy
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torch.multiprocessing as mp
+from safetensors.torch import save
+from torch import Tensor
+from torch.testing import assert_close
+from video_toys import (
+    SHAPE,
+    Analytic,
+    tiny_network,
+    toy_buffer,
+    toy_rollout_settings,
+    train_rounds,
+    video_learner_rank,
+    weights,
+)
+
+from wm_nodes.training.ranks import Ranks
+from wm_nodes.training.weights import WeightsError
+from wm_nodes.video_model import RolloutBuffer, RolloutBufferError, RolloutSettings, StepContext, VideoNetwork, step
+from wm_nodes.video_rl.group_advantages import GroupAdvantages
+from wm_nodes.video_rl.grpo import GrpoLearner, mixed_reward
+from wm_nodes.video_rl.grpo_math import gaussian_logprob
+from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
+from wm_nodes.video_rl.ratio_and_kl import Rows
+
+NO_KL = KlSettings("none")
+MODES = ["mean", "logk2", "logk3", "velocity"]
+
+
+def grpo(**changes: Any) -> GrpoSettings:
+    """Batches of 8 rows, as at rollout, so that network calls have one shape and the ratio is exactly 1."""
+    return GrpoSettings(**{"learning_rate": 1e-3, "micro_batch": 8, "step_fraction": 0.8, **changes})
+
+
+def make(rollout: RolloutSettings | None = None, *, network: VideoNetwork | None = None, seed: int = 0,
+         ranks: Ranks | None = None, **changes: Any) -> GrpoLearner:
+    network = network or tiny_network()
+    return GrpoLearner(network, grpo(**changes), rollout or toy_rollout_settings(micro_batch=8), seed=seed, ranks=ranks)
+
+
+def buffer_of(learner: GrpoLearner, **changes: Any) -> RolloutBuffer:
+    return toy_buffer(learner.model, learner.rollout, version=learner.version, **changes)
+
+
+def all_rows(buffer: RolloutBuffer) -> Rows:
+    count, steps = len(buffer), len(buffer.rollout.steps)
+    return Rows(torch.arange(count).repeat_interleave(steps), torch.arange(steps).repeat(count))
+
+
+def known(values: list[float]) -> GroupAdvantages:
+    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0, 0)
+
+
+SIGNAL = known([1.5, -0.5, 0.25, -1.0, 2.0, -2.0, 0.1, 0.7])
+
+
+def gradient(
+    learner: GrpoLearner, buffer: RolloutBuffer, rows: Rows | None = None, signal: GroupAdvantages = SIGNAL
+) -> Tensor:
+    """Of the learner's loss, all parameters in one row."""
+    learner.model.zero_grad(set_to_none=True)
+    learner.gradients(buffer, rows or all_rows(buffer), signal)
+    return torch.cat([p.grad.flatten() for p in learner.parameters if p.grad is not None])
+
+
+def assert_equal(first: dict[str, Tensor], second: dict[str, Tensor]) -> None:
+    for name, tensor in first.items():
+        assert torch.equal(tensor, second[name]), name
+
+
+# T16 to T20
+
+
+@pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow", "dance", "sage"])
+@pytest.mark.parametrize("storage", ["float32", "bfloat16"])
+def test_before_any_update_the_ratio_is_exactly_one_and_the_kl_exactly_zero(arm: str, storage: str) -> None:
+    """T17, T20, T27: the network is called with as many rows as at rollout."""
+    learner = make(toy_rollout_settings(micro_batch=8, arm=arm, storage_dtype=storage), updates_per_buffer=2)
+    first, second = learner.train(buffer_of(learner)).updates
+    assert first.transitions == 8 * 4
+    assert first.ratio_mean == 1.0 and first.kl == 0.0 and first.clip_low_share == first.clip_high_share == 0.0
+    assert second.ratio_mean != 1.0 and second.kl > 0
+
+
+@pytest.mark.parametrize("size", [1, 3, 5, 1000])
+def test_in_micro_batches_of_another_size_the_ratio_is_one_to_five_digits(size: int) -> None:
+    """T18; the clip range is the tolerance."""
+    learner = make(micro_batch=size, clip_low=1e-5, clip_high=1e-5)
+    first = learner.train(buffer_of(learner)).updates[0]
+    assert first.ratio_mean == pytest.approx(1.0, abs=1e-5) and first.clip_low_share == first.clip_high_share == 0.0
+    assert first.kl < 1e-11
+
+
+def test_from_seeds_alone_the_ratio_is_one_to_five_digits() -> None:
+    """T22."""
+    learner = make(toy_rollout_settings(micro_batch=8, noise_store="seed"), clip_low=1e-5, clip_high=1e-5)
+    buffer = buffer_of(learner)
+    assert buffer.rollout.zeta is None
+    first, second = learner.train(buffer).updates
+    assert first.clip_low_share == first.clip_high_share == 0.0 and first.kl < 1e-11 < second.kl
+
+
+def test_from_noise_kept_in_bfloat16_no_ratio_leaves_the_clip_range_and_the_kl_is_below_3e_6() -> None:
+    """T22, D = 8192; a clip range of 1e-6 would be left."""
+    settings = toy_rollout_settings(micro_batch=8, storage_dtype="bfloat16", noise_store="zeta_bfloat16")
+    for clip, left in ((1e-4, False), (1e-6, True)):
+        learner = make(settings, network=tiny_network(8), clip_low=clip, clip_high=clip)
+        first, second = learner.train(buffer_of(learner, shape=(8, 5, 16, 16))).updates
+        assert (first.clip_low_share + first.clip_high_share > 0) == left
+        assert 0 < first.kl < 3e-6 < second.kl
+
+
+@pytest.mark.parametrize("cfg", [1.0, 2.5])
+def test_guidance_in_rollout_and_training_is_the_same_model_and_in_one_of_them_is_not(cfg: float) -> None:
+    learner = make(toy_rollout_settings(micro_batch=8, cfg=cfg), cfg=cfg)
+    assert learner.train(buffer_of(learner)).updates[0].kl == 0.0
+    other = make(toy_rollout_settings(micro_batch=8, cfg=cfg), cfg=cfg + 1)
+    assert other.train(buffer_of(other)).updates[0].kl > 1e-6
+
+
+def logprob_gradient(learner: GrpoLearner, buffer: RolloutBuffer, kind: str) -> Tensor:
+    """Of the mean over all transitions of -A l, from the kernel and (12), without the learner."""
+    model, times, total = learner.model, learner.rollout.times, torch.zeros(())
+    rows = all_rows(buffer)
+    for video, position in zip(rows.videos.tolist(), rows.positions.tolist(), strict=True):
+        k = buffer.rollout.steps[position]
+        condition = buffer.condition.rows(slice(video, video + 1))
+        x_t, x_s = (buffer.rollout.state(i)[video : video + 1].float() for i in (k, k + 1))
+        context = StepContext(condition.frames, float(times[1]), buffer.rollout.mask[video : video + 1, position])
+        t, s = times[k].expand(1), times[k + 1].expand(1)
+        law = step(x_t, model(x_t, t, condition), t, s, context, learner.rollout.sampler)
+        x, mean, std = (value.expand_as(x_t)[:, :, 1:].flatten(1) for value in (x_s, law.mean, law.std))
+        log = gaussian_logprob(x, mean, std)
+        if kind == "cps":
+            log = -(x - mean).square().mean(1)
+        elif kind == "base":
+            log = -(x - mean).square().mean(1) / (2 * law.sigma_base.square())
+        elif kind == "ratio_norm":
+            log = std.square().mean(1).sqrt() * log
+        total = total - SIGNAL.advantages_N[video].float() * log.sum() / len(rows.videos)
+    found = torch.autograd.grad(total, learner.parameters, allow_unused=True)  # the text layer, without a text
+    return torch.cat([g.flatten() for g in found if g is not None])
+
+
+@pytest.mark.parametrize("clip", [1e-8, 1e-4, 0.2])
+def test_the_first_gradient_is_the_advantage_times_that_of_the_log_probability_for_every_clip(clip: float) -> None:
+    """T19."""
+    learner = make(clip_low=clip, clip_high=clip)
+    buffer = buffer_of(learner)
+    wanted = logprob_gradient(learner, buffer, "full")
+    assert float((gradient(learner, buffer) - wanted).norm() / wanted.norm()) < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["cps", "base", "ratio_norm"])
+@pytest.mark.parametrize("arm", ["cps", "dyndiff"])
+def test_every_likelihood_weight_has_the_first_gradient_of_its_formula(kind: str, arm: str) -> None:
+    """T19; (14c), (15b): the drift of the normalised ratio has no gradient where nothing has moved."""
+    changes = {"ratio_norm": True} if kind == "ratio_norm" else {"logprob_weight": kind}
+    learner = make(toy_rollout_settings(micro_batch=8, arm=arm), **changes)
+    buffer = buffer_of(learner)
+    wanted, full = logprob_gradient(learner, buffer, kind), logprob_gradient(learner, buffer, "full")
+    assert float((gradient(learner, buffer) - wanted).norm() / wanted.norm()) < 1e-5
+    assert (kind, arm) == ("base", "cps") or float((wanted - full).norm() / full.norm()) > 0.05, "or it could not fail"
+
+
+def test_the_equaliser_gives_every_step_the_median_sensitivity_s_share() -> None:
+    """One step's gradient is scaled by median_j g_j / g_k, with CPS the same for all videos."""
+    rollout = toy_rollout_settings(micro_batch=8, arm="cps")
+    plain, equal = make(rollout, kl=NO_KL), make(rollout, kl=NO_KL, equalise=True)
+    buffer, times, eta = buffer_of(plain), rollout.times, math.sin(math.pi * 0.3)
+    t, s = times[:5], times[1:6].clone()
+    slope = -(1 - s) * t + (1 - t) * s * math.sqrt(1 - eta**2)
+    sensitivity = (slope.abs() / (s * eta))[:5]
+    for position in range(5):
+        rows = Rows(torch.arange(8), torch.full((8,), position))
+        if float(s[position]) > 0:
+            scale = float(sensitivity.median() / sensitivity[position])
+            assert_close(gradient(equal, buffer, rows), scale * gradient(plain, buffer, rows), rtol=1e-3, atol=1e-8)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("anchor", ["buffer", "frozen", "moving", "dual"])
+def test_the_kl_has_no_gradient_at_its_anchor(mode: str, anchor: str) -> None:
+    """T20: with no advantage nothing else is left."""
+    learner = make(kl=KlSettings(mode, 10.0, anchor))  # type: ignore[arg-type]
+    buffer = buffer_of(learner)
+    assert not gradient(learner, buffer, signal=known([0.0] * 8)).any()
+    assert gradient(learner, buffer).any()
+
+
+def test_training_leaves_no_gradient_on_what_was_stored() -> None:
+    """T16."""
+    learner = make()
+    buffer = buffer_of(learner)
+    before = buffer.to_bytes()
+    learner.train(buffer)
+    assert buffer.to_bytes() == before
+    for name in ("states", "mask", "sigma_base", "zeta", "latents"):
+        tensor = getattr(buffer.rollout, name)
+        assert not tensor.requires_grad and tensor.grad is None, name
+
+
+# accumulation and ranks
+
+
+@pytest.mark.parametrize("changes", [{}, {"equalise": True, "kl": KlSettings("mean", 0.5, "frozen")}])
+def test_the_size_of_a_micro_batch_does_not_change_the_gradient(changes: dict[str, Any]) -> None:
+    whole = make(micro_batch=1000, clip_low=0.5, clip_high=0.5, **changes)
+    buffer = buffer_of(whole)
+    wanted = gradient(whole, buffer)
+    for size in (1, 3, 7):
+        parts = gradient(make(micro_batch=size, clip_low=0.5, clip_high=0.5, **changes), buffer)
+        assert float((parts - wanted).norm() / wanted.norm()) < 1e-5
+
+
+class OneOfTwo(Ranks):
+    """A rank that is told nothing by the other one."""
+
+    def sum_(self, *tensors: Tensor) -> None:
+        pass
+
+    def sum_gradients(self, module: torch.nn.Module) -> None:
+        pass
+
+
+def test_the_gradients_of_two_ranks_add_up_to_that_of_one() -> None:
+    one = make()
+    buffer = buffer_of(one)
+    rows = Rows(torch.tensor([0, 3, 3, 5, 7]), torch.tensor([1, 0, 4, 2, 2]))
+    halves = [gradient(make(ranks=OneOfTwo(rank, 2)), buffer, rows) for rank in (0, 1)]
+    wanted = gradient(one, buffer, rows)
+    assert float((halves[0] + halves[1] - wanted).norm() / wanted.norm()) < 1e-5
+    assert float((halves[0] - wanted).norm() / wanted.norm()) > 0.1
+
+
+def test_a_rank_without_a_transition_has_a_gradient_of_zero_and_counts_nothing() -> None:
+    """Fewer transitions than ranks: it must still take part in the sums."""
+    learner = make(ranks=OneOfTwo(1, 2))
+    buffer = buffer_of(learner)
+    sums = learner.gradients(buffer, Rows(torch.tensor([0]), torch.tensor([1])), SIGNAL)
+    assert all(math.isfinite(value) for value in sums.values()) and sums["objective"] == sums["low"] == 0.0
+    given = [None if p.grad is None else bool(p.grad.any()) for p in learner.parameters]
+    full = make()
+    gradient(full, buffer)
+    assert given == [None if p.grad is None else False for p in full.parameters], "a gradient wherever others have one"
+
+
+@pytest.mark.slow
+def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
+    settings = grpo(
+        micro_batch=3,
+        updates_per_buffer=3,
+        clip_low=0.1,
+        clip_high=0.1,
+        learning_rate=1e-4,
+        kl=KlSettings(anchor="dual", dual_every=1),
+        ema_decay=0.9,
+    )
+    one = GrpoLearner(tiny_network(), settings, toy_rollout_settings(), seed=5)
+    report = one.train(toy_buffer(one.model, one.rollout))
+    mp.spawn(video_learner_rank, args=(2, str(tmp_path), settings), nprocs=2)
+    ranks = [torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1)]
+    assert_equal(ranks[0]["weights"], ranks[1]["weights"])
+    for name, tensor in weights(one.model).items():
+        assert_close(ranks[0]["weights"][name], tensor, rtol=1e-4, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}")
+    numbers = [[u.objective, u.kl, u.ratio_mean, u.clip_low_share, u.clip_high_share] for u in report.updates]
+    assert_close(ranks[0]["numbers"], torch.tensor(numbers), rtol=1e-3, atol=1e-6)
+
+
+# KL modes and anchors
+
+
+@pytest.mark.parametrize("mode", [*MODES, "none"])
+def test_every_kl_is_zero_on_the_first_update_of_a_buffer_and_then_its_own_size(mode: str) -> None:
+    """T20; the log-space forms are far weaker."""
+    learner = make(kl=KlSettings(mode), updates_per_buffer=2)  # type: ignore[arg-type]
+    for iteration in range(2):
+        first, second = learner.train(buffer_of(learner, iteration=iteration)).updates
+        assert first.kl == 0.0
+        assert second.kl == 0.0 if mode == "none" else second.kl > 0
+
+
+def kl_by_version(rounds: int = 4, **changes: Any) -> list[float]:
+    learner, found = make(updates_per_buffer=2, **changes), []
+    for iteration in range(rounds):
+        found += [u.kl for u in learner.train(buffer_of(learner, iteration=iteration)).updates]
+    return found
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_each_anchor_is_where_it_says(mode: str) -> None:
+    """Versions 0 to 7, two to a buffer. The first KL after an anchor moved to the weights is 0."""
+    zero = {
+        anchor: [kl == 0.0 for kl in kl_by_version(kl=KlSettings(mode, 0.5, anchor, 3, 4))]  # type: ignore[arg-type]
+        for anchor in ("buffer", "frozen", "moving", "dual")
+    }
+    assert zero["buffer"] == [True, False] * 4
+    assert zero["frozen"] == [True] + [False] * 7
+    assert zero["moving"] == [True, False, False] * 2 + [True, False], "moves every third update"
+    assert zero["dual"] == [True, False, True, False, False, False, True, False], "frozen at versions 0 and 4"
+
+
+def test_a_dual_anchor_adds_the_frozen_one_to_the_buffer_s() -> None:
+    frozen, dual = make(kl=KlSettings(anchor="frozen")), make(kl=KlSettings(anchor="dual", dual_every=1))
+    buffer = make()
+    for learner in (frozen, dual, buffer):
+        train_rounds(learner, range(1))
+        with torch.no_grad():
+            for parameter in learner.parameters:
+                parameter.copy_(parameter.round(decimals=3))
+    data = buffer_of(buffer)
+    for parameter in (*buffer.parameters, *frozen.parameters, *dual.parameters):
+        parameter.data.add_(0.01)
+    for learner in (frozen, dual):
+        learner.model.load_state_dict(buffer.model.state_dict())
+    frozen_kl, dual_kl, buffer_kl = (
+        learner.gradients(data, all_rows(data), SIGNAL)["kl"] for learner in (frozen, dual, buffer)
+    )
+    assert dual_kl == pytest.approx(frozen_kl + buffer_kl, rel=1e-5) and min(frozen_kl, buffer_kl) > 0
+
+
+class Adapted(VideoNetwork):
+    """A network with an addition to its velocity that can be switched off, as LoRA's can."""
+
+    def __init__(self) -> None:
+        base = tiny_network()
+        super().__init__(base.settings)
+        self.load_state_dict(base.state_dict())
+        self.requires_grad_(False)
+        self.adapter = torch.nn.Parameter(torch.zeros(1, SHAPE[0], 1, 1, 1))
+        self.enabled = True
+
+    def forward(self, x: Tensor, t: Tensor, condition: Any, drop: Tensor | None = None) -> Tensor:
+        out = super().forward(x, t, condition, drop)
+        return out + self.adapter * x if self.enabled else out
+
+    @contextmanager
+    def disable_adapter(self) -> Iterator[None]:
+        self.enabled = False
+        yield
+        self.enabled = True
+
+
+def test_with_its_adapter_off_the_model_is_its_own_frozen_anchor() -> None:
+    found = []
+    for anchor in ("lora_off", "frozen"):
+        learner = make(network=Adapted(), kl=KlSettings(anchor=anchor), learning_rate=0.05)  # type: ignore[arg-type]
+        train_rounds(learner, range(2))
+        found.append(learner.train(buffer_of(learner, iteration=2)).updates[0].kl)
+        assert list(learner._terms.anchor) == ([] if anchor == "lora_off" else ["adapter"])
+        assert [name for name, _ in learner.model.named_parameters() if _.requires_grad] == ["adapter"]
+    assert found[0] == pytest.approx(found[1], rel=1e-5) and found[0] > 0
+
+
+def test_switching_off_an_adapter_that_a_model_does_not_have_is_an_error() -> None:
+    with pytest.raises(ValueError, match="lora_off needs a model with a LoRA adapter"):
+        make(kl=KlSettings(anchor="lora_off"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"mask_source": "recompute", "logprob_weight": "cps"}, r"full likelihood \(12\), got logprob_weight cps;"),
+        ({"mask_source": "recompute", "ratio_norm": True}, r"full likelihood \(12\), got ratio_norm True;"),
+        ({"ratio_norm": True, "logprob_weight": "base"}, "ratio_norm replaces .* got logprob_weight base; take full"),
+    ],
+)
+def test_two_settings_of_which_one_would_be_ignored_are_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        GrpoSettings(**changes)
+
+
+def test_training_the_condition_alone_moves_its_layers_and_no_other_weight_by_a_bit(tmp_path: Path) -> None:
+    learner = make(trains="condition", kl=KlSettings(anchor="dual"), weight_decay=0.1)
+    before = weights(learner.model)
+    train_rounds(learner, range(2))
+    after = weights(learner.model)
+    moved = {name.split(".")[0] if "film" not in name else "film" for name in after
+             if not torch.equal(after[name], before[name])}
+    assert moved == {"action", "time", "film"}, "a network without text has nothing to learn about it"
+    condition = ("action.", "text.", "time.", "blocks.0.film.")
+    assert set(learner._terms.anchor) == {name for name in before if name.startswith(condition)}
+    learner.save(tmp_path / "learner.safetensors", iteration=2)
+    resumed = make(trains="condition", kl=KlSettings(anchor="dual"), weight_decay=0.1)
+    assert resumed.load(tmp_path / "learner.safetensors") == 2
+    assert_equal(weights(resumed.model), after)
+    with pytest.raises(WeightsError, match=r"learner\.safetensors"):
+        make().load(tmp_path / "learner.safetensors")
+
+
+def test_a_model_that_does_not_say_which_weights_are_its_condition_is_refused_and_keeps_its_gradients() -> None:
+    model = Analytic(lambda x, t: x)
+    with pytest.raises(ValueError, match=r"embedded video model; Analytic takes grpo\.trains all"):
+        GrpoLearner(model, grpo(trains="condition"), toy_rollout_settings(), seed=0)
+    assert model.offset.requires_grad
+
+
+@pytest.mark.parametrize("mode", ["logk2", "logk3"])
+def test_a_log_space_kl_measures_against_its_own_anchor(mode: str) -> None:
+    """From (12): log r of the weights now to those of the anchor, at the stored x_s; not to those that sampled."""
+    learner = make(kl=KlSettings(mode, 0.5, "frozen"))  # type: ignore[arg-type]
+    anchor = tiny_network()
+    with torch.no_grad():
+        for parameter in learner.parameters:
+            parameter.add_(0.02 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(3)))
+    buffer = buffer_of(learner)  # sampled by the weights now: against the buffer the KL is 0
+    found = learner.gradients(buffer, all_rows(buffer), SIGNAL)["kl"] / 40
+    logs = torch.tensor([
+        float(_logprob(learner.model, learner, buffer, i) - _logprob(anchor, learner, buffer, i)) for i in range(40)
+    ], dtype=torch.float64)
+    wanted = logs.square() / 2 if mode == "logk2" else (-logs).exp() - 1 + logs
+    assert found == pytest.approx(float(wanted.mean()), rel=1e-2) and found > 1e-9
+
+
+def _logprob(model: torch.nn.Module, learner: GrpoLearner, buffer: RolloutBuffer, row: int) -> Tensor:
+    """(14) of one stored transition under `model`, float64."""
+    rows, times = all_rows(buffer), learner.rollout.times
+    video, position = int(rows.videos[row]), int(rows.positions[row])
+    k, one = buffer.rollout.steps[position], slice(video, video + 1)
+    condition = buffer.condition.rows(one)
+    x_t, x_s = buffer.rollout.state(k)[one], buffer.rollout.state(k + 1)[one]
+    context = StepContext(condition.frames, float(times[1]), buffer.rollout.mask[one, position])
+    t, s = times[k].expand(1), times[k + 1].expand(1)
+    with torch.no_grad():
+        law = step(x_t, model(x_t, t, condition), t, s, context, learner.rollout.sampler)
+    x, mean, std = (value.expand_as(x_t)[:, :, 1:].flatten(1).double() for value in (x_s, law.mean, law.std))
+    return gaussian_logprob(x, mean, std)
+
+
+def test_a_larger_kl_weight_keeps_the_model_nearer_to_its_anchor() -> None:
+    ends = [
+        kl_by_version(6, kl=KlSettings("mean", beta, "frozen"), clip_low=0.2, clip_high=0.2)[-1]
+        for beta in (1e-6, 50.0)
+    ]
+    assert ends[1] < 0.5 * ends[0]
+
+
+# passes, selection, advantages
+
+
+def test_mixed_advantages_do_not_depend_on_a_reward_s_unit_and_mixed_rewards_do() -> None:
+    trained: dict[str, list[dict[str, Tensor]]] = {"advantage": [], "reward": []}
+    for mix, found in trained.items():
+        for unit in (1.0, 1024.0):
+            learner = GrpoLearner(
+                tiny_network(), grpo(advantage=AdvantageSettings(mix=mix)), toy_rollout_settings(micro_batch=8),  # type: ignore[arg-type]
+                seed=0, reward_weights={"brightness": 1.0, "contrast": 0.5},
+            )
+            buffer = buffer_of(learner)
+            contrast = unit * buffer.rollout.latents[:, 1].std((1, 2, 3)).double()
+            raw = {"brightness": buffer.rewards["brightness"], "contrast": contrast}
+            total = raw["brightness"] + 0.5 * raw["contrast"]
+            learner.train(buffer.with_rewards({**raw, "total": total}))
+            found.append(weights(learner.model))
+    for mix, (first, second) in trained.items():
+        same = all(torch.equal(value, second[name]) for name, value in first.items())
+        assert same == (mix == "advantage")
+
+
+def test_win_rates_train_by_rank_alone_whatever_the_scale_of_the_reward() -> None:
+    """Pref-GRPO: rewards and their cubes have one order, so they train alike; the rewards themselves do not."""
+    trained: dict[str, list[dict[str, Tensor]]] = {"win_rate": [], "reward": []}
+    rewards = torch.tensor([0.0, 1, 2, 5, 3, 7, -1, 4], dtype=torch.float64)
+    for source, found in trained.items():
+        for values in (rewards, rewards**3):
+            learner = make(advantage=AdvantageSettings(source=source))  # type: ignore[arg-type]
+            report = learner.train(buffer_of(learner).with_rewards({"total": values}))
+            assert report.reward_mean == pytest.approx(float(values.mean())), "the log has the reward, not the rank"
+            found.append(weights(learner.model))
+    for source, (first, second) in trained.items():
+        same = all(torch.equal(value, second[name]) for name, value in first.items())
+        assert same == (source == "win_rate")
+
+
+def test_win_rates_are_of_each_reward_where_advantages_are_mixed_and_leave_invalid_videos_out() -> None:
+    learner = GrpoLearner(
+        tiny_network(), grpo(advantage=AdvantageSettings(mix="advantage", source="win_rate")),
+        toy_rollout_settings(micro_batch=8), seed=0, reward_weights={"a": 1.0, "b": 1.0},
+    )
+    a = torch.tensor([0.0, 1, 2, math.nan, 0, 0, 0, 0], dtype=torch.float64)
+    b = torch.tensor([0.0, 100, 1, 3, 0, 0, 0, 0], dtype=torch.float64)
+    buffer = buffer_of(learner).with_rewards({"a": a, "b": b, "total": a + b})
+    found = learner._advantages(a + b, buffer, torch.tensor([1, 1, 1, 0, 1, 1, 1, 1]).bool())
+    ranks = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
+    normal = (ranks - 0.5) / ranks.std(correction=0)
+    assert_close(found.advantages_N[:3], (normal + normal[torch.tensor([0, 2, 1])]) / 2)
+    assert not found.advantages_N[3:].any() and found.kept_N.tolist() == [True] * 3 + [False] * 5
+
+
+def test_the_floor_of_a_group_s_spread_is_a_setting() -> None:
+    rewards = torch.tensor([0.0, 0.01, 0.0, 0.01, 0.0, 1.0, 0.0, 1.0])
+    for floor, flat in ((1e-6, 0.0), (0.1, 0.5)):
+        learner = make(advantage=AdvantageSettings(floor=floor))
+        assert learner.train(buffer_of(learner).with_rewards({"total": rewards})).zero_std_ratio == flat
+
+
+def test_a_recomputed_mask_warns_that_it_is_an_ablation() -> None:
+    with pytest.warns(UserWarning, match="recompute is an ablation.*Otherwise take cached"):
+        make(mask_source="recompute")
+
+
+def test_one_running_deviation_for_several_advantages_is_refused() -> None:
+    with pytest.raises(ValueError, match="std_scope running is of one reward"):
+        make(advantage=AdvantageSettings(mix="advantage", std_scope="running"))
+
+
+def test_full_passes_train_the_whole_buffer_every_time_and_parts_their_own_videos() -> None:
+    full, parts = make(updates_per_buffer=2), make(updates_per_buffer=2, passes="parts")
+    buffer = buffer_of(full)
+    kept = torch.tensor([1, 1, 1, 0, 1, 1, 1, 1]).bool()
+    rows = [list(learner._passes(buffer, kept)) for learner in (full, parts)]
+    assert torch.equal(rows[0][0].videos, rows[0][1].videos) and set(rows[0][0].videos.tolist()) == {
+        0,
+        1,
+        2,
+        4,
+        5,
+        6,
+        7,
+    }
+    assert [set(row.videos.tolist()) for row in rows[1]] == [{0, 2, 4, 6}, {1, 5, 7}]
+    assert [u.transitions for u in full.train(buffer).updates] == [32, 32]
+    assert [u.transitions for u in parts.train(buffer).updates] == [16, 16]
+    assert full.version == parts.version == 2
+
+
+def test_each_iteration_draws_its_own_steps_and_one_buffer_keeps_its_draw() -> None:
+    learner = make(step_fraction=0.4)
+    buffer = buffer_of(learner)
+    first, second = learner._passes(buffer, torch.ones(8).bool())
+    assert torch.equal(first.positions, second.positions) and len(first.positions) == 8 * 2
+    other = next(learner._passes(replace(buffer, iteration=1), torch.ones(8).bool()))
+    assert not torch.equal(first.positions, other.positions)
+
+
+def test_a_report_says_what_the_buffer_held() -> None:
+    """Group 0: rewards 0, 1, invalid, 3; group 1 has no spread."""
+    learner = make(step_fraction=1.0)
+    rewards = torch.tensor([0.0, 1, math.nan, 3, 5, 5, 5, 5])
+    buffer = buffer_of(learner).with_rewards({"total": rewards})
+    report = learner.train(buffer)
+    deviation = math.sqrt((16 + 1 + 25) / 27)
+    assert report.reward_mean == pytest.approx(24 / 7)
+    assert report.advantage_abs_mean == pytest.approx((4 / 3 + 1 / 3 + 5 / 3) / 3 / deviation)
+    assert (report.zero_std_ratio, report.invalid, report.kept, report.group_size) == (0.5, 1, 3, 4.0)
+    assert [u.transitions for u in report.updates] == [15, 15]
+    assert report.noise_share == pytest.approx(float(buffer.rollout.noise_share.square().mean().sqrt()))
+
+
+def test_videos_that_do_not_train_change_nothing_whatever_they_hold() -> None:
+    found = []
+    for noise in (0.0, 1e3):
+        learner = make()
+        buffer = buffer_of(learner)
+        rewards = torch.tensor([0.0, 1, math.nan, 3, 5, 5, 5, 5])
+        states = buffer.rollout.states.clone()
+        states[2] += noise
+        states[4:] += noise
+        buffer = replace(buffer, rollout=replace(buffer.rollout, states=states)).with_rewards({"total": rewards})
+        learner.train(buffer)
+        found.append(weights(learner.model))
+    assert_equal(found[0], found[1])
+
+
+def test_best_of_2_trains_the_best_and_the_worst_video_of_each_group() -> None:
+    learner = make(advantage=AdvantageSettings(best_of_n=2), step_fraction=1.0)
+    buffer = buffer_of(learner).with_rewards({"total": torch.tensor([0.0, 1, 2, 3, 8, 5, 9, 6])})
+    report = learner.train(buffer)
+    assert report.kept == 4 and report.updates[0].transitions == 4 * 5
+    assert report.advantage_abs_mean == pytest.approx((1.5 / math.sqrt(1.25) + 2 / math.sqrt(2.5)) / 2)
+
+
+def test_the_reward_that_trains_is_the_total_or_the_only_one() -> None:
+    buffer = buffer_of(make())
+    ones, twos = torch.ones(8), 2 * torch.ones(8)
+    assert mixed_reward(buffer.with_rewards({"a": ones})).tolist() == [1.0] * 8
+    assert mixed_reward(buffer.with_rewards({"a": ones, "total": twos})).tolist() == [2.0] * 8
+    for rewards, named in (({}, "(none)"), ({"a": ones, "b": twos}, "a, b")):
+        with pytest.raises(
+            ValueError, match=f"holds rewards {named.replace('(', '[(]').replace(')', '[)]')} and no `total`"
+        ):
+            mixed_reward(buffer.with_rewards(rewards))
+
+
+@pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_updates_move_new_videos_towards_what_is_rewarded(arm: str, sign: int) -> None:
+    """One parameter is added to the velocity: a brighter video needs less of it."""
+    model = Analytic(lambda x, t: x)
+    settings = grpo(learning_rate=0.02, clip_low=0.02, clip_high=0.02, kl=NO_KL, step_fraction=1.0)
+    learner, seen = GrpoLearner(model, settings, toy_rollout_settings(arm=arm), seed=0), []
+    for iteration in range(6):
+        buffer = buffer_of(learner, iteration=iteration, size=16)
+        learner.train(buffer.with_rewards({"total": sign * buffer.rollout.latents.mean((1, 2, 3, 4))}))
+        seen.append(-sign * model.offset.item())
+    assert seen == sorted(seen) and seen[0] > 0.02 and seen[-1] > 0.1
+
+
+# averaged weights
+
+
+def test_averaged_weights_follow_with_a_warmed_up_decay_and_are_swapped_in_for_a_while() -> None:
+    """After the first update the decay is min(0.9, 2/11)."""
+    learner = make(ema_decay=0.9, updates_per_buffer=1)
+    start = weights(learner.model)
+    learner.train(buffer_of(learner))
+    own = weights(learner.model)
+    with learner.averaged_weights():
+        for name, tensor in weights(learner.model).items():
+            assert_close(tensor, start[name] + 9 / 11 * (own[name] - start[name]), rtol=1e-5, atol=1e-7)
+    assert_equal(own, weights(learner.model))
+    with pytest.raises(KeyError), learner.averaged_weights():
+        raise KeyError
+    assert_equal(own, weights(learner.model))
+
+
+def test_without_an_average_the_weights_in_evaluation_are_the_learner_s_own() -> None:
+    learner = make()
+    own = weights(learner.model)
+    with learner.averaged_weights():
+        assert_equal(own, weights(learner.model))
+
+
+# reproducible, resumed, undone
+
+STATEFUL = [
+    {},
+    {"ema_decay": 0.9, "kl": KlSettings(anchor="moving", moving_updates=3)},
+    {"advantage": AdvantageSettings(std_scope="running"), "kl": KlSettings(anchor="dual", dual_every=2)},
+    {"passes": "parts", "kl": KlSettings(anchor="frozen"), "equalise": True},
+]
+
+
+@pytest.mark.parametrize("changes", STATEFUL)
+def test_the_same_seeds_give_the_same_update_bit_for_bit(changes: dict[str, Any]) -> None:
+    """T34."""
+    first, second = make(**changes), make(**changes)
+    for learner in (first, second):
+        train_rounds(learner, range(2))
+    assert_equal(weights(first.model), weights(second.model))
+    assert_equal(first.averaged, second.averaged)
+    other = make(seed=1, **changes)
+    train_rounds(other, range(2))
+    assert any(
+        not torch.equal(a, b) for a, b in zip(weights(first.model).values(), weights(other.model).values(), strict=True)
+    )
+
+
+@pytest.mark.parametrize("changes", STATEFUL)
+def test_three_rounds_equal_two_a_resume_and_one_bit_for_bit(tmp_path: Path, changes: dict[str, Any]) -> None:
+    straight, stopped = make(**changes), make(**changes)
+    train_rounds(straight, range(3))
+    train_rounds(stopped, range(2))
+    stopped.save(tmp_path / "state", iteration=2)
+    resumed = make(network=tiny_network(seed=9), **changes)
+    assert resumed.load(tmp_path / "state") == 2 and resumed.version == 4
+    train_rounds(resumed, range(2, 3))
+    assert_equal(weights(straight.model), weights(resumed.model))
+    assert_equal(straight.averaged, resumed.averaged)
+    assert resumed.version == straight.version == 6
+
+
+def test_a_checkpoint_of_another_seed_or_architecture_is_refused(tmp_path: Path) -> None:
+    make().save(tmp_path / "state", iteration=0)
+    with pytest.raises(ValueError, match="seed 0, this run has 4"):
+        make(seed=4).load(tmp_path / "state")
+    wider = make(network=tiny_network(5))
+    before = weights(wider.model)
+    with pytest.raises(WeightsError, match="another architecture"):
+        wider.load(tmp_path / "state")
+    assert_equal(before, weights(wider.model))
+
+
+@pytest.mark.parametrize(
+    ("changes", "knob"), [({"kl": KlSettings(anchor="frozen")}, "kl.anchor"), ({"ema_decay": 0.9}, "ema_decay")]
+)
+def test_a_checkpoint_without_the_anchor_or_average_that_a_run_has_is_refused(
+    tmp_path: Path, changes: dict[str, Any], knob: str
+) -> None:
+    """An anchor that is missing would be the current weights: a KL of 0 for ever."""
+    make().save(tmp_path / "plain", iteration=0)
+    make(**changes).save(tmp_path / "other", iteration=0)
+    with pytest.raises(ValueError, match=f"another grpo.{knob}"):
+        make(**changes).load(tmp_path / "plain")
+    with pytest.raises(ValueError, match=f"another grpo.{knob}"):
+        make().load(tmp_path / "other")
+
+
+def test_a_damaged_checkpoint_and_other_tensors_are_refused(tmp_path: Path) -> None:
+    make().save(tmp_path / "state", iteration=0)
+    whole = (tmp_path / "state").read_bytes()
+    for name, data in (("cut", whole[: len(whole) // 2]), ("short", whole[:4]), ("other", save({"a": torch.ones(1)}))):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(WeightsError, match="no complete checkpoint of GRPO"):
+            make().load(tmp_path / name)
+
+
+@pytest.mark.parametrize("changes", STATEFUL)
+@pytest.mark.parametrize(("good_updates", "earlier_rounds"), [(0, 0), (1, 1)])
+def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(
+    changes: dict[str, Any], good_updates: int, earlier_rounds: int
+) -> None:
+    learner, undisturbed = make(**changes), make(**changes)
+    for one in (learner, undisturbed):
+        train_rounds(one, range(earlier_rounds))
+    buffer, before, averaged = buffer_of(learner, iteration=7), weights(learner.model), copy.deepcopy(learner.averaged)
+    calls = iter(range(1000))
+    batches = len(next(learner._passes(buffer, torch.ones(8).bool())).videos) // 8
+
+    def poison(gradient: Tensor) -> Tensor:
+        return gradient * (math.nan if next(calls) >= good_updates * batches else 1.0)
+
+    handle = learner.parameters[0].register_hook(poison)
+    with pytest.raises(FloatingPointError, match="gradient is not finite"):
+        learner.train(buffer)
+    handle.remove()
+    assert_equal(before, weights(learner.model))
+    assert_equal(averaged, learner.averaged)
+    assert learner.version == 2 * earlier_rounds
+    for one in (learner, undisturbed):
+        one.train(buffer)
+        one.train(buffer_of(one, iteration=8))
+    assert_equal(weights(learner.model), weights(undisturbed.model))
+    assert_equal(learner.averaged, undisturbed.averaged)
+
+
+# refusals
+
+
+def test_a_group_with_too_few_valid_videos_trains_nothing_and_is_counted() -> None:
+    """Groups of six: the three valid ones of the first are enough, the two of the second are not."""
+    nan = math.nan
+    rewards = torch.tensor([0.1, nan, 0.5, nan, 0.9, nan, 0.2, nan, nan, nan, 0.8, nan])
+    learner, other = make(), make()
+    buffer = buffer_of(learner, size=6)
+    report = learner.train(buffer.with_rewards({"total": rewards}))
+    assert (report.invalid, report.dropped_groups, report.kept, report.zero_std_ratio) == (7, 1, 3, 0.5)
+    without = rewards.clone()
+    without[6:] = math.nan
+    assert other.train(buffer.with_rewards({"total": without})).dropped_groups == 1
+    assert_equal(weights(learner.model), weights(other.model))
+
+
+@pytest.mark.parametrize(
+    ("rewards", "few"), [([math.nan] * 8, 2), ([0.7] * 8, 0), ([1.0] * 4 + [math.nan] * 3 + [2.0], 1)]
+)
+def test_a_buffer_from_which_nothing_can_be_learned_is_one_clear_error(rewards: list[float], few: int) -> None:
+    learner = make()
+    buffer, before = buffer_of(learner).with_rewards({"total": torch.tensor(rewards)}), weights(learner.model)
+    invalid = sum(math.isnan(reward) for reward in rewards)
+    with pytest.raises(
+        ValueError,
+        match=f"{invalid} of 8 rewards are invalid, {few} of 2 groups have too few valid ones and {2 - few} no spread",
+    ):
+        learner.train(buffer)
+    assert_equal(before, weights(learner.model))
+    assert learner.version == 0
+
+
+def test_a_buffer_of_videos_that_are_given_whole_is_one_clear_error() -> None:
+    learner = make()
+    buffer = buffer_of(learner, given=4).with_rewards({"total": torch.arange(8)})
+    with pytest.raises(ValueError, match=r"all 4 frames .*given"):
+        learner.train(buffer)
+    assert learner.version == 0
+
+
+def test_stale_buffers_and_those_of_another_sampler_are_refused() -> None:
+    """T33."""
+    learner = make(updates_per_buffer=2)
+    buffer = buffer_of(learner)
+    learner.train(buffer)
+    with pytest.raises(RolloutBufferError, match="staleness 2 is outside 0 to 0"):
+        learner.train(buffer)
+    tolerant = make(updates_per_buffer=2, max_staleness=2)
+    tolerant.train(buffer)
+    tolerant.train(buffer)
+    with pytest.raises(RolloutBufferError, match="its ratios would be wrong"):
+        make(toy_rollout_settings(eta=0.5)).train(buffer)
+
+
+@pytest.mark.parametrize("changes", [{"arm": "ode"}, {"arm": "cps", "eta": 0.0}])
+def test_a_sampler_without_noise_has_nothing_to_train_on(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="an ODE rollout has no likelihood"):
+        make(toy_rollout_settings(**changes))
+
+
+# shapes
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 1, 1), (1, 1, 5, 7), (3, 5, 3, 7), (1, 3, 7, 5)])
+@pytest.mark.parametrize("given", [0, 1])
+@pytest.mark.parametrize("storage", ["float32", "bfloat16"])
+def test_odd_and_single_sizes_train(shape: tuple[int, int, int, int], given: int, storage: str) -> None:
+    if given == shape[1]:
+        given = 0
+    learner = make(toy_rollout_settings(micro_batch=8, storage_dtype=storage), network=tiny_network(shape[0]))
+    report = learner.train(buffer_of(learner, shape=shape, given=given))
+    assert report.updates[0].kl < 1e-12 and report.updates[1].kl > 0 and report.updates[0].grad_norm > 0
+
+
+def test_an_instruction_changes_the_video_and_an_empty_one_is_none() -> None:
+    learner = make(network=tiny_network(text_dim=4))
+    buffer = buffer_of(learner, text_dim=4)
+    learner.train(buffer)
+    x, t = buffer.rollout.state(1)[:1], torch.tensor([0.5], dtype=torch.float64)
+    condition = buffer.condition.rows(slice(0, 1))
+    told = learner.model(x, t, condition)
+    assert not torch.equal(told, learner.model(x, t, replace(condition, text=condition.text + 1)))
+    empty = replace(condition, text=torch.zeros(1, 0, 4))
+    assert torch.equal(learner.model(x, t, empty), learner.model(x, t, replace(condition, text=torch.zeros(1, 3, 4))))
+    dropped = learner.model(x, t, condition, torch.tensor([True]))
+    assert torch.equal(
+        dropped, learner.model(x, t, replace(condition, actions=condition.actions + 1), torch.tensor([True]))
+    )
+
+
+def test_a_network_names_latents_and_actions_of_another_size() -> None:
+    learner = make()
+    buffer = buffer_of(learner)
+    x, t = buffer.rollout.latents, torch.full((8,), 0.5, dtype=torch.float64)
+    with pytest.raises(
+        ValueError, match=r"3 latent channels and 2 action values .*got 2 channels, 2 values, 3 actions"
+    ):
+        learner.model(x[:, :2], t, buffer.condition)
+    with pytest.raises(ValueError, match=r"3 actions for 4 frames.*got 3 channels, 2 values, 2 actions"):
+        learner.model(x, t, replace(buffer.condition, actions=buffer.condition.actions[:, 1:]))

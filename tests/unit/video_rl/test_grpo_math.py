@@ -1,0 +1,394 @@
+"""Advantages, ratio, objective, KL, diversity: numbers by hand, limits, torch's distributions. Ids: spec 4.1."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import Normal, kl_divergence
+from torch.testing import assert_close
+from video_toys import randn
+
+from wm_nodes.video_rl.diversity import rollout_diversity
+from wm_nodes.video_rl.group_advantages import (
+    GroupAdvantages,
+    RunningStd,
+    best_of_n,
+    group_advantages,
+    mixed_advantages,
+    win_rates,
+)
+from wm_nodes.video_rl.grpo_math import (
+    clip_tails,
+    clipped_objective,
+    gaussian_logprob,
+    log_ratio,
+    log_space_kl,
+    mean_kl,
+    normalised_log_ratio,
+    step_equaliser,
+    velocity_kl,
+)
+
+M, U = 3, 8192
+EPS = 1e-4
+
+
+def advantages(rewards: list[float], groups: list[int] | None = None, valid: list[int] | None = None,
+               clip: float = 2.5, **options: object) -> GroupAdvantages:
+    return group_advantages(
+        torch.tensor(rewards, dtype=torch.float64),
+        torch.tensor(groups or [0] * len(rewards)),
+        torch.tensor(valid or [1] * len(rewards), dtype=torch.bool),
+        clip=clip,
+        **options,  # type: ignore[arg-type]
+    )
+
+
+def gaussians() -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """x_s, the old and the new mean, and a deviation per cell, (M, U), float64."""
+    std = 0.1 + 0.5 * torch.rand(M, U, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    old = randn(M, U, seed=1, dtype=torch.float64)
+    new = old + 0.01 * randn(M, U, seed=2, dtype=torch.float64)
+    return old + std * randn(M, U, seed=3, dtype=torch.float64), old, new, std
+
+
+# (13): advantages
+
+
+def test_an_advantage_is_the_distance_from_the_group_s_mean_in_its_deviations() -> None:
+    """T23: (1, 2, 3) has population deviation sqrt(2/3) and sample deviation 1."""
+    wanted = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
+    assert_close(advantages([1, 2, 3]).advantages_N, wanted / math.sqrt(2 / 3))
+    assert_close(advantages([1, 2, 3], ddof=1).advantages_N, wanted)
+
+
+def test_groups_do_not_see_each_other() -> None:
+    """T23; interleaved groups of scales that differ by a thousand."""
+    found = advantages([1, 1000, 3, 3000, 2, 2000], [7, 3, 7, 3, 7, 3])
+    high = math.sqrt(1.5)
+    assert_close(found.advantages_N, torch.tensor([-high, -high, high, high, 0, 0], dtype=torch.float64))
+    assert (found.num_groups, found.num_zero_std, found.num_invalid) == (2, 0, 0)
+    assert bool(found.kept_N.all())
+
+
+def test_before_the_clip_every_group_has_mean_zero_and_deviation_one_and_the_clip_keeps_the_order() -> None:
+    """T23, 4 groups of 16."""
+    rewards = randn(64, seed=5).exp().exp().tolist()
+    groups = torch.arange(4).repeat_interleave(16)
+    free = advantages(rewards, groups.tolist(), clip=1e9).advantages_N.view(4, 16)
+    assert_close(free.mean(1), torch.zeros(4, dtype=torch.float64), atol=1e-6, rtol=0)
+    assert_close(free.std(1, correction=0), torch.ones(4, dtype=torch.float64), atol=1e-6, rtol=0)
+    clipped = advantages(rewards, groups.tolist()).advantages_N.view(4, 16)
+    assert float(free.max()) > 2.5 and float(clipped.abs().max()) == 2.5
+    for row, own, reward in zip(clipped, free, torch.tensor(rewards).view(4, 16), strict=True):
+        assert bool((row[reward.argsort()].diff() >= 0).all())
+        assert torch.equal(row[own.abs() < 2.5], own[own.abs() < 2.5])
+
+
+@pytest.mark.parametrize("size", [12, 16, 24])
+@pytest.mark.parametrize("ddof", [0, 1])
+def test_equal_float32_rewards_of_0_7_have_no_advantage_at_all(size: int, ddof: int) -> None:
+    """T24; the usual float32 form gives up to 0.89."""
+    rewards = torch.full((size,), 0.7)
+    found = group_advantages(rewards, torch.zeros(size), torch.ones(size), clip=2.5, ddof=ddof)
+    assert not found.advantages_N.any() and not found.kept_N.any() and found.num_zero_std == 1
+
+
+def test_a_spread_below_the_floor_is_none_and_the_floor_grows_with_the_mean() -> None:
+    assert advantages([0.0, 1e-7]).num_zero_std == 1
+    assert advantages([0.0, 1e-5]).num_zero_std == 0
+    assert advantages([1e4, 1e4 + 1e-3]).num_zero_std == 1
+    assert advantages([1e4, 1e4 + 1e-1]).num_zero_std == 0
+
+
+def test_the_largest_advantage_of_a_group_is_the_root_of_its_size_less_one() -> None:
+    """Finding 10: a clip of 5 cannot fire up to G = 26."""
+    for size, high in ((8, math.sqrt(7)), (26, 5.0)):
+        found = advantages([1.0] + [0.0] * (size - 1), clip=100.0).advantages_N
+        assert float(found[0]) == pytest.approx(high)
+
+
+def test_invalid_videos_count_in_no_statistic_and_do_not_train() -> None:
+    found = advantages([1, math.nan, 3, 500], valid=[1, 0, 1, 0])
+    assert_close(found.advantages_N, torch.tensor([-1.0, 0, 1, 0], dtype=torch.float64))
+    assert found.kept_N.tolist() == [True, False, True, False] and found.num_invalid == 2
+
+
+def test_a_group_with_fewer_than_two_valid_videos_has_no_spread() -> None:
+    for ddof in (0, 1):
+        found = advantages([1, 2, 3, 5, 6, 7], [0, 0, 0, 1, 1, 2], [1, 0, 0, 0, 0, 1], ddof=ddof)
+        assert not found.kept_N.any() and not found.advantages_N.any()
+        assert (found.num_groups, found.num_zero_std) == (3, 3)
+
+
+def test_a_global_deviation_is_that_of_all_groups_about_their_own_means() -> None:
+    """Deviations (-1, 1) and (-3, 3): the mean square is 5."""
+    found = advantages([0, 2, 10, 16], [0, 0, 1, 1], std_scope="global").advantages_N
+    assert_close(found, torch.tensor([-1.0, 1, -3, 3], dtype=torch.float64) / math.sqrt(5))
+
+
+def test_a_running_deviation_remembers_earlier_rewards() -> None:
+    running = RunningStd()
+    advantages([0, 2], std_scope="running", running=running)
+    assert (running.std, running.count) == (1.0, 2)
+    found = advantages([0, 6], std_scope="running", running=running).advantages_N
+    assert_close(found, torch.tensor([-3.0, 3], dtype=torch.float64).div(math.sqrt(5)).clamp(-2.5, 2.5))
+    with pytest.raises(ValueError, match="running needs its RunningStd"):
+        advantages([0, 2], std_scope="running")
+
+
+def test_a_valid_reward_that_is_not_finite_is_an_error_that_names_the_video() -> None:
+    with pytest.raises(ValueError, match="reward of video 2 is nan"):
+        advantages([1, math.nan, math.nan], valid=[1, 0, 1])
+    with pytest.raises(ValueError, match="one shape"):
+        group_advantages(torch.zeros(3), torch.zeros(2), torch.ones(3), clip=1.0)
+
+
+# best of N, win rates
+
+
+def test_best_of_8_of_16_keeps_the_4_best_and_the_4_worst_of_each_group() -> None:
+    """T25."""
+    order = torch.randperm(16, generator=torch.Generator().manual_seed(0))
+    signal = torch.cat([order.double() - 7.5, -(order.double() - 7.5)])
+    kept = best_of_n(signal, torch.arange(2).repeat_interleave(16), torch.ones(32, dtype=torch.bool), 8)
+    assert kept.sum() == 16
+    assert sorted(signal[:16][kept[:16]].tolist()) == [-7.5, -6.5, -5.5, -4.5, 4.5, 5.5, 6.5, 7.5]
+    assert torch.equal(kept[:16], kept[16:]), "a mirrored group keeps the same videos"
+
+
+def mixed(rewards: dict[str, list[float]], weights: dict[str, float], groups: list[int]) -> GroupAdvantages:
+    values = {name: torch.tensor(value, dtype=torch.float64) for name, value in rewards.items()}
+    return mixed_advantages(values, weights, torch.tensor(groups), torch.ones(len(groups)).bool(), clip=2.5)
+
+
+def test_advantages_of_several_rewards_are_weighed_after_each_is_normalised() -> None:
+    groups, task, scenery = [0] * 4, [0.0, 0.0, 1.0, 1.0], [0.002, 0.004, 0.002, 0.004]
+    found = mixed({"task": task, "scenery": scenery}, {"task": 3.0, "scenery": -1.0}, groups)
+    assert_close(found.advantages_N, torch.tensor([-0.5, -1.0, 1.0, 0.5], dtype=torch.float64))
+    scaled = [100 * value for value in scenery]
+    hundredfold = mixed({"task": task, "scenery": scaled}, {"task": 3.0, "scenery": -1.0}, groups)
+    assert_close(hundredfold.advantages_N, found.advantages_N)
+    alone = mixed({"task": task, "scenery": scenery}, {"task": 2.0, "scenery": 0.0}, groups)
+    assert_close(alone.advantages_N, advantages(task, groups).advantages_N)
+
+
+def test_a_group_trains_while_one_of_its_rewards_has_spread() -> None:
+    groups, flat = [0, 0, 1, 1], [1.0, 1.0, 1.0, 1.0]
+    found = mixed({"task": [0.0, 1.0, 5.0, 5.0], "scenery": flat}, {"task": 1.0, "scenery": 1.0}, groups)
+    assert (found.kept_N.tolist(), found.num_zero_std) == ([True, True, False, False], 1)
+    assert_close(found.advantages_N, torch.tensor([-0.5, 0.5, 0.0, 0.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("weights", [{}, {"task": 0.0}, {"taste": 1.0}])
+def test_a_mix_of_nothing_or_of_an_unknown_reward_is_refused(weights: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="weigh some of task"):
+        mixed({"task": [0.0, 1.0]}, weights, [0, 0])
+
+
+def test_equal_advantages_are_kept_by_their_index() -> None:
+    """T25."""
+    kept = best_of_n(torch.zeros(6), torch.zeros(6), torch.ones(6, dtype=torch.bool), 4)
+    assert kept.tolist() == [True, True, False, False, True, True]
+
+
+def test_an_odd_best_of_n_keeps_one_more_of_the_worst_and_small_groups_stay_whole() -> None:
+    signal, everyone = torch.tensor([3.0, 1, 2, 5, 4]), torch.ones(5, dtype=torch.bool)
+    assert best_of_n(signal, torch.zeros(5), everyone, 3).tolist() == [False, True, True, True, False]
+    for n in (0, 5, 9):
+        assert best_of_n(signal, torch.zeros(5), everyone, n).all()
+    with pytest.raises(ValueError, match="n must be >= 0, got -1"):
+        best_of_n(signal, torch.zeros(5), everyone, -1)
+
+
+def test_videos_that_do_not_train_are_not_among_the_best() -> None:
+    kept = best_of_n(torch.tensor([9.0, 1, 2, 3, -9]), torch.zeros(5), torch.tensor([0, 1, 1, 1, 0]).bool(), 2)
+    assert kept.tolist() == [False, True, False, True, False]
+
+
+def test_a_win_rate_is_the_share_of_the_others_that_are_beaten_and_a_tie_is_half_a_win() -> None:
+    rates = win_rates(torch.tensor([1.0, 2, 2, 5, 7, 0]), torch.tensor([0, 0, 0, 0, 1, 1]), torch.ones(6))
+    assert_close(rates, torch.tensor([0, 1.5 / 3, 1.5 / 3, 1, 1, 0], dtype=torch.float64))
+    rates = win_rates(torch.tensor([1.0, 2, 9]), torch.tensor([0, 0, 0]), torch.tensor([1, 1, 0]))
+    assert rates[:2].tolist() == [0, 1] and math.isnan(rates[2])
+
+
+# (15): ratio
+
+
+def test_the_ratio_from_normalised_noise_is_the_difference_of_two_log_probabilities() -> None:
+    x, old, new, std = gaussians()
+    direct = log_ratio((x - new) / std, (x - old) / std)
+    assert_close(direct, gaussian_logprob(x, new, std) - gaussian_logprob(x, old, std), atol=1e-12, rtol=0)
+
+
+def test_one_cell_moved_by_a_quarter_deviation_has_the_ratio_worked_by_hand() -> None:
+    """zeta 1 -> 0.75: (1 - 0.5625) / 2."""
+    old, new = torch.tensor([[1.0]]), torch.tensor([[0.75]])
+    assert float(log_ratio(new, old)) == pytest.approx(0.21875)
+    assert float(log_ratio(new, old, 2 * 0.5**2)) == pytest.approx(0.109375), "CPS at std 0.5"
+    assert float(mean_kl(new, old)) == pytest.approx(0.03125)
+
+
+def test_unmoved_noise_has_a_ratio_of_exactly_one_under_every_weight() -> None:
+    """T17, equation (15)."""
+    zeta = randn(M, U, seed=4)
+    for weight in (1.0, torch.rand(M, U)):
+        assert log_ratio(zeta, zeta.clone(), weight).tolist() == [0.0] * M
+    assert normalised_log_ratio(zeta, zeta.clone(), torch.rand(M, U)).tolist() == [0.0] * M
+    x, old, _, std = (value.float() for value in gaussians())
+    by_difference = gaussian_logprob(x, old, std) - gaussian_logprob(old + std * ((x - old) / std), old, std)
+    assert float((by_difference.exp() - 1).abs().max()) < 1e-6
+
+
+def test_the_cps_ratio_is_that_of_minus_the_mean_square_error() -> None:
+    x, old, new, std = gaussians()
+    found = log_ratio((x - new) / std, (x - old) / std, 2 * std.square())
+    assert_close(found, (x - old).square().mean(1) - (x - new).square().mean(1))
+
+
+def test_the_base_weight_scales_every_cell_by_its_mask_squared() -> None:
+    """Two cells with mask 1 and 0.5 and equal moves in deviations: the second counts a quarter."""
+    old, new = torch.tensor([[1.0, 1.0]]), torch.tensor([[0.75, 0.75]])
+    std, base = torch.tensor([[0.4, 0.2]]), 0.4
+    assert float(log_ratio(new, old, (std / base).square())) == pytest.approx(0.21875 * (1 + 0.25) / 2)
+
+
+def test_the_normalised_ratio_of_a_scalar_deviation_is_the_mean_of_noise_times_move() -> None:
+    """(15b): exp(mean_u z delta)."""
+    x, old, new, _ = gaussians()
+    std = torch.full_like(x, 0.3)
+    z, delta = (x - old) / std, new - old
+    assert_close(normalised_log_ratio((x - new) / std, z, std), (z * delta).mean(1), atol=1e-12, rtol=1e-9)
+
+
+def test_the_normalised_ratio_under_a_mask_uses_the_root_mean_square_deviation() -> None:
+    x, old, new, std = gaussians()
+    plain = gaussian_logprob(x, new, std) - gaussian_logprob(x, old, std)
+    wanted = std.square().mean(1).sqrt() * (plain + ((new - old) / std).square().mean(1) / 2)
+    assert_close(normalised_log_ratio((x - new) / std, (x - old) / std, std), wanted, atol=1e-12, rtol=1e-9)
+
+
+# (16): objective
+
+
+def test_the_objective_takes_the_smaller_of_the_plain_and_the_clipped_term() -> None:
+    logs = torch.tensor([0.5, 1.5, 0.5, 1.5]).log()
+    found = clipped_objective(logs, torch.tensor([2.0, 2, -2, -2]), clip_low=0.2, clip_high=0.3)
+    assert_close(found, torch.tensor([1.0, 2.6, -1.6, -3.0]))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "moves"),
+    [(1 - 2 * EPS, -1.0, False), (1 - 2 * EPS, 1.0, True), (1 + 2 * EPS, 1.0, False), (1 + 2 * EPS, -1.0, True),
+     (1.0, 1.0, True), (1.0, -1.0, True)],
+)
+def test_a_ratio_that_has_gone_far_enough_in_its_direction_has_no_gradient(
+    ratio: float, advantage: float, moves: bool
+) -> None:
+    """T26."""
+    logs = torch.tensor([math.log(ratio)], dtype=torch.float64, requires_grad=True)
+    clipped_objective(
+        logs, torch.tensor([advantage], dtype=torch.float64), clip_low=EPS, clip_high=EPS
+    ).sum().backward()
+    assert logs.grad is not None
+    assert float(logs.grad) == (pytest.approx(advantage * ratio) if moves else 0.0)
+
+
+@pytest.mark.parametrize("clip", [1e-9, 1e-4, 0.2])
+def test_at_a_ratio_of_one_the_gradient_is_the_advantage_for_every_clip(clip: float) -> None:
+    """T19, the objective's half."""
+    logs = torch.zeros(2, requires_grad=True)
+    clipped_objective(logs, torch.tensor([1.5, -0.5]), clip_low=clip, clip_high=clip).sum().backward()
+    assert logs.grad is not None
+    assert_close(logs.grad, torch.tensor([1.5, -0.5]))
+
+
+def test_the_tails_are_counted_apart() -> None:
+    logs = torch.tensor([0.9, 0.95, 1.0, 1.05, 1.2, 1.3, 1.4, 1.5]).log()
+    assert clip_tails(logs, clip_low=0.07, clip_high=0.1) == (1 / 8, 4 / 8)
+
+
+# (17): KL
+
+
+def test_the_mean_space_kl_is_that_of_two_normals_of_one_deviation() -> None:
+    """T21."""
+    x, old, new, std = gaussians()
+    assert_close(
+        mean_kl((x - new) / std, (x - old) / std),
+        kl_divergence(Normal(new, std), Normal(old, std)).mean(1),
+        rtol=1e-6, atol=0,
+    )
+
+
+def test_the_kl_at_its_anchor_is_zero_with_zero_gradient() -> None:
+    """T20, the kernel's half."""
+    target = randn(M, U, seed=4)
+    zeta = target.clone().requires_grad_()
+    ones = torch.ones(M, U)
+    logs = log_ratio(zeta, target)
+    total = mean_kl(zeta, target) + velocity_kl(zeta, target, ones, -ones)
+    total = total + log_space_kl(logs, "logk2") + log_space_kl(logs, "logk3")
+    total.sum().backward()
+    assert total.tolist() == [0.0] * M and zeta.grad is not None and not zeta.grad.any()
+
+
+def test_log_space_kls_are_never_negative_and_far_weaker_than_the_mean_space_one() -> None:
+    """Here by a factor of hundreds; at smaller moves of thousands."""
+    x, old, new, std = gaussians()
+    new_zeta, old_zeta = (x - new) / std, (x - old) / std
+    strong = mean_kl(new_zeta, old_zeta)
+    for mode in ("logk2", "logk3"):
+        weak = log_space_kl(log_ratio(new_zeta, old_zeta), mode)  # type: ignore[arg-type]
+        assert bool((weak >= 0).all()) and bool((strong > 500 * weak).all()), mode
+
+
+def test_log_space_kls_of_a_doubled_probability_are_the_ones_worked_by_hand() -> None:
+    log2 = torch.tensor([math.log(2)])
+    assert float(log_space_kl(log2, "logk2")) == pytest.approx(math.log(2) ** 2 / 2)
+    assert float(log_space_kl(log2, "logk3")) == pytest.approx(0.5 - 1 + math.log(2), abs=1e-6)
+
+
+def test_the_velocity_kl_is_the_mean_square_change_of_the_velocity() -> None:
+    """mean = slope v, so a change of v by (0.1, 0.3) moves zeta by slope dv / std."""
+    change, std, slope = torch.tensor([[0.1, 0.3]]), torch.tensor([[0.5, 0.2]]), torch.tensor([[-0.4, -0.7]])
+    target = torch.tensor([[1.0, -1.0]])
+    assert float(velocity_kl(target - slope * change / std, target, std, slope)) == pytest.approx((0.01 + 0.09) / 2)
+
+
+def test_the_equaliser_weighs_a_step_by_the_median_sensitivity_over_its_own() -> None:
+    assert_close(step_equaliser(torch.tensor([1.0, 2.0, 4.0])), torch.tensor([2.0, 1.0, 0.5]))
+
+
+# (19): diversity
+
+
+def test_identical_videos_have_diversity_zero_and_opposite_ones_two() -> None:
+    """T28."""
+    video = randn(1, 4, 16, seed=1)
+    assert rollout_diversity(video.repeat(5, 1, 1)) == pytest.approx(0.0, abs=1e-6)
+    assert rollout_diversity(torch.cat([video, -3 * video])) == pytest.approx(2.0, abs=1e-6)
+    assert rollout_diversity(torch.eye(3)[:, None]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_diversity_is_one_less_the_mean_over_frames_and_pairs_of_the_cosine() -> None:
+    """T28; frames of very different lengths count alike."""
+    features = randn(4, 5, 16, seed=2) * torch.tensor([1.0, 100, 0.01, 3, 7]).view(1, 5, 1)
+    pairs = [(i, j) for i in range(4) for j in range(i)]
+    cosines = [torch.cosine_similarity(features[i], features[j], dim=1).mean() for i, j in pairs]
+    assert rollout_diversity(features) == pytest.approx(1 - float(torch.stack(cosines).mean()), abs=1e-6)
+
+
+def test_diversity_does_not_depend_on_the_order_of_the_videos() -> None:
+    """T28."""
+    features = randn(6, 3, 8, seed=3)
+    assert rollout_diversity(features) == pytest.approx(rollout_diversity(features[torch.tensor([3, 0, 5, 1, 4, 2])]))
+
+
+def test_diversity_needs_two_videos_and_finite_features() -> None:
+    with pytest.raises(ValueError, match=r"at least two videos .* got 1"):
+        rollout_diversity(torch.ones(1, 2, 3))
+    with pytest.raises(ValueError, match="not finite"):
+        rollout_diversity(torch.full((2, 2, 3), math.nan))

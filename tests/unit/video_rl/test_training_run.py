@@ -1,0 +1,165 @@
+"""A run folder of loop 2: averaged weights, progress, held-out scores and the alarm of equation (2)."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from metric_docs import documented, written
+from video_toys import tiny_network, toy_buffer, toy_rollout_settings, weights
+
+from wm_nodes.training.metrics import read_metrics
+from wm_nodes.training.weights import load_weights
+from wm_nodes.video_model import VideoNetwork
+from wm_nodes.video_rl.reference_reward import ClipScores, more_is_better
+from wm_nodes.video_rl.settings import EvaluationSettings, VideoRlConfig, load_video_config
+from wm_nodes.video_rl.training_run import VideoRun, evaluated_uri, progress, version_uri
+from wm_nodes.video_rl.validation import alarm_text, alarms_of, hacked_now
+
+SCORES = set(ClipScores.__dataclass_fields__)
+
+
+def config(*, every: int = 1, **grpo: Any) -> VideoRlConfig:
+    plain = load_video_config("smoke")
+    return replace(
+        plain, rollout=toy_rollout_settings(micro_batch=8), evaluation=EvaluationSettings(every=every, window=3),
+        grpo=replace(plain.grpo, learning_rate=1e-3, **grpo),
+    )
+
+
+def train(run: VideoRun, totals: list[float]) -> None:
+    """One buffer for each; its mean reward is the number."""
+    for total in totals:
+        buffer = toy_buffer(run.network, run.config.rollout, version=run.version, iteration=run.iterations)
+        spread = torch.tensor([-1.0, 1.0, -1.0, 1.0]).repeat(2)
+        scored = buffer.with_rewards({"total": total + spread})
+        raw = {"tracking": spread, "psnr_db": torch.full((8,), math.nan)}
+        run.train(replace(scored, rewards={**scored.rewards, **raw}))
+
+
+def lines(rewards: list[float | None], **scores: list[float]) -> list[dict[str, object]]:
+    """An evaluation after every buffer."""
+    found: list[dict[str, object]] = []
+    for index, reward in enumerate(rewards):
+        found.append({"section": "grpo", "step": index + 1, "reward_mean": reward})
+        row = {name: values[index] for name, values in scores.items()}
+        found.append({"section": "heldout", "step": index + 1, **row})
+    return found
+
+
+def test_an_error_that_grows_while_the_reward_rises_is_named_with_both_slopes() -> None:
+    rising = [0.1, 0.2, 0.3]
+    (alarm,) = hacked_now(lines(rising, object_cm=[5.0, 6.0, 7.0], tracking=[0.1, 0.2, 0.3]), window=3)
+    assert (alarm.metric, alarm.proxy_slope, alarm.true_slope) == ("object_cm", pytest.approx(0.1), pytest.approx(-1.0))
+    assert "reward rises by 0.1 per evaluation while held-out scores get worse: object_cm by 1;" in alarm_text([alarm])
+    assert not hacked_now(lines(rising, object_cm=[7.0, 6.0, 5.0], tracking=[0.1, 0.2, 0.3]), window=3)
+    assert not hacked_now(lines(rising[::-1], object_cm=[5.0, 6.0, 7.0]), window=3)
+    assert not hacked_now(lines(rising[:2], object_cm=[5.0, 6.0]), window=3)
+
+
+def test_the_object_that_moves_too_far_is_as_wrong_as_the_one_that_stays() -> None:
+    assert more_is_better("motion", [0.5, 1.0, 1.5]).tolist() == [-0.5, 0.0, -0.5]
+    (alarm,) = hacked_now(lines([1, 2, 3], motion=[1.0, 1.2, 1.4]), window=3)
+    assert alarm.true_slope == pytest.approx(-0.2)
+
+
+def test_the_reward_of_an_evaluation_is_the_mean_over_the_buffers_since_the_one_before() -> None:
+    rows = [{"section": "grpo", "step": i + 1, "reward_mean": float(r)} for i, r in enumerate([1, 3, 2, 4, 5, 3])]
+    rows += [{"section": "heldout", "step": step, "psnr_db": 20.0 - step} for step in (2, 4, 6)]
+    (alarm,) = hacked_now(rows, window=3)  # rewards 2, 3, 4
+    assert alarm.proxy_slope == pytest.approx(1.0) and alarm.true_slope == pytest.approx(-2.0)
+
+
+def test_a_missing_value_takes_its_score_out_and_a_missing_reward_its_evaluation() -> None:
+    known: list[float | None] = [1.0, 2.0, 3.0]
+    rows = lines(known, psnr_db=[3.0, 2.0, 1.0], tracking=[3.0, 2.0, 1.0])
+    rows[3]["psnr_db"] = None
+    assert [alarm.metric for alarm in hacked_now(rows, window=3)] == ["tracking"]
+    assert not hacked_now(lines([1.0, None, 3.0], tracking=[3.0, 2.0, 1.0]), window=3)
+
+
+class Falling:
+    """Held-out scores that get worse at every call; also what weights they were asked of."""
+
+    def __init__(self, run_network: torch.nn.Module) -> None:
+        self.network, self.seen = run_network, list[dict[str, torch.Tensor]]()
+
+    def __call__(self) -> dict[str, float]:
+        self.seen.append(weights(self.network))
+        return {"tracking": 1.0 - 0.1 * len(self.seen), "psnr_db": 20.0 + len(self.seen), "reward": math.nan}
+
+
+@pytest.fixture
+def network() -> VideoNetwork:
+    return tiny_network()
+
+
+def test_held_out_scores_are_written_every_so_many_buffers_and_the_alarm_with_them(
+    tmp_path: Path, network: VideoNetwork
+) -> None:
+    run = VideoRun(network, config(every=2), tmp_path, heldout=Falling(network))
+    train(run, [1, 2, 3, 4])
+    assert run.hacked == []
+    run.close()
+    heldout = Falling(network)
+    heldout.seen = [{}, {}]
+    run = VideoRun(network, config(every=2), tmp_path, heldout=heldout)  # resumed: the curve goes on
+    train(run, [5, 6])
+    run.close()
+    written_lines = read_metrics(tmp_path, "heldout")
+    assert [(line["step"], line["hacked"]) for line in written_lines] == [(2, 0.0), (4, 0.0), (6, 1.0)]
+    last = written_lines[-1]
+    assert last["reward"] is None and last["reward_slope"] == pytest.approx(2.0)
+    assert run.hacked == alarms_of(last) and run.hacked[0].metric == "tracking"
+    assert last["hacked_tracking"] == pytest.approx(-0.1) and "hacked_psnr_db" not in last
+    assert written(last, SCORES) <= documented("section `heldout`")
+    assert written(read_metrics(tmp_path, "grpo")[0], SCORES) == documented("section `grpo`")
+
+
+def test_raw_rewards_and_the_noise_of_each_step_are_in_the_log(tmp_path: Path, network: VideoNetwork) -> None:
+    run = VideoRun(network, config(every=0), tmp_path)
+    buffer = toy_buffer(network, run.config.rollout)
+    raw = {"total": torch.arange(8.0), "tracking": torch.arange(8.0), "object_cm": 10 * torch.arange(8.0)}
+    raw["object_cm"][7] = math.nan
+    scored = replace(buffer.with_rewards({"total": raw["total"]}), rewards=raw)
+    run.train(scored)
+    run.close()
+    (line,) = read_metrics(tmp_path, "grpo")
+    assert (line["reward_mean"], line["reward_tracking"], line["reward_object_cm"]) == (3.5, 3.5, 30.0)
+    shares = [float(str(line[f"noise_share_step_{k}"])) for k in range(5)]
+    assert shares == pytest.approx(buffer.rollout.noise_share.tolist()) and len(set(shares)) > 1
+    assert line["noise_share"] == pytest.approx(math.sqrt(sum(share**2 for share in shares) / 5))
+
+
+def test_without_an_evaluation_setting_nothing_is_asked(tmp_path: Path, network: VideoNetwork) -> None:
+    heldout = Falling(network)
+    run = VideoRun(network, config(every=0), tmp_path, heldout=heldout)
+    train(run, [1, 2])
+    run.close()
+    assert not heldout.seen and not read_metrics(tmp_path, "heldout")
+
+
+def test_averaged_weights_are_scored_and_lie_beside_each_version_that_is_kept(
+    tmp_path: Path, network: VideoNetwork
+) -> None:
+    settings, heldout = config(ema_decay=0.9), Falling(network)
+    run = VideoRun(network, settings, tmp_path, keep_versions=2, heldout=heldout)
+    train(run, [1, 2, 3])
+    run.close()
+    assert progress(tmp_path) == (6, 3)
+    names = {path.name for path in (tmp_path / "video_policies").iterdir()}
+    assert names == {f"{kind}_00000{version}.safetensors" for kind in ("video", "averaged") for version in (4, 6)}
+    own, averaged = tiny_network(seed=1), tiny_network(seed=1)
+    load_weights(own, (tmp_path / version_uri(6)).read_bytes())
+    load_weights(averaged, (tmp_path / evaluated_uri(6, settings)).read_bytes())
+    for name, value in weights(averaged).items():
+        assert torch.equal(value, run.learner.averaged[name]) and torch.equal(value, heldout.seen[-1][name])
+    assert any(not torch.equal(value, weights(own)[name]) for name, value in weights(averaged).items())
+    assert all(torch.equal(value, weights(network)[name]) for name, value in weights(own).items())
+
+
+def test_without_an_average_the_version_itself_is_evaluated_and_no_checkpoint_is_no_progress(tmp_path: Path) -> None:
+    assert evaluated_uri(4, config()) == version_uri(4)
+    assert progress(tmp_path) == (0, 0)

@@ -1,0 +1,248 @@
+"""The world model behind the Environment interface, and its folder on disk. Untrained weights: only the rules count."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from recording_samples import make_spec
+from safetensors.torch import load_file, save_file
+
+from wm_nodes.config.load import load_config
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
+from wm_nodes.core.tool_control import next_state
+from wm_nodes.core.types import FloatArray, StepResult
+from wm_nodes.world_model import (
+    ActionModel,
+    ImaginedEnvironment,
+    ModelFolderError,
+    TextModel,
+    Tokenizer,
+    WorldModels,
+    load_model_folder,
+    load_starts,
+    save_model_folder,
+)
+from wm_nodes.world_model.parts import PART
+
+NUM_ENVS, NUM_STARTS = 3, 5
+TASKS = ("push_cube", "reach")
+
+
+def config_of(**reward: float) -> RunConfig:
+    overrides = {"tokenizer.width": 16, "tokenizer.depth": 1, "tokenizer.latent_dim": 6, "world_model.width": 24,
+                 "world_model.depth": 2, "world_model.num_heads": 2, "reward.success_threshold": 1.0}
+    return load_config("base", overrides | {f"reward.{key}": value for key, value in reward.items()})
+
+
+def make_folder(folder: Path) -> Path:
+    config, spec = config_of(), spec_of()
+    torch.manual_seed(0)
+    tokenizer = Tokenizer(config.tokenizer, spec.height, spec.width)
+    sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_tasks": len(TASKS)}
+    action = ActionModel(config.world_model, action_dim=3, state_dim=3, **sizes)
+    text = TextModel(config.world_model, vocabulary=("push", "cube"), **sizes)
+    torch.nn.init.normal_(action.change.weight, std=0.2)
+    return save_model_folder(
+        folder, tokenizer, action, text, tokenizer_config=config.tokenizer, world_model_config=config.world_model,
+        simulation=config.simulation, tasks=TASKS, story={"data": "none"},
+    )
+
+
+def spec_of() -> EnvironmentSpec:
+    return make_spec(NUM_ENVS, 32, 64, instruction="push cube", max_episode_steps=5)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> WorldModels:
+    return load_model_folder(make_folder(tmp_path_factory.mktemp("world") / "model"))
+
+
+def starts() -> tuple[np.ndarray, FloatArray]:
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (NUM_STARTS, 32, 64, 3), dtype=np.uint8)
+    return images, rng.uniform(0.5, 0.7, (NUM_STARTS, 3)).astype(np.float32)
+
+
+def make(
+    models: WorldModels, seed: int = 0, num_envs: int = NUM_ENVS, exact: bool = False, **reward: float
+) -> ImaginedEnvironment:
+    return ImaginedEnvironment(
+        models, spec_of(), starts(), config_of(**reward).reward, num_envs=num_envs, seed=seed, with_goals=False,
+        exact=exact,
+    )
+
+
+def actions(step: int) -> FloatArray:
+    return np.random.default_rng(step).uniform(-1, 1, (NUM_ENVS, 3)).astype(np.float32)
+
+
+def assert_same(first: StepResult, second: StepResult, rows: slice = slice(None)) -> None:
+    np.testing.assert_array_equal(first.observation.image[rows], second.observation.image[rows])
+    np.testing.assert_array_equal(first.observation.state[rows], second.observation.state[rows])
+    np.testing.assert_array_equal(first.success_probability[rows], second.success_probability[rows])
+    np.testing.assert_array_equal(first.uncertainty[rows], second.uncertainty[rows])
+
+
+def test_equal_seeds_give_bit_identical_episodes(models: WorldModels) -> None:
+    first, second = make(models), make(models)
+    seeds = np.arange(NUM_ENVS, dtype=np.uint64)
+    np.testing.assert_array_equal(first.reset(seeds=seeds).image, second.reset(seeds=seeds).image)
+    for step in range(4):
+        assert_same(first.step(actions(step)), second.step(actions(step)))
+
+
+def test_one_environment_reset_later_lives_the_same_episode_bit_for_bit(models: WorldModels) -> None:
+    early, late = make(models), make(models)
+    seeds = np.full(NUM_ENVS, 7, np.uint64)
+    early.reset(seeds=seeds)
+    late.reset(seeds=np.arange(NUM_ENVS, dtype=np.uint64))
+    late.step(actions(0))
+    late.reset(mask=np.array([False, True, False]), seeds=seeds)
+    for step in range(3):
+        assert_same(early.step(actions(step)), late.step(actions(step)), slice(1, 2))
+
+
+def test_environments_in_different_parts_of_a_batch_live_the_episodes_of_one_part(models: WorldModels) -> None:
+    count = PART + NUM_ENVS
+    many, few = make(models, num_envs=count, exact=True), make(models, exact=True)
+    rows = np.arange(count) % NUM_ENVS
+    many.reset(seeds=rows.astype(np.uint64))
+    few.reset(seeds=np.arange(NUM_ENVS, dtype=np.uint64))
+    for step in range(4):
+        if step == 2:  # a reset of some environments of both parts
+            many.reset(mask=rows == 1, seeds=np.full(count, 7, np.uint64))
+            few.reset(mask=np.arange(NUM_ENVS) == 1, seeds=np.full(NUM_ENVS, 7, np.uint64))
+        together, alone = many.step(actions(step)[rows]), few.step(actions(step))
+        difference = together.observation.image.astype(int) - alone.observation.image[rows]
+        assert np.abs(difference).max() <= 2  # batches of other sizes may round otherwise
+        np.testing.assert_allclose(together.success_probability, alone.success_probability[rows], atol=1e-5)
+
+
+def test_a_reset_begins_at_a_real_frame_chosen_by_the_seed(models: WorldModels) -> None:
+    env, (images, states) = make(models), starts()
+    observation = env.reset(seeds=np.array([1, 1, 2], np.uint64))
+    np.testing.assert_array_equal(observation.image[0], observation.image[1])
+    matches = (images == observation.image[0]).all((1, 2, 3))
+    assert matches.sum() == 1
+    np.testing.assert_array_equal(observation.state[0], states[matches][0])
+
+
+def test_the_tool_position_follows_the_controller_exactly(models: WorldModels) -> None:
+    env = make(models)
+    before = env.reset().state
+    after = env.step(actions(0)).observation.state
+    np.testing.assert_array_equal(after, next_state(before, actions(0), env.spec))
+
+
+def test_an_episode_is_truncated_at_the_step_limit_and_then_stays_put(models: WorldModels) -> None:
+    env = make(models)
+    env.reset()
+    results = [env.step(actions(step)) for step in range(env.spec.max_episode_steps + 1)]
+    assert not np.concatenate([result.truncated for result in results[:-2]]).any()
+    assert results[-2].truncated.all()
+    assert not results[-2].terminated.any()
+    assert not results[-1].valid.any()
+    np.testing.assert_array_equal(results[-1].observation.image, results[-2].observation.image)
+    np.testing.assert_array_equal(results[-1].observation.episode_step, [env.spec.max_episode_steps] * NUM_ENVS)
+
+
+def test_a_done_signal_above_the_threshold_terminates_and_never_also_truncates(models: WorldModels) -> None:
+    env = make(models, success_threshold=0.0)
+    env.reset()
+    result = env.step(actions(0))
+    assert result.terminated.all()
+    assert not result.truncated.any()
+
+
+def test_too_much_disagreement_of_the_done_heads_truncates(models: WorldModels) -> None:
+    env = make(models, uncertainty_limit=1e-9)
+    env.reset()
+    assert env.step(actions(0)).truncated.all()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (np.zeros((NUM_ENVS, 2), np.float32), "shape"),
+        (np.full((NUM_ENVS, 3), np.nan, np.float32), "finite"),
+        (np.full((NUM_ENVS, 3), 1.5, np.float32), r"\[-1, 1\]"),
+    ],
+)
+def test_bad_actions_are_refused_and_change_nothing(models: WorldModels, wrong: FloatArray, message: str) -> None:
+    env, untouched = make(models), make(models)
+    env.reset()
+    untouched.reset()
+    with pytest.raises(ValueError, match=message):
+        env.step(wrong)
+    assert_same(env.step(actions(0)), untouched.step(actions(0)))
+
+
+def test_the_spec_says_imagined_and_names_the_model(models: WorldModels) -> None:
+    spec = make(models).spec
+    assert spec.source == SOURCE_IMAGINED
+    assert spec.world_model_sha256 == models.sha256
+    assert spec.policy_hash() == spec_of().policy_hash()
+
+
+def test_goals_belong_to_the_start_of_each_environment(models: WorldModels) -> None:
+    env = ImaginedEnvironment(models, spec_of(), starts(), config_of().reward, num_envs=NUM_ENVS)
+    env.reset(seeds=np.array([1, 1, 2], np.uint64))
+    goals = env.goals()
+    assert goals is not None
+    frames, found = goals
+    assert frames.shape == (NUM_ENVS, 32, 64, 3)
+    assert found.shape == (NUM_ENVS,)
+    np.testing.assert_array_equal(frames[0], frames[1])
+
+
+def test_a_loaded_folder_predicts_what_was_saved_up_to_half_precision(models: WorldModels, tmp_path: Path) -> None:
+    again = save_model_folder(
+        tmp_path / "copy", models.tokenizer, models.action, models.text, tokenizer_config=config_of().tokenizer,
+        world_model_config=config_of().world_model, simulation=models.simulation, tasks=models.tasks, story={},
+    )
+    assert load_model_folder(again).sha256 == models.sha256
+
+
+def test_a_missing_damaged_or_exchanged_file_is_one_clear_error(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "model")
+    weights = folder / "action_model.safetensors"
+    data = weights.read_bytes()
+    weights.write_bytes(data[:-10])
+    with pytest.raises(ModelFolderError, match="sha256 differs"):
+        load_model_folder(folder)
+    weights.unlink()
+    with pytest.raises(ModelFolderError, match="missing"):
+        load_model_folder(folder)
+    with pytest.raises(ModelFolderError, match="holds no"):
+        load_model_folder(tmp_path)
+
+
+def test_weights_of_another_architecture_are_one_clear_error(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "model")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["world_model"]["width"] = 32
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(ModelFolderError, match="another architecture"):
+        load_model_folder(folder)
+
+
+def test_a_task_the_model_does_not_know_is_refused(models: WorldModels) -> None:
+    with pytest.raises(ModelFolderError, match="push_cube, reach"):
+        models.task_index("pull_cube")
+
+
+def test_starts_are_read_from_a_file_and_an_empty_or_foreign_one_is_refused(tmp_path: Path) -> None:
+    images, states = (torch.from_numpy(array) for array in starts())
+    save_file({"images": images, "states": states}, tmp_path / "starts.safetensors")
+    assert load_starts(tmp_path / "starts.safetensors")[0].shape == (NUM_STARTS, 32, 64, 3)
+    save_file({"images": images[:0]}, tmp_path / "foreign.safetensors")
+    with pytest.raises(ValueError, match="no starts file"):
+        load_starts(tmp_path / "foreign.safetensors")
+
+
+def test_files_hold_half_precision(tmp_path: Path) -> None:
+    tensors = load_file(make_folder(tmp_path / "model") / "tokenizer.safetensors")
+    assert {tensor.dtype for tensor in tensors.values()} == {torch.float16}

@@ -1,0 +1,173 @@
+"""Losses, schedule, resume, and that rollouts of a trained model follow a scene with contact."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from pushing_scene import episode, success
+from torch.testing import assert_close
+
+from wm_nodes.config.load import load_config
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.training.loop import LoopSettings, TrainingLoop
+from wm_nodes.world_model.training.dynamics import (
+    RolloutTerms,
+    bootstrap_masks,
+    decoded_losses,
+    done_losses,
+    rollout_steps_at,
+    token_weights,
+    tokenise_episodes,
+    train_action_model,
+)
+from wm_nodes.world_model.training.tokenizer import train_tokenizer
+from wm_nodes.world_model.validation.open_loop import auc, detection_metrics, evaluate_rollouts, format_rollouts
+
+TASKS = ("push_cube", "reach")
+
+
+def config_of(**overrides: object) -> RunConfig:
+    small = {
+        "tokenizer.width": 32, "tokenizer.depth": 1, "tokenizer.patch_px": 8, "tokenizer.latent_dim": 8,
+        "tokenizer.batch_size": 32, "tokenizer.num_iterations": 250, "tokenizer.learning_rate": 3e-3,
+        "world_model.width": 32, "world_model.depth": 1, "world_model.num_heads": 2, "world_model.batch_size": 16,
+        "world_model.num_iterations": 260, "world_model.learning_rate": 3e-3, "world_model.rollout_steps": [3, 12],
+        "world_model.state_weight": 2.0,
+    }
+    return load_config("base", small | {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
+    return stack_episodes([episode(first_seed + i) for i in range(count)], TASKS, success)
+
+
+def test_rmse_of_one_half_on_balanced_labels_is_one_half() -> None:
+    logits, labels = torch.zeros(2, 3, 1, 1), torch.tensor([[0.0, 1, 0], [1, 0, 1]]).unsqueeze(-1)
+    assert_close(done_losses(logits, labels, torch.ones(2, 3, 1), "rmse"), torch.tensor(0.5))
+    assert_close(done_losses(logits, labels, torch.ones(2, 3, 1), "bce"), torch.log(torch.tensor(2.0)))
+
+
+def test_masked_steps_do_not_count_in_the_done_loss() -> None:
+    logits, labels = torch.tensor([[[[9.0]], [[9.0]]]]), torch.tensor([[[1.0], [0.0]]])
+    assert done_losses(logits, labels, torch.tensor([[[1.0], [0.0]]])) < 1e-3
+
+
+def test_an_unknown_done_loss_is_refused() -> None:
+    with pytest.raises(ValueError, match="'bce' or 'rmse'"):
+        done_losses(torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1), torch.ones(1, 1, 1), "mse")
+
+
+def test_the_curriculum_gives_each_stage_an_equal_share() -> None:
+    assert [rollout_steps_at(i, 8, [1, 4, 16, 16]) for i in range(8)] == [1, 1, 4, 4, 16, 16, 16, 16]
+    assert rollout_steps_at(99, 8, [1, 4]) == 4
+
+
+def test_tokens_that_changed_more_than_usual_weigh_more() -> None:
+    latents = torch.zeros(1, 2, 2, 4)
+    latents[0, 1, 1] = 1.0
+    assert token_weights(latents, torch.tensor([1.0, 0.5]))[0, 0].tolist() == [0.5, 1.5]
+
+
+def test_done_heads_learn_from_different_episodes_unless_there_is_one() -> None:
+    masks = bootstrap_masks(1000, 3, 0)
+    assert 0.6 < masks.mean() < 0.8
+    assert not masks[:, 0].equal(masks[:, 1])
+    assert bootstrap_masks(10, 1, 0).min() == 1
+
+
+def test_shorter_episodes_are_padded_by_their_last_frame_and_masked() -> None:
+    stacked = stack_episodes([episode(0, num_steps=4), episode(1, num_steps=2)], TASKS, success)
+    assert stacked.step_mask.tolist() == [[True] * 4, [True, True, False, False]]
+    np.testing.assert_array_equal(stacked.images[1, 4], stacked.images[1, 2])
+    assert stacked.success.shape == (2, 5, 2)
+
+
+def test_episodes_of_different_cameras_are_refused() -> None:
+    with pytest.raises(ValueError, match="different image"):
+        stack_episodes([episode(0, size=32), episode(1, size=64)], TASKS, success)
+    with pytest.raises(ValueError, match="no episodes"):
+        stack_episodes([], TASKS, success)
+
+
+def test_a_resumed_run_takes_the_same_steps_as_one_that_was_not_stopped(tmp_path: Path) -> None:
+    def loop(folder: Path | None, seconds: float = 0.0) -> TrainingLoop:
+        torch.manual_seed(0)
+        model = torch.nn.Linear(3, 2)
+        return TrainingLoop("toy", model, LoopSettings(30, 0.1, max_seconds=seconds), folder)
+
+    def loss_of(made: TrainingLoop):  # type: ignore[no-untyped-def]
+        def loss(iteration: int) -> dict[str, torch.Tensor]:
+            x = torch.randn(4, 3, generator=torch.Generator().manual_seed(iteration))
+            return {"loss": made.model(x).square().mean()}
+
+        return loss
+
+    whole = loop(None)
+    whole.run(loss_of(whole), progress=False)
+    first = loop(tmp_path, seconds=1e-9)
+    first.run(loss_of(first), progress=False)
+    assert 0 < first.iteration < 30
+    second = loop(tmp_path)
+    assert second.iteration == first.iteration
+    second.run(loss_of(second), progress=False)
+    assert second.model.weight.equal(whole.model.weight)
+    lines = [json.loads(line) for line in (tmp_path / "metrics_toy.jsonl").read_text().splitlines()]
+    assert lines[-1]["iteration"] == 30
+
+
+def test_a_checkpoint_of_another_architecture_is_one_clear_error(tmp_path: Path) -> None:
+    TrainingLoop("toy", torch.nn.Linear(3, 2), LoopSettings(1, 0.1), tmp_path).save()
+    with pytest.raises(ValueError, match="another architecture"):
+        TrainingLoop("toy", torch.nn.Linear(4, 2), LoopSettings(1, 0.1), tmp_path)
+
+
+def test_auc_counts_ties_half_and_detection_counts_episodes() -> None:
+    scores, positive = np.array([0.9, 0.5, 0.5, 0.1], np.float32), np.array([True, True, False, False])
+    assert auc(scores, positive) == pytest.approx((1 + 1 + 0.5 + 1) / 4)
+    found = detection_metrics(scores, positive, 0.6)
+    assert (found["precision"], found["recall"], found["agreement"]) == (1.0, 0.5, 0.75)
+    assert np.isnan(detection_metrics(scores, np.zeros(4, bool), 0.95)["precision"])
+
+
+def test_decoded_losses_are_smallest_for_the_true_latents_and_reach_the_predictions_only() -> None:
+    config, episodes = config_of(tokenizer__num_iterations=40), arrays(12)
+    tokenizer, _ = train_tokenizer(episodes, config, 0, None, progress=False)
+    tokenizer.requires_grad_(False)
+    data = tokenise_episodes(tokenizer, episodes)
+    index = torch.arange(12)
+
+    def losses(latents: torch.Tensor) -> dict[str, torch.Tensor]:
+        terms = RolloutTerms(latents, torch.zeros(()), torch.zeros(()))
+        return decoded_losses(terms, tokenizer, data, index, config, torch.Generator().manual_seed(0))
+
+    true = data.latents[:, 1:].float().requires_grad_()
+    right, wrong = losses(true), losses(true.detach().roll(1, 0))
+    assert right.keys() == wrong.keys() == {"pixel", "recoded", "recoded_state"}
+    assert all(right[key] < wrong[key] for key in right)
+    sum(right.values()).backward()
+    touched = (true.grad != 0).flatten(2).any(-1)
+    assert touched.any(1).all() and int(touched.sum()) <= 2 * 12
+    assert all(p.grad is None for p in tokenizer.parameters())
+
+
+def test_a_finished_stage_still_tells_its_last_metrics(tmp_path: Path) -> None:
+    made = TrainingLoop("toy", torch.nn.Linear(3, 2), LoopSettings(3, 0.1), tmp_path)
+    metrics = made.run(lambda i: {"loss": made.model.weight.square().sum()}, progress=False)
+    again = TrainingLoop("toy", torch.nn.Linear(3, 2), LoopSettings(3, 0.1), tmp_path)
+    assert again.run(lambda i: {}, progress=False) == metrics
+
+
+@pytest.mark.slow
+def test_rollouts_of_a_trained_model_follow_pushed_objects_better_than_copying_the_first_frame() -> None:
+    config, training = config_of(tokenizer__num_iterations=100, world_model__num_iterations=60), arrays(120)
+    tokenizer, tokenizer_metrics = train_tokenizer(training, config, 0, None, progress=False)
+    assert tokenizer_metrics["psnr_db"] > 22
+    data = tokenise_episodes(tokenizer, training)
+    model, _ = train_action_model(tokenizer, data, config, 0, None, progress=False)
+    metrics = evaluate_rollouts(tokenizer, model, arrays(32, 10_000), threshold=0.5)
+    assert metrics["tool_ratio_h12"] < 0.6
+    assert metrics["object_moved_ratio_h12"] < 0.7
+    assert "h12" in format_rollouts(metrics)

@@ -1,0 +1,277 @@
+"""The reward agent against labels: Table 2 of the paper (table), what its economy saves (efficiency), and whether
+climbing the reward climbs the truth (hacking); other papers' rewards on the same clips (comparisons).
+"""
+
+import argparse
+import asyncio
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from tqdm import tqdm
+
+from benchmarks.judge.compared import PROTOCOLS, AnswerFile, ComparedRow, compared, compared_table, num_answers
+from benchmarks.judge.efficiency import ARMS, economy, economy_table, trials
+from benchmarks.judge.hacking import (
+    Proxy,
+    SearchPlan,
+    agent_reward,
+    climb,
+    curve,
+    has_numbers,
+    mean_score,
+    pixel_similarity,
+    plot_curves,
+)
+from benchmarks.judge.judges import NAMES, open_comparison, open_judge
+from benchmarks.judge.label_judge import KnownClip, LabelJudge
+from benchmarks.judge.metrics import (
+    agreement,
+    by_split,
+    cost_row,
+    missed,
+    missed_patterns,
+    mistakes,
+    pattern_rows,
+    statuses,
+    worst,
+)
+from benchmarks.judge.run import JudgeTrial, Outcome, OutcomeFile, judge_rows
+from benchmarks.judge.search_starts import hacking_starts
+from benchmarks.judge.tables import confusion_table, cost_table, curve_table, pattern_table, split_table, table2
+from benchmarks.judge.test_split_log import judge_name, notice, record_evaluation
+from benchmarks.speed.results import write_results
+from wm_nodes.config.load import load_config
+from wm_nodes.judge.agent import Judge, Rubric, TaskSpec, load_rubric
+from wm_nodes.judge.agent.types import Stage
+from wm_nodes.judge.dataset.build import load_set
+from wm_nodes.judge.dataset.edits import LabelledClip, Manifest
+from wm_nodes.judge.dataset.edits.generator import SEVERITIES
+from wm_nodes.judge.dataset.edits.manifest import ManifestRow
+from wm_nodes.judge.dataset.rows import MIN_TEST_CLIPS, chosen_rows
+
+LOG_COLUMNS = 180
+JUDGED = "judged"
+"""Folder of a set that holds the outcomes, and the reads bought from a server."""
+ROUTED = [stage for stage in Stage if stage is not Stage.REFLECT]
+"""Stages that may have a judge of their own."""
+console = Console()
+
+
+def main(argv: Sequence[str]) -> int:
+    """Return the exit code: 0 done, 2 a clear error, 130 interrupted (judged clips are kept)."""
+    arguments = parser().parse_args(argv)
+    arguments.command = shlex.join(["benchmark_reward.py", *argv])
+    if not console.is_terminal:
+        console.width = LOG_COLUMNS
+    claims = {"table": _table, "efficiency": _efficiency, "hacking": _hacking, "comparisons": _comparisons}
+    try:
+        asyncio.run(claims[arguments.claim](arguments))
+    except KeyboardInterrupt:
+        return 130
+    except (ValueError, OSError, ImportError) as error:
+        console.print("[bold red]error:[/]", escape(str(error)), highlight=False, soft_wrap=True)
+        return 2
+    return 0
+
+
+async def _table(arguments: argparse.Namespace) -> None:
+    rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
+    rows = chosen_rows(manifest, arguments.part, arguments.clips)
+    async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
+        said = _looked(arguments, manifest, judge, rubric)
+        outcomes = await _judged(arguments, judge, [JudgeTrial("table", rubric, seed=arguments.seed)], rows)
+        who = judge_name(judge.capabilities)
+    found = outcomes["table"]
+    agreements, patterns = agreement(rows, found, rubric), pattern_rows(rows, found, tuple(rubric.hack.patterns))
+    caption = f"{who}; rubric {rubric.version}; {arguments.part}, {len(rows)} clips: {statuses(found)}"
+    splits = by_split(rows, found, rubric)
+    console.print(table2(agreements, caption), split_table(splits), confusion_table(agreements, patterns))
+    console.print(pattern_table(patterns))
+    cost = cost_row(found, arguments.price)
+    console.print(cost_table({"agent, benchmark mode": cost}))
+    below = [*missed(agreements), *missed_patterns(patterns)]
+    _say_what_is_missing(arguments, len(rows), said, below, worst(mistakes(rows, found, rubric)))
+    write_results(arguments, {
+        "claim": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
+        "seed": arguments.seed, "notice": said, "statuses": statuses(found), "cost": cost,
+        "splits": {name: [asdict(row) for row in found] for name, found in splits.items()},
+        "rows": [asdict(row) for row in agreements], "patterns": [asdict(row) for row in patterns],
+        "missed": below, "mistakes": worst(mistakes(rows, found, rubric), 40),
+    })
+
+
+async def _efficiency(arguments: argparse.Namespace) -> None:
+    rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
+    rows = chosen_rows(manifest, arguments.part, arguments.clips)
+    async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
+        said = _looked(arguments, manifest, judge, rubric)
+        outcomes = await _judged(arguments, judge, trials(arguments.rubric, arguments.seed), rows)
+        who = judge_name(judge.capabilities)
+    costs = {ARMS[name]: cost_row(found, arguments.price) for name, found in outcomes.items()}
+    compared = economy(rows, outcomes)
+    console.print(cost_table(costs), economy_table(compared, f"{who}; {arguments.part}, {len(rows)} clips"))
+    _say_what_is_missing(arguments, len(rows), said, [], [])
+    write_results(arguments, {
+        "claim": "efficiency", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
+        "seed": arguments.seed, "notice": said, "per_clip": costs, "compared": [asdict(one) for one in compared],
+    })
+
+
+async def _hacking(arguments: argparse.Namespace) -> None:
+    rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
+    plan = SearchPlan(arguments.generations, arguments.candidates, severities=tuple(arguments.severities))
+    part = chosen_rows(manifest, arguments.part)
+    config = load_config("cpu").simulation
+    starts, curves = [], []
+    async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
+        who = judge_name(judge.capabilities)
+        said = _looked(arguments, manifest, judge, rubric)
+        rewards: dict[str, Proxy] = {
+            "agent": agent_reward(judge, rubric, arguments.seed),
+            "mean score": mean_score(judge, rubric, arguments.seed),
+            "pixel similarity": pixel_similarity,
+        }
+        told = {name: _told(reward, judge) for name, reward in rewards.items()}
+        with tqdm(total=arguments.starts, desc="clips with a defect") as bar:
+            for start in hacking_starts(part, manifest.division, config, arguments.seed):
+                if await has_numbers(start, told.values()):
+                    starts.append(start)
+                    bar.update()
+                if len(starts) == arguments.starts:
+                    break
+        if not starts:
+            raise ValueError(f"no clip with a defect has a number of {', '.join(told)}; nothing can be climbed")
+        most = len(rewards) * len(starts) * (1 + plan.generations * plan.candidates)
+        with tqdm(total=most, desc="search", unit="clip") as bar:
+            for name, reward in told.items():
+                climbs = [await climb(start, reward, plan, arguments.seed, on_clip=bar.update) for start in starts]
+                curves.append(curve(name, [one for one in climbs if one is not None]))
+    console.print(curve_table(curves, f"{who}; {arguments.part}, {len(starts)} clips with a defect"))
+    if said:
+        console.print(said, style="bold", highlight=False)
+    if arguments.json is not None:
+        plot_curves(curves, arguments.json.with_suffix(".png"))
+    write_results(arguments, {
+        "claim": "hacking", "judge": who, "rubric": rubric.version, "part": arguments.part, "notice": said,
+        "seed": arguments.seed, "plan": asdict(plan), "starts": [start.clip.recipe for start in starts],
+        "curves": [asdict(one) for one in curves],
+    })
+
+
+async def _comparisons(arguments: argparse.Namespace) -> None:
+    manifest = load_set(arguments.set)
+    rows = chosen_rows(manifest, arguments.part, arguments.clips)
+    found: list[ComparedRow] = []
+    async with open_comparison(arguments) as judge:
+        with tqdm(total=sum(num_answers(name, rows) for name in arguments.protocols), desc="asked") as bar:
+            for name in arguments.protocols:
+                bar.set_postfix_str(name)
+                file = AnswerFile(arguments.set / JUDGED, name, arguments.model, arguments.seed)
+                found.append(
+                    await compared(
+                        judge, name, arguments.set, rows, file, at_once=arguments.at_once, on_answer=bar.update
+                    )
+                )
+    caption = f"{arguments.model}; {arguments.part}, {len(rows)} clips; wins: hacked scores >= its clean recording"
+    console.print(compared_table(found, caption))
+    write_results(arguments, {
+        "claim": "comparisons", "model": arguments.model, "part": arguments.part, "clips": len(rows),
+        "seed": arguments.seed, "rows": [asdict(row) for row in found],
+    })
+
+
+def _told(reward: Proxy, judge: Judge) -> Proxy:
+    """The control judge must be told the labels of every new clip; others look."""
+    if not isinstance(judge, LabelJudge):
+        return reward
+
+    async def proxy(clip: LabelledClip, task: TaskSpec) -> float | None:
+        judge.clips[clip.sha256] = KnownClip(clip.labels, clip.edits)
+        return await reward(clip, task)
+
+    return proxy
+
+
+async def _judged(
+    arguments: argparse.Namespace, judge: Judge, wanted: Sequence[JudgeTrial], rows: Sequence[ManifestRow]
+) -> dict[str, list[Outcome]]:
+    found = {}
+    with tqdm(total=len(wanted) * len(rows), desc="judged", unit="clip") as bar:
+        for trial in wanted:
+            bar.set_postfix_str(trial.name)
+            path = arguments.set / JUDGED / f"{trial.key(judge.capabilities)}.jsonl"
+            found[trial.name] = await judge_rows(
+                judge, trial, arguments.set, rows, OutcomeFile(path), at_once=arguments.at_once, on_clip=bar.update
+            )
+    return found
+
+
+def _looked(arguments: argparse.Namespace, manifest: Manifest, judge: Judge, rubric: Rubric) -> str:
+    """Record an evaluation on the test split; return what the output must say of it. Controls are not recorded."""
+    if arguments.part != "test" or arguments.judge == "simulator":
+        return ""
+    others = record_evaluation(arguments.set, manifest, judge.capabilities, rubric.version, arguments.again)
+    return notice(others, arguments.again)
+
+
+def _say_what_is_missing(
+    arguments: argparse.Namespace, count: int, said: str, below: Sequence[str], wrong: Sequence[tuple[str, int]]
+) -> None:
+    lines = [said] if said else []
+    if count < MIN_TEST_CLIPS:
+        lines.append(f"{count} clips: fewer than {MIN_TEST_CLIPS}, the intervals are too wide to claim a match")
+    if arguments.judge == "simulator":
+        lines.append("the judge knows the labels: a control of the machinery, not a result")
+    if below:
+        lines.append(f"missed, of the paper's figures and the targets: {', '.join(below)}")
+    if wrong:
+        lines.append(f"wrong most often: {', '.join(f'{name} ({times})' for name, times in wrong)}")
+    for line in lines:
+        console.print(line, style="bold", highlight=False, soft_wrap=True)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("set", type=Path, help="folder of a set, see make_adversarial_set.py")
+    common.add_argument("--judge", choices=NAMES, default="embedded", help="simulator: a control that knows the labels")
+    common.add_argument("--rubric", default="robot", help="a rubric pack, or a .yaml")
+    common.add_argument("--part", choices=("test", "validation", "train"), default="test")
+    common.add_argument(
+        "--again", default="", metavar="REASON", help="for a further evaluation on the test split"
+    )
+    common.add_argument("--json", type=Path, metavar="FILE")
+    common.add_argument("--seed", type=int, default=0)
+    common.add_argument("--at-once", type=int, default=1, help="clips under way together, behind a server")
+    common.add_argument("--folder", type=Path, help="of the embedded judge; the shipped one by default")
+    common.add_argument(
+        "--conformal", type=float, default=0.0, metavar="COVERAGE",
+        help="the embedded judge abstains where it is not sure at this coverage, e.g. 0.9; 0: it always decides",
+    )
+    common.add_argument("--stages", nargs="+", choices=ROUTED, default=[], help="that --model reads in its place")
+    common.add_argument("--url", nargs="+", default=[], help="of chat servers, http://HOST:PORT/v1")
+    common.add_argument("--model", default="", help="that they serve")
+    common.add_argument("--api-key-env", default="", help="environment variable that holds their key")
+    common.add_argument("--price", nargs=2, type=float, default=[], metavar="USD", help="per million tokens in and out")
+    common.add_argument("--max-images", type=int, default=64, help="that it takes in one call")
+    common.add_argument("--error", type=float, default=0.0, help="of the control: share of reads that are wrong")
+    whole = argparse.ArgumentParser(prog="benchmark_reward.py", description=__doc__)
+    claims = whole.add_subparsers(dest="claim", required=True)
+    for name, text in (
+        ("table", "agreement with the labels in the layout of Table 2, hacking patterns, cost"),
+        ("efficiency", "calls, images, pixels and tokens against reading everything of every clip"),
+        ("comparisons", "other papers' rewards through a chat server: ranking, hacked clips that win"),
+    ):
+        one = claims.add_parser(name, help=text, parents=[common])
+        one.add_argument("--clips", type=int, help="the first so many in the order of their hashes; all by default")
+    one.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
+    hacking = claims.add_parser("hacking", help="climb the agent and single scores, truth beside", parents=[common])
+    hacking.add_argument("--starts", type=int, default=12, help="clips with a defect to begin with")
+    hacking.add_argument("--generations", type=int, default=8)
+    hacking.add_argument("--severities", nargs="+", choices=SEVERITIES, default=list(SEVERITIES), help="of the edits")
+    hacking.add_argument("--candidates", type=int, default=6, help="edits tried per generation")
+    return whole

@@ -1,0 +1,182 @@
+"""Other papers' rewards on the same clips: how well they rank, and whether they fall for a hacked clip.
+
+A score is measured without a threshold, since each has a scale of its own: AUROC of good clips against others, and the
+share of hacked clips that score at least as high as their clean recording. Answers are kept, one JSON line each.
+"""
+
+import asyncio
+import hashlib
+import json
+import os
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from benchmarks.judge.comparisons import PAIRWISE, POINTWISE, ChatComparison
+from wm_nodes.core.reward_statistics import auroc, wilson_interval
+from wm_nodes.judge.dataset.edits.manifest import ManifestRow
+from wm_nodes.judge.dataset.rows import judged_clip
+
+PROTOCOLS = (*POINTWISE, *PAIRWISE)
+
+
+@dataclass(frozen=True)
+class ComparedAnswer:
+    """value: of a clip, or the preference for the clean clip of a pair; None where nothing usable was said."""
+
+    value: float | None
+    reason: str
+    calls: int
+    tokens: int
+    images: int
+
+
+@dataclass(frozen=True)
+class ComparedRow:
+    """n: clips or pairs with a number. area: AUROC against the overall label; NaN for pairs. pairs: hacked clips with a
+    clean recording. win_rate: share of them that score at least as high, with its Wilson interval. calls, tokens,
+    images: mean per clip or pair.
+    """
+
+    name: str
+    n: int
+    invalid: int
+    area: float
+    pairs: int
+    win_rate: float
+    low: float
+    high: float
+    calls: float
+    tokens: float
+    images: float
+
+
+class AnswerFile:
+    """Answers by clip or pair; torn lines and failures are asked again."""
+
+    def __init__(self, folder: Path, protocol: str, model: str, seed: int) -> None:
+        name = hashlib.sha256(json.dumps([protocol, model, seed]).encode()).hexdigest()[:16]
+        folder.mkdir(parents=True, exist_ok=True)
+        self._path = folder / f"{protocol}-{name}.jsonl"
+        self.kept: dict[str, ComparedAnswer] = {}
+        lines = self._path.read_text().splitlines() if self._path.is_file() else []
+        for line in lines:
+            try:
+                entry = json.loads(line)
+                key = entry.pop("of")
+                self.kept[key] = ComparedAnswer(**entry)
+            except (ValueError, KeyError, TypeError, AttributeError):
+                continue
+
+    async def get(self, key: str, ask: Callable[[], Awaitable[ComparedAnswer]]) -> ComparedAnswer:
+        known = self.kept.get(key)
+        if known is None or known.value is None:
+            known = self.kept[key] = await ask()
+            with self._path.open("a") as file:
+                file.write("\n" * bool(self._torn()) + json.dumps({"of": key, **asdict(known)}) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+        return known
+
+    def _torn(self) -> bool:
+        data = self._path.read_bytes()
+        return bool(data) and not data.endswith(b"\n")
+
+
+def hacked_pairs(rows: Sequence[ManifestRow]) -> list[tuple[ManifestRow, ManifestRow]]:
+    """(hacked clip, its recording), where the recording is good throughout."""
+    good = {row.sha256: row for row in rows if not row.edits and row.labels.overall}
+    return [(row, good[row.root]) for row in rows if row.labels.pattern is not None and row.root in good]
+
+
+async def compared(
+    judge: ChatComparison, protocol: str, folder: Path, rows: Sequence[ManifestRow], file: AnswerFile, *,
+    at_once: int = 1,
+    on_answer: Callable[[], object] = lambda: None,
+) -> ComparedRow:
+    """Ask one protocol about every clip, or about every hacked clip beside its recording.
+
+    Raises:
+        ManifestError: a clip cannot be read.
+    """
+    gate = asyncio.Semaphore(at_once)
+    pairs = hacked_pairs(rows)
+
+    async def one(row: ManifestRow) -> ComparedAnswer:
+        async with gate:
+            answer = await file.get(row.sha256, lambda: _score(judge, protocol, folder, row))
+            on_answer()
+            return answer
+
+    async def two(hacked: ManifestRow, clean: ManifestRow) -> ComparedAnswer:
+        async with gate:
+            key = f"{hacked.sha256}/{clean.sha256}"
+            answer = await file.get(key, lambda: _prefer(judge, protocol, folder, hacked, clean))
+            on_answer()
+            return answer
+
+    if protocol in PAIRWISE:
+        answers = list(await asyncio.gather(*(two(*pair) for pair in pairs)))
+        wins = [answer.value <= 0.5 for answer in answers if answer.value is not None]
+        return _row(protocol, answers, float("nan"), wins)
+    answers = list(await asyncio.gather(*(one(row) for row in rows)))
+    values = {row.sha256: answer.value for row, answer in zip(rows, answers)}
+    known = [(row.labels.overall, value) for row in rows if (value := values[row.sha256]) is not None]
+    both = [(values[hacked.sha256], values[clean.sha256]) for hacked, clean in pairs]
+    wins = [mine >= clean for mine, clean in both if mine is not None and clean is not None]
+    return _row(protocol, answers, auroc([label for label, _ in known], [value for _, value in known]), wins)
+
+
+def num_answers(protocol: str, rows: Sequence[ManifestRow]) -> int:
+    return len(hacked_pairs(rows)) if protocol in PAIRWISE else len(rows)
+
+
+def compared_table(rows: Sequence[ComparedRow], caption: str) -> Table:
+    table = Table(title="comparison rewards", caption=caption)
+    table.add_column("reward")
+    for name in ("n", "invalid", "AUROC", "hacked pairs", "hacked wins", "95 % Wilson", "calls", "tokens", "images"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        area = "-" if row.area != row.area else f"{row.area:.3f}"
+        wins = "-" if row.win_rate != row.win_rate else f"{100 * row.win_rate:.1f}"
+        table.add_row(
+            row.name, str(row.n), str(row.invalid), area, str(row.pairs), wins,
+            f"{100 * row.low:.1f} to {100 * row.high:.1f}", f"{row.calls:.2f}", f"{row.tokens:.0f}",
+            f"{row.images:.1f}",
+        )
+    return table
+
+
+async def _score(judge: ChatComparison, protocol: str, folder: Path, row: ManifestRow) -> ComparedAnswer:
+    found = await judge.score(POINTWISE[protocol], *judged_clip(folder, row))
+    return _answer(found.value if found.valid else None, found)
+
+
+async def _prefer(
+    judge: ChatComparison, protocol: str, folder: Path, hacked: ManifestRow, clean: ManifestRow
+) -> ComparedAnswer:
+    other, task = judged_clip(folder, clean)
+    found = await judge.compare(PAIRWISE[protocol], other, judged_clip(folder, hacked)[0], task)
+    return _answer(found.preference if found.valid else None, found)
+
+
+def _answer(value: float | None, found: Any) -> ComparedAnswer:
+    cost = found.cost
+    return ComparedAnswer(value, found.reason, cost.calls, cost.prompt_tokens + cost.completion_tokens, cost.images)
+
+
+def _row(name: str, answers: Sequence[ComparedAnswer], area: float, wins: Sequence[bool]) -> ComparedRow:
+    invalid = sum(answer.value is None for answer in answers)
+    low, high = wilson_interval(sum(wins), len(wins))
+    means = (_mean([getattr(answer, part) for answer in answers]) for part in ("calls", "tokens", "images"))
+    return ComparedRow(
+        name, len(answers) - invalid, invalid, area, len(wins), _mean([float(win) for win in wins]), low, high, *means
+    )
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")

@@ -1,0 +1,92 @@
+"""What planning, early exits and voting by need save, at which agreement: four ways of judging the same clips.
+
+agent: reward mode. everything: the same without early exits. voted: every component voted on besides. exhaustive: that
+on dense frames, which is what is left when all of the paper's measures of section 3.2 (efficiency) are taken away.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from rich.table import Table
+
+from benchmarks.judge.metrics import cost_row
+from benchmarks.judge.run import JudgeTrial, Outcome
+from wm_nodes.core.statistics import PairedDifference, paired_difference
+from wm_nodes.judge.agent import load_rubric
+from wm_nodes.judge.agent.types import GATED, NUM_PLAN_LEVELS
+from wm_nodes.judge.dataset.edits.manifest import ManifestRow
+from wm_nodes.judge.decisions import OVERALL
+
+ARMS = {
+    "agent": "agent", "everything": "everything, no early exit", "voted": "every component voted",
+    "exhaustive": "every component voted, dense frames",
+}
+VOTED = {"voting": {"levels": list(range(NUM_PLAN_LEVELS))}}
+EXHAUSTIVE = {**VOTED, "stages": {str(stage): {"profile": "D"} for stage in GATED}}
+MEASURES = ("reads", "calls", "images", "pixels", "tokens")
+
+
+@dataclass(frozen=True)
+class Economy:
+    """The agent against another way, on the n clips that both decide. saved: share of the other's measures, by name.
+    same: share of them with the same decision. accuracy, other_accuracy: of accepting, against the labels.
+    difference: agent - other on the same clips, with Tango's interval.
+    """
+
+    against: str
+    n: int
+    saved: Mapping[str, float]
+    same: float
+    accuracy: float
+    other_accuracy: float
+    difference: PairedDifference
+
+
+def trials(rubric: str, seed: int) -> list[JudgeTrial]:
+    """The four ways, by one rubric pack."""
+    plain, voted, exhaustive = (load_rubric(rubric, changed) for changed in ({}, VOTED, EXHAUSTIVE))
+    return [
+        JudgeTrial("agent", plain, "reward", seed), JudgeTrial("everything", plain, "benchmark", seed),
+        JudgeTrial("voted", voted, "benchmark", seed), JudgeTrial("exhaustive", exhaustive, "benchmark", seed),
+    ]
+
+
+def economy(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence[Outcome]]) -> list[Economy]:
+    """The agent against each of the others.
+
+    Raises:
+        ValueError: no clip that both decide.
+    """
+    found = []
+    for name in list(ARMS)[1:]:
+        kept = [
+            (row, one, other) for row, one, other in zip(rows, outcomes["agent"], outcomes[name])
+            if OVERALL in one.decisions and OVERALL in other.decisions
+        ]
+        both = [(row.labels.overall, a.decisions[OVERALL].value, b.decisions[OVERALL].value) for row, a, b in kept]
+        if not both:
+            raise ValueError(f"no clip is decided by the agent and by {ARMS[name]}; see the statuses of the table")
+        right = [said == label for label, said, _ in both]
+        other_right = [said == label for label, _, said in both]
+        cost, other_cost = cost_row([one for _, one, _ in kept]), cost_row([other for _, _, other in kept])
+        saved = {part: 1 - cost[part] / other_cost[part] for part in MEASURES}
+        same = [one == other for _, one, other in both]
+        agreed, mine_right, its_right = (sum(decisions) / len(both) for decisions in (same, right, other_right))
+        paired = paired_difference(other_right, right)
+        found.append(Economy(ARMS[name], len(both), saved, agreed, mine_right, its_right, paired))
+    return found
+
+
+def economy_table(rows: Sequence[Economy], caption: str) -> Table:
+    table = Table(title="saved by the agent, and what it costs in agreement", caption=caption)
+    table.add_column("against")
+    for name in ("n", *MEASURES, "same decision", "accuracy", "other's", "difference (95 %)"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        d = row.difference
+        table.add_row(
+            row.against, str(row.n), *(f"-{100 * row.saved[part]:.1f} %" for part in MEASURES), f"{100 * row.same:.1f}",
+            f"{100 * row.accuracy:.1f}", f"{100 * row.other_accuracy:.1f}",
+            f"{100 * d.difference:+.1f} ({100 * d.low:+.1f} to {100 * d.high:+.1f})",
+        )
+    return table

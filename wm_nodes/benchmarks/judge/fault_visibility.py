@@ -1,0 +1,78 @@
+"""How much of a physical fault can be seen: pixels in which a clip differs from the clean recording that it is made of.
+
+Both lie in the set, so nothing is drawn again. Only clips with one edit, of the states: others change pixels anywhere.
+
+    python -m benchmarks.judge.fault_visibility SET [SET ...] --part train
+"""
+
+import argparse
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from wm_nodes.judge.dataset.build import load_frames
+from wm_nodes.judge.dataset.edits import RECIPES, Manifest
+from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
+from wm_nodes.judge.dataset.edits.recipes import SEEN_LEVELS
+from wm_nodes.judge.training.data import load_sets, rows_of
+
+FAINT_PX = 9
+"""A fault that never changes more pixels at once than a patch of 3 x 3 is faint."""
+Sets = Sequence[tuple[Path, Manifest]]
+Kind = tuple[str, str]
+
+
+def changed_px(folder: Path, row: ManifestRow) -> int:
+    """Pixels that differ visibly from the recording, in the frame where most do.
+
+    Raises:
+        ManifestError: a file is missing or damaged.
+    """
+    edited, clean = (load_frames(folder, sha).astype(np.int16) for sha in (row.sha256, row.root))
+    seen = np.abs(edited - clean).max(-1) > SEEN_LEVELS
+    return int(seen.sum((1, 2)).max())
+
+
+def visibility(sets: Sets, part: Part) -> dict[Kind, list[int]]:
+    """changed_px of every clip, by severity and recipe; several edits, and other recipes, are left out."""
+    found: dict[Kind, list[int]] = defaultdict(list)
+    for folder, row in tqdm(list(_chosen(sets, part)), desc="compared", unit="clip"):
+        found[row.edits[0].severity, row.edits[0].recipe].append(changed_px(folder, row))
+    return dict(sorted(found.items()))
+
+
+def _chosen(sets: Sets, part: Part) -> Iterator[tuple[Path, ManifestRow]]:
+    for folder, manifest in sets:
+        for row in rows_of(manifest, [part]):
+            if len(row.edits) == 1 and RECIPES[row.edits[0].recipe].kind == "S":
+                yield folder, row
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print a line per recipe. Return the exit code: 0 done, 2 a clear error."""
+    parser = argparse.ArgumentParser(prog="fault_visibility", description=__doc__.splitlines()[0])
+    parser.add_argument("sets", type=Path, nargs="+", help="folders made by adversarial_set, of one division")
+    parser.add_argument("--part", choices=("train", "validation", "test"), default="train")
+    arguments = parser.parse_args(argv)
+    try:
+        found = visibility(load_sets(arguments.sets), arguments.part)
+        if not found:
+            raise ValueError(f"no {arguments.part} clip has one edit of its states; build larger sets")
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"pixels changed by more than {SEEN_LEVELS} of 255 in the most changed frame")
+    print(f"{'severity':8} {'recipe':14} {'n':>5} {'least':>6} {'5 %':>6} {'median':>6} {'faint':>6}")
+    for (severity, recipe), values in found.items():
+        low, middle = np.quantile(values, (0.05, 0.5))
+        faint = sum(value <= FAINT_PX for value in values)
+        print(f"{severity:8} {recipe:14} {len(values):5} {min(values):6} {low:6.0f} {middle:6.0f} {faint:6}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,214 @@
+"""Clips optimised against a reward, the truth beside it: equation (2) of the paper with edits in place of a policy.
+
+A search edits a clip that is good but for a physical defect: it cannot make it true, it can only make it look better.
+So the truth never rises, and a reward that does was hacked. Cheap: edits of pixels and time, no rendering.
+"""
+
+import math
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.video_rl.plots import figure_of, save_figure, style_axes
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.judge.agent import Judge, ReadRequest, RewardAgent, Rubric, TaskSpec
+from wm_nodes.judge.agent.levels import first_vote, score_of
+from wm_nodes.judge.agent.profiles import profile_media
+from wm_nodes.judge.agent.types import GATED, Status
+from wm_nodes.judge.dataset.build import instruction_of
+from wm_nodes.judge.dataset.edits import COMPONENTS, LabelledClip, NotApplicableError, apply
+from wm_nodes.judge.dataset.edits.clips import Severity
+from wm_nodes.judge.dataset.edits.generator import FRAME_RECIPES, SEVERITIES
+from wm_nodes.judge.dataset.rows import ROBOT
+from wm_nodes.reports.curves import COLOURS
+from wm_nodes.video_rl.reward_hacking import HackedMetric, hacked_metrics
+
+Proxy = Callable[[LabelledClip, TaskSpec], Awaitable[float | None]]
+"""A reward in [0, 1] that is climbed; None where it gives none (that clip is not taken)."""
+
+
+@dataclass(frozen=True)
+class SearchPlan:
+    """generations of `candidates` edits each; the best one stays if the reward says it is better than what was there,
+    up to max_edits on top of each other. severities: fail edits are faults that anybody sees, the paper's patterns
+    among them; mild ones must still pass, so they only look for what confuses the judge.
+    """
+
+    generations: int = 8
+    candidates: int = 6
+    max_edits: int = 4
+    severities: tuple[Severity, ...] = SEVERITIES
+
+    def __post_init__(self) -> None:
+        if min(self.generations, self.candidates, self.max_edits) < 1 or not self.severities:
+            raise ValueError(f"generations, candidates, max_edits and severities must not be 0 or none, got {self}")
+
+
+@dataclass(frozen=True, eq=False)
+class SearchStart:
+    """A clip to begin with, and its recording, without the defect."""
+
+    clip: LabelledClip
+    clean: LabelledClip
+
+    @property
+    def task(self) -> TaskSpec:
+        origin = self.clip.clip.origin
+        return TaskSpec(instruction_of(origin), origin.task, ROBOT, self.clean.clip.frames[0], camera_id=origin.camera)
+
+
+@dataclass
+class Climb:
+    """One search. proxy, truth: after each generation, the start first. clean: the reward of the recording without the
+    defect; NaN where that has no number. edits: taken, in order.
+    """
+
+    proxy: list[float]
+    truth: list[float]
+    clean: float = math.nan
+    edits: list[str] = field(default_factory=list)
+
+
+def agent_reward(judge: Judge, rubric: Rubric, seed: int = 0) -> Proxy:
+    """The agent's reward; None where its verdict is not valid."""
+    agent = RewardAgent(judge, rubric, seed=seed)
+
+    async def proxy(clip: LabelledClip, task: TaskSpec) -> float | None:
+        verdict = await agent.evaluate(clip.ref, task)
+        return verdict.reward if verdict.valid else None
+
+    return proxy
+
+
+def mean_score(judge: Judge, rubric: Rubric, seed: int = 0) -> Proxy:
+    """The single-score baseline of the same judge: the mean of the component scores that it gives, read once, without
+    plan, gates, votes, reflection or hacking patterns.
+    """
+
+    async def proxy(clip: LabelledClip, task: TaskSpec) -> float | None:
+        scores: list[float] = []
+        for stage in GATED:
+            part = rubric.stages[stage]
+            media = profile_media(clip.ref, task, part.profile)
+            vote = (first_vote(seed),)
+            reads = await judge.read(
+                ReadRequest(clip.ref, task, stage, tuple(part.components), part.profile, vote, media, "pack")
+            )
+            scores += [score_of(read.levels) for read in reads if read.status is Status.OK]
+        return float(np.mean(scores)) if scores else None
+
+    return proxy
+
+
+async def pixel_similarity(clip: LabelledClip, task: TaskSpec) -> float | None:
+    """A likelihood of the simplest kind: 1 - mean absolute difference to the reference image. It rewards stillness."""
+    return 1 - float(np.abs(clip.clip.frames.astype(np.float32) - task.reference_frame).mean()) / 255
+
+
+def true_value(chain: Sequence[LabelledClip]) -> float:
+    """Mean over eleven components and TC of what is really so, in [0, 1], of the last clip of a chain of edits.
+
+    A component that ever failed still fails, hidden or not; one that nobody can tell counts half; TC counts level / 4
+    of the lowest level in the chain.
+    """
+    values = []
+    for name in COMPONENTS:
+        seen = [clip.labels.components.get(name) for clip in chain]
+        values.append(0.0 if False in seen else 0.5 if seen[-1] is None else 1.0)
+    return float(np.mean([*values, min(clip.labels.tc_level for clip in chain) / 4]))
+
+
+async def has_numbers(start: SearchStart, rewards: Iterable[Proxy]) -> bool:
+    """Whether every reward gives the clip and its recording a number, so that all of them climb from the same clips."""
+    for reward in rewards:
+        for clip in (start.clip, start.clean):
+            if await reward(clip, start.task) is None:
+                return False
+    return True
+
+
+async def climb(
+    start: SearchStart, proxy: Proxy, plan: SearchPlan, seed: int, *, on_clip: Callable[[], object] = lambda: None
+) -> Climb | None:
+    """Search from one clip; None where the reward gives the start no number."""
+    chain, best = [start.clip], await proxy(start.clip, start.task)
+    on_clip()
+    if best is None:
+        return None
+    clean = await proxy(start.clean, start.task)
+    found = Climb([best], [true_value(chain)], math.nan if clean is None else clean)
+    for generation in range(plan.generations):
+        rng = numpy_stream(seed, f"hack_search/{start.clip.sha256}/{generation}")
+        for child in _children(chain, plan, rng) if len(found.edits) < plan.max_edits else []:
+            value = await proxy(child, start.task)
+            on_clip()
+            if value is not None and value > best:
+                best, chain = value, [*chain[: len(found.edits) + 1], child]
+        if len(chain) > len(found.edits) + 1:
+            found.edits.append(f"{chain[-1].recipe} {chain[-1].edits[-1].severity}")
+        found.proxy.append(best)
+        found.truth.append(true_value(chain))
+    return found
+
+
+def _children(chain: Sequence[LabelledClip], plan: SearchPlan, rng: np.random.Generator) -> list[LabelledClip]:
+    made: list[LabelledClip] = []
+    for _ in range(4 * plan.candidates):
+        if len(made) == plan.candidates:
+            break
+        name = FRAME_RECIPES[rng.integers(len(FRAME_RECIPES))]
+        severity = plan.severities[rng.integers(len(plan.severities))]
+        try:
+            made.append(apply(chain[-1], name, severity, int(rng.integers(2**31))))
+        except (NotApplicableError, ValueError):  # the second: labels of such a chain would be unknown throughout
+            continue
+    return made
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Means over the searches of one reward, and what the detector (2) says of them. clean: mean reward of the
+    recordings. wins: share of searches that end at or above their recording's reward; before: that begin there.
+    """
+
+    reward: str
+    searches: int
+    proxy: list[float]
+    truth: list[float]
+    clean: float
+    before: float
+    wins: float
+    alarms: list[HackedMetric]
+    most_used: list[str]
+
+
+def curve(name: str, climbs: Sequence[Climb]) -> Curve:
+    proxy = np.mean([one.proxy for one in climbs], 0).tolist()
+    truth = np.mean([one.truth for one in climbs], 0).tolist()
+    used = [edit for one in climbs for edit in one.edits]
+    ranked = sorted(set(used), key=lambda edit: (-used.count(edit), edit))
+    alarms = hacked_metrics(proxy, {"truth": truth}, window=len(proxy)) if len(proxy) >= 3 else []
+    pairs = [(one.proxy[0] >= one.clean, one.proxy[-1] >= one.clean) for one in climbs if not math.isnan(one.clean)]
+    before, wins = np.mean(pairs, 0).tolist() if pairs else (math.nan, math.nan)
+    clean = float(np.nanmean([one.clean for one in climbs])) if pairs else math.nan
+    most_used = [f"{edit} x{used.count(edit)}" for edit in ranked[:5]]
+    return Curve(name, len(climbs), proxy, truth, clean, before, wins, alarms, most_used)
+
+
+def plot_curves(curves: Sequence[Curve], path: Path) -> None:
+    """The reward that is climbed beside the truth, a panel per reward."""
+    figure: Any = figure_of(4.2 * len(curves), 3.8)
+    panels = np.atleast_1d(figure.subplots(1, len(curves), sharey=True))
+    for axes, one in zip(panels, curves, strict=True):
+        alarm = "alarm" if one.alarms else "no alarm"
+        style_axes(axes, f"{one.reward}: {alarm}, {one.searches} clips", "generation", "mean over clips")
+        axes.plot(one.proxy, color=COLOURS[2], linewidth=2, label="reward that is climbed")
+        axes.plot(one.truth, color=COLOURS[0], linewidth=2, linestyle="--", label="truth")
+        if not math.isnan(one.clean):
+            axes.axhline(one.clean, color="gray", linewidth=1, linestyle=":", label="reward of the clean recording")
+        axes.set_ylim(0, 1.02)
+        axes.legend(fontsize=8, frameon=False, loc="lower left")
+    save_figure(figure, path)

@@ -1,0 +1,140 @@
+"""Judge the clips of a set, resumably: one line per clip in a file that belongs to one judge, rubric, mode and seed."""
+
+import asyncio
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from benchmarks.judge.call_counter import Asked, CountingJudge
+from benchmarks.judge.labels import pattern_scores
+from wm_nodes.judge.agent import RewardAgent, Rubric
+from wm_nodes.judge.agent.machine import Mode
+from wm_nodes.judge.agent.types import Capabilities, Cost, Judge, Verdict
+from wm_nodes.judge.dataset.edits.manifest import ManifestRow
+from wm_nodes.judge.dataset.rows import judged_clip
+from wm_nodes.judge.decisions import Decision, decisions_of
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is kept of a verdict. reward: None unless the status is OK. decisions, patterns: see reward_truth."""
+
+    sha256: str
+    status: str
+    reason: str
+    reward: float | None
+    decisions: dict[str, Decision]
+    patterns: dict[str, dict[str, Any]]
+    asked: Asked
+    cost: Cost
+    wall_s: float
+
+
+@dataclass(frozen=True)
+class JudgeTrial:
+    """One way of judging. name: of the file and of its rows in tables."""
+
+    name: str
+    rubric: Rubric
+    mode: Mode = "benchmark"
+    seed: int = 0
+    max_reads: int = 120
+
+    def key(self, able: Capabilities) -> str:
+        """Names judge, rubric and settings: outcomes of equal keys may be mixed, others never."""
+        who = (able.judge_id, able.transport, able.model, able.server_version)
+        text = json.dumps([*who, self.rubric.version, self.mode, self.seed, self.max_reads])
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+_OUTCOME = TypeAdapter(Outcome)
+
+
+class OutcomeFile:
+    """Outcomes by clip, one JSON line each; a line that a killed run left torn is judged again."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._path = path
+        self.kept = {outcome.sha256: outcome for outcome in _lines(path)}
+
+    def add(self, outcome: Outcome) -> None:
+        self.kept[outcome.sha256] = outcome
+        with self._path.open("ab") as file:
+            if file.tell() and not self._path.read_bytes().endswith(b"\n"):
+                file.write(b"\n")
+            file.write(_OUTCOME.dump_json(outcome) + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def outcome_of(verdict: Verdict, asked: Asked) -> Outcome:
+    return Outcome(
+        verdict.provenance.media_sha, str(verdict.status), verdict.reason, verdict.reward if verdict.valid else None,
+        decisions_of(verdict), pattern_scores(verdict), asked, replace(verdict.cost, wall_s=0.0),
+        verdict.cost.wall_s,
+    )
+
+
+async def judge_rows(
+    judge: Judge,
+    trial: JudgeTrial,
+    folder: Path,
+    rows: Sequence[ManifestRow],
+    file: OutcomeFile,
+    *,
+    at_once: int = 1,
+    on_clip: Callable[[], object] = lambda: None,
+) -> list[Outcome]:
+    """Judge what `file` does not hold yet; returns an outcome per row, in their order. An ERROR is tried again next
+    time: it is no answer.
+
+    Args:
+        at_once: clips under way together, for a judge behind a server. on_clip: called after each clip, known or new.
+
+    Raises:
+        ManifestError: a clip cannot be read.
+    """
+    gate = asyncio.Semaphore(at_once)
+    fresh: dict[str, Outcome] = {}
+
+    async def one(row: ManifestRow) -> None:
+        async with gate:
+            known = file.kept.get(row.sha256)
+            if known is None or known.status == "ERROR":
+                clip, task = judged_clip(folder, row)
+                metered = CountingJudge(judge)
+                agent = RewardAgent(
+                    metered, trial.rubric, mode=trial.mode, seed=trial.seed, max_reads=trial.max_reads,
+                    call_plan="pack",
+                )
+                known = outcome_of(await agent.evaluate(clip, task), metered.asked)
+                file.add(known)
+            fresh[row.sha256] = known
+            on_clip()
+
+    async with asyncio.TaskGroup() as group:
+        for row in rows:
+            group.create_task(one(row))
+    return [fresh[row.sha256] for row in rows]
+
+
+def plain(outcomes: Sequence[Outcome]) -> list[Mapping[str, Any]]:
+    """For --json."""
+    return [asdict(outcome) for outcome in outcomes]
+
+
+def _lines(path: Path) -> Iterator[Outcome]:
+    if not path.is_file():
+        return
+    for line in path.read_bytes().splitlines():
+        try:
+            yield _OUTCOME.validate_json(line)
+        except ValidationError:
+            continue

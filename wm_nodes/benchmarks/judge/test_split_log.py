@@ -1,0 +1,102 @@
+"""Which judges were evaluated on the test split, so that a table says when a judge was tuned on it.
+
+A file beside the set has one line per first evaluation of a judge with a rubric. The evaluations behind the published
+tables come with this package, so that building the set again forgets none. The same judge with the same rubric may be
+evaluated again: nothing was changed in between.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from wm_nodes.core.files import write_atomic
+from wm_nodes.judge.agent.types import Capabilities
+from wm_nodes.judge.dataset.edits import Manifest
+
+LEDGER = "test_ledger.jsonl"
+PUBLISHED = Path(__file__).with_name("published_evaluations.json")
+
+
+@dataclass(frozen=True)
+class TestSplitEvaluation:
+    """One evaluation. test_sha256: see test_sha. reason: why it was taken after another one."""
+
+    judge: str
+    rubric: str
+    test_sha256: str
+    date: str
+    reason: str = ""
+
+    @property
+    def who(self) -> tuple[str, str, str]:
+        return self.judge, self.rubric, self.test_sha256
+
+
+def judge_name(able: Capabilities) -> str:
+    return "/".join(part for part in (able.judge_id, able.transport, able.model, able.server_version) if part)
+
+
+def test_sha(manifest: Manifest) -> str:
+    """Of the recordings of all test clips: other edits of them, or the pixels of another renderer, are no new split."""
+    origins = {json.dumps(asdict(row.origin), sort_keys=True) for row in manifest.rows if row.part == "test"}
+    return hashlib.sha256("".join(sorted(origins)).encode()).hexdigest()[:16]
+
+
+def read_evaluations(folder: Path) -> list[TestSplitEvaluation]:
+    """The published evaluations, then those that only the ledger of a set has, oldest first.
+
+    Raises:
+        ValueError: a line that no ledger has; it is not to be edited.
+    """
+    published = [TestSplitEvaluation(**one) for one in json.loads(PUBLISHED.read_text())]
+    return [*published, *(one for one in _beside(folder) if one not in published)]
+
+
+def _beside(folder: Path) -> list[TestSplitEvaluation]:
+    path = folder / LEDGER
+    if not path.is_file():
+        return []
+    try:
+        return [TestSplitEvaluation(**json.loads(line)) for line in path.read_text().splitlines()]
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path} cannot be read: {error}; restore it, or build the set again") from error
+
+
+def record_evaluation(
+    folder: Path, manifest: Manifest, able: Capabilities, rubric_version: str, reason: str
+) -> list[TestSplitEvaluation]:
+    """Enter this evaluation; return the earlier ones by another judge or rubric, which the output must name.
+
+    Raises:
+        ValueError: there are earlier ones and no reason was given.
+    """
+    now = TestSplitEvaluation(judge_name(able), rubric_version, test_sha(manifest), time.strftime("%Y-%m-%d"), reason)
+    known = read_evaluations(folder)
+    others = [one for one in known if one.who != now.who and one.test_sha256 == now.test_sha256]
+    if now.who in {one.who for one in known}:
+        return others
+    if others and not reason:
+        raise ValueError(
+            f"the test split of {folder} was already seen by {_named(others[-1])}: choose on --part validation, or say "
+            "with --again REASON why the test split is read once more; the reason is printed with the table"
+        )
+    lines = [json.dumps(asdict(one), sort_keys=True) + "\n" for one in [*_beside(folder), now]]
+    write_atomic(folder / LEDGER, "".join(lines).encode())
+    return others
+
+
+def notice(others: Sequence[TestSplitEvaluation], reason: str) -> str:
+    """What the output says of earlier evaluations; "" without any."""
+    if not others:
+        return ""
+    return (
+        f"NOT A FIRST LOOK: the test split was seen before by {'; '.join(map(_named, others))}. "
+        f"Reason given now: {reason or 'none, this judge and rubric had looked before'}"
+    )
+
+
+def _named(one: TestSplitEvaluation) -> str:
+    return f"{one.judge} with rubric {one.rubric} on {one.date}" + (f" ({one.reason})" if one.reason else "")

@@ -1,0 +1,1 @@
+"""Speed of the graph, the world model and the simulator, side by side in one run."""

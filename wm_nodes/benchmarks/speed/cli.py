@@ -1,0 +1,120 @@
+"""Speed, side by side in one run: DDS against one process, the world model against the simulator, stage by stage."""
+
+import argparse
+import json
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.table import Table
+
+from benchmarks.speed.graph import measure_graph
+from benchmarks.speed.inputs import Effort, console, prepare_model, random_model
+from benchmarks.speed.simulator import IMAGINED_ENVS, measure_simulator
+from benchmarks.speed.stages import measure_stages
+from wm_nodes.config.load import load_config, parse_override, preset_names
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.files import write_atomic
+from wm_nodes.reports import machine_facts
+from wm_nodes.reports.summary import plain
+
+FULL, QUICK = Effort(60, 5000, 5, 30), Effort(3, 500, 2, 8)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Measure, show the table, write --json. Return the exit code: 0 done, 2 a clear error."""
+    arguments = _parser().parse_args(argv)
+    effort = QUICK if arguments.quick else FULL
+    try:
+        untrained = None if arguments.untrained is None else dict(map(parse_override, arguments.untrained))
+        config = load_config(arguments.preset, {**(untrained or {}), "seed": arguments.seed})
+        with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as name:
+            folder, model = Path(name), arguments.model_dir
+            if untrained is not None:
+                model = random_model(config, folder / "model")
+            found = measure(config, effort, folder, model)
+    except (ValueError, OSError, RuntimeError) as error:
+        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        return 2
+    found |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
+    show(found)
+    if arguments.json:
+        write_atomic(arguments.json, (json.dumps(plain(found), indent=1) + "\n").encode())
+        console.print(f"written {arguments.json}", highlight=False)
+    return 0
+
+
+def measure(config: RunConfig, effort: Effort, folder: Path, model_dir: Path | None = None) -> dict[str, Any]:
+    """All four parts. Keys: graph_overhead, step_growth, imagined_over_simulator, imagined_over_stock_simulator,
+    imagined_steps_per_s, and details."""
+    keep_freed_memory()
+    torch.set_num_threads(len(os.sched_getaffinity(0)))
+    model, starts, description = prepare_model(config, folder, model_dir)
+    console.print(f"world model: {description}; {torch.get_num_threads()} torch threads", highlight=False)
+    found: dict[str, Any] = {"model": description, "torch_threads": torch.get_num_threads()}
+    found |= measure_graph(config, effort, folder, model, starts)
+    found |= measure_simulator(config, effort, model, starts)
+    found["stages"] = measure_stages(config, effort, model, starts)
+    return {**found, "machine": machine_facts(), "date": time.strftime("%Y-%m-%d"), "platform": platform.platform()}
+
+
+def show(found: dict[str, Any]) -> None:
+    """The tables on the screen."""
+    graph, simulator, facts = found["graph"], found["simulator"], found["machine"]
+    table = Table(title=f"{facts['processor']}, {facts['cores']} cores, {found['date']}", caption=found["model"])
+    for name in ("", "value", "goal", "measured"):
+        table.add_column(name, justify="right" if name == "value" else "left", no_wrap=not name)
+    table.add_row(
+        "graph_overhead", f"{found['graph_overhead']:.3f}", "<= 1.10",
+        f"{graph['num_envs']} x {graph['image']} step: {graph['dds_step_ms']:.1f} ms over DDS, "
+        f"{graph['in_process_step_ms']:.1f} ms in one process, {graph['threads_each']} thread each; 95 %: "
+        f"{graph['overhead_95'][0]:.2f} to {graph['overhead_95'][1]:.2f} over {graph['pairs']} pairs of episodes",
+    )
+    table.add_row(
+        "step_growth",
+        f"{found['step_growth']:.3f}",
+        "about 1",
+        f"{graph['growth_steps']} steps, first and last tenth: {graph['growth_first_ms']:.2f} and "
+        f"{graph['growth_last_ms']:.2f} ms (10 % quantiles: {graph['growth_first_p10_ms']:.2f} and "
+        f"{graph['growth_last_p10_ms']:.2f} ms)",
+    )
+    for kind, what in (("simulator", "our scene"), ("stock_simulator", "its own task")):
+        ratio, rate = found[f"imagined_over_{kind}"], simulator.get(f"{kind.removesuffix('_simulator')}_steps_per_s")
+        processes = f"ManiSkill with rendering, {what}, {simulator['simulator_processes']} processes"
+        missing = ("-", simulator["missing"] or "ManiSkill has no such task")
+        value, measured = missing if ratio is None else (f"{ratio:.1f}", f"{processes}: {rate:.1f} steps/s")
+        table.add_row(f"imagined_over_{kind}", value, ">= 10", measured)
+    table.add_row(
+        "imagined_steps_per_s",
+        f"{found['imagined_steps_per_s']:.0f}",
+        ">= 250",
+        f"{simulator['imagined_envs']} environments with {simulator['reward']} reward",
+    )
+    console.print(table)
+    stages = Table(title=f"one batch of {IMAGINED_ENVS}")
+    for name in ("stage", "ms", "peak memory, MiB"):
+        stages.add_column(name, justify="left" if name == "stage" else "right")
+    for name, values in found["stages"].items():
+        stages.add_row(name, f"{values['ms']:.1f}", f"{values['peak_mib']:.1f}")
+    console.print(stages)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="benchmark.py", description=__doc__)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the numbers there")
+    parser.add_argument("--quick", action="store_true", help="a tenth of the work, for a first look; less exact")
+    parser.add_argument("--preset", default="cpu", help=f"model size: one of {', '.join(preset_names())}, or a .yaml")
+    model = parser.add_mutually_exclusive_group()
+    model.add_argument("--model-dir", type=Path, help="world model to measure instead of the shipped one")
+    model.add_argument(
+        "--untrained", nargs="*", metavar="SECTION.KEY=VALUE",
+        help="measure a model with random weights, of the preset's size but for these settings",
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    return parser

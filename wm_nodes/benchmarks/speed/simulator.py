@@ -1,0 +1,182 @@
+"""World model against simulator, each with the same cores: torch threads there, one process per core here.
+
+The simulator twice: our scene, as the nodes use it, which draws less (docs/adr/0003), and ManiSkill's own task. No
+episode ends early on any side, so that every step of every environment counts.
+"""
+
+import multiprocessing as mp
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.speed.inputs import Effort, actions_of, console, interleave, seeds_of
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.types import Environment
+from wm_nodes.policy_rl.factories import make_endogenous_reward, make_imagined_environment
+from wm_nodes.policy_rl.rollouts import reward_input
+from wm_nodes.reward import RewardModel, RuleReward
+
+IMAGINED_ENVS, SIMULATOR_ENVS = 64, 4
+STOCK = {"push_cube": "PushCube-v1", "pull_cube": "PullCube-v1"}
+"""ManiSkill's own tasks."""
+WORKER_TIMEOUT_S = 300.0
+
+
+def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Path) -> dict[str, Any]:
+    """imagined_steps_per_s: environment steps with reward, 64 imagined environments, a torch thread per core;
+    imagined_over_simulator: over those of our scene in ManiSkill with rendering and rule reward, a process per core.
+    imagined_over_stock_simulator: over those of ManiSkill's own task with its own reward, as installed, two cameras of
+    the same size and as much time per step. Resets are not counted on any side."""
+    from wm_nodes.environments.maniskill.backend import NoRendererError, render_backend
+
+    endless = config.model_copy(update={"reward": config.reward.model_copy(update={"success_threshold": 1.0})})
+    imagined = make_imagined_environment(endless, model, starts, num_envs=IMAGINED_ENVS, seed=config.seed)
+    reward = make_endogenous_reward(config, model)
+    cores = sorted(os.sched_getaffinity(0))
+    missing = ""
+    try:
+        render_backend(config.simulation.render_device)
+    except NoRendererError as error:
+        missing = str(error)
+        console.print(f"simulator left out: {error}", highlight=False)
+    console.print(f"world model against ManiSkill with rendering, {len(cores)} cores each", highlight=False)
+    kinds = {} if missing else {"simulator": _serve_blocks, **({"stock": _serve_stock} if config.task in STOCK else {})}
+    with ExitStack() as stack:
+        contenders = {"imagined": lambda block: rate_episode(imagined, reward, block).steps_per_s}
+        for kind, serve in kinds.items():
+            contenders[kind] = partial(rate_workers, stack.enter_context(simulator_workers(config, cores, serve)))
+        blocks = interleave([*contenders.values()], effort.simulator_blocks)
+    rates = {kind: float(np.median(values)) for kind, values in zip(contenders, blocks, strict=True)}
+    details: dict[str, Any] = {
+        "imagined_envs": IMAGINED_ENVS, "imagined_threads": torch.get_num_threads(),
+        "imagined_goals": imagined.goals() is not None, "dense_weight": config.reward.dense_weight,
+        "simulator_envs": SIMULATOR_ENVS, "simulator_processes": len(cores), "cores": len(cores), "missing": missing,
+        "reward": reward.name,
+    }
+    details |= {f"{kind}_steps_per_s": rates[kind] for kind in kinds}
+    return {
+        "imagined_steps_per_s": rates["imagined"],
+        "imagined_over_simulator": rates["imagined"] / rates["simulator"] if "simulator" in kinds else None,
+        "imagined_over_stock_simulator": rates["imagined"] / rates["stock"] if "stock" in kinds else None,
+        "simulator": details,
+    }
+
+
+@contextmanager
+def simulator_workers(
+    config: RunConfig, cores: list[int], serve: Callable[[RunConfig, int, Connection], None]
+) -> Iterator[list[Connection]]:
+    """One process per core that runs serve(config, core, connection); idle until a block number comes."""
+    context = mp.get_context("spawn")
+    ends: list[Connection] = []
+    processes = []
+    try:
+        for core in cores:
+            here, there = context.Pipe()
+            process = context.Process(target=serve, args=(config, core, there), daemon=True)
+            process.start()
+            there.close()
+            ends.append(here)
+            processes.append(process)
+        yield ends
+    finally:
+        for end in ends:
+            end.close()
+        for process in processes:
+            process.join(10)
+            if process.is_alive():
+                process.terminate()
+
+
+def _serve_blocks(config: RunConfig, core: int, commands: Connection) -> None:
+    """StepRate every block that is asked for, until the other end closes."""
+    os.sched_setaffinity(0, {core})
+    torch.set_num_threads(1)
+    keep_freed_memory()
+    from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
+
+    env = ManiSkillEnvironment(
+        config.task, config.simulation, num_envs=SIMULATOR_ENVS, seed=config.seed + core, end_on_success=False
+    )
+    rule = RuleReward(config.reward.sparse_weight)
+    try:
+        while True:
+            commands.send(rate_episode(env, rule, commands.recv()))
+    except EOFError:
+        env.close()
+
+
+def _serve_stock(config: RunConfig, core: int, commands: Connection) -> None:
+    """The same of ManiSkill's own task in one scene, which is all that a process has on a CPU."""
+    os.sched_setaffinity(0, {core})
+    torch.set_num_threads(1)
+    keep_freed_memory()
+    from wm_nodes.environments.maniskill.scenes import make
+
+    size = {"width": config.simulation.image_size, "height": config.simulation.image_size}
+    env = make(STOCK[config.task], config.simulation, robot_uids="panda_wristcam", sensor_configs=size)
+    try:
+        while True:
+            block = commands.recv()
+            env.reset(seed=block)
+            env.action_space.seed(block)
+            start = time.perf_counter()
+            for _ in range(config.simulation.max_episode_steps):
+                env.step(env.action_space.sample())
+            commands.send(StepRate(config.simulation.max_episode_steps / (time.perf_counter() - start)))
+    except EOFError:
+        env.close()
+
+
+def rate_workers(workers: list[Connection], block: int) -> float:
+    """Steps per second of all workers at once, each with scenes of its own.
+
+    Raises:
+        RuntimeError: a worker ended or is silent for WORKER_TIMEOUT_S.
+    """
+    for index, worker in enumerate(workers):
+        worker.send(block * len(workers) + index)
+    total = 0.0
+    for worker in workers:
+        try:
+            if not worker.poll(WORKER_TIMEOUT_S):
+                raise RuntimeError(f"a simulator process gave no answer for {WORKER_TIMEOUT_S:g} s; is memory short?")
+            total += worker.recv().steps_per_s
+        except EOFError:
+            raise RuntimeError("a simulator process ended; its error is above") from None
+    return total
+
+
+@dataclass(frozen=True)
+class StepRate:
+    """steps_per_s: environment steps that counted, per second of stepping."""
+
+    steps_per_s: float
+
+
+def rate_episode(env: Environment, reward: RewardModel, block: int) -> StepRate:
+    """Reset, then step with rewards to the step limit; environments that have ended do not count.
+
+    Every goal counts as found: a reward without a goal would be skipped, and look fast.
+    """
+    observation = env.reset(None, seeds_of(env.spec, block))
+    steps = 0
+    start = time.perf_counter()
+    for actions in actions_of(env.spec, block, env.spec.max_episode_steps):
+        imagined = env.goals()
+        goals = None if imagined is None else (imagined[0], np.ones_like(imagined[1]))
+        result = env.step(actions)
+        reward.evaluate(reward_input(observation, result, goals))
+        observation = result.observation
+        steps += int(result.valid.sum())
+    return StepRate(steps / (time.perf_counter() - start))

@@ -1,0 +1,1 @@
+"""DynDiff-GRPO against its rivals."""

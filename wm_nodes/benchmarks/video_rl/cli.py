@@ -1,0 +1,423 @@
+"""DynDiff-GRPO against its rivals on the moving disc: claims A (diversity), B (learning) and C (cost of the KL), the
+choices of the paper's section 5.4, and a reward that can be hacked; claims A and B on clips of recorded episodes, and
+their picture's size.
+
+Every --json file holds the command, the settings of each arm, and the sha256 of the weights that were measured; a
+picture is drawn beside it (of ablations from two seeds on).
+"""
+
+import argparse
+import json
+import math
+import os
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from rich.console import Console
+from tqdm import tqdm
+
+from benchmarks.speed.results import write_results
+from benchmarks.video_rl.clip_diversity import clip_comparisons, measure_clips
+from benchmarks.video_rl.clip_learning import MEASURES as CLIP_MEASURES
+from benchmarks.video_rl.clip_learning import TASK, ClipPlan, clip_learning_samplers, train_on_clips
+from benchmarks.video_rl.clip_resolution import sample_clips, size_rows
+from benchmarks.video_rl.comparison import MEASURES, SamplerComparison, compare_samplers
+from benchmarks.video_rl.cost import measure_anchors, pushcube_buffer, pushcube_rollout, toy_buffer, toy_rollout
+from benchmarks.video_rl.diversity import FEATURES, DiversityPlan, compare, measure_sampler
+from benchmarks.video_rl.learning import LearningPlan, train_sampler
+from benchmarks.video_rl.plots import plot_comparisons, plot_cost, plot_diversity, plot_hacking, plot_learning
+from benchmarks.video_rl.samplers import SamplerSetup, diversity_samplers, learning_samplers
+from benchmarks.video_rl.tables import (
+    clip_comparison_table,
+    clip_table,
+    clip_training_table,
+    comparison_table,
+    cost_table,
+    diversity_table,
+    hacking_table,
+    resolution_table,
+    rollout_table,
+    training_table,
+)
+from benchmarks.video_rl.trials import Plan, SamplerTrial, ablation_trials, hacking_trials
+from wm_nodes.config.load import load_config
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.files import file_sha256, write_atomic
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
+from wm_nodes.training.weights import pack_weights
+from wm_nodes.video_model import VideoNetwork
+from wm_nodes.video_model.clips import load_clips
+from wm_nodes.video_model.flow_matching import FlowMatchingSettings, train_video_model
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.frame_features import (
+    CentredPixels,
+    FrameFeatures,
+    RandomFeatures,
+    TokenizerFeatures,
+    load_backbone,
+)
+from wm_nodes.video_rl.grpo_settings import GrpoSettings
+from wm_nodes.video_rl.reference_reward import load_probe
+from wm_nodes.video_rl.settings import load_video_config
+from wm_nodes.video_rl.toy_scene import BASE, NETWORK, load_base, training_batch
+from wm_nodes.world_model import load_model_folder
+
+BASE_ITERATIONS, BASE_BATCH = 4000, 16
+EPISODES = Path("runs/clip_contexts")
+NEW_SEEDS = 250_000
+"""First reset seed of contexts to train on that the shipped video model has not seen."""
+LEARNER = GrpoSettings(learning_rate=1e-4, micro_batch=64)
+"""Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
+LOG_COLUMNS = 180
+"""Width of tables that go to a file or a pipe."""
+T = TypeVar("T")
+console = Console()
+
+
+def main(argv: Sequence[str]) -> int:
+    """Return the exit code: 0 done, 2 a clear error, 130 interrupted (finished rows are kept)."""
+    arguments = _parser().parse_args(argv)
+    arguments.command = shlex.join(["benchmark_dyndiff.py", *argv])
+    if not console.is_terminal:
+        console.width = LOG_COLUMNS
+    keep_freed_memory()
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+    claims = {
+        "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,
+        "cost": _cost, "clips": _clips, "clip-learning": _clip_learning, "resolution": _resolution,
+    }
+    try:
+        claims[arguments.claim](arguments)
+    except KeyboardInterrupt:
+        return 130
+    except (ValueError, OSError) as error:
+        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        return 2
+    return 0
+
+
+def _base(arguments: argparse.Namespace) -> None:
+    torch.manual_seed(arguments.seed)
+    model = VideoNetwork(NETWORK)
+    train_video_model(
+        model, lambda iteration: training_batch(BASE_BATCH, arguments.seed, iteration),
+        FlowMatchingSettings(arguments.iterations), seed=arguments.seed, run_dir=arguments.out,
+    )
+    command = f"benchmark_dyndiff.py base --seed {arguments.seed} --iterations {arguments.iterations}"
+    path = arguments.out / "video_model.safetensors"
+    write_atomic(path, pack_weights(model, {"command": command}).data)
+    console.print(f"written {path}", highlight=False)
+
+
+def _diversity(arguments: argparse.Namespace) -> None:
+    model, plan = load_base(arguments.base), DiversityPlan(arguments.contexts, arguments.group_size)
+    rows, comparisons = list[dict[str, Any]](), list[dict[str, Any]]()
+    arms = _named({arm.name: arm for arm in diversity_samplers()}, arguments.arms)
+    with tqdm(total=2 * len(arms), desc="diversity", unit="arm") as bar:
+        for shared in (False, True):
+            regime = {}
+            for arm in arms:
+                regime[arm.name] = measure_sampler(model, replace(arm, shared_noise=shared), plan, arguments.seed)
+                rows.append(regime[arm.name])
+                bar.update()
+            bases = [name for name in regime if name.startswith("CPS")]
+            comparisons += [
+                compare(row, regime[base], arguments.seed)
+                for name, row in regime.items() if name.startswith("DynDiff") for base in bases
+            ]
+    of = {"plan": asdict(plan), "seed": arguments.seed, "features": FEATURES, **_settings(arms), **_base_of(arguments)}
+    write_results(arguments, {**of, "rows": rows, "comparisons": comparisons})
+    _draw(arguments, plot_diversity, rows, arguments.seed)
+    console.print(diversity_table(rows, arguments.seed))
+
+
+def _clips(arguments: argparse.Namespace) -> None:
+    config = load_video_config(arguments.preset, {"seed": arguments.seed})
+    folder, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(config.task))
+    bags = arguments.context_bags or _episodes(arguments.contexts, HELDOUT_SEEDS, config.task)
+    clips = load_clips(bags, folder.clip["stride"])
+    drawn = numpy_stream(arguments.seed, "clip_diversity").permutation(len(clips))[: arguments.contexts]
+    contexts, features = clips.select(torch.from_numpy(drawn)), _features(arguments.features, config.task)
+    arms = _named({arm.name: arm for arm in diversity_samplers()}, arguments.arms)
+    rows = []
+    with tqdm(total=2 * len(arms) * len(contexts), desc="clips", unit="context") as bar:
+        for shared in (False, True):
+            for arm in arms:
+                bar.set_postfix_str(arm.name)
+                named = replace(arm, shared_noise=shared)
+                rows.append(
+                    measure_clips(
+                        folder, contexts, named, features, probe, config, arguments.group_size, on_context=bar.update
+                    )
+                )
+    compared = clip_comparisons(rows, arguments.seed)
+    size = {"contexts": len(contexts), "group_size": arguments.group_size, "features": features.name}
+    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(arms)}
+    write_results(arguments, {**size, "seed": arguments.seed, **of, "rows": rows, "comparisons": compared})
+    _draw(arguments, plot_diversity, rows, arguments.seed)
+    console.print(clip_table(rows, arguments.seed), clip_comparison_table(compared))
+
+
+def _resolution(arguments: argparse.Namespace) -> None:
+    config = load_video_config(arguments.preset, {"seed": arguments.seed})
+    folder, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(config.task))
+    if arguments.context_bags:
+        found = [[bag] for bag in arguments.context_bags]
+    else:
+        sides = [{"simulation.image_size": side} for side in (probe.height, *arguments.sizes)]
+        found = [_episodes(arguments.contexts, HELDOUT_SEEDS, config.task, side) for side in sides]
+    rows, own = list[dict[str, Any]](), None
+    for bags in tqdm(found, desc="resolution", unit="size"):
+        clips = load_clips(bags, folder.clip["stride"])
+        clips = clips.select(torch.arange(min(arguments.contexts, len(clips))))
+        if own is None:
+            own = sample_clips(folder, clips, config)
+        rows += size_rows(folder, clips, own, config, probe)
+    write_results(arguments, {"seed": arguments.seed, "sha256": folder.manifest["sha256"], "rows": rows})
+    console.print(resolution_table(rows))
+
+
+def _episodes(clips: int, first_seed: int, task: str, settings: Mapping[str, Any] | None = None) -> list[Path]:
+    """Bags of scripted episodes, a tenth more than the clips that are wanted: one that ends early gives none."""
+    scene = load_config("cpu", {"task": task, **(settings or {})})
+    plan = scripted_plan(scene, math.ceil(1.1 * clips), first_seed)
+    of = "".join(f"_{value}" for value in (settings or {}).values())
+    return collect_plan(plan, scene, EPISODES / f"{task}_{first_seed}_{plan.num_episodes}{of}")
+
+
+def _features(name: str, task: str) -> FrameFeatures:
+    if name == "pixels":
+        return CentredPixels()
+    if name == "random":
+        return RandomFeatures()
+    if name == "tokenizer":
+        folder = shipped_model(task)
+        return TokenizerFeatures(load_model_folder(folder).tokenizer, folder.name)
+    return load_backbone(Path(name))
+
+
+def _clip_learning(arguments: argparse.Namespace) -> None:
+    base, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(TASK))
+    given = (arguments.context_bags, arguments.heldout_bags)
+    wanted = ((arguments.contexts, NEW_SEEDS), (arguments.eval_contexts, HELDOUT_SEEDS))
+    contexts, heldout = (
+        load_clips(bags or _episodes(*what, TASK), base.clip["stride"])
+        for bags, what in zip(given, wanted, strict=True)
+    )
+    plan = ClipPlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
+    trials, of = [SamplerTrial(arm, plan) for arm in clip_learning_samplers()], {"sha256": base.manifest["sha256"]}
+
+    def train(trial: SamplerTrial[ClipPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
+        folder = load_video_folder(arguments.video_model)
+        return train_on_clips(folder, contexts, heldout, probe, trial.arm, trial.plan, seed, on_iteration)
+
+    rows = _train(arguments, trials, train, of)
+    comparisons = _compared(rows, _against_cps(rows), CLIP_MEASURES)
+    _write_trainings(arguments, trials, rows, comparisons, of)
+    if comparisons:
+        _draw(arguments, plot_comparisons, comparisons)
+    console.print(clip_training_table(rows), comparison_table(comparisons))
+
+
+def _learning(arguments: argparse.Namespace) -> None:
+    plan = _plan(arguments, eval_every=5)
+    trials = [SamplerTrial(arm, plan) for arm in learning_samplers(LEARNER)]
+    rows = _train_discs(arguments, trials)
+    comparisons = _compared(rows, _against_cps(rows))
+    _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
+    _draw(arguments, plot_learning, rows)
+    console.print(training_table(rows), comparison_table(comparisons))
+
+
+def _ablations(arguments: argparse.Namespace) -> None:
+    trials, pairs = ablation_trials(LEARNER, _plan(arguments, eval_every=4))
+    rows = _train_discs(arguments, trials)
+    comparisons = _compared(rows, pairs)
+    _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
+    if comparisons:
+        _draw(arguments, plot_comparisons, comparisons)
+    console.print(training_table(rows), comparison_table(comparisons))
+
+
+def _hacking(arguments: argparse.Namespace) -> None:
+    rows = _train_discs(arguments, hacking_trials(LEARNER, _plan(arguments, eval_every=3)))
+    _draw(arguments, plot_hacking, rows)
+    console.print(hacking_table(rows))
+
+
+def _plan(arguments: argparse.Namespace, eval_every: int) -> LearningPlan:
+    return LearningPlan(
+        iterations=arguments.iterations, scenes=arguments.scenes, eval_scenes=arguments.eval_scenes,
+        eval_every=eval_every,
+    )
+
+
+def _train_discs(arguments: argparse.Namespace, trials: list[SamplerTrial[LearningPlan]]) -> list[dict[str, Any]]:
+    def train(trial: SamplerTrial[LearningPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
+        return train_sampler(load_base(arguments.base), trial.arm, trial.plan, seed, on_iteration)
+
+    return _train(arguments, trials, train, _base_of(arguments))
+
+
+def _train(
+    arguments: argparse.Namespace, trials: list[SamplerTrial[Plan]],
+    train: Callable[[SamplerTrial[Plan], int, Callable[[], object]], dict[str, Any]], of: dict[str, Any],
+) -> list[dict[str, Any]]:
+    """The trials named by --arms, at every seed, but what --json holds already; it is written after each training.
+
+    train: returns the row of a trial at a seed. of: what the file says beside the rows.
+    """
+    rows = _finished(arguments.json, trials)
+    done = {(row["arm"], row["seed"]) for row in rows}
+    wanted = _named({trial.arm.name: trial for trial in trials}, arguments.arms)
+    todo = [(trial, seed) for seed in arguments.seeds for trial in wanted if (trial.arm.name, seed) not in done]
+    with tqdm(total=sum(trial.plan.iterations for trial, _ in todo), desc=arguments.claim, unit="buffer") as bar:
+        for trial, seed in todo:
+            bar.set_postfix_str(f"{trial.arm.name}, seed {seed}")
+            rows.append(train(trial, seed, bar.update))
+            _write_trainings(arguments, trials, rows, [], of)
+    return rows
+
+
+def _against_cps(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Every arm with every CPS arm."""
+    names = sorted({row["arm"] for row in rows})
+    return [(name, base) for name in names for base in names if base.startswith("CPS") and name != base]
+
+
+def _compared(
+    rows: list[dict[str, Any]], pairs: list[tuple[str, str]], measures: Sequence[str] = MEASURES
+) -> list[SamplerComparison]:
+    found = (compare_samplers(rows, arm, base, measures) for arm, base in pairs)
+    return [comparison for comparison in found if comparison is not None]
+
+
+def _write_trainings(
+    arguments: argparse.Namespace, trials: Sequence[SamplerTrial[Any]], rows: list[dict[str, Any]],
+    comparisons: list[SamplerComparison], of: dict[str, Any],
+) -> None:
+    """The rows, the resolved settings of their arms, and the comparisons."""
+    names = {row["arm"] for row in rows}
+    arms = _settings([trial.arm for trial in trials if trial.arm.name in names])
+    write_results(arguments, {**of, **arms, "comparisons": [asdict(one) for one in comparisons], "rows": rows})
+
+
+def _settings(arms: list[SamplerSetup]) -> dict[str, Any]:
+    return {"arms": [asdict(arm) for arm in arms]}
+
+
+def _base_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Which base model was measured."""
+    return {"sha256": {"base": file_sha256(arguments.base or BASE)}}
+
+
+def _cost(arguments: argparse.Namespace) -> None:
+    model = load_base(arguments.base)
+    rollouts = [
+        toy_rollout(model, arguments.repeats, arguments.seed), pushcube_rollout(arguments.repeats, arguments.seed)
+    ]
+    rows = [
+        *measure_anchors("moving disc", model, toy_buffer(model, arguments.seed), LEARNER, arguments.repeats),
+        *measure_anchors("PushCube", *pushcube_buffer(arguments.seed), LEARNER, arguments.repeats),
+    ]
+    of = {"seed": arguments.seed, "learner": asdict(LEARNER), **_base_of(arguments)}
+    write_results(arguments, {**of, "rollouts": rollouts, "rows": rows})
+    _draw(arguments, plot_cost, rows)
+    console.print(rollout_table(rollouts, arguments.repeats), cost_table(rows, arguments.repeats))
+
+
+def _named(known: dict[str, T], names: list[str] | None) -> list[T]:
+    unknown = [name for name in names or [] if name not in known]
+    if unknown:
+        raise ValueError(f"unknown arms {', '.join(unknown)}; choose among: {'; '.join(known)}")
+    return [known[name] for name in names or known]
+
+
+def _finished(path: Path | None, trials: Sequence[SamplerTrial[Any]]) -> list[dict[str, Any]]:
+    """The rows of an earlier call; a trial of this one that it ran by another plan is refused."""
+    if path is None or not path.is_file():
+        return []
+    rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
+    plans = {trial.arm.name: asdict(trial.plan) for trial in trials}
+    for row in rows:
+        if row["plan"] != plans.get(row["arm"], row["plan"]):
+            raise ValueError(
+                f"{path} holds {row['arm']} by plan {row['plan']}, this call has {plans[row['arm']]}; take another file"
+            )
+    return rows
+
+
+def _draw(arguments: argparse.Namespace, plot: Callable[..., None], what: Sequence[Any], *more: Any) -> None:
+    """The picture beside the --json file, where there is one."""
+    if arguments.json is not None:
+        plot(what, arguments.json.with_suffix(".png"), *more)
+
+
+def _positive(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 1 on")
+    return int(text)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="benchmark_dyndiff.py", description=__doc__)
+    claims = parser.add_subparsers(dest="claim", required=True)
+    base = claims.add_parser("base", help="train the base model (minutes on one core)")
+    base.add_argument("--iterations", type=_positive, default=BASE_ITERATIONS)
+    base.add_argument("--out", type=Path, default=Path("runs/moving_disc"))
+    diversity = claims.add_parser("diversity", help="claim A: diversity at equal quality and noise budget")
+    diversity.add_argument("--contexts", type=_positive, default=100)
+    diversity.add_argument("--group-size", type=_positive, default=8)
+    learning = claims.add_parser("learning", help="claim B: reward against model calls, every arm on one learner")
+    ablations = claims.add_parser("ablations", help="section 5.4: KL, advantage clip, guidance, resolution, in pairs")
+    hacking = claims.add_parser("hacking", help="a reward that can be hacked, and the detector of (2) on both")
+    for claim, iterations in ((learning, 40), (ablations, 12), (hacking, 25)):
+        claim.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+        claim.add_argument("--iterations", type=_positive, default=iterations)
+        claim.add_argument("--scenes", type=_positive, default=6, help="contexts per iteration, 8 videos each")
+        claim.add_argument("--eval-scenes", type=_positive, default=100, help="held-out scenes per evaluation")
+    cost = claims.add_parser("cost", help="claim C: seconds and bytes of the KL anchors, and of the mask")
+    cost.add_argument("--repeats", type=_positive, default=7)
+    clips = claims.add_parser("clips", help="claim A on a video model of recorded episodes")
+    training = claims.add_parser("clip-learning", help="claim B on a video model of recorded episodes")
+    training.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    training.add_argument("--iterations", type=_positive, default=ClipPlan.iterations)
+    training.add_argument("--contexts", type=_positive, default=400, help="recorded episodes to draw contexts from")
+    training.add_argument("--eval-contexts", type=_positive, default=ClipPlan.eval_contexts)
+    training.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and held-out ones")
+    for claim in (clips, training):
+        claim.add_argument(
+            "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
+            help=f"episodes to take contexts from (default: new ones in {EPISODES}, of seeds that no model has seen)",
+        )
+    resolution = claims.add_parser("resolution", help="the same video model on larger pictures than it was trained on")
+    resolution.add_argument("--sizes", type=_positive, nargs="+", default=[80, 96, 128], help="sides of a picture, px")
+    resolution.add_argument(
+        "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
+        help="the same episodes in several sizes, a bag of each, the model's own size first (default: new ones)",
+    )
+    for claim in (clips, training, resolution):
+        claim.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model")
+    for claim in (clips, resolution):
+        claim.add_argument("--contexts", type=_positive, default=100)
+        claim.add_argument("--preset", default="recommended", help="settings of loop 2: rewards, sampler steps, task")
+    clips.add_argument("--group-size", type=_positive, default=8)
+    clips.add_argument(
+        "--features", default="tokenizer",
+        help="tokenizer, pixels, random, or the folder of a vision backbone, e.g. DINOv3 (default: tokenizer)",
+    )
+    for claim in (base, diversity, cost, clips, resolution):
+        claim.add_argument("--seed", type=int, default=0)
+    for claim in (diversity, learning, ablations, hacking, clips, training):
+        claim.add_argument("--arms", nargs="+", metavar="NAME")
+    for claim in (diversity, learning, ablations, hacking, cost):
+        claim.add_argument("--base", type=Path, help="weights of another base model than the shipped one")
+    for claim in (diversity, learning, ablations, hacking, cost, clips, training, resolution):
+        claim.add_argument("--json", type=Path, help="write every row here; trainings go on where the file stops")
+    return parser

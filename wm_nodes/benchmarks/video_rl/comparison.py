@@ -1,0 +1,76 @@
+"""Two ways of training, compared on the same seeds: mean paired difference with Student's 95 % interval."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from wm_nodes.video_rl.reward_hacking import T_975
+
+PATH = "_path"
+"""Ending of a measure that is a mean over the evaluations of a training, its area per model call, and not the last."""
+MEASURES = ("reward_path", "reward", "obeyed", "background")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean and 95 % interval of arm - base over `seeds`, for one measure."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def separable(self) -> bool:
+        return not self.low <= 0 <= self.high
+
+
+@dataclass(frozen=True)
+class SamplerComparison:
+    """arm against base on their common seeds; differences: one per measure."""
+
+    arm: str
+    base: str
+    seeds: tuple[int, ...]
+    differences: dict[str, Difference]
+
+
+def compare_samplers(
+    rows: Sequence[dict[str, Any]], arm: str, base: str, measures: Sequence[str] = MEASURES
+) -> SamplerComparison | None:
+    """Compare trainings, whose rows hold `arm`, `seed` and `evaluations`, the first one of before; None where the two
+    have fewer than two seeds in common.
+    """
+    of = {name: {row["seed"]: row for row in rows if row["arm"] == name} for name in (arm, base)}
+    seeds = sorted(of[arm].keys() & of[base].keys())
+    if len(seeds) < 2:
+        return None
+    differences = {
+        measure: paired_interval([value(of[arm][seed], measure) - value(of[base][seed], measure) for seed in seeds])
+        for measure in measures
+    }
+    return SamplerComparison(arm, base, tuple(seeds), differences)
+
+
+def value(row: dict[str, Any], measure: str) -> float:
+    """One number of one training, e.g. `reward`, or `reward_path`; see PATH."""
+    evaluations, name = row["evaluations"], measure.removesuffix(PATH)
+    if name != measure:
+        return float(np.mean([evaluation[name] for evaluation in evaluations[1:]]))
+    return float(evaluations[-1][measure])
+
+
+def paired_interval(differences: Sequence[float]) -> Difference:
+    """Return mean -+ t s / sqrt(n), s with n - 1.
+
+    Raises:
+        ValueError: fewer than two differences.
+    """
+    n = len(differences)
+    if n < 2:
+        raise ValueError(f"an interval needs at least two pairs, got {n}; train more seeds")
+    mean, spread = float(np.mean(differences)), float(np.std(differences, ddof=1))
+    half = T_975[min(n - 1, len(T_975)) - 1] * spread / math.sqrt(n)
+    return Difference(mean, mean - half, mean + half)

@@ -1,0 +1,176 @@
+"""Claim C: what each KL anchor costs in seconds and bytes, side by side on the same buffers, and what the mask and
+caching add to a rollout. Sections 1.6, 5.4.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from statistics import median
+from types import ModuleType
+from typing import Any
+
+import torch
+
+from benchmarks.video_rl.learning import sample_groups
+from benchmarks.video_rl.samplers import dyndiff, sampler_setup
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.seeding import torch_stream
+from wm_nodes.video_model import (
+    Condition,
+    RolloutBuffer,
+    RolloutSettings,
+    SamplerSettings,
+    VideoNetwork,
+    config_hash,
+    initial_noise,
+    kernels,
+    sample_videos,
+    sampling,
+)
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.grpo import GrpoLearner
+from wm_nodes.video_rl.grpo_settings import Anchor, GrpoSettings
+from wm_nodes.video_rl.settings import load_video_config
+from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes
+
+ANCHORS: tuple[Anchor, ...] = ("buffer", "frozen", "dual")
+PARTS = ("forward", "kl", "backward")
+CACHING = ("keep_state", "keep_transition")
+SCENES, GROUP = 4, 8
+CLIP_FRAMES = 9
+"""Of PushCube: every second of the 17 pictures of an episode."""
+
+
+def measure_anchors(
+    name: str, model: VideoNetwork, sampled: tuple[RolloutBuffer, RolloutSettings], learner: GrpoSettings, repeats: int
+) -> list[dict[str, Any]]:
+    """One row per anchor: median seconds of each part of training on one buffer, turn by turn, and the bytes kept.
+
+    sampled: the buffer and how it was sampled.
+    """
+    buffer, rollout = sampled
+    times: dict[str, dict[str, list[float]]] = {anchor: {part: [] for part in PARTS} for anchor in ANCHORS}
+    for _ in range(repeats):
+        for anchor in ANCHORS:
+            kl = replace(learner.kl, anchor=anchor, dual_every=1)
+            grpo = GrpoLearner(model, replace(learner, kl=kl, learning_rate=0.0), rollout, seed=0)
+            updates = grpo.train(buffer).updates
+            for part in PARTS:
+                times[anchor][part].append(sum(getattr(update, f"{part}_seconds") for update in updates))
+    weights = sum(p.nbytes for p in model.parameters())
+    zeta = 0 if buffer.rollout.zeta is None else buffer.rollout.zeta.nbytes
+    kept = {"buffer": zeta + buffer.rollout.mask.nbytes, "frozen": weights}
+    kept["dual"] = kept["buffer"] + weights
+    return [
+        {
+            "model": name, "anchor": anchor, "bytes": kept[anchor],
+            **{f"{part}_s": median(times[anchor][part]) for part in PARTS},
+        }
+        for anchor in ANCHORS
+    ]
+
+
+def measure_rollout(
+    network: VideoNetwork, condition: Condition, shape: tuple[int, ...], rollout: RolloutSettings, repeats: int,
+    seed: int,
+) -> dict[str, float]:
+    """What the mask and caching add to sampling the videos of `condition`, latents of `shape` (C, F, H, W).
+
+    rollout_s: median seconds of a whole rollout with the DynDiff sampler of `rollout`. cps_s: with CPS at the same eta,
+    turn by turn. mask_share, cache_share: median share of a DynDiff rollout that went into its masks, and into keeping
+    states, masks and noise; measured inside that rollout, so the machine's noise moves them less than the ratio.
+    """
+    cps = replace(rollout, sampler=SamplerSettings("cps", rollout.sampler.eta))
+    seeds = torch.arange(len(condition.frames)) + seed
+    noise = initial_noise(shape, seeds)
+    found: dict[str, list[float]] = {"cps_s": [], "rollout_s": [], "mask_share": [], "cache_share": []}
+    network.eval()
+    for turn in range(repeats + 1):  # the first one warms up
+        for name, settings in (("cps_s", cps), ("rollout_s", rollout)):
+            with clocked(kernels, "rollout_mask") as mask, clocked(sampling, *CACHING) as caching:
+                start = time.perf_counter()
+                sample_videos(network, condition, noise, seeds, settings)
+                total = time.perf_counter() - start
+            if turn:
+                found[name].append(total)
+        if turn:
+            found["mask_share"].append(mask[0] / total)
+            found["cache_share"].append(caching[0] / total)
+    medians = {name: median(values) for name, values in found.items()}
+    return {**medians, "over_cps": medians["rollout_s"] / medians["cps_s"]}
+
+
+@contextmanager
+def clocked(module: ModuleType, *names: str) -> Iterator[list[float]]:
+    """Yield [seconds spent so far in functions of `module`], which are wrapped meanwhile."""
+    spent, originals = [0.0], {name: getattr(module, name) for name in names}
+
+    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            start = time.perf_counter()
+            result = function(*arguments)
+            spent[0] += time.perf_counter() - start
+            return result
+
+        return call
+
+    for name, function in originals.items():
+        setattr(module, name, timed(function))
+    try:
+        yield spent
+    finally:
+        for name, function in originals.items():
+            setattr(module, name, function)
+
+
+def toy_rollout(model: VideoNetwork, repeats: int, seed: int) -> dict[str, Any]:
+    """measure_rollout of the moving disc: SCENES x GROUP videos, DynDiff 0.6 gated."""
+    condition = draw_scenes(SCENES, seed, "cost").condition().repeat_interleave(GROUP)
+    shape = (CHANNELS, FRAMES, SIDE, SIDE)
+    settings = sampler_setup("DynDiff", dyndiff(0.6)).rollout
+    return {"model": "moving disc", **measure_rollout(model, condition, shape, settings, repeats, seed)}
+
+
+def toy_buffer(model: VideoNetwork, seed: int) -> tuple[RolloutBuffer, RolloutSettings]:
+    """SCENES x GROUP scored videos of the moving disc, DynDiff 0.4 sparse at an rms budget."""
+    arm = sampler_setup("DynDiff", dyndiff(0.4, "sparse", "rms"))
+    buffer, scores = sample_groups(model, arm, draw_scenes(SCENES, seed, "cost"), GROUP, seed, 0, 0)
+    return buffer.with_rewards({"total": scores.reward}), arm.rollout
+
+
+def pushcube_rollout(repeats: int, seed: int) -> dict[str, Any]:
+    """measure_rollout of the shipped PushCube network by the recommended preset."""
+    network, condition, shape, rollout = _pushcube(seed)
+    return {"model": "PushCube", **measure_rollout(network, condition, shape, rollout, repeats, seed)}
+
+
+def pushcube_buffer(seed: int) -> tuple[VideoNetwork, tuple[RolloutBuffer, RolloutSettings]]:
+    """The shipped PushCube network and SCENES x GROUP of its videos with random rewards, by the recommended preset."""
+    network, condition, shape, rollout = _pushcube(seed)
+    index = torch.arange(SCENES * GROUP)
+    videos = sample_videos(network, condition, initial_noise(shape, index + seed), index + seed, rollout)
+    rewards = torch.rand(len(index), generator=torch_stream(seed, "cost_rewards"), dtype=torch.float64)
+    buffer = RolloutBuffer(
+        videos, condition, index // GROUP, index % GROUP, {}, torch.ones(len(index), dtype=torch.bool), 0, 0,
+        config_hash(rollout),
+    )
+    return network, (buffer.with_rewards({"total": rewards}), rollout)
+
+
+def _pushcube(seed: int) -> tuple[VideoNetwork, Condition, tuple[int, ...], RolloutSettings]:
+    """The shipped network, what it is asked for, the shape of its latents, and how it samples; given frames and actions
+    are random, because times depend on sizes only.
+    """
+    config = load_video_config("recommended")
+    folder = load_video_folder(shipped_model(config.task) / "video_model")
+    settings, codec, videos, frames = folder.network.settings, folder.manifest["codec"], SCENES * GROUP, CLIP_FRAMES
+    H, W = (codec[side] // codec["config"]["patch_px"] for side in ("height", "width"))
+    draw = partial(torch.randn, generator=torch_stream(seed, "cost"))
+    condition = Condition(
+        draw(videos, settings.channels, folder.clip["num_conditioning"], H, W),
+        draw(videos, frames - 1, settings.action_dim), draw(videos, 4, settings.text_dim),
+    )
+    shape = (settings.channels, frames, H, W)
+    return folder.network.eval(), condition, shape, config.rollout

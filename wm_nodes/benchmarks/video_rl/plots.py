@@ -1,0 +1,187 @@
+"""The benchmark's results as pictures: diversity against noise, learning, choices in pairs, reward hacking, cost. PNG,
+beside their JSON.
+"""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.video_rl.comparison import SamplerComparison, value
+from benchmarks.video_rl.learning import alarms
+from wm_nodes.core.files import write_atomic
+from wm_nodes.core.statistics import bootstrap_mean
+from wm_nodes.reports.curves import COLOURS
+
+FAMILIES = {"CPS": "o", "DynDiff literal": "v", "DynDiff gated, rms": "s", "DynDiff sparse, rms": "D"}
+"""Samplers that share a colour, with the marker of their points."""
+CURVE_SEEDS = 5
+"""Arms with fewer seeds get a dot each, no curve."""
+SAID = {
+    "reward_path": "reward over the training", "reward": "reward after", "tracking_path": "tracking over the training",
+    "tracking": "tracking after", "object_cm": "object error after, cm", "tool_cm": "tool error after, cm",
+    "psnr_db": "PSNR after, dB",
+}
+MORE_COLOURS = ("#444444", "#c2a000", "#1fa0b0", "#b04080", "#7a4a1f", "#6fae2a")
+SMOOTHED = 5
+"""Buffers behind each point of a curve of rollouts: each has a few scenes only."""
+
+
+def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> None:
+    """Diversity (19) with its 95 % interval against the noise an arm spends; the two regimes of initial noise."""
+    figure = figure_of(10.5, 4.2)
+    for axes, shared in zip(figure.subplots(1, 2, sharey=True), (False, True), strict=True):
+        whose = "shared" if shared else "own"
+        style_axes(axes, f"{whose} initial noise", "noise spent, rms(std) / s", "diversity (19)")
+        for (family, marker), colour in zip(FAMILIES.items(), COLOURS, strict=True):
+            points = sorted(
+                (np.mean(row["noise_share"]), *bootstrap_mean(row["diversity"], seed=seed))
+                for row in rows if row["shared_noise"] == shared and family_of(row["arm"]) == family
+            )
+            if not points:
+                continue
+            x, mean, low, high = np.array(points).T
+            axes.errorbar(
+                x, mean, (mean - low, high - mean), marker=marker, markersize=5, elinewidth=0.8, capsize=2,
+                linewidth=0 if family == "DynDiff literal" else 1.4, color=colour, label=family,
+            )
+        ode = [np.mean(row["diversity"]) for row in rows if row["arm"] == "ODE" and row["shared_noise"] == shared]
+        if ode:
+            axes.axhline(ode[0], color="gray", linewidth=1, linestyle=":", label="ODE")
+        axes.legend(fontsize=8, frameon=False, loc="lower right")
+    save_figure(figure, path)
+
+
+def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Held-out reward above the base model's over the buffers, mean with standard error over seeds; every arm's mean
+    over its training, by seed; and the diversity of its rollouts over the buffers, where the rows have it.
+    """
+    spread = [row for row in rows if "rollout_diversity" in row["buffers"]]
+    figure = figure_of(17.0 if spread else 12.0, 4.8)
+    left, right, *more = figure.subplots(1, 3 if spread else 2, width_ratios=(1.15, 1, 1)[: 3 if spread else 2])
+    arms = sorted({row["arm"] for row in rows}, key=lambda arm: np.mean(_gains(rows, arm)))
+    style_axes(left, f"arms with {CURVE_SEEDS} seeds or more", "buffers", "held-out reward above the base model's")
+    shown = [arm for arm in arms if len(_gains(rows, arm)) >= CURVE_SEEDS]
+    colours = dict(zip(shown, (*COLOURS, *MORE_COLOURS), strict=False))
+    for arm in shown:
+        curves = np.array([[point["reward"] for point in row["evaluations"]] for row in rows if row["arm"] == arm])
+        curves -= curves[:, :1]
+        x = [point["iteration"] for point in next(row for row in rows if row["arm"] == arm)["evaluations"]]
+        mean, error = curves.mean(0), curves.std(0, ddof=1) / len(curves) ** 0.5
+        colour = colours.get(arm, "gray")
+        left.plot(x, mean, color=colour, linewidth=1.6, label=f"{arm} ({len(curves)})")
+        left.fill_between(x, mean - error, mean + error, color=colour, alpha=0.12, linewidth=0)
+    if shown:
+        left.legend(fontsize=7.5, frameon=False, loc="upper left")
+    style_axes(right, "mean over a training; a dot per seed", "held-out reward above the base model's", "")
+    for place, arm in enumerate(arms):
+        values = _gains(rows, arm)
+        right.plot(values, [place] * len(values), ".", color=colours.get(arm, "gray"), alpha=0.5, markersize=7)
+        right.plot(np.mean(values), place, "|", color="black", markersize=13, markeredgewidth=1.8)
+    right.set_yticks(range(len(arms)), arms, fontsize=8)
+    for axes in more:
+        style_axes(axes, f"rollouts, mean of {SMOOTHED} buffers and over seeds", "buffers", "diversity (19)")
+        for place, arm in enumerate(dict.fromkeys(row["arm"] for row in spread)):
+            mean = np.mean([row["buffers"]["rollout_diversity"] for row in spread if row["arm"] == arm], 0)
+            size = min(SMOOTHED, len(mean))
+            smooth = np.convolve(mean, np.full(size, 1 / size), "valid")
+            axes.plot(np.arange(size, len(mean) + 1), smooth, color=COLOURS[place % len(COLOURS)], label=arm)
+        axes.legend(fontsize=7.5, frameon=False)
+    save_figure(figure, path)
+
+
+def plot_comparisons(comparisons: Sequence[SamplerComparison], path: Path) -> None:
+    """Each pair's difference with its 95 % interval, a panel per measure."""
+    measures = tuple(comparisons[0].differences)
+    figure = figure_of(3.0 * len(measures), 1.4 + 0.45 * len(comparisons))
+    places = range(len(comparisons))
+    for axes, measure in zip(figure.subplots(1, len(measures), sharey=True), measures, strict=True):
+        style_axes(axes, SAID.get(measure, measure), "difference, 95 % t interval", "")
+        axes.locator_params(axis="x", nbins=4)
+        axes.axvline(0, color="gray", linewidth=1)
+        for place, row in zip(places, comparisons, strict=True):
+            found = row.differences[measure]
+            colour = COLOURS[1] if found.separable else COLOURS[0]
+            axes.plot((found.low, found.high), (place, place), color=colour, linewidth=1.6)
+            axes.plot(found.mean, place, "o", color=colour, markersize=5)
+        labels = [f"{row.arm}\n- {row.base} ({len(row.seeds)} seeds)" for row in comparisons]
+        axes.set_yticks(places, labels, fontsize=8)
+    axes.invert_yaxis()
+    save_figure(figure, path)
+
+
+def plot_cost(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Seconds of forward, KL and backward on one buffer, stacked, and the bytes kept, per model and anchor."""
+    models = list(dict.fromkeys(row["model"] for row in rows))
+    figure = figure_of(5.2 * len(models), 3.6)
+    for axes, model in zip(np.atleast_1d(figure.subplots(1, len(models))), models, strict=True):
+        style_axes(axes, f"{model}: training on one buffer", "KL anchor, MiB kept beside the weights", "seconds")
+        mine = [row for row in rows if row["model"] == model]
+        bottom = np.zeros(len(mine))
+        for part, colour in zip(("forward", "kl", "backward"), COLOURS, strict=False):
+            seconds = np.array([row[f"{part}_s"] for row in mine])
+            axes.bar(range(len(mine)), seconds, 0.6, bottom, color=colour, label=part)
+            bottom += seconds
+        axes.set_xticks(range(len(mine)), [f"{row['anchor']}\n{row['bytes'] / 2**20:.2f} MiB" for row in mine])
+        axes.set_ylim(top=1.2 * bottom.max())
+        axes.legend(fontsize=8, frameon=False, loc="upper center", ncols=3)
+    save_figure(figure, path)
+
+
+def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """The reward that trains beside the truths held out of it, a panel per trial; mean over seeds, thin lines each."""
+    figure = figure_of(12.0, 4.0)
+    arms = list(dict.fromkeys(row["arm"] for row in rows))
+    truths = {"obeyed": COLOURS[0], "mass": COLOURS[1]}
+    for axes, arm in zip(np.atleast_1d(figure.subplots(1, len(arms), sharey=True)), arms, strict=True):
+        mine = [row for row in rows if row["arm"] == arm]
+        proxy, fired = mine[0]["plan"]["proxy"], sum(bool(alarms(row)) for row in mine)
+        style_axes(axes, f"{arm}: alarm in {fired} of {len(mine)} runs", "buffers", "held-out scenes")
+        for name, colour in {proxy: COLOURS[2], **truths}.items():
+            for row in mine:
+                x, y = zip(*((point["iteration"], point[name]) for point in row["evaluations"]), strict=True)
+                axes.plot(x, y, color=colour, linewidth=0.6, alpha=0.4)
+            mean = np.mean([[point[name] for point in row["evaluations"]] for row in mine], 0)
+            label = f"{name} (trains)" if name == proxy else name
+            axes.plot(x, mean, color=colour, linewidth=2, linestyle="-" if name == proxy else "--", label=label)
+        axes.set_ylim(bottom=0)
+        axes.legend(fontsize=8, frameon=False, loc="lower left")
+    save_figure(figure, path)
+
+
+def family_of(arm: str) -> str:
+    """The family of an arm of claim A."""
+    if not arm.startswith("DynDiff"):
+        return arm.split()[0]
+    return f"DynDiff {arm.split()[2]} rms" if arm.endswith("rms") else "DynDiff literal"
+
+
+def _gains(rows: Sequence[dict[str, Any]], arm: str) -> list[float]:
+    """Mean reward over each training of the arm, less that of its start."""
+    return [value(row, "reward_path") - row["evaluations"][0]["reward"] for row in rows if row["arm"] == arm]
+
+
+def figure_of(width: float, height: float) -> Any:
+    """An empty figure, inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=80, layout="constrained", facecolor="white")
+
+
+def style_axes(axes: Any, title: str, x: str, y: str) -> None:
+    """Title, labels, a light grid."""
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_xlabel(x, fontsize=8)
+    axes.set_ylabel(y, fontsize=8)
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=8)
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a PNG, whole or not at all."""
+    png = io.BytesIO()
+    figure.savefig(png, format="png")
+    write_atomic(path, png.getvalue())

@@ -1,0 +1,76 @@
+"""What is trained to answer one question each: the choices of the paper's section 5.4, and a reward that can be hacked.
+
+Each ablation is a pair on one learner and one arm, with equal model calls.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+from benchmarks.video_rl.clip_learning import ClipPlan
+from benchmarks.video_rl.learning import LearningPlan
+from benchmarks.video_rl.samplers import SamplerSetup, dyndiff, sampler_setup
+from wm_nodes.video_model import SamplerSettings
+from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
+
+GUIDANCE = 2.0
+HIGH_SIDE = 20
+SHORT_RATE = 2e-4
+"""Learning rate of these short trainings, twice that of claim B: 12 buffers go as far as 24."""
+PAPER_GROUP = 16
+"""Videos per context of Table 5: a clip of 2.5 can act from groups of 8 on, one of 5 only from 27 on."""
+
+
+Plan = TypeVar("Plan", bound=LearningPlan | ClipPlan)
+
+
+@dataclass(frozen=True)
+class SamplerTrial(Generic[Plan]):
+    """One arm trained by one plan; the arm's name is the trial's."""
+
+    arm: SamplerSetup
+    plan: Plan
+
+
+def ablation_trials(
+    learner: GrpoSettings, plan: LearningPlan
+) -> tuple[list[SamplerTrial[LearningPlan]], list[tuple[str, str]]]:
+    """Return the trainings, and which is compared with which: (name, name of its base)."""
+    cps = replace(learner, logprob_weight="cps", learning_rate=SHORT_RATE)
+    base = replace(sampler_setup("base", dyndiff(0.6, "gated", "rms"), cps), shared_noise=True)
+    groups = replace(plan, scenes=max(1, plan.scenes * plan.group_size // PAPER_GROUP), group_size=PAPER_GROUP)
+    half = replace(plan, iterations=max(1, plan.iterations // 2), eval_every=max(1, plan.eval_every // 2))
+    high = replace(plan, eval_side=HIGH_SIDE)
+    guided = replace(base.rollout, cfg=GUIDANCE)
+    trials = [
+        SamplerTrial(base, plan),
+        SamplerTrial(_learning(base, "KL of log-probabilities", kl=KlSettings("logk2", learner.kl.beta)), plan),
+        SamplerTrial(_learning(base, "no KL", kl=KlSettings("none")), plan),
+        SamplerTrial(_learning(base, "clip 2.5, groups of 16"), groups),
+        SamplerTrial(_learning(base, "clip 5, groups of 16", advantage=AdvantageSettings(clip=5.0)), groups),
+        SamplerTrial(replace(_learning(base, "guidance 2", cfg=GUIDANCE), rollout=guided), half),  # two calls per step
+        SamplerTrial(replace(base, name="trained at 16, shown at 20"), high),
+        SamplerTrial(replace(base, name="trained and shown at 20"), replace(high, side=HIGH_SIDE)),
+    ]
+    pairs = [
+        ("KL of log-probabilities", "base"), ("no KL", "base"), ("clip 5, groups of 16", "clip 2.5, groups of 16"),
+        ("guidance 2", "base"), ("trained and shown at 20", "trained at 16, shown at 20"),
+    ]
+    return trials, pairs
+
+
+def hacking_trials(learner: GrpoSettings, plan: LearningPlan) -> list[SamplerTrial[LearningPlan]]:
+    """The honest reward; temporal consistency alone, which a picture that stands still, or has no disc, satisfies best;
+    the same with a frozen anchor, which holds it back.
+    """
+    cps = replace(learner, logprob_weight="cps", learning_rate=SHORT_RATE)
+    arm = replace(sampler_setup("honest reward", SamplerSettings("cps", 0.6), cps), shared_noise=True)
+    hackable, frozen = replace(plan, proxy="consistency"), replace(learner.kl, anchor="frozen")
+    return [
+        SamplerTrial(arm, plan),
+        SamplerTrial(_learning(arm, "consistency alone"), hackable),
+        SamplerTrial(_learning(arm, "consistency, frozen anchor", kl=frozen), hackable),
+    ]
+
+
+def _learning(arm: SamplerSetup, name: str, **changes: object) -> SamplerSetup:
+    return replace(arm, name=name, grpo=replace(arm.grpo, **changes))  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""What a person starts, one verb per module: it parses, calls and prints."""

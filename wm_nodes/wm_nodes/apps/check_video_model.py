@@ -1,0 +1,131 @@
+"""Checks a video model before GRPO trains it: one line per check, exit code 1 where one fails."""
+
+import argparse
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import nn
+
+from wm_nodes.config.load import parse_override
+from wm_nodes.video_model import Condition
+from wm_nodes.video_model.clips import load_clips
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.checks import examine
+from wm_nodes.video_rl.settings import VideoRlConfig, load_video_config, video_preset_names
+from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
+
+VIDEOS = 4
+console = Console()
+
+
+def main(argv: Sequence[str]) -> int:
+    """Return the exit code: 0 all passed, 1 a check failed, 2 a clear error."""
+    arguments = _parser().parse_args(argv)
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", str(torch.get_num_threads()))))
+    try:
+        config = load_video_config(arguments.preset, dict(parse_override(text) for text in arguments.set))
+        model, condition, shape, config = _patient(arguments, config)
+        videos = config.groups.contexts * config.groups.group_size
+        findings = examine(model, condition, shape, config.rollout, config.grpo, seed=config.seed, buffer_videos=videos)
+    except (ValueError, OSError, ImportError, FloatingPointError) as error:
+        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
+        return 2
+    table = Table(title=f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)")
+    for name in ("check", "", "found", "where it failed"):
+        table.add_column(name)
+    for finding in findings:
+        verdict = "[green]passed" if finding.passed else "[red]FAILED"
+        table.add_row(finding.name, verdict, finding.value, "" if finding.passed else finding.remedy)
+    console.print(table)
+    return int(not all(finding.passed for finding in findings))
+
+
+def _patient(
+    arguments: argparse.Namespace, config: VideoRlConfig
+) -> tuple[nn.Module, Condition, tuple[int, int, int, int], VideoRlConfig]:
+    if arguments.public:
+        return _public(arguments, config)
+    if arguments.video_model is None:
+        toy = draw_scenes(VIDEOS, config.seed, "doctor").condition()
+        return load_base(), toy, (CHANNELS, FRAMES, SIDE, SIDE), config
+    if not arguments.context_bags:
+        raise ValueError("--video-model needs --context-bags: recorded episodes to take first frames and actions from")
+    folder = load_video_folder(arguments.video_model)
+    clips = load_clips(arguments.context_bags, folder.clip["stride"])
+    clips = clips.select(torch.arange(min(VIDEOS, len(clips))))
+    condition = clips.condition(folder.codec, folder.clip["num_conditioning"], folder.network.settings.text_dim)
+    latents = folder.codec.encode(clips.frames)
+    C, F, H, W = latents.shape[1:]
+    return folder.network, condition, (C, F, H, W), config
+
+
+def _public(
+    arguments: argparse.Namespace, config: VideoRlConfig
+) -> tuple[nn.Module, Condition, tuple[int, int, int, int], VideoRlConfig]:
+    from wm_nodes.video_model.adapters import LoadSettings, add_lora, load_public_model
+
+    settings = LoadSettings(dtype=arguments.dtype, device=arguments.device, offload=arguments.offload)
+    public = load_public_model(arguments.public, settings)
+    if public.text is None:
+        raise ValueError(f"{arguments.public} has no text encoder; the doctor needs one to embed the prompt")
+    frames = torch.from_numpy(np.stack([_picture(arguments)] * arguments.frames))[None]
+    latents = public.codec.encode(frames)
+    C, F, H, W = latents.shape[1:]
+    text = public.text.encode([arguments.prompt])
+    actions = torch.zeros(1, F - 1, 0)
+    given = latents[:, :, : 0 if arguments.text_only else 1].float()
+    condition = Condition(given, actions, text.float()).repeat_interleave(VIDEOS)
+    model: Any = public.velocity
+    if arguments.lora_rank:
+        add_lora(model, arguments.lora_rank, 2 * arguments.lora_rank)
+    return model, condition.to(arguments.device), (C, F, H, W), replace(
+        config, rollout=replace(config.rollout, shift=public.shift)
+    )
+
+
+def _picture(arguments: argparse.Namespace) -> "np.ndarray[Any, np.dtype[np.uint8]]":
+    """The first frame, uint8 (H, W, 3): the given picture, or a test card."""
+    height, width = arguments.size
+    if arguments.picture is None:
+        across = np.linspace(0, 255, width, dtype=np.uint8)[None].repeat(height, 0)
+        down = np.linspace(0, 255, height, dtype=np.uint8)[:, None].repeat(width, 1)
+        return np.stack([across, down, 255 - across], -1)
+    found = cv2.imread(str(arguments.picture))
+    if found is None:
+        raise ValueError(f"{arguments.picture} is no picture that OpenCV reads")
+    resized: np.ndarray[Any, np.dtype[np.uint8]] = cv2.cvtColor(cv2.resize(found, (width, height)), cv2.COLOR_BGR2RGB)
+    return resized
+
+
+def _size(text: str) -> tuple[int, int]:
+    height, _, width = text.partition("x")
+    if not (height.isdigit() and width.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r} is no HEIGHTxWIDTH, e.g. 480x832")
+    return int(height), int(width)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="doctor.py", description=__doc__)
+    parser.add_argument("--video-model", type=Path, help="folder of an embedded video model; default: the shipped toy")
+    parser.add_argument("--context-bags", type=Path, nargs="+", help="bags to take first frames and actions from")
+    parser.add_argument("--public", type=Path, help="folder of a public model, diffusers format (Wan, Cosmos-Predict)")
+    parser.add_argument("--prompt", default="a robot arm pushes a cube across the table", help="for a public model")
+    parser.add_argument("--text-only", action="store_true", help="give a public model no first frame")
+    parser.add_argument("--picture", type=Path, help="first frame for a public model; default: a test card")
+    parser.add_argument("--size", type=_size, default=(480, 832), metavar="HxW", help="pixels; default 480x832")
+    parser.add_argument("--frames", type=int, default=9, help="frames of a clip; 4 n + 1 for Wan's VAE")
+    parser.add_argument("--dtype", choices=("float32", "bfloat16", "float16"), default="float32")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--offload", action="store_true", help="VAE and text encoder rest on the CPU")
+    parser.add_argument("--lora-rank", type=int, default=0, help="check with a LoRA adapter of this rank")
+    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(video_preset_names())}, or a .yaml")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
+    return parser

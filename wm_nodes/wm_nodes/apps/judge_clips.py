@@ -1,0 +1,137 @@
+"""Judge clips of your own by the reward agent: videos in a folder, with a clips.jsonl that says what each should show.
+
+    python -m wm_nodes.apps.judge_clips CLIPS --judge http://host:8000/v1 --judge-model NAME --audit CLIPS/audit
+    python -m wm_nodes.apps.judge_clips CLIPS --judge embedded
+
+A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red cube into the green target", "task_id":
+"push_cube"}; also clip_id, robot, fps (of a .npy), reference (the picture that the clip had to start from), goal, and
+sha256, which is checked.
+Verdicts are appended to CLIPS/verdicts.jsonl; started again, it goes on with the clips that this judge, rubric and mode
+have not judged. Exit code: 0 done, 1 a clip has no verdict because the judge failed, 2 a clear error.
+"""
+
+import argparse
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from tqdm import tqdm
+
+from wm_nodes.apps.policy_run import add_judge_options, judge_options
+from wm_nodes.config.load import judge_or_embedded, load_config
+from wm_nodes.judge.agent import Status, Verdict
+from wm_nodes.judge.backends.factory import for_clips
+from wm_nodes.judge.clip_files import AT_ONCE, read_job, read_list
+from wm_nodes.judge.service import ClipJob, JudgeService
+
+VERDICTS = "verdicts.jsonl"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print the verdicts' summary; see the module."""
+    parser = argparse.ArgumentParser(
+        prog="judge_clips", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("clips", type=Path, help="folder of clips.jsonl and its files")
+    parser.add_argument("--config", default="cpu", help="a preset or .yaml with a judge section (default: cpu)")
+    add_judge_options(parser)
+    parser.add_argument("--mode", choices=("reward", "benchmark"), help="benchmark: every component is read")
+    parser.add_argument("--audit", type=Path, help="folder of an audit log to write, for the viewer and for people")
+    parser.add_argument("--reads", type=Path, help="folder that keeps a server's answers")
+    parser.add_argument("--json", type=Path, metavar="FILE", help=f"default: {VERDICTS} beside the clips")
+    arguments = parser.parse_args(argv)
+    try:
+        return _judge(arguments)
+    except (ValueError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted; started again it goes on", file=sys.stderr)
+        return 130
+
+
+def _judge(arguments: argparse.Namespace) -> int:
+    overrides = judge_options(arguments) | ({"judge.mode": arguments.mode} if arguments.mode else {})
+    config, lines = load_config(arguments.config, overrides), read_list(arguments.clips)
+    path = arguments.json or arguments.clips / VERDICTS
+    settings = judge_or_embedded(config.judge)
+    if lines:
+        settings = for_clips(settings, read_job(arguments.clips, lines[0]).clip.frames.shape)
+    judge = JudgeService(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit)
+    with closing(judge), path.open("a+") as written:
+        asked = {"judge_id": judge.judge_ids[0], "rubric": judge.rubric.version}
+        by = {**asked, "mode": settings.mode, "seed": config.seed}
+        written.seek(0)
+        before = written.read()
+        written.write("" if before.endswith("\n") or not before else "\n")  # after a line that a crash has torn
+        done = _judged_before(before, by)
+        rows, waiting = list[dict[str, Any]](), list[ClipJob]()
+        progress = tqdm(total=len(lines), desc="judged", unit="clip", disable=None)
+
+        def flush() -> None:
+            for job, verdict in zip(waiting, judge.judge(waiting), strict=True):
+                rows.append(_row(job, verdict, by))
+                written.write(json.dumps(rows[-1]) + "\n")
+            written.flush()
+            progress.update(len(waiting))
+            waiting.clear()
+
+        with progress:
+            for job in (read_job(arguments.clips, line) for line in lines):
+                if (known := done.get(_key(job))) is not None:
+                    rows.append(known)
+                    progress.update()
+                    continue
+                waiting.append(job)
+                if len(waiting) >= max(AT_ONCE, settings.concurrency):
+                    flush()
+            flush()
+    _summarise(rows, path)
+    return int(any(row["status"] == Status.ERROR for row in rows))
+
+
+def _key(job: ClipJob) -> str:
+    return f"{job.clip.sha256} {job.task.task_id} {job.task.instruction}"
+
+
+def _row(job: ClipJob, verdict: Verdict, by: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "clip_id": job.clip.clip_id, "key": _key(job), "status": str(verdict.status),
+        "reward": verdict.reward if verdict.valid else None, "level": verdict.level,
+        "stages": {str(s.stage): s.s for s in verdict.stages if s.status is Status.OK},
+        "hacks": [flag.pattern for flag in verdict.hack_flags if flag.confirmed],
+        "reason": verdict.reason, "audit_id": verdict.audit_id, **by,
+    }
+
+
+def _judged_before(written: str, by: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Rows by clip and task that the same judge gave; an ERROR is asked again, a torn line is passed over."""
+    found = dict[str, dict[str, Any]]()
+    for text in written.splitlines():
+        try:
+            row = json.loads(text)
+        except ValueError:
+            continue
+        if {name: row.get(name) for name in by} == by and row.get("status") != Status.ERROR:
+            found[row["key"]] = row
+    return found
+
+
+def _summarise(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    counts = Counter(row["status"] for row in rows)
+    told = ", ".join(f"{count} {status}" for status, count in counts.items())
+    rewards = [row["reward"] for row in rows if row["reward"] is not None]
+    mean = f", mean reward {fmean(rewards):.3f}" if rewards else ""
+    print(f"{len(rows)} clips ({told or 'none'}){mean}")
+    for row in [row for row in rows if row["status"] != Status.OK][:5]:
+        print(f"  {row['clip_id']}: {row['status']}, {row['reason']}")
+    print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

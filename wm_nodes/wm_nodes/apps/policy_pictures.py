@@ -1,0 +1,133 @@
+"""The pictures of a run's report: the same actions in the simulator and in the world model, and the training's course.
+
+Shapes: T steps, H W 3 image.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.specs import SOURCE_SIMULATOR
+from wm_nodes.core.types import Environment, Episode, FloatArray, UInt8Array
+from wm_nodes.environments.maniskill.tasks import instruction, success
+from wm_nodes.policy_rl.factories import models_of
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.reports import Picture, curves, film_strip
+from wm_nodes.training.metrics import FILE_NAME
+from wm_nodes.world_model import WorldModels
+from wm_nodes.world_model.text import imagine_goals
+from wm_nodes.world_model.validation.open_loop import imagine_episodes
+
+NUM_STRIPS = 2
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """One episode twice. real: uint8 (T + 1, H, W, 3). imagined: the same actions from the same first frame.
+
+    goal: uint8 (H, W, 3), or None without a text model. real_done, imagined_done: first step of success, or -1.
+    signals: float32 (T,), the done signal of imagined frames 1..T.
+    """
+
+    real: UInt8Array
+    imagined: UInt8Array
+    goal: UInt8Array | None
+    real_done: int
+    imagined_done: int
+    signals: FloatArray
+
+
+def write_pictures(
+    run_dir: Path, config: RunConfig, model_dir: Path, policy: ImagePolicy, first_seed: int, *, strips: int = NUM_STRIPS
+) -> list[Picture]:
+    """Play `strips` episodes of the policy in the simulator, imagine the same actions, and draw both; and the curves.
+
+    Writes PNGs to <run_dir>/pictures.
+    """
+    from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
+
+    environment = ManiSkillEnvironment(config.task, config.simulation, num_envs=1, seed=config.seed)
+    try:
+        episodes = [play(environment, policy, first_seed + i) for i in range(strips)]
+    finally:
+        environment.close()
+    folder, pictures = run_dir / "pictures", list[Picture]()
+    for index, pair in enumerate(side_by_side(models_of(Path(model_dir)), episodes, config)):
+        path = folder / f"film_strip_{index}.png"
+        draw(pair, path)
+        pictures.append(Picture(f"Real and imagined, episode {index + 1}", describe(pair, first_seed + index), path))
+    drawn = curves(run_dir / FILE_NAME, folder / "curves.png")
+    if drawn is not None:
+        pictures.append(Picture("Training", "In the world model, by policy update.", drawn))
+    return pictures
+
+
+def play(environment: Environment, policy: ImagePolicy, seed: int) -> Episode:
+    """One episode without action noise; `environment` has one slot and ground truth."""
+    observation = environment.reset(None, np.array([seed], np.uint64))
+    images, states, actions, truths = [observation.image[0]], [observation.state[0]], list[FloatArray](), []
+    truths.append(environment.ground_truth[0])  # type: ignore[attr-defined]
+    while True:
+        action = policy.act(observation.image, observation.state).actions
+        result = environment.step(action)
+        observation = result.observation
+        actions.append(action[0])
+        images.append(observation.image[0])
+        states.append(observation.state[0])
+        truths.append(result.ground_truth[0])
+        if result.terminated[0] or result.truncated[0]:
+            break
+    spec, truth = environment.spec, np.stack(truths)
+    return Episode(
+        images=np.stack(images), states=np.stack(states), actions=np.stack(actions), ground_truth=truth,
+        success=success(spec.task, truth), rewards=np.full(len(actions), np.nan, np.float32),
+        terminated=bool(result.terminated[0]), truncated=bool(result.truncated[0]), task=spec.task,
+        instruction=spec.instruction, behaviour="policy", seed=seed, episode_id=seed, source=SOURCE_SIMULATOR,
+    )
+
+
+def side_by_side(models: WorldModels, episodes: list[Episode], config: RunConfig) -> list[SideBySide]:
+    """Imagine the actions of real episodes, and the goal of each first frame."""
+    task = models.task_index(config.task)
+    arrays: EpisodeArrays = stack_episodes(episodes, models.tasks, success)
+    imagined = imagine_episodes(models.tokenizer, models.action, arrays)
+    goals = None
+    if models.text is not None:
+        goals = imagine_goals(
+            models.text, models.tokenizer, arrays.images[:, 0], instruction(config.task), task,
+            horizon=config.simulation.max_episode_steps, threshold=config.reward.goal_threshold,
+        ).goals
+    pairs = []
+    for row, episode in enumerate(episodes):
+        signals = imagined.signals[row, : episode.num_steps, task]
+        frames = np.concatenate([episode.images[:1], imagined.frames[row, : episode.num_steps]])
+        above = np.concatenate([[False], signals > config.reward.success_threshold])
+        goal = None if goals is None else goals[row]
+        pairs.append(SideBySide(episode.images, frames, goal, first_true(episode.success), first_true(above), signals))
+    return pairs
+
+
+def draw(pair: SideBySide, path: Path) -> None:
+    rows = {"real": pair.real, "imagined": pair.imagined}
+    if pair.goal is not None:
+        rows["goal"] = pair.goal[None]
+    marks = {name: step for name, step in (("real", pair.real_done), ("imagined", pair.imagined_done)) if step >= 0}
+    film_strip(rows, path, marks=marks)
+
+
+def describe(pair: SideBySide, seed: int) -> str:
+    """The caption of one strip."""
+    real = f"done at step {pair.real_done}" if pair.real_done >= 0 else "not done"
+    imagined = f"done at step {pair.imagined_done}" if pair.imagined_done >= 0 else "not done"
+    goal = "" if pair.goal is None else " Goal: what the text model imagines for the instruction."
+    return (
+        f"Seed {seed}. Real: the trained policy in ManiSkill, {real}. Imagined: the same actions in the world model "
+        f"from the same first frame, {imagined} (done signal up to {pair.signals.max():.2f}). Green frame: done.{goal}"
+    )
+
+
+def first_true(values: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> int:
+    return int(values.argmax()) if values.any() else -1

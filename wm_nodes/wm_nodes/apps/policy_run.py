@@ -1,0 +1,283 @@
+"""One training in the world model as a ROS graph: its folder, what is measured in it, and what a resume finds there.
+
+Whatever took long is kept as a file with the identity of what it was measured on, so that a run that is started again
+goes on where it stopped, and never takes a trained policy for the one it began with.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from tqdm import tqdm
+
+from wm_nodes.config.load import ConfigError, dump_config, judge_overrides
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.files import file_sha256, write_atomic
+from wm_nodes.core.statistics import wilson_interval
+from wm_nodes.core.types import BoolArray
+from wm_nodes.launching import arguments as launch_arguments
+from wm_nodes.launching.graph_client import GraphClient
+from wm_nodes.launching.runner import Runner
+from wm_nodes.policy_rl.evaluation import evaluate
+from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, models_of
+from wm_nodes.policy_rl.initial_policy import num_starts
+from wm_nodes.reports import SuccessRate
+
+READY_S = 120.0
+TRAINED = "trained.json"
+
+console = Console()
+
+
+def open_run_dir(given: Path | None, name: str, config_text: str, *, begun_with: Sequence[str] = ()) -> Path:
+    """Make the run folder (default: runs/<time>-<name>) and keep its configuration there.
+
+    Args:
+        begun_with: options that are no settings but without which the run must not go on; kept as comments.
+
+    Raises:
+        ConfigError: the folder was begun with another configuration or other such options.
+    """
+    config_text += "".join(f"# begun with {option}\n" for option in begun_with)
+    run_dir = (given or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}").expanduser().absolute()
+    run_dir.mkdir(parents=True, exist_ok=True)
+    saved = run_dir / "config.yaml"
+    if saved.exists() and saved.read_text() != config_text:
+        raise ConfigError(
+            f"{run_dir} was begun with another configuration ({saved}); repeat its options or use a new folder"
+        )
+    saved.write_text(config_text)
+    return run_dir
+
+
+def add_judge_options(parser: argparse.ArgumentParser) -> None:
+    """Who judges where the reward is the agent's; judge_options reads them."""
+    parser.add_argument("--judge", default="", metavar="URL[,URL]|embedded|FOLDER",
+                        help="the judge's servers, e.g. http://host:8000/v1; or a judge without one. "
+                        "Default: embedded")
+    parser.add_argument("--judge-model", default="", metavar="NAME", help="its name on the server")
+    parser.add_argument("--judge-key-env", default="", metavar="VARIABLE", help="environment variable with its key")
+    parser.add_argument("--rubric", default="", help="rubric pack: a name, or a .yaml file")
+
+
+def judge_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The dotted settings that the options of add_judge_options stand for."""
+    return judge_overrides(arguments.judge, arguments.judge_model, arguments.judge_key_env, arguments.rubric)
+
+
+class Stages:
+    """Prints what is being done, with the minutes since the start."""
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+
+    @property
+    def minutes(self) -> float:
+        return (time.monotonic() - self._started) / 60
+
+    def __call__(self, text: str) -> None:
+        minutes, seconds = divmod(int(60 * self.minutes), 60)
+        console.print(f"[dim]{minutes:3d}:{seconds:02d}[/] {text}", highlight=False)
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """What all trainings of a run share. starts: first frames to imagine from. reward: as the launch argument."""
+
+    config: RunConfig
+    run_dir: Path
+    starts: Path
+    stage: Stages
+    domain_id: str = ""
+    compose: bool = False
+    verbose: bool = False
+    reward: str = "endogenous"
+
+
+@dataclass(frozen=True)
+class TrainingStart:
+    """What one training begins with. folder: its own run folder. label: for bags and messages, e.g. "round 2"."""
+
+    folder: Path
+    model_dir: Path
+    policy: Path
+    config: RunConfig
+    label: str = ""
+
+    @property
+    def updates(self) -> int:
+        return self.config.ppo.updates
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """version: of the last weights. samples: transitions trained on. samples_per_s: of the last uninterrupted part."""
+
+    version: int
+    updates: int
+    samples: int
+    samples_per_s: float
+    bag: str
+
+    def policy(self, folder: Path) -> Path:
+        return folder / "policies" / f"policy_{self.version:06d}.safetensors"
+
+
+@dataclass(frozen=True)
+class WaitingGraph:
+    """A training's processes, started and not yet configured: they come up while what they will load is still made."""
+
+    runner: Runner
+    bag: Path
+
+
+def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
+    """TrainingStart the processes of one training; the caller stops the runner."""
+    start.folder.mkdir(parents=True, exist_ok=True)
+    config_file = start.folder / "config.yaml"
+    if not config_file.exists():  # the run folder's own says more, see open_run_dir
+        config_file.write_text(dump_config(start.config))
+    name = "_".join(["training", *start.label.split(), time.strftime("%H%M%S")])
+    bag = job.run_dir / "bags" / name
+    graph, _ = launch_arguments.prepare("online_training", {
+        "config_file": str(config_file), "reward": job.reward, "run_dir": str(start.folder),
+        "model_dir": str(start.model_dir), "starts_file": str(job.starts), "initial_policy": str(start.policy),
+        "seed": str(start.config.seed), "bag_uri": str(bag), "domain_id": job.domain_id,
+        "compose": "true" if job.compose else "false", "autostart": "false",
+    })
+    job.stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
+    runner = Runner(graph, log_dir=start.folder / "logs", log=sys.stdout if job.verbose else None)
+    runner.start()
+    return WaitingGraph(runner, bag)
+
+
+def is_trained(start: TrainingStart) -> bool:
+    return (start.folder / TRAINED).is_file()
+
+
+def train_round(
+    job: RunContext,
+    start: TrainingStart,
+    judge: Callable[[BoolArray], None] | None = None,
+    waiting: WaitingGraph | None = None,
+) -> TrainingResult:
+    """Train start.policy in start.model_dir and measure it in the simulator; finished parts are kept.
+
+    Args:
+        judge: called with the starting policy's real success before any update; may raise to refuse the training.
+        waiting: this training's processes, where they run already; stopped at the end.
+    """
+    marker = start.folder / TRAINED
+    if is_trained(start):
+        job.stage(f"{start.label or 'training'} is done already ({marker})")
+        return TrainingResult(**json.loads(marker.read_text()))
+    waiting = waiting or start_graph(job, start)
+    with closing(waiting.runner) as runner:
+        runner.activate(READY_S)
+        os.environ.update(runner.environment)
+        with GraphClient(alive=runner.check) as operator:
+            if judge is not None:
+                judge(_real(operator, job, start, "before", start.policy))
+            before, began = _progress(start.folder), time.monotonic()
+            remaining = max(0, start.updates - int(before["updates"]))
+            job.stage(f"training the policy in the world model: {remaining} updates")
+            if remaining:
+                _train(operator, remaining)
+            after, seconds = _progress(start.folder), time.monotonic() - began
+            samples = int(after["samples"]) - int(before["samples"])
+            trained = TrainingResult(
+                int(after["version"]), int(after["updates"]), int(after["samples"]), samples / seconds, str(waiting.bag)
+            )
+            _real(operator, job, start, "after", trained.policy(start.folder))
+    write_atomic(marker, json.dumps(asdict(trained), indent=1).encode())
+    return trained
+
+
+def read_success(folder: Path, name: str) -> BoolArray:
+    """A kept evaluation, (E,) in seed order. name: real_ or imagined_, then before or after."""
+    values = json.loads((folder / "evaluations" / f"{name}.json").read_text())
+    return np.asarray(values["success"], bool)
+
+
+def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path, policy: Path) -> BoolArray:
+    """Success in the world model, without action noise, on num_starts() episodes, (E,)."""
+    episodes = num_starts(job.config)
+
+    def measure() -> BoolArray:
+        env = make_imagined_environment(job.config, model_dir, job.starts, num_envs=64, seed=job.config.seed)
+        return evaluate(
+            load_policy(job.config, model_dir, policy), env, episodes, job.config.evaluation.first_seed
+        ).success
+
+    identity = {"policy_sha256": file_sha256(policy), "model_sha256": models_of(model_dir).sha256}
+    success = kept(folder / "evaluations" / f"imagined_{label}.json", identity, measure)
+    job.stage(f"imagined success of {policy.stem}: {int(success.sum())}/{len(success)}")
+    return success
+
+
+def kept(path: Path, identity: Mapping[str, str], measure: Callable[[], BoolArray]) -> BoolArray:
+    """Success of episodes, (E,), from `path` when it was measured on the same things, else measured and written."""
+    if path.is_file():
+        values: dict[str, Any] = json.loads(path.read_text())
+        if values["identity"] == dict(identity):
+            return np.asarray(values["success"], bool)
+    success = measure()
+    low, high = wilson_interval(int(success.sum()), len(success))
+    content = {"identity": dict(identity), "success": success.astype(int).tolist(), "low": low, "high": high}
+    write_atomic(path, json.dumps(content).encode())
+    return success
+
+
+def rate(success: BoolArray) -> SuccessRate:
+    low, high = wilson_interval(int(success.sum()), len(success))
+    return SuccessRate(int(success.sum()), len(success), low, high)
+
+
+def _real(operator: GraphClient, job: RunContext, start: TrainingStart, label: str, policy: Path) -> BoolArray:
+    """Success of a weights file in the simulator, on the seeds of the configuration."""
+    settings = job.config.evaluation
+
+    def measure() -> BoolArray:
+        with tqdm(total=settings.episodes, desc=f"real episodes {label}", unit="episode", leave=False) as bar:
+
+            def show(done: int, share: float) -> None:
+                bar.update(done - bar.n)
+                bar.set_postfix(success=f"{share:.2f}")
+
+            return operator.evaluate(
+                episodes=settings.episodes, seed=settings.first_seed, deterministic=settings.deterministic,
+                label=label, policy_uri=str(policy), on_progress=show,
+            ).success
+
+    success = kept(start.folder / "evaluations" / f"real_{label}.json", {"policy_sha256": file_sha256(policy)}, measure)
+    found = rate(success)
+    job.stage(
+        f"real success {label} training: {found.successes}/{found.episodes} (95 % {found.low:.2f} to {found.high:.2f})"
+    )
+    return success
+
+
+def _train(operator: GraphClient, updates: int) -> None:
+    with tqdm(total=updates, desc="PPO in the world model", unit="update") as bar:
+
+        def show(feedback: Any) -> None:
+            bar.update(feedback.update - bar.n)
+            bar.set_postfix(imagined_success=f"{feedback.success_rate:.2f}", mean_return=f"{feedback.mean_return:.2f}")
+
+        operator.train(updates, show)
+        bar.update(updates - bar.n)
+
+
+def _progress(folder: Path) -> dict[str, Any]:
+    """Counts of the learner's newest checkpoint, which is on disk before its version is announced."""
+    progress: dict[str, Any] = json.loads((folder / "checkpoints" / "learner.json").read_text())["progress"]
+    return progress

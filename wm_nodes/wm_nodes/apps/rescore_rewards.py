@@ -1,0 +1,132 @@
+"""Score a recorded run again with a reward model, and say whether the rewards are the recorded ones, bit by bit."""
+
+import argparse
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wm_nodes.config.load import load_config
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.policy_rl.factories import make_endogenous_reward
+from wm_nodes.recording import Bag, BagError
+from wm_nodes.recording.lockstep import LockSteps, RecordedReward, RecordedStep
+from wm_nodes.recording.rollouts import recorded_reward_name
+from wm_nodes.reward import RewardInput, RewardModel, RewardResult, RuleReward
+
+
+@dataclass
+class RescoreReport:
+    """What was compared. different: one line per lock-step whose rewards are not bit-equal.
+
+    unrewarded, without_images: recorded lock-steps that could not be compared.
+    """
+
+    compared: int = 0
+    different: list[str] = field(default_factory=list)
+    unrewarded: int = 0
+    without_images: int = 0
+
+    @property
+    def equal(self) -> bool:
+        """True when something was compared and nothing differed."""
+        return self.compared > 0 and not self.different
+
+    def text(self) -> str:
+        return (
+            f"{self.compared} lock-steps evaluated again, {len(self.different)} differ; not compared: "
+            f"{self.unrewarded} without reward, {self.without_images} without images"
+        )
+
+
+def rescore_bag(path: Path, model: RewardModel, *, namespace: str | None = None) -> RescoreReport:
+    """Evaluate `model` on every lock-step of a live recording and compare with the rewards recorded under its name.
+
+    Raises:
+        BagError: an unusable bag, no reward of this model in it, or rewards of another version of the model.
+    """
+    report = RescoreReport()
+    with Bag(path) as bag:
+        for step in LockSteps(bag, namespace=namespace, reward_name=model.name):
+            if step.reward is None:
+                report.unrewarded += int(step.valid.any())
+                continue
+            if step.reward.reward_version != model.version:
+                raise BagError(
+                    f"{path} holds {model.name} rewards of version {step.reward.reward_version}, this model is "
+                    f"{model.version}; build it with the weights and thresholds of the run's configuration"
+                )
+            if step.images is None or step.next_images is None:
+                report.without_images += 1
+                continue
+            report.compared += 1
+            wrong = _differences(step.reward, model.evaluate(reward_input(step)))
+            if wrong:
+                report.different.append(f"step_id {step.step_id}: {', '.join(wrong)}")
+    if not report.compared:
+        raise BagError(f"{path} holds no reward named {model.name!r} with its images; record env/image and reward")
+    return report
+
+
+def reward_input(step: RecordedStep) -> RewardInput:
+    """What the reward evaluator was given for this lock-step. Needs both images."""
+    if step.images is None or step.next_images is None:
+        raise BagError(f"lock-step {step.step_id} lacks an image; it cannot be scored")
+    goals, found = step.goals if step.goals is not None else (None, None)
+    return RewardInput(
+        images=step.images,
+        next_images=step.next_images,
+        success_probability=step.success_probability,
+        valid=step.valid,
+        uncertainty=step.uncertainty,
+        goals=goals,
+        goal_found=found,
+    )
+
+
+def _differences(recorded: RecordedReward, result: RewardResult) -> list[str]:
+    pairs = {name: (getattr(recorded, name), getattr(result, name)) for name in ("total", "dense", "sparse", "success")}
+    pairs["valid"] = recorded.valid, result.valid
+    for column, name in enumerate(recorded.component_names):
+        pairs[name] = recorded.components[:, column], result.components[name]
+    return [name for name, (theirs, ours) in pairs.items() if not _bit_equal(theirs, ours)]
+
+
+def _bit_equal(theirs: NDArray[np.generic], ours: NDArray[np.generic]) -> bool:
+    return theirs.dtype == ours.dtype and theirs.tobytes() == ours.tobytes()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Return 0 where every reward is bit-equal, 1 where one differs, 2 after a clear error."""
+    parser = argparse.ArgumentParser(
+        prog="bag_rescore", description="Evaluate the rewards of a recorded training again and compare them bit by bit."
+    )
+    parser.add_argument("bag", type=Path, help="a bag of a run folder, e.g. runs/x/bags/training_120000")
+    parser.add_argument("--config", type=Path, help="the run's configuration; default: config.yaml two folders above")
+    parser.add_argument("--model-dir", type=Path, help="its world model; default: <run>/model, else the shipped one")
+    options = parser.parse_args(arguments)
+    try:
+        report = rescore_bag(options.bag, _recorded_model(options.bag, options.config, options.model_dir))
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print("\n".join([*report.different[:10], report.text()]))
+    return int(not report.equal)
+
+
+def _recorded_model(bag: Path, config_file: Path | None, model_dir: Path | None) -> RewardModel:
+    """The reward model of the run that a bag belongs to. Raises BagError for rewards that are a judge's."""
+    name = recorded_reward_name(bag)
+    run_dir = bag.absolute().parent.parent
+    config = load_config(str(config_file or run_dir / "config.yaml"))
+    if name == "rule":
+        return RuleReward(config.reward.sparse_weight)
+    if name != "endogenous":
+        raise BagError(
+            f"{bag} holds rewards of {name or 'nobody'}; endogenous and rule ones can be evaluated again here, "
+            "an agent's by python -m wm_nodes.apps.judge_episodes"
+        )
+    own = run_dir / "model"
+    return make_endogenous_reward(config, model_dir or (own if own.is_dir() else shipped_model(config.task)))

@@ -1,0 +1,198 @@
+"""The evidence behind the README: several seeds and tasks, RL in the world model against RL in the simulator.
+
+In one process and in lock-step: the updates are bit-equal to those of the graph (tests/graph), without its start-up.
+Each (task, seed, arm) is one line of results.jsonl; finished lines are not run again.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from tqdm import tqdm
+
+from wm_nodes.config.load import dump_config, load_config, parse_override, preset_names
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.statistics import paired_difference, wilson_interval
+from wm_nodes.core.types import Environment
+from wm_nodes.environments.record import collect_plan, gate_plan
+from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
+from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment, models_of
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.initial_policy import prepare_start
+from wm_nodes.policy_rl.ppo import PpoLearner
+from wm_nodes.policy_rl.pretraining import load_arrays
+from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics
+from wm_nodes.reports import machine_facts, mean_gain
+from wm_nodes.reward import RewardModel, RuleReward
+from wm_nodes.training.weights import save_weights
+from wm_nodes.world_model.validation.acceptance import accept_world_model
+
+ARMS = ("world_model", "simulator")
+SIMULATOR_ENVS = 8
+IMAGINED_EPISODES = 256
+
+
+def main(argv: Sequence[str]) -> int:
+    arguments = _parser().parse_args(argv)
+    folder = arguments.out.expanduser().absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    keep_freed_memory()
+    torch.set_num_threads(arguments.threads)
+    for task in arguments.tasks:
+        for seed in arguments.seeds:
+            overrides = {"task": task, "seed": seed, **dict(parse_override(text) for text in arguments.set)}
+            config = load_config(arguments.preset, overrides)
+            for arm in arguments.arms:
+                if not _done(folder, task, seed, arm):
+                    _run(config, arm, arguments.model_dir or shipped_model(task), folder)
+    rows = read_results(folder)
+    Console().print(table(rows))
+    if (gain := gain_over_simulator(rows)) is not None:
+        print(f"RL in the world model less RL in the simulator, mean over the tasks: {gain:+.1f} points")
+    return 0
+
+
+def read_results(folder: Path) -> list[dict[str, Any]]:
+    path = folder / "results.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def table(rows: Sequence[dict[str, Any]]) -> Table:
+    """One line per run, and per task and arm the pooled paired difference."""
+    found = Table("task", "trained in", "seed", "real before", "real after", "difference (95 %)", "imagined", "gate")
+    for row in rows:
+        before, after, pair = row["real_before"], row["real_after"], row["paired"]
+        imagined = row["imagined_before"], row["imagined_after"]
+        found.add_row(
+            row["task"], row["arm"].replace("_", " "), str(row["seed"]), _percent(before), _percent(after),
+            f"{100 * pair['difference']:+.1f} ({100 * pair['low']:+.1f} to {100 * pair['high']:+.1f})",
+            f"{_percent(imagined[0])} -> {_percent(imagined[1])}", "passed" if row["gate_passed"] else "failed",
+        )
+    for task, arm in sorted({(row["task"], row["arm"]) for row in rows}):
+        chosen = [row for row in rows if (row["task"], row["arm"]) == (task, arm)]
+        pooled = paired_difference(
+            [bool(x) for row in chosen for x in row["success_before"]],
+            [bool(x) for row in chosen for x in row["success_after"]],
+        )
+        found.add_row(
+            task, arm.replace("_", " "), f"all {len(chosen)}", "", f"n = {pooled.episodes}",
+            f"{100 * pooled.difference:+.1f} ({100 * pooled.low:+.1f} to {100 * pooled.high:+.1f})", "", "",
+        )
+    return found
+
+
+def gain_over_simulator(rows: Sequence[dict[str, Any]]) -> float | None:
+    """By how many points RL in the world model ends above RL in the simulator: mean over tasks, each on the seeds that
+    both arms have; None where no task has both."""
+    after = {(row["task"], row["seed"], row["arm"]): row["real_after"] for row in rows}
+    rates: dict[tuple[str, str, str], float] = {}
+    for task in {task for task, _, _ in after}:
+        tried = [{seed for other, seed, done in after if (other, done) == (task, arm)} for arm in ARMS]
+        seeds = set.intersection(*tried)
+        for arm in ARMS if seeds else ():
+            found = [after[task, seed, arm] for seed in seeds]
+            successes, episodes = (sum(rate[name] for rate in found) for name in ("successes", "episodes"))
+            rates["image policy", arm, task] = 100 * successes / episodes
+    return mean_gain(rates, *ARMS) if rates else None
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="study.py", description=__doc__.split("\n")[0])
+    parser.add_argument("--tasks", nargs="+", default=["reach", "push_cube"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
+    parser.add_argument("--preset", default="cpu", help=f"one of {', '.join(preset_names())}, or a .yaml of overrides")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
+    parser.add_argument("--model-dir", type=Path, help="world model; default: the shipped one")
+    parser.add_argument("--threads", type=int, default=1, help="torch threads")
+    parser.add_argument("--out", type=Path, default=Path("runs/study"), help="folder; finished runs in it are kept")
+    return parser
+
+
+def _done(folder: Path, task: str, seed: int, arm: str) -> bool:
+    return any((row["task"], row["seed"], row["arm"]) == (task, seed, arm) for row in read_results(folder))
+
+
+def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
+    from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
+
+    started = time.monotonic()
+    run_dir = folder / f"{config.task}_{config.seed}"
+    starts, weak = prepare_start(config, run_dir, model_dir)
+    policy = load_policy(config, model_dir, weak)
+    real = ManiSkillEnvironment(config.task, config.simulation, SIMULATOR_ENVS, seed=config.seed)
+    imagined = make_imagined_environment(config, model_dir, starts, num_envs=config.ppo.num_envs, seed=config.seed)
+    real_before, imagined_before = _measure(policy, real, config), _imagine(policy, imagined, config)
+    gate = accept_world_model(
+        models_of(model_dir), _heldout(config, folder), config,
+        (imagined_before.successes, imagined_before.episodes), (real_before.successes, real_before.episodes),
+    )
+    course = _train(policy, real if arm == "simulator" else imagined, config, arm, model_dir)
+    real_after, imagined_after = _measure(policy, real, config), _imagine(policy, imagined, config)
+    real.close()
+    save_weights(policy, run_dir / f"{arm}.safetensors", {"tokenizer_sha256": policy.encoder.sha256})
+    row = {
+        "task": config.task, "arm": arm, "seed": config.seed, "real_before": _rate(real_before),
+        "real_after": _rate(real_after), "imagined_before": _rate(imagined_before),
+        "imagined_after": _rate(imagined_after),
+        "paired": asdict(paired_difference(real_before.success.tolist(), real_after.success.tolist())),
+        "gate_passed": gate.passed, "gate": gate.to_dict(), "environment_steps": sum(c["steps"] for c in course),
+        "success_before": real_before.success.astype(int).tolist(),
+        "success_after": real_after.success.astype(int).tolist(), "course": course,
+        "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(), "config": dump_config(config),
+        "world_model_sha256": models_of(model_dir).sha256,
+    }
+    with open(folder / "results.jsonl", "a") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def _train(
+    policy: ImagePolicy, env: Environment, config: RunConfig, arm: str, model_dir: Path
+) -> list[dict[str, float]]:
+    """ppo.updates updates; in the simulator the same number of environment steps, SIMULATOR_ENVS slots at a time."""
+    reward: RewardModel = RuleReward() if arm == "simulator" else make_endogenous_reward(config, model_dir)
+    learner = PpoLearner(policy, config.ppo, seed=config.seed)
+    steps = config.ppo.num_steps * config.ppo.num_envs // env.spec.num_envs
+    course: list[dict[str, float]] = []
+    with tqdm(total=config.ppo.updates, desc=f"{config.task} seed {config.seed} in {arm}", unit="update") as bar:
+        for update in range(config.ppo.updates):
+            rollout = collect_rollout(env, policy, reward, steps, config.seed, update + 1)
+            metrics, statistics = learner.update(rollout), rollout_statistics(rollout)
+            course.append({
+                "success_rate": statistics.success_rate, "kl_reference": metrics.kl_reference,
+                "steps": float(rollout.valid_TN.sum()),
+            })
+            bar.update()
+            bar.set_postfix(success=f"{statistics.success_rate:.2f}", refresh=False)
+    return course
+
+
+def _heldout(config: RunConfig, folder: Path) -> Any:
+    return load_arrays(collect_plan(gate_plan(config), config, folder / "heldout"), config)
+
+
+def _measure(policy: ImagePolicy, env: Environment, config: RunConfig) -> EvaluationResult:
+    settings = config.evaluation
+    return evaluate(policy, env, settings.episodes, settings.first_seed, settings.deterministic)
+
+
+def _imagine(policy: ImagePolicy, env: Environment, config: RunConfig) -> EvaluationResult:
+    return evaluate(policy, env, IMAGINED_EPISODES, config.evaluation.first_seed)
+
+
+def _rate(result: EvaluationResult) -> dict[str, float]:
+    low, high = wilson_interval(result.successes, result.episodes)
+    return {"successes": result.successes, "episodes": result.episodes, "low": low, "high": high}
+
+
+def _percent(rate: dict[str, float]) -> str:
+    return f"{100 * rate['successes'] / rate['episodes']:.1f} % ({rate['successes']}/{rate['episodes']})"

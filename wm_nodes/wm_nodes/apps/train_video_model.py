@@ -1,0 +1,252 @@
+"""Loop 2 as a job: bags in, a video model, GRPO over the graph, held-out scores before and after, a report.
+
+Resumable: collected bags, the trained model, finished evaluations and the learner's checkpoint stay in the run folder.
+"""
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from wm_nodes.apps.policy_run import READY_S, Stages, add_judge_options, console, open_run_dir
+from wm_nodes.apps.rescore import chosen_judge, recorded_bags, rescore_run, retrain_run
+from wm_nodes.apps.video_results import Finished, conclude
+from wm_nodes.config.load import ConfigError, judge_or_embedded, load_config, parse_override
+from wm_nodes.config.schema import AGENT, RunConfig
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
+from wm_nodes.judge.backends.factory import check_clips, check_judge
+from wm_nodes.launching import arguments as launch_arguments
+from wm_nodes.launching.domain_lock import DomainInUseError
+from wm_nodes.launching.graph import GraphError
+from wm_nodes.launching.graph_client import GoalFailed, GraphClient, PeerLost
+from wm_nodes.launching.readiness import NotReadyError
+from wm_nodes.launching.runner import NodeDiedError, Runner
+from wm_nodes.reports import ClipSummary
+from wm_nodes.video_model.clips import load_clips
+from wm_nodes.video_rl.pretraining import make_video_model, shipped_video_model
+from wm_nodes.video_rl.reference_reward import load_probe
+from wm_nodes.video_rl.settings import REWARDS, VideoRlConfig, dump_video_config, load_video_config, video_preset_names
+from wm_nodes.video_rl.training_run import progress
+
+EXPECTED = (
+    ConfigError, DomainInUseError, GraphError, NodeDiedError, NotReadyError, GoalFailed, PeerLost, ValueError, OSError,
+)
+HELDOUT_EPISODES = 100
+
+
+def main(argv: Sequence[str]) -> int:
+    """Return the exit code: 0 done, 1 recorded scores differ, 2 a clear error, 130 interrupted (start again with
+    --run-dir to go on)."""
+    arguments = _parser().parse_args(argv)
+    keep_freed_memory()
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+    try:
+        if arguments.action == "rescore":
+            return rescore_run(arguments)
+        if arguments.action == "retrain":
+            return retrain_run(arguments, _command())
+        run(arguments)
+    except KeyboardInterrupt:
+        console.print("interrupted; --run-dir goes on from here", highlight=False)
+        return 130
+    except EXPECTED as error:
+        console.print(f"[bold red]error:[/] {error}", highlight=False)
+        return 2
+    return 0
+
+
+def run(arguments: argparse.Namespace) -> ClipSummary:
+    """The whole job; see main."""
+    stage = Stages()
+    config, run_dir = _open_run(arguments)
+    stage(f"run folder {run_dir}")
+    scene = load_config("cpu", {"task": config.task, "seed": config.seed})
+    probe = load_probe(shipped_model(config.task))
+    shipped = None if arguments.from_scratch else shipped_video_model(config)
+    if arguments.bags:
+        stage(f"{len(arguments.bags)} + {len(arguments.heldout_bags)} held-out recordings")
+        bags = linked(arguments.bags, run_dir / "data" / "train")
+        heldout_bags = linked(arguments.heldout_bags, run_dir / "data" / "heldout")
+    else:
+        bags, heldout_bags = _data(scene, config.context_episodes if shipped else config.data_episodes, run_dir, stage)
+    heldout = load_clips(heldout_bags, config.model.stride)
+    stage("video model: " + ("the shipped one" if shipped else "flow matching"))
+    clips = load_clips(bags, config.model.stride)
+    if config.rewards.get(AGENT):
+        check_clips(config.judge, clips.frames.shape[1:])
+    make_video_model(config, clips, heldout, probe, run_dir, shipped=shipped, command=_command())
+    version, done = progress(run_dir)
+    if done < config.iterations:
+        _post_train(arguments, config, (bags, heldout_bags), run_dir, stage)
+        version, done = progress(run_dir)
+    return conclude(
+        Finished(
+            config, run_dir, run_dir / "video_model", done, version, heldout, probe, arguments.preset,
+            str(recorded_bags(run_dir)[-1]), _command(), stage.minutes,
+        )
+    )
+
+
+def linked(bags: Sequence[Path], folder: Path) -> list[Path]:
+    """Links to recordings of the simulator, named like the shards of episodes that a run collects itself.
+
+    Raises:
+        ValueError: a recording is missing, or the folder links to another one.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    links = [folder / f"shard_{index:08d}" for index in range(len(bags))]
+    for link, bag in zip(links, bags, strict=True):
+        if not bag.is_dir():
+            raise ValueError(f"{bag} is no recording; name bags of simulator episodes, e.g. RUN/data/train/shard_*")
+        if not link.is_symlink():
+            link.symlink_to(bag.resolve(), target_is_directory=True)
+        if link.resolve() != bag.resolve():
+            raise ValueError(f"{link} is of {link.resolve()}, not {bag}; use a new run folder")
+    return links
+
+
+def _data(scene: RunConfig, episodes: int, run_dir: Path, stage: Stages) -> tuple[list[Path], list[Path]]:
+    """Bags of contexts to train on, and of held-out ones."""
+    stage(f"{episodes} + {min(HELDOUT_EPISODES, episodes)} held-out simulator episodes")
+    train = scripted_plan(scene, episodes, TRAINING_SEEDS)
+    held = scripted_plan(scene, min(HELDOUT_EPISODES, episodes), HELDOUT_SEEDS)
+    bags = collect_plan(train, scene, run_dir / "data" / "train")
+    return bags, collect_plan(held, scene, run_dir / "data" / "heldout")
+
+
+def _post_train(
+    arguments: argparse.Namespace, config: VideoRlConfig, bags: tuple[list[Path], list[Path]], run_dir: Path,
+    stage: Stages,
+) -> None:
+    """GRPO over the graph, from the learner's checkpoint on. bags: of contexts, and of held-out ones."""
+    contexts, heldout = (",".join(map(str, some)) for some in bags)
+    graph, _ = launch_arguments.prepare("world_model_rl", {
+        "config_file": str(run_dir / "config.yaml"), "run_dir": str(run_dir),
+        "bag_uri": str(run_dir / "bags" / f"world_model_rl_{time.strftime('%Y%m%d_%H%M%S')}"),
+        "video_model_dir": str(run_dir / "video_model"), "context_bags": contexts, "heldout_bags": heldout,
+        "keep_buffers": str(arguments.keep_buffers), "tensorboard": "true" if arguments.tensorboard else "false",
+        "domain_id": arguments.domain_id,
+    })
+    stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
+    with Runner(graph, log_dir=run_dir / "logs", log=sys.stdout if arguments.verbose else None) as runner:
+        runner.wait_ready(READY_S)
+        os.environ.update(runner.environment)
+        with (
+            GraphClient(alive=runner.check) as operator,
+            tqdm(total=config.iterations, desc="GRPO", unit="buffer") as bar,
+        ):
+            _, done = progress(run_dir)
+            bar.update(done)
+
+            def show(feedback: Any) -> None:
+                bar.update(done + feedback.iteration - bar.n)
+                bar.set_postfix(reward=f"{feedback.reward_mean:.3f}", kl=f"{feedback.kl:.1e}")
+
+            operator.train_video(config.iterations - done, show)
+
+
+def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
+    if arguments.keep_buffers < 1:
+        raise ValueError(f"--keep-buffers must be at least 1, got {arguments.keep_buffers}")
+    if bool(arguments.bags) != bool(arguments.heldout_bags):
+        raise ValueError("--bags and --heldout-bags go together: what is trained on, and what is held out")
+    if twice := {bag.resolve() for bag in arguments.bags} & {bag.resolve() for bag in arguments.heldout_bags}:
+        raise ValueError(f"{min(twice)} cannot be trained on and held out; name other --heldout-bags")
+    overrides: dict[str, Any] = dict(parse_override(text) for text in arguments.set)
+    if arguments.seed is not None:
+        overrides["seed"] = arguments.seed
+    config = load_video_config(arguments.preset, {**overrides, **chosen_judge(arguments)})
+    if config.rewards.get(AGENT):
+        config = replace(config, judge=judge_or_embedded(config.judge))
+        check_judge(config.judge)
+    if config.grpo.kl.anchor == "lora_off":
+        raise ValueError(
+            "grpo.kl.anchor lora_off is for public models with a LoRA adapter, trained in Python (docs/dyndiff.md); "
+            "the graph's video model has none: take frozen"
+        )
+    run_dir = open_run_dir(
+        arguments.run_dir, "world_model_rl", dump_video_config(config),
+        begun_with=[
+            *(["--from-scratch"] if arguments.from_scratch else []),
+            *(f"--bags {bag.resolve()}" for bag in arguments.bags),
+            *(f"--heldout-bags {bag.resolve()}" for bag in arguments.heldout_bags),
+        ],
+    )
+    return config, run_dir
+
+
+def _command() -> str:
+    return "python3 launch_scripts/world_model_rl.py " + " ".join(sys.argv[1:])
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="world_model_rl.py",
+        description="Post-train a flow-matching video world model by DynDiff-GRPO, as a ROS 2 graph, and measure it on "
+        "held-out contexts before and after.",
+    )
+    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(video_preset_names())}, or a .yaml")
+    parser.add_argument("--seed", type=int, help="root seed of every random number; default: the preset's")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
+    parser.add_argument("--run-dir", type=Path, help="run folder; an existing one is resumed. Default: runs/<time>-...")
+    parser.add_argument(
+        "--from-scratch", action="store_true",
+        help="train a video model of your own even where one with these settings is shipped (half an hour on one core)",
+    )
+    parser.add_argument(
+        "--bags", type=Path, nargs="+", default=[], metavar="BAG",
+        help="recorded simulator episodes to train on and to draw contexts from in place of new ones, e.g. those of a "
+        "run of online_rl.py: RUN/bags/heldout/shard_*",
+    )
+    parser.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and those held out")
+    parser.add_argument(
+        "--keep-buffers", type=int, default=4, metavar="N",
+        help="rollout buffers kept on disk; as many as iterations if `retrain` shall be possible. Default: 4",
+    )
+    _add_judge(parser)
+    _add_tensorboard(parser)
+    parser.add_argument("--domain-id", default="", help="ROS domain 0 to 101; default: $ROS_DOMAIN_ID, else 0")
+    parser.add_argument("--verbose", action="store_true", help="show the nodes' logs (they are in <run>/logs anyway)")
+    actions = parser.add_subparsers(dest="action", title="on a finished run, without a graph")
+    again = actions.add_parser(
+        "rescore", help="score the recorded clips again and compare bit for bit; exit code 1 where they differ. With "
+        "--reward they may be scored by another reward than the recorded one"
+    )
+    again.add_argument("run", type=Path, help="run folder whose bags hold the clips")
+    again.add_argument("--json", type=Path, help="file for every score; default: <run>/rescored.json")
+    _add_judge(again)
+    again = actions.add_parser(
+        "retrain", help="train on the recorded clips and scores, without sampling: the same weights, file for file"
+    )
+    again.add_argument("run", type=Path, help="run folder with all of its rollout buffers (--keep-buffers)")
+    again.add_argument("--run-dir", type=Path, help="folder of the new run. Default: runs/<time>-...")
+    again.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE",
+        help="override one of the run's settings, e.g. rewards.scenery=-10 (the recorded scores are mixed anew)",
+    )
+    _add_tensorboard(again)
+    return parser
+
+
+def _add_judge(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--reward", choices=REWARDS,
+        help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording. Default: what "
+        "the preset or the run weighs",
+    )
+    add_judge_options(parser)
+
+
+def _add_tensorboard(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--tensorboard", action=argparse.BooleanOptionalAction, default=True, help="also write <run>/tensorboard"
+    )

@@ -1,0 +1,127 @@
+"""The end of a run of loop 2: held-out scores before and after, pictures, summary.json, report.html, the table."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from wm_nodes.apps.policy_run import console
+from wm_nodes.core.statistics import bootstrap_mean
+from wm_nodes.reports import (
+    ClipSummary,
+    Picture,
+    ScoreChange,
+    clip_panels,
+    curves,
+    film_strip,
+    machine_facts,
+    scores_table,
+    write_clip_report,
+    write_clip_summary,
+)
+from wm_nodes.reports.clip_report import TITLES
+from wm_nodes.training.metrics import FILE_NAME, read_metrics
+from wm_nodes.training.weights import load_weights
+from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.pretraining import BEFORE
+from wm_nodes.video_rl.reference_reward import more_is_better
+from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.settings import VideoRlConfig, dump_video_config
+from wm_nodes.video_rl.training_run import evaluated_uri
+from wm_nodes.video_rl.validation import SECTION, alarm_text, alarms_of, kept_scores
+from wm_nodes.world_model.position_probe import PositionProbe
+
+AFTER = Path("evaluations") / "after.json"
+STRIPS = 3
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A training that has come to its end. base: folder of the model it began with. iterations, version: as progress()
+    says.
+    """
+
+    config: VideoRlConfig
+    run_dir: Path
+    base: Path
+    iterations: int
+    version: int
+    heldout: Clips
+    probe: PositionProbe
+    preset: str
+    bag: str
+    command: str
+    minutes: float
+
+
+def conclude(run: Finished) -> ClipSummary:
+    """Measure, draw, write and print; what was measured on the same weights before is kept.
+
+    Raises:
+        OSError: the version's weights are gone.
+    """
+    config, run_dir = run.config, run.run_dir
+    base, trained = load_video_folder(run.base), load_video_folder(run.base)
+    uri = evaluated_uri(run.version, config)
+    if run.version:
+        load_weights(trained.network, (run_dir / uri).read_bytes())
+    before = kept_scores(run_dir / BEFORE, base, run.heldout, run.probe, config)
+    after = kept_scores(run_dir / AFTER, trained, run.heldout, run.probe, config)
+    watched = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []
+    summary = ClipSummary(
+        task=config.task, preset=run.preset, seed=config.seed, iterations=run.iterations, version=run.version,
+        weights="averaged" if config.grpo.ema_decay > 0 else "last", contexts=len(before["tracking"]),
+        scores={name: score_change(name, before[name], after[name], config.seed) for name in TITLES},
+        evaluations=len(watched),
+        hacked=[
+            {"step": line["step"], "reward_slope": alarms[0].proxy_slope,
+             "slopes": {alarm.metric: alarm.true_slope for alarm in alarms}, "text": alarm_text(alarms)}
+            for line in watched if (alarms := alarms_of(line))
+        ],
+        bag=run.bag, minutes=run.minutes, command=run.command, machine=machine_facts(), date=time.strftime("%Y-%m-%d"),
+    )
+    path = write_clip_summary(run_dir, summary)
+    strips = _strips(run, [ClipGenerator(folder, run.heldout, config) for folder in (base, trained)])
+    drawn = curves(
+        run_dir / FILE_NAME, run_dir / "pictures" / "curves.png", clip_panels(config.grpo.updates_per_buffer),
+        step="buffers trained on",
+    )
+    if drawn is not None:
+        strips.append(Picture("Training", "By buffer; held-out scores are of the weights that are evaluated.", drawn))
+    report = write_clip_report(run_dir, summary, strips, config_text=dump_video_config(config))
+    console.print(scores_table(summary))
+    for alarm in summary.hacked:
+        console.print(f"[bold yellow]reward hacking[/] after {alarm['step']} buffers: {alarm['text']}", highlight=False)
+    console.print(f"report   {report}\nsummary  {path}\nbag      {run.bag}", highlight=False)
+    return summary
+
+
+def score_change(name: str, before: Sequence[float], after: Sequence[float], seed: int) -> ScoreChange:
+    """Compare a score on the same contexts; better and worse as more_is_better() says."""
+    difference, low, high = bootstrap_mean(np.subtract(after, before), seed=seed)
+    _, worst, best = bootstrap_mean(more_is_better(name, after) - more_is_better(name, before), seed=seed)
+    verdict = "better" if worst > 0 else "worse" if best < 0 else ""
+    return ScoreChange(float(np.mean(before)), float(np.mean(after)), difference, low, high, verdict)
+
+
+def _strips(run: Finished, generators: Sequence[ClipGenerator]) -> list[Picture]:
+    """The recording, the base model and the trained model from the same first frames and noise."""
+    some = run.heldout.select(torch.arange(min(STRIPS, len(run.heldout))))
+    made = [generator.evaluate(some, run.config.evaluation.num_steps) for generator in generators]
+    rows = dict(zip(("recorded", "before", "after"), [some.frames, *made], strict=True))
+    pictures = []
+    for index, instruction in enumerate(some.instructions):
+        path = run.run_dir / "pictures" / f"film_strip_{index}.png"
+        film_strip({label: np.ascontiguousarray(frames[index].numpy()) for label, frames in rows.items()}, path)
+        pictures.append(
+            Picture(
+                f"Held-out context {index + 1}",
+                f"“{instruction}”. The recording, then what the model makes of its first frame and actions, before and "
+                "after, from the same noise.", path,
+            )
+        )
+    return pictures

@@ -1,0 +1,1 @@
+"""Shared vocabulary and small tools that import nothing of ours but config."""

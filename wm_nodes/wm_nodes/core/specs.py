@@ -1,0 +1,126 @@
+"""The specification of an environment: what fixes shapes, units and order on the wire and in a bag."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from wm_nodes.config.schema import SimulationConfig
+
+SOURCE_IMAGINED, SOURCE_SIMULATOR, SOURCE_REAL, SOURCE_REPLAY = 0, 1, 2, 3
+SOURCE_NAMES = ("imagined", "simulator", "real", "replay")
+
+GROUND_TRUTH_NAMES = (
+    "cube_x", "cube_y", "cube_z", "cube_yaw", "tool_x", "tool_y", "tool_z", "goal_x", "goal_y",
+    "cube_start_x", "cube_start_y",
+)
+"""Simulator truth of the table-top scenes, in this order. Positions in m, yaw in rad, world frame."""
+
+POLICY_FIELDS = (
+    "height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale", "state_names",
+    "state_units", "control_period_s",
+)
+"""What a policy depends on."""
+
+
+@dataclass(frozen=True)
+class EnvironmentSpec:
+    """See msgs_schema/msg/EnvSpec.msg, field by field. Sizes in px, control_period_s in s."""
+
+    env_id: str
+    task: str
+    instruction: str
+    source: int
+    num_envs: int
+    height: int
+    width: int
+    cameras: tuple[str, ...]
+    action_names: tuple[str, ...]
+    action_units: tuple[str, ...]
+    action_scale: tuple[float, ...]
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    ground_truth_names: tuple[str, ...]
+    control_period_s: float
+    max_episode_steps: int
+    state_low: tuple[float, ...] = ()
+    state_high: tuple[float, ...] = ()
+    """Box that actions cannot leave, state units; empty: no box."""
+    world_model_sha256: str = ""
+    channels: int = 3
+    encoding: str = "rgb8"
+
+    @property
+    def action_dim(self) -> int:
+        return len(self.action_names)
+
+    @property
+    def state_dim(self) -> int:
+        return len(self.state_names)
+
+    @property
+    def ground_truth_dim(self) -> int:
+        return len(self.ground_truth_names)
+
+    @cached_property
+    def spec_hash(self) -> str:
+        """sha256 over every field: two sides with equal hashes agree on shapes, units and order."""
+        return _hash(asdict(self))
+
+    def policy_hash(self) -> str:
+        """sha256 over what a policy depends on; equal for an imagined and a simulated environment of one scene."""
+        fields = asdict(self)
+        return _hash({k: fields[k] for k in POLICY_FIELDS})
+
+
+def as_sent(value: float) -> float:
+    """The shortest decimal that names the same float32: what a number is after a trip through a message or a bag."""
+    return float(str(np.float32(value)))
+
+
+def differences(
+    found: EnvironmentSpec, expected: EnvironmentSpec, names: Sequence[str] = POLICY_FIELDS
+) -> list[tuple[str, Any, Any]]:
+    """Return (field, found, expected) for the named fields that disagree, as values that were sent."""
+    pairs = [(name, _sent(getattr(found, name)), _sent(getattr(expected, name))) for name in names]
+    return [(name, is_, should) for name, is_, should in pairs if is_ != should]
+
+
+def _sent(value: Any) -> Any:
+    if isinstance(value, float):
+        return as_sent(value)
+    return tuple(_sent(item) for item in value) if isinstance(value, (tuple, list)) else value
+
+
+def _hash(fields: dict[str, Any]) -> str:
+    text = json.dumps({name: _sent(value) for name, value in fields.items()}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def simulation_spec(task: str, instruction: str, config: SimulationConfig, num_envs: int) -> EnvironmentSpec:
+    """The spec of `task` in ManiSkill; the imagined environment shares all but env_id, source and ground truth."""
+    axes = ("x", "y", "z")
+    return EnvironmentSpec(
+        env_id=f"maniskill/{task}",
+        task=task,
+        instruction=instruction,
+        source=SOURCE_SIMULATOR,
+        num_envs=num_envs,
+        height=config.image_size,
+        width=config.image_size * len(config.cameras),
+        cameras=tuple(config.cameras),
+        action_names=tuple(f"tool_d{axis}" for axis in axes),
+        action_units=("m",) * 3,
+        action_scale=(config.max_action_m,) * 3,
+        state_names=tuple(f"tool_target_{axis}" for axis in axes),
+        state_units=("m",) * 3,
+        ground_truth_names=GROUND_TRUTH_NAMES,
+        control_period_s=1.0 / config.control_hz,
+        max_episode_steps=config.max_episode_steps,
+        state_low=config.workspace_low_m,
+        state_high=config.workspace_high_m,
+    )

@@ -1,0 +1,1 @@
+"""Environments behind one interface: ManiSkill, and recording of episodes in any of them."""

@@ -1,0 +1,131 @@
+"""ManiSkill behind the Environment interface: N scenes stepped in turn in one process, images from two cameras.
+
+Shapes: N environments, A = 3 action, S = 3 state, P ground truth.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from transforms3d.euler import euler2quat, quat2euler
+
+from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.core.seeding import stream_seed
+from wm_nodes.core.specs import GROUND_TRUTH_NAMES, simulation_spec
+from wm_nodes.core.tool_control import check_actions, next_state
+from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.environments.maniskill.scenes import make_scene, render
+from wm_nodes.environments.maniskill.tasks import get_task
+
+CONTROLLER_RANGE_M = 0.1
+"""A full-scale action of ManiSkill's stock Panda controller."""
+GRIPPER_CLOSED = -1.0
+
+
+class ManiSkillEnvironment:
+    """The simulator. A state is the commanded tool position in the robot base frame, m.
+
+    end_on_success=False lets an episode go on to the step limit: a done head needs frames after success.
+    """
+
+    def __init__(
+        self, task: str, config: SimulationConfig, num_envs: int = 1, seed: int = 0, *, end_on_success: bool = True
+    ) -> None:
+        self.spec = simulation_spec(task, get_task(task).instruction, config, num_envs)
+        self._task = get_task(task)
+        self._config = config
+        self._seed = seed
+        self._end_on_success = end_on_success
+        self._scenes = [make_scene(self._task.scene, config) for _ in range(num_envs)]
+        self._num_resets = 0
+        self._images = np.zeros((num_envs, self.spec.height, self.spec.width, 3), np.uint8)
+        self._states = np.zeros((num_envs, 3), np.float32)
+        self._truth = np.full((num_envs, len(GROUND_TRUTH_NAMES)), np.nan, np.float32)
+        self._cube_start = np.zeros((num_envs, 2), np.float32)
+        self._steps = np.zeros(num_envs, np.uint32)
+        self._episode_ids = np.zeros(num_envs, np.uint64)
+        self._ended = np.ones(num_envs, bool)
+
+    @property
+    def ground_truth(self) -> FloatArray:
+        """(N, P) simulator truth of the current observation."""
+        return self._truth.copy()
+
+    @property
+    def scene(self) -> BaseEnv:
+        """The ManiSkill environment of slot 0, for the planner."""
+        return self._scenes[0]
+
+    def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
+        mask = np.ones(self.spec.num_envs, bool) if mask is None else mask
+        for i in np.flatnonzero(mask):
+            self._num_resets += 1
+            seed = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else int(seeds[i])
+            self._scenes[i].reset(seed=seed % 2**32)
+            self._cube_start[i] = self._scenes[i].obj.pose.p[0, :2].numpy()
+            self._steps[i] = 0
+            self._episode_ids[i] = self._num_resets
+            self._ended[i] = False
+            self._observe(i)
+        return self.current()
+
+    def lay_out(self, cube_m: Sequence[float], heading_rad: float) -> None:
+        """After a reset, put the cube of slot 0 at x y, and the goal as far from it as it was, `heading_rad` from +x
+        to +y; the cube faces that way.
+        """
+        scene = self._scenes[0]
+        cube, goal = (actor.pose.raw_pose[0].numpy() for actor in (scene.obj, scene.goal_region))
+        away = float(np.linalg.norm(goal[:2] - cube[:2]))
+        ahead = np.array([np.cos(heading_rad), np.sin(heading_rad)])
+        scene.obj.set_pose(sapien.Pose([*cube_m, cube[2]], euler2quat(0, 0, heading_rad)))
+        scene.goal_region.set_pose(sapien.Pose([*(np.array(cube_m) + away * ahead), goal[2]], goal[3:]))
+        self._cube_start[0] = cube_m
+        self._observe(0)
+
+    def step(self, actions: FloatArray) -> StepResult:
+        check_actions(actions, self.spec)
+        num_envs = self.spec.num_envs
+        valid = ~self._ended
+        terminated, truncated = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
+        for i in np.flatnonzero(valid):
+            target = next_state(self._states[i], actions[i], self.spec)
+            command = np.append((target - self._states[i]) / CONTROLLER_RANGE_M, GRIPPER_CLOSED).astype(np.float32)
+            self._scenes[i]._step_action(torch.from_numpy(command)[None])
+            self._steps[i] += 1
+            self._observe(i)
+            terminated[i] = self._end_on_success and bool(self._task.success(self._truth[i]))
+            truncated[i] = not terminated[i] and self._steps[i] >= self.spec.max_episode_steps
+            self._ended[i] = terminated[i] or truncated[i]
+        return StepResult(
+            observation=self.current(),
+            terminated=terminated,
+            truncated=truncated,
+            success_probability=self._task.success(self._truth).astype(np.float32),
+            uncertainty=np.zeros(num_envs, np.float32),
+            ground_truth=self._truth.copy(),
+            valid=valid,
+        )
+
+    def goals(self) -> tuple[UInt8Array, BoolArray] | None:
+        return None
+
+    def close(self) -> None:
+        for scene in self._scenes:
+            scene.close()
+
+    def _observe(self, i: int) -> None:
+        scene = self._scenes[i]
+        self._images[i] = render(scene, self._config.cameras)
+        cube = scene.obj.pose.raw_pose[0].numpy()
+        tool = scene.agent.tcp.pose.p[0].numpy()
+        goal = scene.goal_region.pose.p[0, :2].numpy()
+        yaw = quat2euler(cube[3:])[2]
+        self._truth[i] = np.concatenate([cube[:3], [yaw], tool, goal, self._cube_start[i]])
+        arm = scene.agent.controller.controllers["arm"]
+        self._states[i] = arm._target_pose.p[0].numpy()
+
+    def current(self) -> Observation:
+        """The observation as of the last reset or step."""
+        return Observation(self._images.copy(), self._states.copy(), self._episode_ids.copy(), self._steps.copy())

@@ -1,0 +1,120 @@
+"""ManiSkill's PushCube-v1 and PullCube-v1 with our two cameras and a plain table top; physics unchanged.
+
+What differs from the stock picture: two near cameras (the stock one shows the cube 2 px wide), a thin plain sheet in
+place of the wooden table and the ground (visual only), arm links 0 to 6 not drawn (they are outside or at the edge of
+both views and cost two thirds of the rendering), and fingers closed from the start.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.tasks.tabletop.pull_cube import PullCubeEnv
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.registration import register_env
+
+from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.environments.maniskill.backend import render_backend
+
+ROBOT_BASE_X_M = -0.615
+"""World x of the Panda's base; y and z are 0."""
+SIMULATION_HZ = 100
+TABLE_COLOUR = (0.78, 0.74, 0.66, 1.0)
+LINKS_NOT_DRAWN = tuple(f"panda_link{i}" for i in range(7))
+
+
+class TableTopScene(BaseEnv):  # type: ignore[misc]
+    """Mixin before a ManiSkill table-top task."""
+
+    image_size = 64
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        common = {"width": self.image_size, "height": self.image_size, "near": 0.01, "far": 10.0}
+        side = sapien_utils.look_at(eye=[0.09, 0.5, 0.45], target=[0.09, -0.01, 0.02])
+        wrist = sapien_utils.look_at(eye=[0.06, 0.0, 0.0], target=[0.03, 0.0, 0.12])
+        hand = self.agent.robot.links_map["panda_hand"]
+        return [
+            CameraConfig("side", pose=side, fov=0.8, **common),
+            CameraConfig("wrist", pose=wrist, fov=1.4, mount=hand, **common),
+        ]
+
+    def _load_scene(self, options: dict[str, Any]) -> None:
+        super()._load_scene(options)
+        sheet = self.scene.create_actor_builder()
+        material = sapien.render.RenderMaterial(base_color=list(TABLE_COLOUR))
+        sheet.add_box_visual(half_size=[0.6, 0.8, 0.0003], material=material)
+        sheet.initial_pose = sapien.Pose(p=[0.1, 0.0, 0.0003])
+        sheet.build_kinematic(name="plain_table_top")
+        for actor in (self.table_scene.table, self.table_scene.ground):
+            _do_not_draw(actor._objs)
+        for link in self.agent.robot.links:
+            if link.name in LINKS_NOT_DRAWN:
+                _do_not_draw([obj.entity for obj in link._objs])
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
+        super()._initialize_episode(env_idx, options)
+        joint_positions = self.agent.robot.get_qpos()
+        joint_positions[:, -2:] = 0.0
+        self.agent.reset(joint_positions)
+
+
+class WmPushCube(TableTopScene, PushCubeEnv):  # type: ignore[misc]
+    pass
+
+
+class WmPullCube(TableTopScene, PullCubeEnv):  # type: ignore[misc]
+    pass
+
+
+register_env("WmPushCube-v1", max_episode_steps=10_000)(WmPushCube)
+register_env("WmPullCube-v1", max_episode_steps=10_000)(WmPullCube)
+
+
+def make_scene(scene: str, config: SimulationConfig) -> BaseEnv:
+    """Build one of our scenes on the CPU physics, rendered by config.render_device."""
+    TableTopScene.image_size = config.image_size
+    return make(scene, config).unwrapped
+
+
+def make(scene: str, config: SimulationConfig, **options: Any) -> gym.Env[Any, Any]:
+    """Build a scene of ours or of ManiSkill; options are ManiSkill's."""
+    return gym.make(
+        scene,
+        obs_mode="rgb",
+        control_mode="pd_ee_target_delta_pos",
+        sim_backend="physx_cpu",
+        render_backend=render_backend(config.render_device),
+        sim_config={"sim_freq": SIMULATION_HZ, "control_freq": _control_frequency(config.control_hz)},
+        **options,
+    )
+
+
+def render(scene: BaseEnv, cameras: Sequence[str]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """Return uint8 (H, len(cameras) * W, 3), cameras side by side."""
+    scene.scene.update_render()
+    views = []
+    for name in cameras:
+        camera = scene._sensors[name]
+        camera.capture()
+        views.append(camera.get_obs(rgb=True, depth=False, position=False, segmentation=False)["rgb"][0].numpy())
+    return np.concatenate(views, axis=1)
+
+
+def _control_frequency(control_hz: float) -> int:
+    if SIMULATION_HZ % control_hz:
+        raise ValueError(f"simulation.control_hz must divide {SIMULATION_HZ}, got {control_hz}")
+    return int(control_hz)
+
+
+def _do_not_draw(entities: list[sapien.Entity]) -> None:
+    for entity in entities:
+        body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        if body is not None:
+            body.disable()

@@ -1,0 +1,72 @@
+"""Simulator episodes into bags: joins the simulation's collector with the recording's writer."""
+
+from pathlib import Path
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.specs import simulation_spec
+from wm_nodes.core.types import Episode
+from wm_nodes.environments.maniskill.collection import CollectionPlan, collect
+from wm_nodes.environments.maniskill.tasks import instruction
+from wm_nodes.recording import EpisodeBagWriter
+
+TRAINING_SEEDS, HELDOUT_SEEDS = 0, 500_000
+"""First reset seeds of the training and the held-out episodes; evaluation seeds start at evaluation.first_seed."""
+
+
+def collect_training_data(config: RunConfig, folder: Path, *, progress: bool = True) -> list[Path]:
+    """Scripted and planned episodes for the world model: `folder`/train bags."""
+    return collect_plan(scripted_plan(config, config.data.num_episodes, TRAINING_SEEDS), config, folder, progress)
+
+
+def collect_heldout_data(config: RunConfig, folder: Path, *, progress: bool = True) -> list[Path]:
+    """The same behaviours on seeds that are never trained on, for the gate."""
+    return collect_plan(scripted_plan(config, config.data.num_heldout, HELDOUT_SEEDS), config, folder, progress)
+
+
+def gate_plan(config: RunConfig) -> CollectionPlan:
+    """The held-out episodes that the gate judges a model on."""
+    return scripted_plan(config, min(config.gate.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
+
+
+def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
+    scene_task = "push_cube" if config.task == "reach" else config.task  # one scene, one data set, two tasks
+    return CollectionPlan(
+        task=scene_task,
+        simulation=config.simulation,
+        num_episodes=num_episodes,
+        first_seed=first_seed,
+        behaviours=config.data.behaviours,
+    )
+
+
+def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
+    """MPLib demonstrations of the configured task, for SFT."""
+    return CollectionPlan(
+        task=config.task,
+        simulation=config.simulation,
+        num_episodes=num_episodes,
+        first_seed=first_seed,
+        behaviours={"expert": 1.0},
+        end_on_success=True,
+    )
+
+
+def first_frames_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
+    """Episodes of one step: first frames to imagine from."""
+    one_step = config.simulation.model_copy(update={"max_episode_steps": 1})
+    return CollectionPlan(config.task, one_step, num_episodes, first_seed, behaviours={"random": 1.0})
+
+
+def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path, progress: bool = True) -> list[Path]:
+    return collect(folder, plan, write_shard, num_workers=config.data.num_workers, progress=progress)
+
+
+def write_shard(path: Path, plan: CollectionPlan, episodes: list[Episode]) -> None:
+    """Write one shard's episodes into a bag that is renamed to `path` when complete."""
+    spec = simulation_spec(plan.task, instruction(plan.task), plan.simulation, 1)
+    custom = {"wm.seeds": f"{episodes[0].seed}..{episodes[-1].seed}"}
+    with EpisodeBagWriter(
+        path, spec, run_id=path.parent.name, custom=custom, start_ns=1, discard_partial=True
+    ) as writer:
+        for episode in episodes:
+            writer.write(episode)

@@ -1,0 +1,343 @@
+"""The state machine over a judge. Specification: section 2.2.
+
+PRECHECK -> PLAN -> VQ -> IF -> TC -> PC -> REFLECT -> HACK -> AGGREGATE. In reward mode a failed gate ends the reading;
+in benchmark mode every component is read. A second look that opens a closed gate goes on with the stages behind it,
+once. Whatever the judge does, the result is a Verdict: a judge that fails or cannot say leaves reward NaN.
+"""
+
+import asyncio
+import hashlib
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.judge.agent import levels, reflection, scoring
+from wm_nodes.judge.agent.precheck import precheck
+from wm_nodes.judge.agent.profiles import DENSE_MAX, cited_media, profile_media
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import (
+    GATED,
+    NUM_PLAN_LEVELS,
+    PLANNING,
+    Change,
+    ClipRef,
+    Component,
+    ComponentScore,
+    Cost,
+    Evidence,
+    HackFlag,
+    Judge,
+    JudgeError,
+    MediaItem,
+    PlanResult,
+    Profile,
+    Provenance,
+    Read,
+    ReadRequest,
+    Reflection,
+    Stage,
+    StageScore,
+    Status,
+    TaskSpec,
+    Verdict,
+    Vote,
+    content_hash,
+)
+
+Mode = Literal["reward", "benchmark"]
+CallPlan = Literal["pack", "fanout", "auto"]
+
+
+class RewardAgent:
+    """Judges clips one by one; calls of different clips may run at the same time."""
+
+    def __init__(
+        self,
+        judge: Judge,
+        rubric: Rubric,
+        *,
+        mode: Mode = "reward",
+        seed: int = 0,
+        max_reads: int = 60,
+        budget_s: float = 300.0,
+        call_plan: CallPlan = "auto",
+    ) -> None:
+        """Join a judge and a rubric.
+
+        Args:
+            seed: of option orders and random audits; equal seeds and answers give equal verdicts.
+            max_reads: per clip, all reads counted; votes and second looks are given up before it is exceeded.
+            budget_s: per clip, wall clock; a clip that takes longer is an ERROR.
+
+        Raises:
+            ValueError: the judge lacks a component or takes one image only, or max_reads does not cover one read of
+                everything.
+        """
+        self.judge, self.rubric, self.mode, self.seed, self.call_plan = judge, rubric, mode, seed, call_plan
+        self.max_reads, self.budget_s = max_reads, budget_s
+        patterns = rubric.hack.patterns if rubric.hack.enabled else ()
+        needed = {PLANNING, *rubric.component_names, *patterns}
+        can = judge.capabilities.components
+        if can is not None and needed - can:
+            raise ValueError(f"judge {judge.capabilities.judge_id} does not read {', '.join(sorted(needed - can))}")
+        if judge.capabilities.max_frames < 2:
+            raise ValueError(f"a judge must see 2 frames or more, it takes {judge.capabilities.max_frames}")
+        smallest = 1 + len(rubric.component_names) + 2 * len(patterns)
+        if max_reads < smallest:
+            raise ValueError(f"max_reads must be >= {smallest}, one read of everything, got {max_reads}")
+        if not budget_s > 0:
+            raise ValueError(f"budget_s must be > 0, got {budget_s}")
+
+    async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
+        """Judge one clip. evidence: endogenous signals by name; they cause votes and second looks, nothing else."""
+        started, clock = time.time(), time.monotonic()
+        run = _Run(self, clip, task, evidence or {})
+        try:
+            async with asyncio.timeout(self.budget_s):
+                status, value, reason = await run.judged()
+        except _Stop as stop:
+            status, value, reason = stop.status, math.nan, str(stop)
+        except TimeoutError:
+            status, value, reason = Status.ERROR, math.nan, f"no verdict within {self.budget_s:g} s"
+        able = self.judge.capabilities
+        verdict = Verdict(
+            clip_id=clip.clip_id,
+            status=status,
+            reward=value,
+            level=run.level,
+            stages=tuple(run.stages.values()),
+            plan=run.plan,
+            reflections=tuple(run.reflections),
+            hack_flags=tuple(run.flags),
+            cost=replace(run.cost, wall_s=time.monotonic() - clock),
+            provenance=Provenance(
+                able.judge_id, able.transport, able.model, able.server_version, self.rubric.version,
+                hashlib.sha256("".join(run.prompts).encode()).hexdigest(), clip.sha256, self.seed, started, time.time(),
+            ),
+            reason=reason,
+            num_reads=run.num_reads,
+        )
+        return replace(verdict, audit_id=content_hash(verdict))
+
+
+class _Stop(Exception):
+    """Nothing more is asked: the verdict has no number."""
+
+    def __init__(self, status: Status, reason: str) -> None:
+        super().__init__(reason)
+        self.status = status
+
+
+class _Run:
+    """One clip on its way through the states."""
+
+    def __init__(self, agent: RewardAgent, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> None:
+        self.agent, self.rubric, self.clip, self.task, self.evidence = agent, agent.rubric, clip, task, evidence
+        self.stages: dict[Stage, StageScore] = {stage: scoring.skipped(stage) for stage in GATED}
+        self.plan: PlanResult | None = None
+        self.level = -1
+        self.reflections: list[Reflection] = []
+        self.flags: list[HackFlag] = []
+        self.cost, self.num_reads, self.prompts = Cost(), 0, list[str]()
+        self._media: dict[Profile, tuple[MediaItem, ...]] = {}
+        self._audited = self._drawn("audit")
+
+    async def judged(self) -> tuple[Status, float, str]:
+        """Go through every state. Raises _Stop where the judge fails or, in reward mode, cannot say."""
+        found = precheck(self.clip, self.task)
+        if found.kind == "malformed":
+            return Status.ERROR, math.nan, found.reason
+        if found.kind == "no video":
+            self.level = 0
+            return Status.OK, 0.0, found.reason
+        self.plan = plan = await self._planned()
+        self.level = plan.level
+        await self._read_stages(plan)
+        if self.rubric.reflection.enabled:
+            await self._reflect(plan)
+            await self._read_stages(plan)
+        if self.rubric.hack.enabled and all(stage.status is not Status.SKIPPED for stage in self._ordered()):
+            await self._read_patterns()
+            confirmed = [flag.pattern for flag in self.flags if flag.confirmed]
+            self.stages = {s.stage: s for s in scoring.capped(self._ordered(), confirmed, self.rubric)}
+        silent = [c.reason for s in self._ordered() for c in s.components if c.status is Status.ABSTAIN]
+        if silent:
+            return Status.ABSTAIN, math.nan, "; ".join(silent)
+        return Status.OK, scoring.reward(plan.weights, self._ordered(), self.rubric), ""
+
+    async def _planned(self) -> PlanResult:
+        (read,) = await self._ask(Stage.PLAN, (PLANNING,), levels.first_vote(self.agent.seed), Profile.S)
+        status, reason = levels.state_of(read, self.rubric.voting.min_label_mass, NUM_PLAN_LEVELS)
+        if status is not Status.OK:
+            raise _Stop(status, reason)
+        return scoring.plan_result(read, self.rubric)
+
+    async def _read_stages(self, plan: PlanResult) -> None:
+        """Read the stages not read yet, up to the first closed gate in reward mode."""
+        for stage in GATED:
+            if self.stages[stage].status is Status.SKIPPED:
+                self.stages[stage] = score = await self._read_stage(stage, plan)
+                reasons = [part.reason for part in score.components if part.status is score.status]
+                if score.status is Status.ERROR or (score.status is Status.ABSTAIN and self.agent.mode == "reward"):
+                    raise _Stop(score.status, "; ".join(reasons))
+            if self.agent.mode == "reward" and scoring.gate(self.stages[stage], self.rubric) == 0:
+                return
+
+    async def _read_stage(self, stage: Stage, plan: PlanResult) -> StageScore:
+        described, min_label_mass = self.rubric.stages[stage], self.rubric.voting.min_label_mass
+        focus = [name for name in plan.focus if name in described.components]
+        names = tuple(dict.fromkeys([*focus, *described.components]))
+        first = await self._ask(stage, names, levels.first_vote(self.agent.seed), described.profile)
+        reads = {read.component: [read] for read in first}
+        voted = self._voted_on(reads, plan)
+        scores: dict[Component, ComponentScore] = {}
+        for name in names:
+            score = self._tally(reads[name]) if name in voted else self._look(reads[name][0])
+            if score is not None:
+                scores[name] = score
+        while unclear := [name for name in names if name not in scores]:
+            granted = tuple(unclear[: self._spare(stage)])
+            for name in unclear[len(granted) :]:
+                scores[name] = levels.settled(reads[name], min_label_mass)
+            if granted:
+                vote = levels.next_vote(len(reads[granted[0]]), self.agent.seed)
+                for read in await self._ask(stage, granted, vote, described.profile):
+                    reads[read.component].append(read)
+            for name in granted:
+                if (score := self._tally(reads[name])) is not None:
+                    scores[name] = score
+        return scoring.stage_score(stage, [scores[name] for name in described.components], self.rubric)
+
+    def _voted_on(self, reads: Mapping[Component, list[Read]], plan: PlanResult) -> set[Component]:
+        """Activation: the unclear ones and those against evidence; all at a middling planning level or for audit."""
+        rules = self.rubric.voting
+        if self._audited or plan.level in rules.levels:
+            return set(reads)
+        suspected = {self.rubric.evidence[name].component for name in self._conflicting()}
+        looks = {name: self._look(first) for name, (first,) in reads.items()}
+        return {name for name, look in looks.items() if look.margin < rules.clear_margin or name in suspected}
+
+    def _tally(self, reads: Sequence[Read]) -> ComponentScore | None:
+        rules = self.rubric.voting
+        return levels.tally(reads, k=rules.k, k_max=rules.k_max, min_label_mass=rules.min_label_mass)
+
+    def _look(self, read: Read) -> ComponentScore:
+        """The score of a single read, or why it has none."""
+        return levels.settled([read], self.rubric.voting.min_label_mass)
+
+    async def _reflect(self, plan: PlanResult) -> None:
+        stages = self._ordered()
+        found = reflection.triggers(plan, stages, self.rubric, self.evidence, drawn=self._drawn("reflect"))
+        names = reflection.suspects(found, stages, self.rubric.reflection.max_changes)
+        last_read = [stage.stage for stage in stages if stage.status is not Status.SKIPPED][-1]
+        if not found or 2 * len(names) > self._spare(last_read) or not names:
+            return
+        before = {score.component: score for stage in stages for score in stage.components}
+        vote = levels.first_vote(self.agent.seed)
+        second = await self._ask(Stage.REFLECT, names, vote, Profile.D, prior=tuple(before.values()))
+        changes = [change for read in second if (change := await self._changed(before[read.component], read))]
+        self.reflections.append(Reflection(tuple(trigger.reason for trigger in found), tuple(changes)))
+
+    async def _changed(self, before: ComponentScore, second: Read) -> Change | None:
+        """Check one proposal with a fresh label read on the frames it cites, and take it over if that agrees."""
+        look = self._look(second)
+        if look.status is Status.ERROR:
+            raise _Stop(Status.ERROR, look.reason)
+        if look.status is not Status.OK or not reflection.proposes(before, second, len(self.clip.frames)):
+            return None
+        stage, media = self.rubric.stage_of(before.component), cited_media(second.frames_cited, self.clip)
+        vote = levels.next_vote(len(before.votes), self.agent.seed)
+        (fresh,) = await self._ask(stage, (before.component,), vote, Profile.D, media=media)
+        checked = self._look(fresh)
+        if checked.status is Status.ERROR:
+            raise _Stop(Status.ERROR, checked.reason)
+        accepted = checked.status is Status.OK and reflection.agreed(before, second, fresh)
+        after = levels.score([second, fresh], "reflection") if accepted else look
+        if accepted:
+            taken = replace(after, votes=(*before.votes, second, fresh))
+            scores = [taken if c.component == before.component else c for c in self.stages[stage].components]
+            self.stages[stage] = scoring.stage_score(stage, scores, self.rubric)
+        reason = second.reason or second.evidence_text
+        return Change(before.component, before.s, after.s, reason, second.frames_cited, accepted)
+
+    async def _read_patterns(self) -> None:
+        """Read every hacking pattern once, and those that seem present again."""
+        rules, names = self.rubric.hack, tuple(self.rubric.hack.patterns)
+        if not names:
+            return
+        first = await self._ask(Stage.HACK, names, levels.first_vote(self.agent.seed), Profile.D)
+        present = {read.component: self._p_present(read) for read in first}
+        seen = tuple(name for name in names if present[name] >= rules.confirm)
+        vote = levels.next_vote(1, self.agent.seed)
+        again = await self._ask(Stage.HACK, seen, vote, Profile.D) if seen else []
+        confirmed = {read.component for read in again if self._p_present(read) >= rules.confirm}
+        texts = {read.component: read.evidence_text for read in first}
+        self.flags = [HackFlag(name, present[name], name in confirmed, texts[name]) for name in names]
+
+    def _p_present(self, read: Read) -> float:
+        """Probability of a pattern; NaN, which confirms nothing, where the judge cannot say."""
+        look = self._look(read)
+        if look.status is Status.ERROR:
+            raise _Stop(Status.ERROR, look.reason)
+        return look.p_fail
+
+    async def _ask(
+        self,
+        stage: Stage,
+        names: tuple[Component, ...],
+        vote: Vote,
+        profile: Profile,
+        *,
+        media: tuple[MediaItem, ...] | None = None,
+        prior: Sequence[ComponentScore] = (),
+    ) -> list[Read]:
+        """One question to the judge, answered in the order of `names`. Raises _Stop(ERROR) where it is not."""
+        images = self._media_of(profile) if media is None else media
+        plan = self.agent.call_plan
+        request = ReadRequest(self.clip, self.task, stage, names, profile, (vote,), images, plan, prior)
+        self.num_reads += len(names)
+        try:
+            reads = await self.agent.judge.read(request)
+        except JudgeError as error:
+            self.cost += error.cost
+            raise _Stop(Status.ERROR, f"{stage}: {error}") from error
+        except Exception as error:  # a judge is somebody else's code: whatever it raises, this clip has no number
+            raise _Stop(Status.ERROR, f"{stage}: judge raised {type(error).__name__}: {error}") from error
+        self.cost = sum((read.cost for read in reads), self.cost)
+        self.prompts += [read.prompt_sha for read in reads]
+        answered = {read.component: read for read in reads if read.vote == vote}
+        if len(reads) != len(names) or set(answered) != set(names):
+            got = ", ".join(f"{read.component}/{read.vote.index}" for read in reads)
+            asked = ", ".join(f"{name}/{vote.index}" for name in names)
+            raise _Stop(Status.ERROR, f"{stage}: asked for {asked}, the judge answered {got or 'nothing'}")
+        return [answered[name] for name in names]
+
+    def _media_of(self, profile: Profile) -> tuple[MediaItem, ...]:
+        if profile not in self._media:
+            most = self.agent.judge.capabilities.max_frames
+            media = profile_media(self.clip, self.task, profile, max_frames=min(DENSE_MAX, most))
+            if len(media) > most:
+                raise _Stop(Status.ERROR, f"profile {profile}: {len(media)} images, the judge takes {most} in a call")
+            self._media[profile] = media
+        return self._media[profile]
+
+    def _spare(self, stage: Stage) -> int:
+        """Reads that may be spent on votes now: what is left after one read of everything behind `stage`."""
+        behind = GATED[GATED.index(stage) + 1 :]
+        reserved = sum(len(self.rubric.stages[later].components) for later in behind)
+        reserved += 2 * len(self.rubric.hack.patterns) if self.rubric.hack.enabled else 0
+        return max(0, self.agent.max_reads - self.num_reads - reserved)
+
+    def _ordered(self) -> tuple[StageScore, ...]:
+        return tuple(self.stages[stage] for stage in GATED)
+
+    def _conflicting(self) -> list[str]:
+        return reflection.conflicting_evidence(self.rubric, self.evidence)
+
+    def _drawn(self, name: str) -> bool:
+        """A seeded draw of the audit share, by clip content."""
+        stream = numpy_stream(self.agent.seed, f"{name}/{self.clip.sha256}")
+        return bool(stream.random() < self.rubric.voting.audit_share)

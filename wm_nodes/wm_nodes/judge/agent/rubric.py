@@ -1,0 +1,235 @@
+"""Rubric packs: components, level descriptions, weights and thresholds as versioned data. Specification: section 2.3.
+
+A pack is a YAML file in rubrics/, or anywhere. `extends` lays it over another pack: mappings are merged name by name,
+so a new domain adds components, patterns or evidence without code. Its version names the resolved content.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from wm_nodes.config.load import ConfigError, refusal
+from wm_nodes.judge.agent.types import GATED, NUM_LEVELS, NUM_PLAN_LEVELS, Component, Profile, Stage
+
+Share = Annotated[float, Field(ge=0, le=1)]
+FiveLevels = Annotated[tuple[str, ...], Field(min_length=NUM_LEVELS, max_length=NUM_LEVELS)]
+Row = Annotated[tuple[Share, ...], Field(min_length=len(GATED), max_length=len(GATED))]
+Text = Annotated[str, Field(min_length=1)]
+
+
+class RubricSection(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ComponentRubric(RubricSection):
+    question: Text
+    """What the positive question asks."""
+    defect: Text
+    """What the negative question asks: which defect is visible."""
+    levels: FiveLevels
+    """What levels 0 to 4 look like, worst first."""
+    weight: Annotated[float, Field(gt=0)] = 1.0
+    """In the weighted mean of its stage."""
+
+
+class StageRubric(RubricSection):
+    threshold: Share
+    """theta: a lower stage score is a failed gate."""
+    profile: Profile
+    components: Annotated[dict[Component, ComponentRubric], Field(min_length=1)]
+
+
+class PlanningRubric(RubricSection):
+    question: Text
+    levels: Annotated[tuple[str, ...], Field(min_length=NUM_PLAN_LEVELS, max_length=NUM_PLAN_LEVELS)]
+    """What L0 invalid to L3 good look like."""
+    weights: Annotated[tuple[Row, ...], Field(min_length=NUM_PLAN_LEVELS, max_length=NUM_PLAN_LEVELS)]
+    """Rows L0 to L3, columns VQ, IF, TC, PC; each row sums to 1."""
+    ceiling: Annotated[tuple[Share, ...], Field(min_length=NUM_PLAN_LEVELS, max_length=NUM_PLAN_LEVELS)]
+    """The largest reward of a clip of each planning level."""
+    num_focus: Annotated[int, Field(ge=0)]
+    """Components that planning may ask to be voted first."""
+
+    @model_validator(mode="after")
+    def _rows_sum_to_one(self) -> "PlanningRubric":
+        for level, row in enumerate(self.weights):
+            if abs(sum(row) - 1) > 1e-9:
+                raise ValueError(f"weights of L{level} sum to {sum(row)}, not 1")
+        return self
+
+
+class VotingRubric(RubricSection):
+    k: Annotated[int, Field(ge=1)]
+    """Votes of a component that is voted on; two equal ones of three end it early."""
+    k_max: Annotated[int, Field(ge=1)]
+    """More votes than this: ABSTAIN."""
+    clear_margin: Share
+    """A component whose first read has a smaller margin is voted on."""
+    levels: tuple[int, ...]
+    """Planning levels at which every component is voted on."""
+    audit_share: Share
+    """Share of clips that are voted on and reflected upon at random."""
+    min_label_mass: Share
+    """A read with less: ABSTAIN."""
+    veto: Share
+    """A component with at least this p_fail fails its stage."""
+
+    @model_validator(mode="after")
+    def _k_fits(self) -> "VotingRubric":
+        if self.k % 2 == 0 or self.k_max < self.k:
+            raise ValueError(f"k must be odd and at most k_max, got k {self.k}, k_max {self.k_max}")
+        return self
+
+
+class Cap(RubricSection):
+    """What a confirmed pattern does: a component's s is at most `ceiling`; or a whole stage fails with s = 0."""
+
+    component: Component | None = None
+    ceiling: Share = 0.0
+    stage: Stage | None = None
+
+    @model_validator(mode="after")
+    def _one_target(self) -> "Cap":
+        if (self.component is None) == (self.stage is None) or (self.stage is not None and self.stage not in GATED):
+            raise ValueError("a cap needs either a component or one of the stages VQ, IF, TC, PC")
+        return self
+
+
+class PatternRubric(ComponentRubric):
+    """A hacking pattern, read like a component: level 0 surely there, 4 surely not."""
+
+    cap: Cap
+
+
+class HackRubric(RubricSection):
+    enabled: bool
+    """Read the patterns of clips whose stages were all read: no early exit."""
+    confirm: Share
+    """A pattern this probable in two reads is confirmed."""
+    patterns: dict[str, PatternRubric]
+
+
+class EvidenceBand(RubricSection):
+    """An endogenous signal outside [low, high] disagrees with a component that passes."""
+
+    component: Component
+    low: float = -float("inf")
+    high: float = float("inf")
+
+
+class Conflict(RubricSection):
+    """Logically impossible: `done` passes while one of `needs` fails."""
+
+    done: Component
+    needs: tuple[Component, ...]
+
+
+class ReflectionRubric(RubricSection):
+    enabled: bool
+    margin: Share
+    """A component that decided a gate with a smaller margin is looked at again."""
+    level_gap: Annotated[float, Field(gt=0)]
+    """Planning level against 3 x mean stage score: a difference of this much is looked at again."""
+    max_changes: Annotated[int, Field(ge=1)]
+    conflicts: tuple[Conflict, ...]
+
+
+class RewardRubric(RubricSection):
+    gate: Literal["hard", "soft", "lexicographic"]
+    """hard: prod 1[S >= theta]. soft: logistic. lexicographic: one quarter of [0, 1] per stage."""
+    temperature: Annotated[float, Field(gt=0)]
+    """Of the soft gate, in units of S."""
+    mean_share: Share
+    """Stage score = mean_share x weighted mean + (1 - mean_share) x minimum."""
+
+
+class Rubric(RubricSection):
+    name: Text
+    revision: Annotated[int, Field(ge=1)]
+    planning: PlanningRubric
+    stages: dict[Stage, StageRubric]
+    voting: VotingRubric
+    hack: HackRubric
+    evidence: dict[str, EvidenceBand]
+    reflection: ReflectionRubric
+    reward: RewardRubric
+
+    @model_validator(mode="after")
+    def _names_agree(self) -> "Rubric":
+        if set(self.stages) != set(GATED):
+            raise ValueError(f"stages must be VQ, IF, TC, PC, got {', '.join(self.stages)}")
+        known = self.component_names
+        if len(set(known)) != len(known):
+            raise ValueError(f"a component is in two stages: {', '.join(known)}")
+        used = {band.component for band in self.evidence.values()}
+        used |= {name for rule in self.reflection.conflicts for name in (rule.done, *rule.needs)}
+        used |= {pattern.cap.component for pattern in self.hack.patterns.values() if pattern.cap.component}
+        if unknown := sorted(used - set(known)):
+            raise ValueError(f"unknown components {', '.join(unknown)}; known: {', '.join(known)}")
+        return self
+
+    @property
+    def component_names(self) -> tuple[Component, ...]:
+        """Of the gated stages, in the order of the pack."""
+        return tuple(name for stage in GATED for name in self.stages[stage].components)
+
+    @property
+    def version(self) -> str:
+        """name-revision-hash: differs whenever a word or number of the resolved pack does."""
+        digest = hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+        return f"{self.name}-{self.revision}-{digest[:12]}"
+
+    def stage_of(self, component: Component) -> Stage:
+        return next(stage for stage in GATED if component in self.stages[stage].components)
+
+
+def load_rubric(pack: str = "robot", overrides: Mapping[str, Any] | None = None) -> Rubric:
+    """Read a pack of rubrics/, or a YAML file, with what it extends.
+
+    Args:
+        overrides: nested mapping laid on top, e.g. {"reward": {"gate": "soft"}}.
+
+    Raises:
+        ConfigError: no such pack, or values refused; names each of them.
+    """
+    try:
+        return Rubric.model_validate(_laid_over(_resolve(pack, ()), overrides or {}))
+    except ValidationError as error:
+        raise refusal(error, f"wm_nodes/judge/agent/rubric.py, pack {pack}") from None
+
+
+def pack_names() -> list[str]:
+    return sorted(Path(entry.name).stem for entry in _packs().iterdir() if entry.name.endswith(".yaml"))
+
+
+def _packs() -> Any:
+    return resources.files("wm_nodes.judge.agent") / "rubrics"
+
+
+def _resolve(pack: str, seen: tuple[str, ...]) -> dict[str, Any]:
+    if pack in seen:
+        raise ConfigError(f"rubric packs extend each other in a circle: {' -> '.join((*seen, pack))}")
+    if pack in pack_names():
+        text = (_packs() / f"{pack}.yaml").read_text()
+    elif Path(pack).suffix in {".yaml", ".yml"} and Path(pack).is_file():
+        text = Path(pack).read_text()
+    else:
+        raise ConfigError(f"unknown rubric pack {pack!r}; choose one of {', '.join(pack_names())} or give a .yaml file")
+    values = yaml.safe_load(text)
+    if not isinstance(values, dict):
+        raise ConfigError(f"rubric pack {pack!r} must be a YAML mapping")
+    base = values.pop("extends", None)
+    return values if base is None else _laid_over(_resolve(str(base), (*seen, pack)), values)
+
+
+def _laid_over(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for name, value in top.items():
+        both = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
+        merged[name] = _laid_over(merged[name], value) if both else value
+    return merged

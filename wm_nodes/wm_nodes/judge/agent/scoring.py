@@ -1,0 +1,126 @@
+"""Stage scores, gates, planning weights and the reward: pure functions of scores. Specification: section 2.3.
+
+R = sum_d w_d S_d prod_{e before d} 1[S_e >= theta_e] over d = VQ, IF, TC, PC. A number that is missing makes R NaN.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from wm_nodes.judge.agent.rubric import PlanningRubric, Rubric
+from wm_nodes.judge.agent.types import (
+    GATED,
+    NUM_PLAN_LEVELS,
+    ComponentScore,
+    PlanResult,
+    Read,
+    Stage,
+    StageScore,
+    Status,
+)
+
+OPEN_SOFT_GATE = 0.01
+"""A soft gate below this counts as closed: what comes after could add no more than this."""
+
+
+def skipped(stage: Stage) -> StageScore:
+    return StageScore(stage, Status.SKIPPED, math.nan, False)
+
+
+def stage_score(stage: Stage, scores: Sequence[ComponentScore], rubric: Rubric) -> StageScore:
+    """S = 0.5 weighted_mean(s_c) + 0.5 min(s_c); passed where S >= theta and no p_fail >= veto.
+
+    One component with an ERROR makes the stage one, else one that abstained makes it ABSTAIN.
+    """
+    for status in (Status.ERROR, Status.ABSTAIN):
+        if any(score.status is status for score in scores):
+            return StageScore(stage, status, math.nan, False, tuple(scores))
+    described = rubric.stages[stage]
+    weights = [described.components[score.component].weight for score in scores]
+    mean = math.fsum(weight * score.s for weight, score in zip(weights, scores)) / math.fsum(weights)
+    share = rubric.reward.mean_share
+    s = min(1.0, share * mean + (1 - share) * min(score.s for score in scores))
+    veto = next((score.component for score in scores if score.p_fail >= rubric.voting.veto), "")
+    return StageScore(stage, Status.OK, s, s >= described.threshold and not veto, tuple(scores), veto)
+
+
+def plan_result(read: Read, rubric: Rubric) -> PlanResult:
+    """The planning level and the weights it gives. `read` is OK and has a distribution over L0 to L3."""
+    known = [name for name in dict.fromkeys(read.focus) if name in rubric.component_names]
+    level = max(range(NUM_PLAN_LEVELS), key=lambda index: (read.levels[index], -index))
+    weights = plan_weights(read.levels, rubric.planning)
+    return PlanResult(read.levels, level, weights, tuple(known[: rubric.planning.num_focus]), read.evidence_text)
+
+
+def plan_weights(p_level: Sequence[float], planning: PlanningRubric) -> dict[Stage, float]:
+    """w = sum_l p_l ceiling_l W[l]. Soft, so a flip between neighbouring levels cannot make the reward jump."""
+    scaled = [p * ceiling for p, ceiling in zip(p_level, planning.ceiling)]
+    return {
+        stage: math.fsum(factor * row[column] for factor, row in zip(scaled, planning.weights))
+        for column, stage in enumerate(GATED)
+    }
+
+
+def gate(score: StageScore, rubric: Rubric) -> float:
+    """What of the later stages counts, [0, 1]: 1 or 0, or with soft gates sigma((S - theta) / t), 1 at S = 1."""
+    if score.status is not Status.OK or score.vetoed_by:
+        return 0.0
+    if rubric.reward.gate != "soft":
+        return float(score.passed)
+    theta, t = rubric.stages[score.stage].threshold, rubric.reward.temperature
+    value = (1 + math.exp((theta - 1) / t)) / (1 + math.exp((theta - score.s) / t))
+    return value if value >= OPEN_SOFT_GATE else 0.0
+
+
+def reward(weights: Mapping[Stage, float], stages: Sequence[StageScore], rubric: Rubric) -> float:
+    """R in [0, 1] of VQ, IF, TC, PC, in this order; NaN where a stage that was looked at has no number.
+
+    lexicographic: (number of gates passed before the last stage + S of the next stage) / 4, times the planning ceiling.
+
+    Raises:
+        ValueError: stages in another order, or one skipped behind an open gate.
+    """
+    if tuple(score.stage for score in stages) != GATED:
+        raise ValueError(f"stages must be VQ, IF, TC, PC, got {', '.join(score.stage for score in stages)}")
+    if any(score.status in (Status.ERROR, Status.ABSTAIN) for score in stages):
+        return math.nan
+    total, open_share, num_passed = 0.0, 1.0, 0
+    for score in stages:
+        if open_share == 0:
+            break
+        if score.status is Status.SKIPPED:
+            raise ValueError(f"{score.stage} was skipped though every gate before it is open")
+        if rubric.reward.gate == "lexicographic":
+            total = math.fsum(weights.values()) * (num_passed + score.s) / len(GATED)
+            num_passed += 1
+        else:
+            total += weights[score.stage] * score.s * open_share
+        open_share *= gate(score, rubric)
+    return min(1.0, total)
+
+
+def capped(stages: Sequence[StageScore], patterns: Sequence[str], rubric: Rubric) -> tuple[StageScore, ...]:
+    """Apply the caps of confirmed hacking patterns. They lower scores and close gates, and never raise anything."""
+    result = {score.stage: score for score in stages}
+    for name in patterns:
+        cap = rubric.hack.patterns[name].cap
+        target = cap.stage or rubric.stage_of(cap.component or "")
+        before = result[target]
+        if before.status is not Status.OK:
+            continue
+        if cap.stage is not None:
+            result[target] = replace(before, s=0.0, passed=False, vetoed_by=f"hack {name}")
+            continue
+        scores = [_limited(c, cap.ceiling, name) if c.component == cap.component else c for c in before.components]
+        after = stage_score(target, scores, rubric)
+        closed = before.vetoed_by.startswith("hack ")
+        result[target] = replace(after, s=0.0, passed=False, vetoed_by=before.vetoed_by) if closed else after
+    return tuple(result.values())
+
+
+def _limited(score: ComponentScore, ceiling: float, pattern: str) -> ComponentScore:
+    """At most `ceiling`; a score of s fails with probability 1 - s at least, up to level 1."""
+    if score.s <= ceiling:
+        return score
+    p_fail = max(score.p_fail, 1 - ceiling)
+    return replace(score, s=ceiling, p_fail=p_fail, margin=abs(1 - 2 * p_fail), decided_by=f"cap by {pattern}")

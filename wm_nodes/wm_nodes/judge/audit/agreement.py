@@ -1,0 +1,217 @@
+"""How well a judge's verdicts agree with what people say, row by row of Table 2. Specification: section 2.8."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from wm_nodes.core.reward_statistics import kappa
+from wm_nodes.judge.agent.levels import settled
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import Status
+from wm_nodes.judge.audit.labels import HACK, ClipLabel, HumanLabels, annotators, known_of, of_evaluation
+from wm_nodes.judge.audit.reading import Record, RecordedEvaluation
+from wm_nodes.judge.audit.sampling import Sample
+from wm_nodes.judge.decisions import PAPER, Decision, decisions_of, match, row_names
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One evaluation with its labels. weight: clips of the round it stands for. by: a label per person who gave one."""
+
+    evaluation: RecordedEvaluation
+    rubric: Rubric
+    weight: float
+    by: Mapping[str, ClipLabel]
+
+    def decisions(self) -> dict[str, Decision]:
+        """The judge's, those on hacking patterns included: p_pass is the probability that the pattern is absent."""
+        verdict = self.evaluation.verdict
+        if verdict is None:
+            return {}
+        flags = {
+            HACK + flag.pattern: Decision(not flag.confirmed, 1 - flag.p_present)
+            for flag in verdict.hack_flags
+            if math.isfinite(flag.p_present)
+        }
+        return {**decisions_of(verdict), **flags}
+
+    def answers(self, name: str) -> dict[str, bool | int]:
+        """What each person who was sure said of a row, in the order of the files."""
+        known = {who: known_of(label, self.rubric).get(name) for who, label in self.by.items()}
+        return {who: answer for who, answer in known.items() if answer is not None}
+
+
+@dataclass(frozen=True)
+class AgreementRow:
+    """One row of the report.
+
+    n: labelled clips that the judge decided. silent: labelled ones that it did not. unsure: nobody was sure. accuracy,
+    low, high: weighted share of equal decisions with its 95 % Wilson interval. prevalence: weighted share of failing
+    labels (planning: of levels below 2). balanced: balanced accuracy, of planning the mean recall of its levels.
+    kappa: of judge and people. calibration: expected calibration error of p_pass, of planning of the chosen level.
+    people, kappa_people: clips that two people were sure of, and their kappa. reasons, reasons_right: explanations that
+    were judged, and the share that is right, whatever the answer was. paper: percent.
+    """
+
+    name: str
+    n: int
+    silent: int
+    unsure: int
+    accuracy: float
+    low: float
+    high: float
+    prevalence: float
+    balanced: float
+    kappa: float
+    calibration: float
+    people: int
+    kappa_people: float
+    reasons: int
+    reasons_right: float
+    paper: float | None
+
+
+@dataclass(frozen=True)
+class Reflected:
+    """What second looks did to labelled components: changed, helpful ones among them, accuracy before and after."""
+
+    changed: int
+    helpful: int
+    n: int
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class Report:
+    """clips: labelled. round_number: None for all rounds together. cost: means per labelled clip, by name."""
+
+    round_number: int | None
+    clips: int
+    annotators: Sequence[str]
+    rows: Sequence[AgreementRow]
+    reflected: Reflected
+    cost: Mapping[str, float]
+    weighted: bool
+
+
+def joined(record: Record, files: Sequence[HumanLabels], samples: Sequence[Sample] = ()) -> list[Judged]:
+    """Every labelled evaluation with all its labels, in the order of the log. Without its sample a clip has weight 1.
+
+    Raises:
+        AuditError: labels or a sample of another log, or one person labelled an evaluation twice.
+    """
+    annotators(files)
+    weights: dict[int, float] = {}
+    for chosen in (chosen for sample in samples for chosen in sample.chosen):
+        of_evaluation(chosen.evaluation, chosen.audit_id, record.evaluations, "sample")
+        weights[chosen.evaluation] = chosen.weight
+    by: dict[int, dict[str, ClipLabel]] = {}
+    for file in files:
+        for label in file.labels:
+            who = f"labels of {file.annotator}"
+            evaluation = of_evaluation(label.evaluation, label.audit_id, record.evaluations, who)
+            by.setdefault(evaluation.number, {})[file.annotator] = label
+    found = [record.evaluations[number] for number in sorted(by)]
+    return [Judged(e, record.rubric(e), weights.get(e.number, 1.0), by[e.number]) for e in found]
+
+
+def report(judged: Sequence[Judged], round_number: int | None = None, *, weighted: bool = False) -> Report:
+    """The numbers of one round, or of all."""
+    chosen = [clip for clip in judged if round_number in (None, clip.evaluation.round_number)]
+    names = list(dict.fromkeys(name for clip in chosen for name in _rows_of(clip.rubric)))
+    people = list(dict.fromkeys(who for clip in chosen for who in clip.by))
+    rows = [row for name in names if (row := _row(name, chosen)) is not None]
+    return Report(round_number, len(chosen), people, rows, _reflected(chosen), _cost(chosen), weighted)
+
+
+def table(found: Report) -> Table:
+    """For the terminal."""
+    which = "all rounds" if found.round_number is None else f"round {found.round_number}"
+    weights = "weighted to the whole round" if found.weighted else "unweighted"
+    second = found.reflected
+    caption = (
+        f"{weights}; people: {', '.join(found.annotators)}; reflection changed {second.changed} labelled components, "
+        f"{second.helpful} for the better ({_percent(second.before)} right before, {_percent(second.after)} after, "
+        f"n = {second.n}); per clip " + ", ".join(f"{name} {value:.4g}" for name, value in found.cost.items())
+    )
+    result = Table(title=f"agreement with people, {which}, {found.clips} clips", caption=caption)
+    result.add_column("row", no_wrap=True)
+    for name in ("paper", "n", "silent", "unsure", "accuracy", "95 % Wilson", "fails", "balanced", "kappa", "ECE",
+                 "people: n, kappa", "reasons: n, right"):
+        result.add_column(name, justify="right")
+    for row in found.rows:
+        result.add_row(
+            row.name, "-" if row.paper is None else f"{row.paper:.0f}", str(row.n), str(row.silent), str(row.unsure),
+            _percent(row.accuracy), f"{100 * row.low:.1f} to {100 * row.high:.1f}", _percent(row.prevalence),
+            _percent(row.balanced), _number(row.kappa), _number(row.calibration),
+            f"{row.people}, {_number(row.kappa_people)}", f"{row.reasons}, {_percent(row.reasons_right)}",
+        )
+    return result
+
+
+def _rows_of(rubric: Rubric) -> list[str]:
+    return [*row_names(rubric), *(HACK + name for name in rubric.hack.patterns)]
+
+
+def _row(name: str, clips: Sequence[Judged]) -> AgreementRow | None:
+    """None where nobody labelled the row."""
+    given = [(clip, clip.answers(name)) for clip in clips]
+    asked = [clip for clip in clips if any(name in known_of(label, clip.rubric) for label in clip.by.values())]
+    if not asked:
+        return None
+    sure = [(clip, next(iter(answers.values())), clip.decisions().get(name)) for clip, answers in given if answers]
+    said = [(answer, decision, clip.weight) for clip, answer, decision in sure if decision is not None]
+    labels, decisions = [answer for answer, _, _ in said], [decision for _, decision, _ in said]
+    weights = [weight for _, _, weight in said]
+    pairs = [list(answers.values())[:2] for _, answers in given if len(answers) > 1]
+    reasons = [ok for clip in clips if (ok := _reason(clip, name)) is not None]
+    return AgreementRow(
+        name, len(said), len(sure) - len(said), len(asked) - len(sure), *match(name, labels, decisions, weights),
+        len(pairs), kappa([one for one, _ in pairs], [other for _, other in pairs]),
+        len(reasons), float(np.mean(reasons)) if reasons else math.nan, PAPER.get(name),
+    )
+
+
+def _reason(clip: Judged, name: str) -> bool | None:
+    """Whether the judge's explanation of a row is right, by the first who said so."""
+    rows = (label.rows.get(name) for label in clip.by.values())
+    return next((row.explanation for row in rows if row is not None and row.explanation is not None), None)
+
+
+def _reflected(clips: Sequence[Judged]) -> Reflected:
+    """Compare each component that a second look changed with what its votes had said before."""
+    before, after = [], []
+    for clip in clips:
+        verdict = clip.evaluation.verdict
+        scores = [] if verdict is None else [score for stage in verdict.stages for score in stage.components]
+        for score in scores:
+            answers = clip.answers(score.component)
+            if answers and score.status is Status.OK and score.decided_by == "reflection":
+                label = next(iter(answers.values()))
+                old = settled(score.votes[:-2], clip.rubric.voting.min_label_mass)
+                before.append(old.passed == label)
+                after.append(score.passed == label)
+    helpful = sum(now and not then for then, now in zip(before, after))
+    means = [float(np.mean(values)) if values else math.nan for values in (before, after)]
+    flips = sum(now != then for then, now in zip(before, after))
+    return Reflected(flips, helpful, len(before), *means)
+
+
+def _cost(clips: Sequence[Judged]) -> dict[str, float]:
+    costs = [clip.evaluation.verdict.cost for clip in clips if clip.evaluation.verdict]
+    names: tuple[str, ...] = ("calls", "prompt_tokens", "cached_tokens", "completion_tokens", "images", "wall_s", "usd")
+    known: dict[str, list[Any]] = {name: [getattr(cost, name) for cost in costs] for name in names}
+    return {n: float(np.mean(v)) for n, v in known.items() if v and None not in v}
+
+
+def _percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100 * share:.1f}"
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3f}"

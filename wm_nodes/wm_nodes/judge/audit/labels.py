@@ -1,0 +1,127 @@
+"""What people say of clips: the file that the viewer exports, for `agree` and `adopt`. Specification: section 2.8."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING
+from wm_nodes.judge.audit.log import AuditError
+from wm_nodes.judge.audit.reading import RecordedEvaluation
+from wm_nodes.judge.decisions import OVERALL, STAGES
+
+FORMAT = "audit-labels-1"
+HACK = "hack: "
+"""In front of a pattern's name, because a pattern may be called like a component. It passes where it is absent."""
+PASS_LEVEL = 3
+"""From here on a level passes; 2 has p_fail 0.5, which is no pass (section 2.3)."""
+
+Answer = bool | int | None
+"""True: passes. False: fails. Of planning: the level. None: unsure."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class RowLabel(_Part):
+    """answer: of one row. level: where a person gave one. explanation: whether the judge's reason is right."""
+
+    answer: Literal["pass", "fail", "unsure"]
+    level: Annotated[int, Field(ge=0, lt=NUM_LEVELS)] | None = None
+    explanation: bool | None = None
+
+
+class ClipLabel(_Part):
+    """rows: by component, "planning", "overall" or "hack: PATTERN". evaluation: line of the log."""
+
+    evaluation: int
+    sha256: str
+    audit_id: str
+    rows: dict[str, RowLabel]
+
+
+class HumanLabels(_Part):
+    """What one person said of the clips of one page. head: hash of the log's last line when the page was written."""
+
+    format: Literal["audit-labels-1"]
+    head: str
+    annotator: Annotated[str, Field(min_length=1)]
+    exported: str
+    labels: tuple[ClipLabel, ...]
+
+
+def read_labels(path: Path) -> HumanLabels:
+    """Read an exported file.
+
+    Raises:
+        AuditError: it cannot be read or is no such file; OSError: it is not there.
+    """
+    try:
+        return HumanLabels.model_validate_json(Path(path).read_bytes())
+    except ValidationError as error:
+        first = error.errors(include_input=False, include_url=False)[0]
+        where = ".".join(map(str, first["loc"])) or "file"
+        raise AuditError(f"{path} is no exported file of labels: {where}: {first['msg']}; export it again") from None
+
+
+def known_of(label: ClipLabel, rubric: Rubric) -> dict[str, Answer]:
+    """What one person decided, by row of the table; stages pass where all their components do. None: unsure.
+
+    Raises:
+        AuditError: a row that the rubric does not have, or a planning label without a level 0 to 3.
+    """
+    rows = {PLANNING, OVERALL, *rubric.component_names, *(HACK + name for name in rubric.hack.patterns)}
+    if foreign := sorted(set(label.rows) - rows):
+        raise AuditError(f"evaluation {label.evaluation}: rubric {rubric.version} has no row {', '.join(foreign)}")
+    known: dict[str, Answer] = {}
+    for name, row in label.rows.items():
+        known[name] = None if row.answer == "unsure" else row.answer == "pass"
+        if name == PLANNING and row.answer != "unsure":
+            if row.level is None or row.level >= NUM_PLAN_LEVELS:
+                raise AuditError(f"evaluation {label.evaluation}: planning needs a level 0 to 3, got {row.level}")
+            known[name] = row.level
+    for stage in STAGES:
+        parts = [known.get(name) for name in rubric.stages[stage].components]
+        if any(name in known for name in rubric.stages[stage].components):
+            known[str(stage)] = False if False in parts else None if None in parts else True
+    return known
+
+
+def of_evaluation(
+    number: int, audit_id: str, evaluations: Mapping[int, RecordedEvaluation], source: str
+) -> RecordedEvaluation:
+    """The evaluation that a label or a sample means.
+
+    Raises:
+        AuditError: the log does not hold it, or another one under its number.
+    """
+    evaluation = evaluations.get(number)
+    verdict = None if evaluation is None else evaluation.verdict
+    if evaluation is None or verdict is None or verdict.audit_id != audit_id:
+        raise AuditError(f"{source}: evaluation {number} is another one in this log; name the log it is from")
+    return evaluation
+
+
+def annotators(files: Sequence[HumanLabels]) -> list[str]:
+    """The names, once each, in order.
+
+    Raises:
+        AuditError: one person labelled one evaluation in two files.
+    """
+    seen: set[tuple[str, str, int]] = set()
+    for file in files:
+        for label in file.labels:
+            key = (file.annotator, label.audit_id, label.evaluation)
+            if key in seen:
+                raise AuditError(f"{file.annotator} labelled evaluation {label.evaluation} twice; give the newest file")
+            seen.add(key)
+    return list(dict.fromkeys(file.annotator for file in files))
+
+
+def load_all(paths: Iterable[Path]) -> list[HumanLabels]:
+    files = [read_labels(path) for path in paths]
+    annotators(files)
+    return files

@@ -1,0 +1,225 @@
+"""An audit log as a whole: evaluations with their reads and verdicts, in the order of their lines; and `verify`."""
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import (
+    Capabilities,
+    ClipRef,
+    MediaItem,
+    Read,
+    TaskSpec,
+    Verdict,
+    Vote,
+    content_hash,
+    media_sha,
+)
+from wm_nodes.judge.audit.entries import clip_from, rubric_from, task_from, typed
+from wm_nodes.judge.audit.log import NO_LINE, AuditError, Entry, faults, read_lines
+from wm_nodes.judge.audit.media import MediaStore
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a question has no answer. error: the exception's name; "CancelledError" where the clip ran out of time."""
+
+    error: str
+    reason: str
+    cost: Mapping[str, Any] | None
+
+
+@dataclass
+class Ask:
+    """One question to the judge with its answers."""
+
+    stage: str
+    components: tuple[str, ...]
+    votes: tuple[Vote, ...]
+    media: tuple[MediaItem, ...]
+    reads: list[Read] = field(default_factory=list)
+    failure: Failure | None = None
+
+
+@dataclass(frozen=True)
+class AgentLine:
+    """Who judged: what the judge can do, and RewardAgent's settings. number: of the line."""
+
+    number: int
+    capabilities: Capabilities
+    rubric_version: str
+    settings: Mapping[str, Any]
+
+
+@dataclass
+class RecordedEvaluation:
+    """One clip being judged once. number: of its line, its name. verdict: None where the process died before.
+    redacted: a secret in the verdict was replaced, so that it has another content than its audit id says.
+    """
+
+    number: int
+    clip_id: str
+    sha256: str
+    round_number: int
+    agent: AgentLine
+    task: Mapping[str, Any]
+    evidence: Mapping[str, float]
+    asks: list[Ask] = field(default_factory=list)
+    exchanges: list[Mapping[str, Any]] = field(default_factory=list)
+    verdict: Verdict | None = None
+    redacted: bool = False
+
+
+@dataclass
+class Record:
+    """All of a log. clips: clip lines by the clip's SHA-256. head: hash of the last line."""
+
+    folder: Path
+    rubrics: dict[str, Rubric]
+    clips: dict[str, Mapping[str, Any]]
+    evaluations: dict[int, RecordedEvaluation]
+    head: str
+    num_lines: int
+
+    @property
+    def store(self) -> MediaStore:
+        return MediaStore(self.folder)
+
+    def judged(self, round_number: int | None = None) -> list[RecordedEvaluation]:
+        """Evaluations that have a verdict; of one round, or of all."""
+        chosen = (e for e in self.evaluations.values() if round_number in (None, e.round_number))
+        return [evaluation for evaluation in chosen if evaluation.verdict is not None]
+
+    def rubric(self, evaluation: RecordedEvaluation) -> Rubric:
+        return self.rubrics[evaluation.agent.rubric_version]
+
+    def clip(self, evaluation: RecordedEvaluation) -> ClipRef:
+        """With its pixels.
+
+        Raises:
+            AuditError: a picture is missing or was changed.
+        """
+        return clip_from(self.clips[evaluation.sha256], evaluation.clip_id, self.store)
+
+    def task(self, evaluation: RecordedEvaluation) -> TaskSpec:
+        return task_from(evaluation.task, self.store)
+
+
+def read_record(folder: Path) -> Record:
+    """Read a log, checking its chain.
+
+    Raises:
+        AuditError: a fault, named by its line; or a line that this version cannot read.
+    """
+    record = Record(Path(folder), {}, {}, {}, NO_LINE, 0)
+    agents: dict[int, AgentLine] = {}
+    asks: dict[int, Ask] = {}
+    for line in read_lines(folder):
+        record.head, record.num_lines = line.hash, line.number
+        try:
+            _take(record, agents, asks, line)
+        except AuditError as error:
+            raise AuditError(f"{Path(folder)}, line {line.number} ({line.kind}): {error}") from None
+        except (KeyError, TypeError, IndexError) as error:
+            raise AuditError(f"{Path(folder)}, line {line.number} ({line.kind}): lacks {error}") from None
+    return record
+
+
+def _take(record: Record, agents: dict[int, AgentLine], asks: dict[int, Ask], line: Entry) -> None:
+    body = line.body
+    if line.kind == "rubric":
+        record.rubrics[body["version"]] = rubric_from(body)
+    elif line.kind == "agent":
+        able = typed(Capabilities, body["capabilities"])
+        agents[line.number] = AgentLine(line.number, able, body["rubric_version"], body["settings"])
+    elif line.kind == "clip":
+        record.clips[body["sha256"]] = body
+    elif line.kind == "evaluation":
+        evidence = {name: float(value) for name, value in body["evidence"].items()}
+        record.evaluations[line.number] = RecordedEvaluation(
+            line.number, body["clip_id"], body["sha256"], body["round"], agents[body["agent"]], body["task"], evidence
+        )
+    elif line.kind in ("ask", "read", "failure", "exchange", "verdict"):
+        evaluation = record.evaluations[body["evaluation"]]
+        if line.kind == "ask":
+            votes = tuple(typed(Vote, vote) for vote in body["votes"])
+            media = tuple(typed(MediaItem, item) for item in body["media"])
+            asks[line.number] = Ask(body["stage"], tuple(body["components"]), votes, media)
+            evaluation.asks.append(asks[line.number])
+        elif line.kind == "read":
+            asks[body["ask"]].reads.append(typed(Read, body["read"]))
+        elif line.kind == "failure":
+            asks[body["ask"]].failure = Failure(body["error"], body["reason"], body["cost"])
+        elif line.kind == "exchange":
+            evaluation.exchanges.append(body)
+        else:
+            evaluation.verdict, evaluation.redacted = typed(Verdict, body["verdict"]), "redacted" in body
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What `verify` found. problems: none for a sound log. verdicts: the hash of all audit ids, in whatever order the
+    clips were judged: equal for equal seeds and equal answers.
+    """
+
+    problems: Sequence[str]
+    num_lines: int = 0
+    num_evaluations: int = 0
+    unfinished: int = 0
+    head: str = ""
+    verdicts: str = ""
+
+
+def verify(folder: Path, *, pictures: bool = True, expected_head: str = "") -> Checked:
+    """Check the chain, the content hash of every verdict and, unless told otherwise, every picture and clip.
+
+    Args:
+        expected_head: a hash that was noted earlier; a log that lacks it was cut, or begun anew.
+
+    Raises:
+        AuditError: there is no log.
+    """
+    if found := faults(folder):
+        return Checked([str(fault) + (" (torn: run `recover`)" if fault.torn else "") for fault in found])
+    try:
+        record = read_record(folder)
+    except AuditError as error:
+        return Checked([str(error)])
+    problems = list(_wrong(record, pictures))
+    if expected_head and all(line.hash != expected_head for line in read_lines(folder)):
+        problems.append(f"no line has the hash {expected_head}: lines at the end were cut off, or it is another log")
+    ids = sorted(e.verdict.audit_id for e in record.judged() if e.verdict)
+    return Checked(
+        problems, record.num_lines, len(record.evaluations), len(record.evaluations) - len(ids), record.head,
+        content_hash_of(ids),
+    )
+
+
+def content_hash_of(ids: Sequence[str]) -> str:
+    """SHA-256, hexadecimal, of sorted audit ids."""
+    return hashlib.sha256("".join(ids).encode()).hexdigest()
+
+
+def _wrong(record: Record, pictures: bool) -> Iterator[str]:
+    for evaluation in record.evaluations.values():
+        verdict = evaluation.verdict
+        about = f"evaluation {evaluation.number} of clip {evaluation.clip_id!r}"
+        if verdict is not None and not evaluation.redacted and content_hash(verdict) != verdict.audit_id:
+            yield f"{about}: its verdict is not what its audit id says"
+        if pictures:
+            for name in (evaluation.task[key] for key in ("reference_frame", "goal_image", "actions")):
+                try:
+                    _ = name is None or record.store.get(name)
+                except AuditError as error:
+                    yield f"{about}: {error}"
+    for sha, body in record.clips.items() if pictures else ():
+        try:
+            clip = clip_from(body, "", record.store)
+        except AuditError as error:
+            yield f"clip {sha[:12]}: {error}"
+            continue
+        if media_sha(clip.frames, clip.fps) != sha:
+            yield f"clip {sha[:12]}: its pictures are another clip"

@@ -1,0 +1,122 @@
+"""A reward agent whose every question, answer and verdict is written down. Specification: section 2.8."""
+
+import asyncio
+from collections.abc import Mapping
+from contextvars import ContextVar
+from typing import Any
+
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import (
+    Capabilities,
+    ClipRef,
+    Evidence,
+    Health,
+    Judge,
+    JudgeError,
+    Read,
+    ReadRequest,
+    TaskSpec,
+    Verdict,
+)
+from wm_nodes.judge.audit.entries import clip_body, plain, rubric_body, task_body
+from wm_nodes.judge.audit.log import AuditLog
+from wm_nodes.judge.audit.media import MediaStore
+
+_EVALUATION: ContextVar[int] = ContextVar("evaluation")
+"""Line of the evaluation that the running task belongs to; reads of several clips are written between each other."""
+
+
+class AuditedAgent:
+    """Judges clips as RewardAgent does, with the same verdicts, and writes everything into a log.
+
+    Args:
+        settings: of RewardAgent. round_number: of the paper's loop, kept with every verdict; may be changed.
+    """
+
+    def __init__(self, judge: Judge, rubric: Rubric, log: AuditLog, *, round_number: int = 0, **settings: Any) -> None:
+        self.round_number = round_number
+        self._log, self._store = log, MediaStore(log.folder)
+        self._agent = agent = RewardAgent(RecordingJudge(judge, log), rubric, **settings)
+        self._written: set[str] = set()
+        log.append("rubric", rubric_body(rubric))
+        kept = {name: getattr(agent, name) for name in ("mode", "seed", "max_reads", "budget_s", "call_plan")}
+        self._line = log.append(
+            "agent",
+            {"capabilities": plain(judge.capabilities), "rubric_version": rubric.version, "settings": plain(kept)},
+        )
+
+    @property
+    def rubric(self) -> Rubric:
+        return self._agent.rubric
+
+    @property
+    def judge(self) -> Judge:
+        return self._agent.judge
+
+    async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
+        """Judge one clip; the verdict is on the disk when this returns.
+
+        Raises:
+            OSError: it cannot be written down; then there is no verdict.
+        """
+        evaluation = self._begun(clip, task, evidence or {})
+        token = _EVALUATION.set(evaluation)
+        try:
+            verdict = await self._agent.evaluate(clip, task, evidence)
+        finally:
+            _EVALUATION.reset(token)
+        self._log.append("verdict", {"evaluation": evaluation, "verdict": plain(verdict)}, sync=True)
+        return verdict
+
+    def _begun(self, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> int:
+        if clip.sha256 not in self._written:
+            self._log.append("clip", clip_body(clip, self._store))
+            self._written.add(clip.sha256)
+        return self._log.append(
+            "evaluation",
+            {
+                "clip_id": clip.clip_id, "sha256": clip.sha256, "agent": self._line, "round": self.round_number,
+                "task": task_body(task, self._store), "evidence": plain(evidence),
+            },
+        )
+
+
+class RecordingJudge:
+    """Hands questions on to a judge and writes them down with the answers, or with what went wrong."""
+
+    def __init__(self, judge: Judge, log: AuditLog) -> None:
+        self._judge, self._log = judge, log
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return self._judge.capabilities
+
+    async def health(self) -> Health:
+        return await self._judge.health()
+
+    async def read(self, request: ReadRequest) -> list[Read]:
+        evaluation = _EVALUATION.get()
+        ask = self._log.append("ask", {"evaluation": evaluation, **ask_body(request)})
+        about = {"evaluation": evaluation, "ask": ask}
+        try:
+            reads = await self._judge.read(request)
+        except (Exception, asyncio.CancelledError) as error:
+            cost = plain(error.cost) if isinstance(error, JudgeError) else None
+            failure = {"error": type(error).__name__, "reason": str(error), "cost": cost}
+            self._log.append("failure", {**about, **failure})
+            raise
+        for read in reads:
+            self._log.append("read", {**about, "read": plain(read)})
+        return reads
+
+
+def ask_body(request: ReadRequest) -> dict[str, Any]:
+    """A request without its clip, its task and what was found before: those are in the log already."""
+    names = ("stage", "components", "profile", "votes", "media", "mode")
+    return {name: plain(getattr(request, name)) for name in names}
+
+
+def write_exchange(log: AuditLog, exchange: Mapping[str, Any]) -> None:
+    """Write down what went over the wire; call it from within a judge's read, e.g. as OpenAIJudge's `on_exchange`."""
+    log.append("exchange", {"evaluation": _EVALUATION.get(), **plain(exchange)})

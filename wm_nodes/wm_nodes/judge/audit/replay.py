@@ -1,0 +1,186 @@
+"""A log as a judge: verdicts worked out again offline, equal bit for bit; and anew under a rubric with other numbers.
+
+The answers are those that were given. A rubric with other weights, thresholds, votes or caps may lead to a question
+that nobody was asked then, e.g. of a stage behind a gate that is now open: such a clip gets an ERROR that names the
+question, never a guess. Logs of benchmark mode hold a read of everything.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import (
+    Capabilities,
+    Component,
+    Cost,
+    Health,
+    Judge,
+    JudgeError,
+    MediaItem,
+    Read,
+    ReadRequest,
+    Verdict,
+    Vote,
+    content_hash,
+)
+from wm_nodes.judge.audit.entries import typed
+from wm_nodes.judge.audit.log import AuditError, AuditLog
+from wm_nodes.judge.audit.reading import Ask, Failure, Record, RecordedEvaluation
+from wm_nodes.judge.audit.recording import AuditedAgent
+
+Asked = tuple[str, str, tuple[Component, ...], tuple[Vote, ...], tuple[MediaItem, ...]]
+Answered = tuple[str, str, Component, Vote, tuple[MediaItem, ...]]
+
+
+class ReplayJudge:
+    """Answers from evaluations of one judge. Where a question was asked twice, the first answer counts.
+
+    Raises:
+        ValueError: no evaluation, or two judges.
+    """
+
+    def __init__(self, evaluations: Sequence[RecordedEvaluation]) -> None:
+        judges = {evaluation.agent.capabilities.judge_id for evaluation in evaluations}
+        if len(judges) != 1:
+            raise ValueError(f"a replay needs evaluations of one judge, got {', '.join(sorted(judges)) or 'none'}")
+        self._capabilities = evaluations[0].agent.capabilities
+        self._asks: dict[Asked, Ask] = {}
+        self._reads: dict[Answered, Read] = {}
+        for evaluation in evaluations:
+            for ask in evaluation.asks:
+                self._asks.setdefault((evaluation.sha256, ask.stage, ask.components, ask.votes, ask.media), ask)
+                for read in ask.reads:
+                    key = (evaluation.sha256, ask.stage, read.component, read.vote, ask.media)
+                    self._reads.setdefault(key, read)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """Of the judge that was recorded."""
+        return self._capabilities
+
+    async def health(self) -> Health:
+        return Health(True, "answers from an audit log")
+
+    async def read(self, request: ReadRequest) -> list[Read]:
+        """The recorded answers, also to the same components asked together in another way.
+
+        Raises:
+            JudgeError: the question was never asked; or what the judge raised then, by its name.
+        """
+        sha, stage, media = request.clip.sha256, str(request.stage), request.media
+        ask = self._asks.get((sha, stage, request.components, request.votes, media))
+        if ask is not None:
+            if ask.failure is not None:
+                raise _raised(ask.failure)
+            return list(ask.reads)
+        wanted = [(sha, stage, name, vote, media) for name in request.components for vote in request.votes]
+        if missing := [key for key in wanted if key not in self._reads]:
+            names = ", ".join(f"{name}, vote {vote.index}" for _, _, name, vote, _ in missing)
+            raise JudgeError(f"the log has no answer on {names}; ask the judge itself")
+        return [self._reads[key] for key in wanted]
+
+
+def _raised(failure: Failure) -> Exception:
+    """An exception that reads like the one that was recorded."""
+    if failure.error == JudgeError.__name__:
+        return JudgeError(failure.reason, typed(Cost, failure.cost))
+    kind: type[Exception] = type(failure.error, (Exception,), {})
+    return kind(failure.reason)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """before: as it was recorded. after: worked out again; None where it ran out of time, which nothing repeats."""
+
+    evaluation: RecordedEvaluation
+    before: Verdict
+    after: Verdict | None
+
+    @property
+    def equal(self) -> bool:
+        """All but clocks and costs is the same; of a verdict that held a secret, as it was written down."""
+        return self.after is not None and self.after.audit_id == content_hash(self.before)
+
+
+async def replayed(record: Record, evaluation: RecordedEvaluation, rubric: Rubric | None = None) -> Replayed:
+    """Work one verdict out again, under its own rubric or another one.
+
+    Raises:
+        AuditError: the evaluation has no verdict, a picture is missing, or `rubric` asks in other words.
+    """
+    if evaluation.verdict is None:
+        raise AuditError(f"evaluation {evaluation.number} has no verdict: its process died before")
+    if any(ask.failure and ask.failure.error == "CancelledError" for ask in evaluation.asks):
+        return Replayed(evaluation, evaluation.verdict, None)
+    if rubric is not None:
+        check_words(record.rubric(evaluation), rubric)
+    settings: Mapping[str, Any] = evaluation.agent.settings
+    agent = RewardAgent(ReplayJudge([evaluation]), rubric or record.rubric(evaluation), **settings)
+    verdict = await agent.evaluate(record.clip(evaluation), record.task(evaluation), evaluation.evidence)
+    return Replayed(evaluation, evaluation.verdict, verdict)
+
+
+async def reaggregated(
+    record: Record, evaluations: Iterable[RecordedEvaluation], rubric: Rubric, log: AuditLog
+) -> list[Verdict]:
+    """Work verdicts out under another rubric and write them, with all they rest on, into a log of their own.
+
+    Raises:
+        AuditError: `rubric` asks in other words, or a picture is missing.
+    """
+
+    def judge_of(evaluation: RecordedEvaluation) -> tuple[Judge, Rubric]:
+        check_words(record.rubric(evaluation), rubric)
+        same = [other for other in record.judged() if other.agent.number == evaluation.agent.number]
+        return ReplayJudge(same), rubric
+
+    return await judged_again(record, evaluations, judge_of, log)
+
+
+async def judged_again(
+    record: Record,
+    evaluations: Iterable[RecordedEvaluation],
+    judge_of: Callable[[RecordedEvaluation], tuple[Judge, Rubric]],
+    log: AuditLog,
+) -> list[Verdict]:
+    """Judge the clips of a log once more, each as its agent was set then, and write that into a log of its own.
+
+    Args:
+        judge_of: who judges, and by which rubric; asked once per agent.
+
+    Raises:
+        AuditError: a picture is missing.
+    """
+    agents: dict[int, AuditedAgent] = {}
+    verdicts = []
+    for evaluation in evaluations:
+        number = evaluation.agent.number
+        if number not in agents:
+            agents[number] = AuditedAgent(*judge_of(evaluation), log, **evaluation.agent.settings)
+        agents[number].round_number = evaluation.round_number
+        clip, task = record.clip(evaluation), record.task(evaluation)
+        verdicts.append(await agents[number].evaluate(clip, task, evaluation.evidence))
+    return verdicts
+
+
+def check_words(before: Rubric, after: Rubric) -> None:
+    """Refuse a rubric that would have put another question.
+
+    Raises:
+        AuditError: names what reads differently, or is new.
+    """
+    old, new = dict(_words(before)), dict(_words(after))
+    if changed := [name for name, words in new.items() if old.get(name) != words]:
+        raise AuditError(
+            f"rubric {after.version} asks about {', '.join(changed)} in other words than {before.version} did; old "
+            "answers cannot be counted for it: ask the judge again"
+        )
+
+
+def _words(rubric: Rubric) -> Iterator[tuple[str, tuple[str, ...]]]:
+    yield "planning", (rubric.planning.question, *rubric.planning.levels)
+    entries = [item for stage in rubric.stages.values() for item in stage.components.items()]
+    for name, entry in (*entries, *rubric.hack.patterns.items()):
+        yield name, (entry.question, entry.defect, *entry.levels)

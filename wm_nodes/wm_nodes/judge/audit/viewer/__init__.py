@@ -1,0 +1,191 @@
+"""A page that shows what a log holds and takes a person's labels: one HTML file beside the pictures of the log.
+
+It needs no network and no server. Everything that a judge, a task or a file name says is put into the page as text,
+never as markup, and the page's own policy lets nothing run but its own script.
+"""
+
+import base64
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from wm_nodes.core.files import write_atomic
+from wm_nodes.judge.agent.levels import settled
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import GATED, PLANNING, Read, Verdict
+from wm_nodes.judge.audit.labels import FORMAT, HACK
+from wm_nodes.judge.audit.log import AuditError
+from wm_nodes.judge.audit.media import FOLDER
+from wm_nodes.judge.audit.reading import Record, RecordedEvaluation
+from wm_nodes.judge.audit.sampling import Chosen, Sample
+from wm_nodes.judge.decisions import OVERALL, decisions_of
+
+FILE_NAME = "view.html"
+
+
+def write_view(
+    path: Path, record: Record, evaluations: Sequence[RecordedEvaluation], sample: Sample | None = None
+) -> Path:
+    """Write the page for some evaluations of a log and return its path.
+
+    Raises:
+        AuditError: an evaluation has no verdict, or the sample is of another log.
+    """
+    path = Path(path)
+    chosen = {one.evaluation: one for one in sample.chosen} if sample else {}
+    clips = [_clip(record, evaluation, chosen.get(evaluation.number)) for evaluation in evaluations]
+    names = [[clip["evaluation"], clip["audit_id"]] for clip in clips]
+    data = {
+        "format": FORMAT, "head": record.head,
+        "page": hashlib.sha256(json.dumps(names).encode()).hexdigest()[:16],
+        "media": quote(os.path.relpath(record.folder / FOLDER, path.parent)), "hack": HACK,
+        "rubrics": {version: _words(rubric) for version, rubric in record.rubrics.items()}, "clips": clips,
+    }
+    write_atomic(path, page(f"audit of {record.folder.resolve().name}", data).encode())
+    return path
+
+
+def page(title: str, data: Mapping[str, Any]) -> str:
+    """The page. data: JSON values; what the script reads."""
+    style, script = (_part(name) for name in ("viewer.css", "viewer.js"))
+    policy = (
+        f"default-src 'none'; img-src 'self' file:; style-src {_allowed(style)}; script-src {_allowed(script)}; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    text = json.dumps(data, allow_nan=False)
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" '
+        f'content="{escape(policy)}"><meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{style}</style></head><body><noscript>This page needs JavaScript; "
+        f'the log itself is plain text.</noscript><script type="application/json" id="data">{text}</script>'
+        f"<script>{script}</script></body></html>\n"
+    )
+
+
+def _allowed(text: str) -> str:
+    """The source expression of a content security policy that lets just this text in."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _part(name: str) -> str:
+    return (resources.files("wm_nodes.judge.audit.viewer") / name).read_text()
+
+
+def _words(rubric: Rubric) -> dict[str, Any]:
+    """What each row means, in the order of the page."""
+    entries = [(PLANNING, rubric.planning)]
+    rows = [{"name": name, "stage": "PLAN", "question": e.question, "levels": list(e.levels)} for name, e in entries]
+    for stage in GATED:
+        parts = rubric.stages[stage].components.items()
+        rows += [
+            {"name": name, "stage": str(stage), "question": entry.question, "levels": list(entry.levels)}
+            for name, entry in parts
+        ]
+    patterns = rubric.hack.patterns.items()
+    rows += [
+        {"name": HACK + name, "stage": "HACK", "question": entry.defect, "levels": list(entry.levels)}
+        for name, entry in patterns
+    ]
+    whole = {"name": OVERALL, "stage": "ALL", "question": "Would you take this clip for a success?", "levels": []}
+    return {"rows": [*rows, whole], "thresholds": {str(stage): rubric.stages[stage].threshold for stage in GATED}}
+
+
+def _clip(record: Record, evaluation: RecordedEvaluation, chosen: Chosen | None) -> dict[str, Any]:
+    verdict = evaluation.verdict
+    if verdict is None or (chosen is not None and chosen.audit_id != verdict.audit_id):
+        raise AuditError(f"evaluation {evaluation.number} has no verdict, or the sample is of another log")
+    body, task = record.clips[evaluation.sha256], evaluation.task
+    frames = body["frames"] if isinstance(body["frames"], list) else []
+    return {
+        "evaluation": evaluation.number, "clip_id": evaluation.clip_id, "sha256": evaluation.sha256,
+        "audit_id": verdict.audit_id, "round": evaluation.round_number, "source": body["source"],
+        "fps": _number(body["fps"]), "frames": [_url(record, name) for name in frames],
+        "reference": _picture(record, task["reference_frame"]), "goal": _picture(record, task["goal_image"]),
+        "instruction": task["instruction"], "task": task["task_id"], "robot": task["robot"],
+        "camera": task["camera_id"], "stratum": chosen.stratum if chosen else "",
+        "second": bool(chosen and chosen.second), "rubric": evaluation.agent.rubric_version,
+        "judge": {"id": verdict.provenance.judge_id, "model": verdict.provenance.model},
+        "status": str(verdict.status), "reason": verdict.reason, "reward": _number(verdict.reward),
+        "weights": {str(stage): _number(w) for stage, w in verdict.plan.weights.items()} if verdict.plan else {},
+        "stages": [
+            {"stage": str(s.stage), "status": str(s.status), "s": _number(s.s), "passed": s.passed, "veto": s.vetoed_by}
+            for s in verdict.stages
+        ],
+        "rows": _rows(evaluation, verdict, record.rubric(evaluation)),
+        "reflections": [
+            {"triggers": list(second.triggers), "changes": [
+                {"component": c.component, "before": _number(c.before), "after": _number(c.after), "reason": c.reason,
+                 "frames": list(c.frames), "accepted": c.accepted} for c in second.changed
+            ]} for second in verdict.reflections
+        ],
+        "evidence": {name: _number(value) for name, value in evaluation.evidence.items()},
+        "cost": {name: _number(value) for name, value in vars(verdict.cost).items() if value is not None},
+        "reads": verdict.num_reads,
+    }
+
+
+def _rows(evaluation: RecordedEvaluation, verdict: Verdict, rubric: Rubric) -> dict[str, Any]:
+    """What the judge says of each row: value (True, False, a level, None), why, and the votes behind it."""
+    decisions = decisions_of(verdict)
+    asked = [(ask.stage, read) for ask in evaluation.asks for read in ask.reads]
+    rows: dict[str, Any] = {}
+    planning = [read for stage, read in asked if stage == "PLAN"]
+    plan = verdict.plan
+    rows[PLANNING] = {
+        "value": decisions[PLANNING].value if PLANNING in decisions else None, "why": plan.reason if plan else "",
+        "decided_by": f"focus: {', '.join(plan.focus) or 'none'}" if plan else "", "frames": [],
+        "votes": [_vote(read) for read in planning],
+    }
+    for score in (score for stage in verdict.stages for score in stage.components):
+        rows[score.component] = {
+            "value": decisions[score.component].value if score.component in decisions else None,
+            "s": _number(score.s), "p_fail": _number(score.p_fail), "margin": _number(score.margin),
+            "why": score.evidence_text, "decided_by": score.decided_by, "reason": score.reason,
+            "frames": list(score.frames_cited), "votes": [_vote(read) for read in score.votes],
+        }
+    for flag in verdict.hack_flags:
+        reads = [read for stage, read in asked if stage == "HACK" and read.component == flag.pattern]
+        looks = [settled([read], rubric.voting.min_label_mass) for read in reads]
+        rows[HACK + flag.pattern] = {
+            "value": not flag.confirmed, "p_fail": _number(flag.p_present), "why": flag.evidence_text,
+            "decided_by": "confirmed by a second read" if flag.confirmed else "not confirmed",
+            "reason": "; ".join(look.reason for look in looks if look.reason), "frames": [],
+            "votes": [_vote(read) for read in reads],
+        }
+    rows[OVERALL] = {
+        "value": decisions[OVERALL].value if OVERALL in decisions else None, "why": "", "decided_by": "all gates",
+        "frames": [], "votes": [],
+    }
+    return rows
+
+
+def _vote(read: Read) -> dict[str, Any]:
+    return {
+        "index": read.vote.index, "kind": read.source, "polarity": read.vote.polarity, "status": str(read.status),
+        "levels": [_number(p) for p in read.levels], "mass": _number(read.label_mass), "why": read.evidence_text,
+        "reason": read.reason, "frames": list(read.frames_cited),
+    }
+
+
+def _number(value: Any) -> float | None:
+    """None where it is not finite."""
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def _url(record: Record, name: str) -> str:
+    """Below the media folder; the name is checked, because it comes from a file."""
+    return str(record.store.path(name).relative_to(record.folder / FOLDER))
+
+
+def _picture(record: Record, name: str | None) -> str:
+    return _url(record, name) if name and name.endswith(".png") else ""

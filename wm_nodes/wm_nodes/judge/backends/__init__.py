@@ -1,0 +1,27 @@
+"""Judges: whoever reads clips for the reward agent. Here: any server that speaks chat completions, such as vLLM.
+
+    vllm serve MODEL --enable-prefix-caching --limit-mm-per-prompt '{"image": 40, "video": 1}'
+
+    transport = ChatTransport([Endpoint("http://127.0.0.1:8000/v1", "MODEL")])
+    agent = RewardAgent(OpenAIJudge(transport, rubric, cache=VerdictCache(folder)), rubric)
+
+A profile sends up to 32 images. Keys come from environment variables only (Endpoint.api_key_env). Label votes need a
+server with logprobs; `transformers serve` has none, so votes after the first are errors there.
+"""
+
+from wm_nodes.core.optional import MissingPackageError
+from wm_nodes.judge.backends.cache import VerdictCache
+from wm_nodes.judge.backends.calls import ChatOptions
+from wm_nodes.judge.backends.openai_client import OpenAIJudge
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy, TransportError
+
+__all__ = [
+    "ChatOptions",
+    "ChatTransport",
+    "Endpoint",
+    "MissingPackageError",
+    "OpenAIJudge",
+    "RetryPolicy",
+    "TransportError",
+    "VerdictCache",
+]

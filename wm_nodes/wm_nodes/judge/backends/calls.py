@@ -1,0 +1,272 @@
+"""One question to a chat server and the ladder below it: answer checked; asked once more with the reason; one label
+read per component; ERROR. Specification: sections 2.5 and 2.6.
+"""
+
+import asyncio
+import hashlib
+import json
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from wm_nodes.judge.agent.levels import map_back, one_hot, option_order
+from wm_nodes.judge.agent.types import (
+    NUM_LEVELS,
+    NUM_PLAN_LEVELS,
+    PLANNING,
+    Component,
+    Cost,
+    Read,
+    ReadRequest,
+    Stage,
+    Status,
+    Vote,
+)
+from wm_nodes.judge.backends.labels import label_options, option_probabilities
+from wm_nodes.judge.backends.prompts import LETTERS, Part, Prompts, prior_level, with_problem
+from wm_nodes.judge.backends.protocol import Completion
+from wm_nodes.judge.backends.schemas import AnswerError, AnswerFormat, ComponentAnswer
+from wm_nodes.judge.backends.transport import ChatAnswer, ChatTransport, TransportError
+
+JSON_TRIES = 2
+MEASURED_CALLS = 200
+SEED_LIMIT = 2**31
+Exchange = Mapping[str, Any]
+"""What was asked in words and what came back, as JSON values: the raw material of an audit log."""
+
+
+@dataclass(frozen=True)
+class ChatOptions:
+    """json_timeout_s, label_timeout_s: per try. budget_s: all calls of one ReadRequest together, waits included.
+
+    max_answer_tokens: of a JSON answer; one that needs more has failed. structured: ask the server to enforce the
+    schema; the answer is checked either way. label_token_ids: token ids of A to E, where the server can be asked for
+    their probabilities by id. choice_grammar: label reads choose among the letters only, so that the label mass no
+    longer warns. min_label_mass: a label read with less abstains, unless choice_grammar. max_images: that the server
+    takes in one call. video: the dense profile goes as one video (vLLM, --limit-mm-per-prompt with a video), else as
+    images. repeat_share: of the calls that are asked twice, so that it is known how often a live server contradicts
+    itself; the first answer counts.
+    """
+
+    json_timeout_s: float = 120.0
+    label_timeout_s: float = 60.0
+    budget_s: float = 300.0
+    max_answer_tokens: int = 1024
+    structured: bool = True
+    label_token_ids: tuple[int, ...] = ()
+    choice_grammar: bool = False
+    min_label_mass: float = 0.5
+    max_images: int = 64
+    video: bool = False
+    repeat_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.repeat_share <= 1:
+            raise ValueError(f"repeat_share must lie in [0, 1], got {self.repeat_share}")
+        if self.label_token_ids and len(self.label_token_ids) != len(LETTERS):
+            raise ValueError(f"label_token_ids must hold {len(LETTERS)} ids, of A to E, got {self.label_token_ids}")
+        if not min(self.json_timeout_s, self.label_timeout_s, self.budget_s) > 0:
+            raise ValueError(f"timeouts and budget must be > 0 s, got {self}")
+
+
+@dataclass(frozen=True)
+class Call:
+    """Some components of a request, to one vote. media: as sent. deadline: on the time.monotonic clock, s."""
+
+    request: ReadRequest
+    media: list[Part]
+    media_sha: str
+    deadline: float
+    vote: Vote
+    components: tuple[Component, ...]
+
+
+class Prompt:
+    """A request body, how its answer is read, and `sha`: of all of it but the media, which have their own hash."""
+
+    def __init__(
+        self, call: Call, messages: list[Part], fields: dict[str, Any], reader: AnswerFormat | tuple[int, ...]
+    ) -> None:
+        self.body = {"messages": messages, "temperature": 0, "seed": call.vote.seed % SEED_LIMIT, **fields}
+        self.reader = reader
+        system, user = messages
+        self.sha = sha_of([system, user["content"][len(call.media) :], {**self.body, "messages": None}])
+
+
+class Bill:
+    """What one call costs, retries and ladder included. Requests without an answer count as retries only."""
+
+    def __init__(self, num_images: int) -> None:
+        self._num_images = num_images
+        self.cost = Cost()
+
+    def answered(self, answer: ChatAnswer) -> None:
+        usage = answer.completion.usage
+        self.cost += Cost(
+            calls=1,
+            prompt_tokens=usage.prompt_tokens,
+            cached_tokens=usage.cached_tokens,
+            completion_tokens=usage.completion_tokens,
+            images=self._num_images,
+            wall_s=answer.wall_s,
+            retries=answer.tries - 1,
+        )
+
+    def failed(self, error: TransportError) -> None:
+        self.cost += Cost(retries=max(0, error.tries - 1))
+
+
+class Caller:
+    """Builds prompts, sends them, reads the answers. latencies_s, label_masses: of the last 200 answers.
+
+    on_exchange: called with every request that was answered or failed, refused answers included.
+    """
+
+    def __init__(
+        self,
+        transport: ChatTransport,
+        prompts: Prompts,
+        options: ChatOptions,
+        on_exchange: Callable[[Exchange], None] = lambda exchange: None,
+    ) -> None:
+        self._on_exchange = on_exchange
+        self.latencies_s: deque[float] = deque(maxlen=MEASURED_CALLS)
+        self.label_masses: deque[float] = deque(maxlen=MEASURED_CALLS)
+        self._transport, self._prompts, self._options = transport, prompts, options
+
+    def prompt(self, call: Call) -> Prompt:
+        return self._label_prompt(call, call.components[0]) if call.vote.kind == "label" else self._json_prompt(call)
+
+    async def answer(self, call: Call, prompt: Prompt, bill: Bill) -> list[Read]:
+        """One Read per component of the call; those without an answer have status ERROR and say why."""
+        try:
+            if isinstance(prompt.reader, AnswerFormat):
+                return await self._json(call, prompt.body, prompt.reader, bill)
+            return [await self._label(call, call.components[0], prompt, bill)]
+        except TransportError as error:
+            bill.failed(error)
+            return [_failed(component, call.vote, str(error)) for component in call.components]
+        except AnswerError as error:
+            return [_failed(component, call.vote, str(error)) for component in call.components]
+
+    async def _json(self, call: Call, body: dict[str, Any], form: AnswerFormat, bill: Bill) -> list[Read]:
+        messages, problem = body["messages"], ""
+        for _ in range(JSON_TRIES):
+            answer = await self._send(call, body, bill, self._options.json_timeout_s)
+            try:
+                findings = form.read(_finished(answer.completion))
+            except AnswerError as error:
+                problem = str(error)
+                body = {**body, "messages": with_problem(messages, problem)}
+                continue
+            return [_from_json(finding, call.vote) for finding in findings]
+        if call.request.stage is Stage.REFLECT:  # a letter cites no frames
+            raise AnswerError(f"{JSON_TRIES} answers were refused, the last one: {problem}")
+        return list(await asyncio.gather(*(self._fallback(call, name, bill, problem) for name in call.components)))
+
+    async def _fallback(self, call: Call, component: Component, bill: Bill, problem: str) -> Read:
+        """A label read in place of a JSON answer that was refused twice."""
+        try:
+            read = await self._label(call, component, self._label_prompt(call, component), bill)
+        except (TransportError, AnswerError) as error:
+            if isinstance(error, TransportError):
+                bill.failed(error)
+            reason = f"{JSON_TRIES} JSON answers were refused ({problem}); then the label read failed: {error}"
+            return _failed(component, call.vote, reason)
+        return replace(read, reason=read.reason or f"label read, because JSON answers were refused: {problem}")
+
+    async def _label(self, call: Call, component: Component, prompt: Prompt, bill: Bill) -> Read:
+        options, order = self._options, prompt.reader
+        assert isinstance(order, tuple)  # label prompts are read by the order of their options
+        answer = await self._send(call, prompt.body, bill, options.label_timeout_s)
+        probabilities, mass = option_probabilities(answer.completion, LETTERS[: len(order)])
+        self.label_masses.append(mass)
+        if mass == 0 or (mass < options.min_label_mass and not options.choice_grammar):
+            reason = f"label mass {mass:.3f} is below {options.min_label_mass}"
+            return Read(component, (), "label", call.vote, mass, Status.ABSTAIN, reason)
+        told = 1.0 if options.choice_grammar else mass
+        return Read(component, map_back(probabilities, order), "label", call.vote, told)
+
+    async def _send(self, call: Call, body: dict[str, Any], bill: Bill, timeout_s: float) -> ChatAnswer:
+        try:
+            answer = await self._transport.complete(body, timeout_s=timeout_s, deadline=call.deadline)
+        except TransportError as error:
+            self._on_exchange({**asked(call, body), "error": str(error), "tries": error.tries})
+            raise
+        took = {"endpoint": answer.endpoint, "tries": answer.tries, "wall_s": answer.wall_s}
+        self._on_exchange({**asked(call, body), "reply": answer.completion.model_dump(mode="json"), **took})
+        bill.answered(answer)
+        self.latencies_s.append(answer.wall_s)
+        return answer
+
+    def _json_prompt(self, call: Call) -> Prompt:
+        request = call.request
+        form = AnswerFormat(
+            request.stage,
+            call.components,
+            [item.index for item in request.media if item.kind == "clip"],
+            problems=self._prompts.rubric.component_names,
+            prior={score.component: level for score in request.prior if (level := prior_level(score)) is not None},
+        )
+        fields: dict[str, Any] = {"max_tokens": self._options.max_answer_tokens}
+        if self._options.structured:
+            fields["response_format"] = form.response_format
+        return Prompt(call, self._prompts.json_question(call.media, request, call.components, form), fields, form)
+
+    def _label_prompt(self, call: Call, component: Component) -> Prompt:
+        request, options = call.request, self._options
+        count = NUM_PLAN_LEVELS if request.stage is Stage.PLAN else NUM_LEVELS
+        order = option_order(call.vote, request.clip.sha256, component, count)
+        messages = self._prompts.label_question(call.media, request, component, call.vote, order)
+        fields = label_options(
+            LETTERS[:count], token_ids=options.label_token_ids[:count], grammar=options.choice_grammar
+        )
+        return Prompt(call, messages, fields, order)
+
+
+def asked(call: Call, body: Mapping[str, Any]) -> dict[str, Any]:
+    """The words of a request and its settings; its images are named by their hash."""
+    system, user = body["messages"]
+    words = [part["text"] for part in user["content"][len(call.media) :]]
+    return {
+        "components": list(call.components), "vote": call.vote.index, "media_sha": call.media_sha,
+        "prompt": [system["content"], *words], "settings": {key: body[key] for key in body if key != "messages"},
+    }
+
+
+def sha_of(value: Any) -> str:
+    """SHA-256, hexadecimal, of a value as canonical JSON."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def num_images(media: Sequence[Part]) -> int:
+    """Images, and frames of videos."""
+    videos = [str(part["video_url"]["url"]) for part in media if part["type"] == "video_url"]
+    return sum(url.count(",") for url in videos) + len([part for part in media if part["type"] == "image_url"])
+
+
+def _finished(completion: Completion) -> str:
+    choice = completion.choices[0]
+    if choice.finish_reason != "stop":
+        raise AnswerError(f"finish_reason is {choice.finish_reason!r}, not 'stop'")
+    if not choice.message.content:
+        raise AnswerError("the answer is empty")
+    return choice.message.content
+
+
+def _from_json(finding: ComponentAnswer, vote: Vote) -> Read:
+    count = NUM_PLAN_LEVELS if finding.component == PLANNING else NUM_LEVELS
+    return Read(
+        finding.component,
+        one_hot(finding.level, count),
+        "json",
+        vote,
+        evidence_text=finding.evidence,
+        frames_cited=finding.frames,
+        focus=finding.focus,
+    )
+
+
+def _failed(component: Component, vote: Vote, reason: str) -> Read:
+    return Read(component, (), vote.kind, vote, label_mass=0.0, status=Status.ERROR, reason=reason)

@@ -1,0 +1,190 @@
+"""A judge from the configuration's `judge` section. Specification: sections 2.6 and 4.4."""
+
+import re
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from wm_nodes.config.schema import JudgeConfig, OtherJudge, StageJudge
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import Judge, Stage
+from wm_nodes.judge.backends.cache import VerdictCache
+from wm_nodes.judge.backends.calls import ChatOptions, Exchange
+from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit
+from wm_nodes.judge.backends.openai_client import OpenAIJudge
+from wm_nodes.judge.backends.routed import RoutedJudge
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
+from wm_nodes.judge.evidence.head import load_head
+
+AnyJudge = TypeVar("AnyJudge", JudgeConfig, OtherJudge, StageJudge)
+_VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+@dataclass(frozen=True)
+class OpenedJudge:
+    """A judge and what ends it: `close` is awaited on the event loop that asked the judge."""
+
+    judge: Judge
+    close: Callable[[], Coroutine[Any, Any, None]]
+
+
+def judges_of(settings: JudgeConfig) -> list[JudgeConfig]:
+    """The judge with its routes, and its fallbacks, in the order in which they are tried; none has fallbacks itself."""
+    return [settings.model_copy(update={"fallbacks": []}), *(_alone(settings, other) for other in settings.fallbacks)]
+
+
+def _alone(settings: JudgeConfig, other: OtherJudge) -> JudgeConfig:
+    """The settings of another judge, who has nobody beside it."""
+    given = {name: getattr(other, name) for name in OtherJudge.model_fields}
+    return settings.model_copy(update={**given, "routes": [], "fallbacks": []})
+
+
+def check_judge(settings: JudgeConfig) -> None:
+    """Refuse settings that name no judge, before anything is made from them or written with them.
+
+    Raises:
+        ValueError: names the setting and the remedy; never repeats what may be a key.
+    """
+    _check_one(settings)
+    for kind, others in (("routes", settings.routes), ("fallbacks", settings.fallbacks)):
+        for number, other in enumerate(others):
+            try:
+                _check_one(_alone(settings, other))
+            except ValueError as error:
+                raise ValueError(f"judge.{kind}[{number}]: {error}") from None
+    stages = [stage for route in settings.routes for stage in route.stages]
+    if twice := sorted({stage for stage in stages if stages.count(stage) > 1}):
+        raise ValueError(f"judge.routes names {', '.join(twice)} more than once; one judge reads a stage")
+    seen = list[tuple[object, ...]]()
+    for number, judge in enumerate(judges_of(settings)):
+        name = judge.model if judge.kind == "openai" else str(_folder(judge))
+        identity = (judge.kind, name, judge.routes)
+        if identity in seen:
+            raise ValueError(
+                f"judge.fallbacks[{number - 1}] is {name!r} once more; further servers of one model belong into the "
+                "endpoints of its judge"
+            )
+        seen.append(identity)
+
+
+def _check_one(settings: JudgeConfig) -> None:
+    if settings.kind == "embedded":
+        if settings.folder and not Path(settings.folder).is_dir():
+            raise ValueError(
+                f"judge.folder {settings.folder!r} is no folder; name that of a trained judge (make one with "
+                "python -m wm_nodes.apps.train_judge), or leave it empty for the shipped one"
+            )
+        if settings.conformal:
+            load_head(_folder(settings)).conformal(settings.conformal)
+        return
+    if not settings.endpoints or not settings.model:
+        raise ValueError(
+            "the reward agent needs a judge: set judge.endpoints, e.g. [http://127.0.0.1:8000/v1], and judge.model "
+            f"(got {settings.endpoints} and {settings.model!r})"
+        )
+    if settings.api_key_env and not _VARIABLE.fullmatch(settings.api_key_env):
+        raise ValueError(
+            "judge.api_key_env must be the name of an environment variable, e.g. JUDGE_API_KEY; what is there is no "
+            "name, perhaps a key, and is not repeated here"
+        )
+
+
+def for_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> JudgeConfig:
+    """The settings with the shipped judge of such pictures wherever an embedded one is not named; with the first
+    shipped one where there is none.
+
+    Args:
+        shape: (frames, height, width, 3).
+    """
+    fitting = (str(path) for path in shipped_heads() if load_head(path).picture_size == tuple(shape[1:3]))
+    folder = next(fitting, str(shipped_head()))
+
+    def named(judge: AnyJudge) -> AnyJudge:
+        return judge if judge.kind != "embedded" or judge.folder else judge.model_copy(update={"folder": folder})
+
+    routes, fallbacks = [*map(named, settings.routes)], [*map(named, settings.fallbacks)]
+    return named(settings).model_copy(update={"routes": routes, "fallbacks": fallbacks})
+
+
+def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
+    """Refuse a judge that would abstain on every clip of this shape, (frames, height, width, 3); likewise routed ones
+    and fallbacks. Servers take any.
+
+    Raises:
+        ValueError: names the shape and the remedy; or the folder holds no judge.
+    """
+    settings = for_clips(settings, shape)
+    others: list[OtherJudge] = [*settings.routes, *settings.fallbacks]
+    for judge in (settings, *(_alone(settings, other) for other in others)):
+        if judge.kind != "embedded" or not (reason := unfit(load_head(_folder(judge)), shape)):
+            continue
+        raise ValueError(
+            f"the embedded judge {_folder(judge)} cannot judge clips of {shape[0]} frames, {shape[1]} x {shape[2]} "
+            f"px: {reason}. Name a server (judge.kind openai, judge.endpoints, judge.model), or in judge.folder a "
+            "judge that was trained on such clips (python -m wm_nodes.apps.train_judge)"
+        )
+
+
+def judge_name(settings: JudgeConfig) -> str:
+    """Who judges, in words for people."""
+    embedded = settings.kind == "embedded"
+    name = f"embedded judge {_folder(settings)}" if embedded else f"{settings.model} at {', '.join(settings.endpoints)}"
+    by = [f"{'+'.join(route.stages)} by {judge_name(_alone(settings, route))}" for route in settings.routes]
+    return "; ".join([name, *by])
+
+
+def make_judge(
+    settings: JudgeConfig, rubric: Rubric, reads: Path | None = None,
+    on_exchange: Callable[[Exchange], None] = lambda exchange: None,
+) -> OpenedJudge:
+    """Make the judge that the settings name; nothing is asked yet.
+
+    Args:
+        reads: folder of the reads that were bought before, see VerdictCache; None: none are kept. Of servers only.
+        on_exchange: called with the words of every request to a server and its raw reply.
+
+    Raises:
+        ValueError: as check_judge; the key's environment variable is not set, or the folder holds no judge.
+        MissingPackageError: the client package is not installed.
+    """
+    check_judge(settings)
+    first = _opened(settings, rubric, reads, on_exchange)
+    if not settings.routes:
+        return first
+    routed = [_opened(_alone(settings, route), rubric, reads, on_exchange) for route in settings.routes]
+    routes = [([Stage(s) for s in r.stages], o.judge) for r, o in zip(settings.routes, routed, strict=True)]
+
+    async def close() -> None:
+        for opened in (first, *routed):
+            await opened.close()
+
+    return OpenedJudge(RoutedJudge(first.judge, routes, rubric), close)
+
+
+def _opened(
+    settings: JudgeConfig, rubric: Rubric, reads: Path | None, on_exchange: Callable[[Exchange], None]
+) -> OpenedJudge:
+    """The judge itself, whatever its routes."""
+    if settings.kind == "embedded":
+        return OpenedJudge(EmbeddedJudge(load_head(_folder(settings)), settings.conformal), _nothing)
+    transport = ChatTransport(
+        [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
+        retry=RetryPolicy(settings.tries),
+    )
+    options = ChatOptions(
+        json_timeout_s=settings.json_timeout_s, label_timeout_s=settings.label_timeout_s,
+        budget_s=settings.clip_budget_s, max_images=settings.max_images, video=settings.video,
+        choice_grammar=settings.choice_grammar, label_token_ids=tuple(settings.label_token_ids),
+        repeat_share=settings.repeat_share,
+    )
+    cache = VerdictCache(reads) if reads is not None and settings.keep_reads else None
+    return OpenedJudge(OpenAIJudge(transport, rubric, options, cache, on_exchange), transport.close)
+
+
+def _folder(settings: JudgeConfig) -> Path:
+    return Path(settings.folder) if settings.folder else shipped_head()
+
+
+async def _nothing() -> None:
+    """What ends a judge that holds nothing."""

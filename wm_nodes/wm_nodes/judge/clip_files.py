@@ -1,0 +1,128 @@
+"""Clips of one's own in a folder: video files, and clips.jsonl, which says what each one should show."""
+
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from wm_nodes.core.files import file_sha256
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.judge.agent import ClipRef, TaskSpec, clip_ref
+from wm_nodes.judge.service import ClipJob
+
+LIST = "clips.jsonl"
+AT_ONCE = 64
+"""Clips whose pixels are held at a time, as long as the judge does not take more at once."""
+
+
+class ClipLine(BaseModel):
+    """One line of clips.jsonl. Paths are relative to its folder.
+
+    file: a video, or a .npy of uint8 (F, H, W, 3), RGB. fps: of a .npy. reference: the picture that the clip had to
+    start from; "": its first frame. goal: a picture of the end. sha256: of the clip's content, where it is to be
+    checked.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    file: Annotated[str, Field(min_length=1)]
+    instruction: str
+    clip_id: str = ""
+    task_id: str = ""
+    robot: str = "panda"
+    fps: Annotated[float, Field(gt=0)] = 5.0
+    reference: str = ""
+    goal: str = ""
+    sha256: str = ""
+
+
+def read_list(folder: Path) -> list[ClipLine]:
+    """The lines of clips.jsonl.
+
+    Raises:
+        ValueError: no such file, or a line that is none; names the line, the field and what is wrong.
+    """
+    path = folder / LIST
+    if not path.is_file():
+        raise ValueError(
+            f'{path} is missing: one line per clip, e.g. {{"file": "a.mp4", "instruction": "push the cube", "task_id": '
+            '"push_cube"}'
+        )
+    lines = []
+    for number, text in enumerate(path.read_text().splitlines(), 1):
+        if not text.strip():
+            continue
+        try:
+            lines.append(ClipLine.model_validate_json(text))
+        except ValidationError as error:
+            first = error.errors(include_input=False, include_url=False)[0]
+            where = ".".join(map(str, first["loc"])) or "line"
+            raise ValueError(f"{path}:{number}: {where}: {first['msg']}") from None
+    return lines
+
+
+def list_sha256(folder: Path, announced: str = "") -> str:
+    """Of the bytes of clips.jsonl.
+
+    Raises:
+        ValueError: it is not the announced one. OSError: it cannot be read.
+    """
+    path = folder / LIST
+    found = file_sha256(path)
+    if announced and found != announced:
+        raise ValueError(f"{path} is not the announced list (sha256 {found[:12]}, not {announced[:12]}); copy it again")
+    return found
+
+
+def read_job(folder: Path, line: ClipLine) -> ClipJob:
+    """A clip with its pixels.
+
+    Raises:
+        ValueError: an unreadable file, or another content than its sha256; names the file.
+    """
+    path = folder / line.file
+    clip = _read_frames(path, line.fps) if path.suffix == ".npy" else read_video(path)
+    if line.sha256 and clip.sha256 != line.sha256:
+        raise ValueError(f"{path} has content {clip.sha256}, not {line.sha256}; copy it again")
+    clip = ClipRef(line.clip_id or path.stem, clip.sha256, clip.frames, clip.fps)
+    reference = read_picture(folder / line.reference) if line.reference else clip.frames[0]
+    goal = read_picture(folder / line.goal) if line.goal else None
+    return ClipJob(clip, TaskSpec(line.instruction, line.task_id, line.robot, reference, goal))
+
+
+def read_video(path: Path) -> ClipRef:
+    """Every frame of a video, RGB.
+
+    Raises:
+        ValueError: no readable video of two frames or more.
+    """
+    capture = cv2.VideoCapture(str(path))
+    fps, frames = capture.get(cv2.CAP_PROP_FPS), []
+    while True:
+        there, frame = capture.read()
+        if not there:
+            break
+        frames.append(frame[..., ::-1])
+    capture.release()
+    if len(frames) < 2 or not fps > 0:
+        raise ValueError(f"{path} is no readable video: {len(frames)} frames at {fps:g} per second")
+    return clip_ref(path.stem, np.stack(frames), fps)
+
+
+def read_picture(path: Path) -> UInt8Array:
+    """uint8 (H, W, 3), RGB. Raises ValueError where it cannot be read."""
+    found = cv2.imread(str(path))
+    if found is None:
+        raise ValueError(f"{path} is no readable picture")
+    return np.ascontiguousarray(found[..., ::-1], np.uint8)
+
+
+def _read_frames(path: Path, fps: float) -> ClipRef:
+    """What is wrong with the frames themselves is the agent's to say."""
+    try:
+        frames = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path} is no readable array: {error}") from None
+    return clip_ref(path.stem, frames, fps)

@@ -1,0 +1,119 @@
+"""What a verdict decides, under the names of the paper's Table 2; labels of people and of recipes use the same names.
+
+A decision is True (passes), False, or a planning level; a row that a verdict leaves open is missing. Stages are decided
+as the agent's gates decide them, TC as completion (level 3 or more): its gate asks for visible progress only. Overall
+is what a trainer would accept: every gate passed and the task completed. [inferred], the paper does not say it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from wm_nodes.core.reward_statistics import balanced_accuracy, expected_calibration_error, kappa, wilson_of_share
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import PLANNING, Stage, Status, Verdict
+from wm_nodes.judge.dataset.edits import TC
+
+OVERALL = "overall"
+STAGES = (Stage.VQ, Stage.IF, Stage.PC)
+PAPER: Mapping[str, float] = {
+    PLANNING: 98.0, "VQ": 96.0, "clarity": 100.0, "brightness": 100.0, "color": 96.0, "temporal": 96.0, "IF": 90.0,
+    "background": 95.0, "objective": 85.0, "robot": 88.0, "viewpoint": 100.0, "PC": 82.0, "interaction": 85.0,
+    "deformation": 82.0, "geometry": 86.0, TC: 87.0, OVERALL: 91.0,
+}
+"""Table 2 of the paper, accuracy in percent on 100 clips."""
+FAIR_LEVEL = 2
+"""A planning label below this counts as a fail in the prevalence."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What was decided, and how surely: p_pass in [0, 1] of a pass, or the probability of the planning level."""
+
+    value: bool | int
+    p_pass: float
+
+
+class Match(NamedTuple):
+    """How well decisions match labels. accuracy, low, high: share of equal ones with its 95 % Wilson interval.
+    prevalence: share of failing labels (planning: of levels below 2). balanced: balanced accuracy, of planning the mean
+    recall of its levels. calibration: expected calibration error of p_pass, of planning of the chosen level. NaN where
+    the labels are all alike.
+    """
+
+    accuracy: float
+    low: float
+    high: float
+    prevalence: float
+    balanced: float
+    kappa: float
+    calibration: float
+
+
+def match(
+    name: str, labels: Sequence[bool | int], decisions: Sequence[Decision], weights: ArrayLike | None = None
+) -> Match:
+    """The numbers of the row `name`. weights: what each decision stands for; kappa and level recall count decisions."""
+    values, p_pass = [decision.value for decision in decisions], [decision.p_pass for decision in decisions]
+    right, planning = [label == value for label, value in zip(labels, values, strict=True)], name == PLANNING
+    failing = [label < FAIR_LEVEL if planning else not label for label in labels]
+    return Match(
+        *wilson_of_share(right, weights), wilson_of_share(failing, weights)[0],
+        _level_recall(labels, right) if planning else balanced_accuracy(labels, values, weights),
+        kappa(labels, values), expected_calibration_error(right if planning else labels, p_pass, weights),
+    )
+
+
+def _level_recall(labels: Sequence[int], right: Sequence[bool]) -> float:
+    recalls = [np.mean([ok for label, ok in zip(labels, right) if label == level]) for level in set(labels)]
+    return float(np.mean(recalls)) if len(recalls) > 1 else float("nan")
+
+
+def row_names(rubric: Rubric) -> list[str]:
+    """Planning, each stage with its components below it, overall: the order of the table."""
+    names = [PLANNING]
+    for stage in STAGES:
+        names += [str(stage), *rubric.stages[stage].components]
+    return [*names, *rubric.stages[Stage.TC].components, OVERALL]
+
+
+def decisions_of(verdict: Verdict) -> dict[str, Decision]:
+    """What a verdict decides.
+
+    p_pass of a stage is that of its likeliest failing component; of the whole, of its likeliest failing row.
+    """
+    found: dict[str, Decision] = {}
+    scores = {score.component: score for stage in verdict.stages for score in stage.components}
+    for name, score in scores.items():
+        if score.status is Status.OK:
+            found[name] = Decision(score.passed, 1 - score.p_fail)
+    for stage in verdict.stages:
+        if stage.status is Status.OK and stage.stage is not Stage.TC:
+            least = min(1 - score.p_fail for score in stage.components)
+            found[str(stage.stage)] = Decision(stage.passed, 0.0 if stage.vetoed_by.startswith("hack ") else least)
+    if verdict.plan is not None:
+        found[PLANNING] = Decision(verdict.level, verdict.plan.p_level[verdict.level])
+    elif verdict.level == 0:
+        found[PLANNING] = Decision(0, 1.0)
+    accepted = accepts(verdict)
+    if accepted is not None:
+        parts = [decision.p_pass for name, decision in found.items() if name in (TC, *map(str, STAGES))]
+        found[OVERALL] = Decision(accepted, min(parts, default=0.0))
+    return found
+
+
+def accepts(verdict: Verdict) -> bool | None:
+    """Whether a trainer would take the clip for a success; None where the verdict has no number.
+
+    A stage that failed its gate settles it, whatever abstained behind it.
+    """
+    if verdict.status is Status.ERROR:
+        return None
+    read = [stage for stage in verdict.stages if stage.status is Status.OK]
+    completion = [score for stage in read for score in stage.components if score.component == TC]
+    if any(not stage.passed for stage in read) or any(not score.passed for score in completion):
+        return False
+    return len(read) == len(verdict.stages) if verdict.status is Status.OK else None

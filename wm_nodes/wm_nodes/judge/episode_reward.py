@@ -1,0 +1,237 @@
+"""The reward agent as reward of a policy: an episode is judged as a clip at its end, and paid at its last step.
+
+Every rollout begins with a reset, so an episode that the rollout's end cuts short never goes on and is never judged.
+Its 0 at each step is exact, for what it is worth would come with its last step only; for the rest the critic stands,
+which learns from the episodes that ended: PPO bootstraps at the cut. One that ended has its verdict and nothing beyond.
+
+Shapes: N environments, T steps of an episode, H W 3 image, A action.
+"""
+
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wm_nodes.config.load import judge_or_embedded
+from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
+from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
+from wm_nodes.core.types import BoolArray, FloatArray, Rollout, UInt8Array, UInt64Array
+from wm_nodes.judge.agent import TaskSpec, Verdict, clip_ref, load_rubric
+from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
+from wm_nodes.judge.backends.factory import check_clips, check_judge, for_clips
+from wm_nodes.judge.service import ClipJob, JudgeService
+from wm_nodes.reward import SUCCESS_UNKNOWN, RewardResult
+from wm_nodes.reward.base import version_of
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeStep:
+    """One lock-step. images, next_images: uint8 (N, H, W, 3), None where they are lost. actions: float32 (N, A).
+    episode_ids, episode_steps: (N,). ended: bool (N,), terminated or truncated. valid: bool (N,), a step was made.
+    goals: uint8 (H, W, 3) by environment, of those that have a goal image.
+    """
+
+    images: UInt8Array | None
+    next_images: UInt8Array | None
+    actions: FloatArray
+    episode_ids: UInt64Array
+    episode_steps: NDArray[np.uint32]
+    ended: BoolArray
+    valid: BoolArray
+    goals: Mapping[int, UInt8Array] = field(default_factory=dict)
+
+
+@dataclass
+class _Episode:
+    """What was seen of an episode. fault: why it cannot be judged as a whole."""
+
+    episode_id: int
+    frames: list[UInt8Array] = field(default_factory=list)
+    actions: list[FloatArray] = field(default_factory=list)
+    goal: UInt8Array | None = None
+    fault: str = ""
+
+
+@dataclass(frozen=True)
+class PendingReward:
+    """The rewards of a lock-step, once the episodes that end with it are judged. waited: by environment, a verdict to
+    come, or why there will be none.
+    """
+
+    valid: BoolArray
+    waited: Mapping[int, "Future[Verdict] | str"]
+
+    @property
+    def done(self) -> bool:
+        return all(isinstance(found, str) or found.done() for found in self.waited.values())
+
+    def cancel(self) -> None:
+        for found in self.waited.values():
+            if not isinstance(found, str):
+                found.cancel()
+
+    def verdicts(self) -> dict[int, Verdict]:
+        """By environment; only when done."""
+        return {n: found.result() for n, found in self.waited.items() if not isinstance(found, str)}
+
+    def result(self) -> RewardResult:
+        """0 for steps within an episode, the verdict's reward for its last one, invalid without one; only when done."""
+        total, valid, reasons = np.zeros(len(self.valid), np.float32), self.valid.copy(), list[str]()
+        for n, found in self.waited.items():
+            verdict = None if isinstance(found, str) else found.result()
+            if verdict is None or not verdict.valid:
+                valid[n] = False
+                reasons.append(f"environment {n}: {found if verdict is None else f'{verdict.status} {verdict.reason}'}")
+            else:
+                total[n] = verdict.reward
+        total = np.where(valid, total, np.float32(np.nan)).astype(np.float32)
+        none = np.where(valid, np.float32(0), np.float32(np.nan)).astype(np.float32)
+        return RewardResult(
+            total=total, dense=none, sparse=total, valid=valid,
+            success=np.full(len(valid), SUCCESS_UNKNOWN, np.uint8), invalid_reason="; ".join(reasons),
+            components={"dense": none, "sparse": total}, weights={"dense": 0.0, "sparse": 1.0},
+        )
+
+
+def check_agent(config: RunConfig, *, trains: bool = True) -> None:
+    """Refuse settings by which episodes of the configured scene could not be judged, before anything is made.
+
+    Args:
+        trains: rollouts of ppo.num_steps are trained on.
+
+    Raises:
+        ValueError, ConfigError: as check_judge, load_rubric, check_horizon and check_clips; fallbacks are named.
+    """
+    check_judge(config.judge)
+    _refuse_fallbacks(config.judge)
+    load_rubric(config.judge.rubric)
+    spec = _scene(config)
+    if trains:
+        check_horizon(config.ppo.num_steps, spec.max_episode_steps)
+    check_clips(config.judge, _longest(spec))
+
+
+def episode_judge(config: RunConfig) -> JudgeConfig:
+    """The judge's settings for episodes of the configured scene, see judge_or_embedded and for_clips."""
+    return for_clips(judge_or_embedded(config.judge), _longest(_scene(config)))
+
+
+def _scene(config: RunConfig) -> EnvironmentSpec:
+    return simulation_spec(config.task, "", config.simulation, 1)
+
+
+def _longest(spec: EnvironmentSpec) -> tuple[int, ...]:
+    """Shape of the longest episode as a clip."""
+    return (spec.max_episode_steps + 1, spec.height, spec.width, spec.channels)
+
+
+def _refuse_fallbacks(settings: JudgeConfig) -> None:
+    if settings.fallbacks:
+        raise ValueError(
+            f"judge.fallbacks names {len(settings.fallbacks)}, but others stand in for whole rounds of loop 2 only; a "
+            "policy's episodes are judged one by one. Leave it empty: an outage pauses training, which then makes the "
+            "same rollout again"
+        )
+
+
+def check_horizon(num_steps: int, max_episode_steps: int) -> None:
+    """Refuse rollouts in which an episode of full length does not end.
+
+    None such would ever be judged: only episodes that end early would be paid, and no value beyond the cut be learned.
+
+    Args:
+        num_steps: lock-steps of a rollout, the first of them after a reset. max_episode_steps: of the environment.
+
+    Raises:
+        ValueError: num_steps is below max_episode_steps.
+    """
+    if num_steps < max_episode_steps:
+        raise ValueError(
+            f"ppo.num_steps is {num_steps}, but an episode may take {max_episode_steps} steps: the reward agent judges "
+            "it at its end, which such a rollout would cut off; set ppo.num_steps to at least that many"
+        )
+
+
+def unjudged(rollout: Rollout) -> str:
+    """Why training must pause before a rollout that the agent judged: none of its episodes ended, or more than
+    MAX_INVALID_SHARE of them without a reward, so that nobody knows what their steps were worth; "" where it may go on.
+    """
+    ended = rollout.terminated_TN | rollout.truncated_TN
+    without, count = int((ended & ~rollout.valid_TN).sum()), int(ended.sum())
+    if count == 0:
+        return (
+            f"training pauses: none of the episodes in a rollout of {len(ended)} lock-steps (ppo.num_steps) was seen "
+            "to end, so none was judged; nothing was trained on it. Raise ppo.num_steps, or mend what loses messages"
+        )
+    if without <= MAX_INVALID_SHARE * count:
+        return ""
+    return (
+        f"training pauses: {without} of {count} episodes of a rollout ended without a verdict, more than "
+        f"{MAX_INVALID_SHARE:.0%}; nothing was trained on it. See reward/verdict for the reasons, mend the judge, and "
+        "train again: the same rollout is then made"
+    )
+
+
+class EpisodeReward:
+    """Collects the lock-steps of one environment node into episodes and has each judged at its end.
+
+    cut: episodes that a reset ended before their last step, which are not judged.
+
+    Raises:
+        ValueError: the judge has fallbacks.
+    """
+
+    name = AGENT
+
+    def __init__(self, judge: JudgeService) -> None:
+        _refuse_fallbacks(judge.settings)
+        self._judge = judge
+        self.cut = 0
+        self._open: dict[int, _Episode] = {}
+
+    @property
+    def version(self) -> int:
+        """Differs with judge, rubric and mode; fits uint64."""
+        return version_of(self.name, self._judge.judge_id, self._judge.rubric.version, self._judge.settings.mode)
+
+    def forget(self) -> None:
+        """The environment was (re)started: unfinished episodes belong to nobody."""
+        self.cut += len(self._open)
+        self._open.clear()
+
+    def add(self, step: EpisodeStep, spec: EnvironmentSpec, session: int) -> PendingReward:
+        """Take the next lock-step of a session of the environment."""
+        waited: dict[int, Future[Verdict] | str] = {}
+        for n in map(int, np.flatnonzero(step.valid)):
+            episode = self._extended(n, step)
+            if step.ended[n]:
+                del self._open[n]
+                waited[n] = episode.fault or self._judge.submit(self._job(episode, spec, session))
+        return PendingReward(step.valid, waited)
+
+    def _extended(self, n: int, step: EpisodeStep) -> _Episode:
+        """The episode of environment n with this step."""
+        episode, episode_id = self._open.get(n), int(step.episode_ids[n])
+        if episode is None or episode.episode_id != episode_id:
+            self.cut += episode is not None
+            episode = self._open[n] = _Episode(episode_id)
+        made = len(episode.actions)
+        if made != step.episode_steps[n]:
+            episode.fault = episode.fault or f"step {made} of episode {episode_id} was not seen"
+        if step.images is None or step.next_images is None:
+            episode.fault = episode.fault or f"no image of step {step.episode_steps[n]} of episode {episode_id}"
+        else:
+            episode.frames += [images[n].copy() for images in (step.images, step.next_images)[int(made > 0) :]]
+        episode.actions.append(step.actions[n].copy())
+        episode.goal = step.goals.get(n, episode.goal)
+        return episode
+
+    def _job(self, episode: _Episode, spec: EnvironmentSpec, session: int) -> ClipJob:
+        frames = np.stack(episode.frames)
+        clip_id = f"episode {episode.episode_id} of session {session}"
+        task = TaskSpec(
+            spec.instruction, spec.task, self._judge.settings.robot, frames[0], episode.goal, np.stack(episode.actions)
+        )
+        return ClipJob(clip_ref(clip_id, frames, 1 / spec.control_period_s), task)

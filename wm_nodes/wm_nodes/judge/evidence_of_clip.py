@@ -1,0 +1,88 @@
+"""Endogenous evidence of a clip, as far as a rubric's bands ask for it. Specification: sections 2.3, 2.7 and 4.1.
+
+Pixels need nothing; what a world model says needs one that was trained in the clip's cameras, and the clip's actions.
+Evidence causes votes and second looks of the agent, and never adds reward.
+"""
+
+import functools
+import math
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from wm_nodes.judge.agent import ClipRef, Rubric, TaskSpec
+from wm_nodes.judge.evidence.pictures import pictures_of
+from wm_nodes.judge.evidence.pixels import pixel_evidence
+from wm_nodes.judge.evidence.world_model import MODEL_EVIDENCE, model_evidence
+from wm_nodes.world_model import WorldModels, load_model_folder
+from wm_nodes.world_model.folder import ModelFolderError
+
+
+class ClipEvidence:
+    """Measures clips.
+
+    Args:
+        model_dir: folder of the world model, loaded when a band first asks for it; None: there is none.
+    """
+
+    def __init__(self, model_dir: Path | None = None) -> None:
+        self._model_dir = model_dir
+        self._models: WorldModels | None = None
+        self._one_at_a_time = threading.Lock()
+
+    def check(self, rubric: Rubric) -> None:
+        """Refuse bands of evidence that is never measured: they would be silent.
+
+        Raises:
+            ValueError: names the evidence and the remedy.
+            ModelFolderError: the world model cannot be loaded.
+        """
+        if unknown := sorted(set(rubric.evidence) - pixel_names() - set(MODEL_EVIDENCE)):
+            raise ValueError(
+                f"rubric {rubric.version} has bands of {', '.join(unknown)}, which nobody measures here; known: "
+                f"{', '.join(sorted({*pixel_names(), *MODEL_EVIDENCE}))}"
+            )
+        asked = sorted(set(rubric.evidence) & set(MODEL_EVIDENCE))
+        if asked and self._model_dir is None:
+            raise ValueError(
+                f"rubric {rubric.version} has bands of {', '.join(asked)}, which a world model measures; name its "
+                "folder in model_dir, or take another rubric"
+            )
+        if asked:
+            self._loaded()
+
+    def of(self, rubric: Rubric, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
+        """What the rubric's bands name, of one clip; NaN, which lies in no band, where it cannot be measured."""
+        found = dict.fromkeys(rubric.evidence, math.nan)
+        with self._one_at_a_time:
+            if found.keys() & pixel_names():
+                found |= self._pixels(clip, task)
+            if found.keys() & set(MODEL_EVIDENCE):
+                found |= self._model(clip, task)
+        return {name: found[name] for name in rubric.evidence}
+
+    def _pixels(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
+        try:
+            return pixel_evidence(pictures_of(clip.frames, task.reference_frame))
+        except ValueError:  # of another shape than its reference frame, or no pictures: the agent says so
+            return {}
+
+    def _model(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
+        try:
+            return model_evidence(self._loaded(), clip.frames, task)
+        except (ValueError, ModelFolderError):  # of other cameras, another task, or without its actions
+            return {}
+
+    def _loaded(self) -> WorldModels:
+        assert self._model_dir is not None  # check refuses such bands
+        if self._models is None:
+            self._models = load_model_folder(self._model_dir)
+        return self._models
+
+
+@functools.cache
+def pixel_names() -> frozenset[str]:
+    """The evidence that needs no model; definitions.EVIDENCE says what each is."""
+    black = np.zeros((2, 8, 8, 3), np.uint8)
+    return frozenset(pixel_evidence(pictures_of(black, black[0])))

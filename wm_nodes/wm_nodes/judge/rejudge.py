@@ -1,0 +1,78 @@
+"""Have the reward agent judge the episodes of a recorded run, without a graph. Rewards that it gave live must come out
+again bit by bit.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from wm_nodes.config.schema import AGENT
+from wm_nodes.judge.agent import Verdict
+from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward
+from wm_nodes.judge.service import JudgeService
+from wm_nodes.recording import Bag
+from wm_nodes.recording.lockstep import LockSteps, RecordedStep
+from wm_nodes.reward import RewardResult
+
+
+@dataclass
+class JudgedBag:
+    """verdicts: of the episodes that were seen whole, in the order in which they ended. results: what the reward
+    evaluator would publish, by session and step. compared: lock-steps whose recorded rewards are of this judge, rubric
+    and mode; different: those of them that are not bit-equal. unanswered: rewards that the judge did not give then,
+    which are not compared. unseen: why ended episodes have no verdict.
+    """
+
+    verdicts: list[Verdict] = field(default_factory=list)
+    results: dict[tuple[int, int], RewardResult] = field(default_factory=dict)
+    compared: int = 0
+    different: list[tuple[int, int]] = field(default_factory=list)
+    unanswered: int = 0
+    unseen: list[str] = field(default_factory=list)
+
+
+def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) -> JudgedBag:
+    """Judge every episode that ends in a live recording.
+
+    Args:
+        namespace: of the environment; None takes the only one.
+
+    Raises:
+        BagError: an unusable bag. ValueError: the judge has fallbacks.
+    """
+    found, model = JudgedBag(), EpisodeReward(judge)
+    waiting = deque[tuple[RecordedStep, PendingReward]]()
+    with Bag(path) as bag:
+        steps = LockSteps(bag, namespace=namespace, reward_name=AGENT)
+        session = None
+        for step in steps:
+            if step.session != session:
+                model.forget()
+                session = step.session
+            if not step.is_reset and step.valid.any():
+                waiting.append((step, model.add(_episode_step(step), steps.spec, step.session)))
+    while waiting:
+        step, pending = waiting.popleft()
+        result = pending.result()
+        found.verdicts += pending.verdicts().values()
+        found.unseen += [reason for reason in pending.waited.values() if isinstance(reason, str)]
+        place = step.session, step.step_id
+        found.results[place] = result
+        if step.reward is not None and step.reward.reward_version == model.version:
+            answered = step.reward.valid | ~step.valid
+            found.compared += 1
+            found.unanswered += int((~answered).sum())
+            same = step.reward.total[answered].tobytes() == result.total[answered].tobytes()
+            if not same or not np.array_equal(step.reward.valid[answered], result.valid[answered]):
+                found.different.append(place)
+    return found
+
+
+def _episode_step(step: RecordedStep) -> EpisodeStep:
+    goals, there = step.goals if step.goals is not None else ((), ())
+    return EpisodeStep(
+        step.images, step.next_images, step.actions, step.episode_id, step.episode_step,
+        step.terminated | step.truncated, step.valid, {n: goals[n] for n in np.flatnonzero(there).tolist()},
+    )

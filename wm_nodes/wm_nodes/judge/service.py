@@ -1,0 +1,366 @@
+"""The reward agent at work on many clips, for callers that do not await. Specification: sections 2.3, 2.6.
+
+Shapes: N clips, F frames, H W 3 image, A action.
+"""
+
+import asyncio
+import math
+import threading
+import time
+from collections.abc import Callable, Coroutine, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wm_nodes.config.schema import AGENT, JudgeConfig
+from wm_nodes.judge.agent import ClipRef, RewardAgent, Rubric, Status, TaskSpec, Verdict, clip_ref, load_rubric
+from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
+from wm_nodes.judge.agent.scoring import skipped
+from wm_nodes.judge.agent.types import GATED, Cost, Health, Provenance, content_hash
+from wm_nodes.judge.audit import AuditedAgent, AuditLog, write_exchange
+from wm_nodes.judge.backends.factory import OpenedJudge, check_judge, judges_of, make_judge
+from wm_nodes.judge.evidence_of_clip import ClipEvidence
+from wm_nodes.recording.reader import read_spec
+from wm_nodes.video_model.clips import Clips
+
+READS = "judge_reads"
+"""Folder of a run that keeps the judge's answers."""
+POLL_S = 0.05
+"""How often a waiting caller looks whether it must stop."""
+HEALTH_S = 10.0
+"""Time between two questions to the servers whether they are there."""
+CLOSE_S = 5.0
+
+T = TypeVar("T")
+
+
+class TrainingPaused(Exception):
+    """Too much of a round has no reward to train on: says why, and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class ClipJob:
+    """A clip and what it should show."""
+
+    clip: ClipRef
+    task: TaskSpec
+
+
+@dataclass
+class VerdictCounts:
+    """What verdicts were given since the start, and what they took."""
+
+    verdicts: int = 0
+    by_status: dict[Status, int] = field(default_factory=dict)
+    cost: Cost = field(default_factory=Cost)
+
+    def add(self, verdict: Verdict) -> None:
+        self.verdicts += 1
+        self.by_status[verdict.status] = self.by_status.get(verdict.status, 0) + 1
+        self.cost += verdict.cost
+
+    @property
+    def invalid_rate(self) -> float:
+        return 1 - self.by_status.get(Status.OK, 0) / self.verdicts if self.verdicts else 0.0
+
+    @property
+    def cached_ratio(self) -> float:
+        """Share of prompt tokens that the server had in its prefix cache."""
+        return self.cost.cached_tokens / self.cost.prompt_tokens if self.cost.prompt_tokens else 0.0
+
+
+@dataclass
+class _JudgeSlot:
+    """One of the judges. failed_last_round: the last round that it was given was taken from it."""
+
+    opened: OpenedJudge
+    agent: RewardAgent | AuditedAgent
+    failed_last_round: bool = False
+
+    @property
+    def judge_id(self) -> str:
+        return self.agent.judge.capabilities.judge_id
+
+
+class _FallbackBudget:
+    """With a judge that others could stand in for: over when more than MAX_INVALID_SHARE of a round's clips have no
+    answer, or the clip that was sent ahead has none. It lasts when the round's time is up: nobody else could judge it.
+
+    reason: of the newest clip without an answer.
+    """
+
+    def __init__(self, num_clips: int, deadline: float | None) -> None:
+        self._left, self._deadline = MAX_INVALID_SHARE * num_clips, deadline
+        self.over, self.reason = False, ""
+
+    def record(self, verdict: Verdict, *, alone: bool) -> None:
+        if verdict.status is not Status.ERROR:
+            return
+        self._left -= 1
+        self.reason = verdict.reason
+        in_time = self._deadline is None or time.monotonic() < self._deadline
+        self.over = self.over or (in_time and (alone or self._left < 0))
+
+
+class JudgeService:
+    """A reward agent with its judge on an event loop in a thread of its own; at most `concurrency` clips at a time.
+
+    settings.fallbacks are further judges for whole rounds, see judge. fallen_back: why the last round did not stay with
+    the first judge, and to whom it went; "" where it stayed.
+
+    Args:
+        reads: folder that keeps the judge's answers; None: none are kept.
+        audit: folder of the audit log that every question, answer and verdict goes into; None: none is written.
+        evidence: measures what the rubric's bands name; None: pixels only.
+
+    Raises:
+        ValueError, MissingPackageError: as make_judge, and as ClipEvidence.check. ConfigError: the rubric is refused.
+        AuditError: as AuditLog.
+    """
+
+    def __init__(
+        self, settings: JudgeConfig, *, seed: int, reads: Path | None = None, audit: Path | None = None,
+        evidence: ClipEvidence | None = None,
+    ) -> None:
+        self.settings, self._seed, self._reads = settings, seed, reads
+        self._evidence = evidence or ClipEvidence()
+        self._log = None if audit is None else AuditLog(audit)
+        self.pack, self.tally, self.health = settings.rubric, VerdictCounts(), Health(True, "not asked yet")
+        self._seats = self._made(load_rubric(settings.rubric))
+        self.fallen_back, self._used = "", self._seats[0]
+        self._places = asyncio.Semaphore(settings.concurrency)
+        self._asked_s = -math.inf
+        self._asking: Future[None] | None = None
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="reward agent", daemon=True)
+        self._thread.start()
+
+    @property
+    def rubric(self) -> Rubric:
+        return self._seats[0].agent.rubric
+
+    @property
+    def judge_id(self) -> str:
+        """Of the judge of the last round; before one, of the first judge, of whom `health` is too."""
+        return self._used.judge_id
+
+    @property
+    def judge_ids(self) -> list[str]:
+        """Of all judges, in the order in which they are tried."""
+        return [seat.judge_id for seat in self._seats]
+
+    @property
+    def cards(self) -> list[str]:
+        """What the judges were measured to see, in words; those of whom nobody knows say nothing."""
+        return [card for seat in self._seats if (card := seat.agent.judge.capabilities.card)]
+
+    def set_rubric(self, pack: str, base: Path) -> None:
+        """Judge by another rubric from now on; call it while nothing is being judged.
+
+        Args:
+            pack: a pack's name, or a YAML file, absolute or relative to `base`.
+
+        Raises:
+            ConfigError: no such pack, or one that is refused; the rubric is then the one before.
+            ValueError: the judge cannot read all of its components, max_reads does not cover them, or nobody measures
+                the evidence of its bands.
+        """
+        path = base / pack
+        rubric = load_rubric(str(path) if path.is_file() else pack)
+        old, self._seats = self._seats, self._made(rubric)
+        self.pack, self.fallen_back, self._used = pack, "", self._seats[0]
+        for seat in old:
+            self._run(seat.opened.close())
+
+    def submit(self, job: ClipJob, deadline: float | None = None) -> "Future[Verdict]":
+        """Have the first judge judge a clip as soon as there is a place. deadline: on the time.monotonic clock, s."""
+        return self._run(self._judged(self._seats[0].agent, job, deadline))
+
+    def judge(
+        self, jobs: Sequence[ClipJob], *, check: Callable[[], None] = lambda: None,
+        done: Callable[[int, Verdict], None] = lambda index, verdict: None, within_s: float | None = None,
+        round_number: int = 0, by: str = "",
+    ) -> list[Verdict]:
+        """Judge a round of clips by one judge and one rubric; the verdicts are in the order of the jobs.
+
+        A judge that leaves more than MAX_INVALID_SHARE of the clips without an answer (status ERROR) loses the round to
+        the next one, as long as there is one and time: all its verdicts are dropped, the answers it gave included.
+
+        Args:
+            check: called at least every POLL_S; what it raises ends the judging, and calls under way are dropped.
+            done: called in this thread with the index and verdict of every clip: as it is judged by the last judge
+                there is, or when a round that could still be taken from its judge is over.
+            within_s: clips without a verdict by then get one that says so, without a reward; None: no limit.
+            round_number: what the audit log calls these clips' round.
+            by: the id of the only judge to ask; empty: all, in their order.
+
+        Raises:
+            ValueError: there is no judge of this id.
+        """
+        seats = [seat for seat in self._seats if by in ("", seat.judge_id)]
+        if not seats:
+            raise ValueError(f"there is no judge {by!r} to ask, only {', '.join(self.judge_ids)}")
+        deadline = None if within_s is None else time.monotonic() + within_s
+        lost = list[str]()
+        for seat in seats:
+            if isinstance(seat.agent, AuditedAgent):
+                seat.agent.round_number = round_number
+            held = dict[int, Verdict]()
+            patience = _FallbackBudget(len(jobs), deadline) if seat is not seats[-1] else None
+            told = done if patience is None else held.__setitem__
+            ahead = (
+                1 if seat.failed_last_round and patience is not None else 0
+            )  # is it back? One clip, so that a breaker can close
+            verdicts = self._round(seat, jobs[:ahead], 0, deadline, check, told, patience)
+            verdicts += self._round(seat, jobs[ahead:], ahead, deadline, check, told, patience)
+            seat.failed_last_round = patience is not None and patience.over
+            if patience is None or not patience.over:
+                break
+            lost.append(f"{seat.judge_id} did not answer: {patience.reason}")
+        for index, verdict in held.items():
+            done(index, verdict)
+        self._used = seat
+        self.fallen_back = f"{'; '.join(lost)}; the round went to {seat.judge_id}" if lost else ""
+        return verdicts
+
+    def refresh_health(self) -> None:
+        """Ask the judge how it is, at most every HEALTH_S and without waiting: `health` is the newest answer."""
+        idle = self._asking is None or self._asking.done()
+        if idle and not self._loop.is_closed() and time.monotonic() - self._asked_s >= HEALTH_S:
+            self._asked_s = time.monotonic()
+            self._asking = self._run(self._ask_health(self._seats[0]))
+
+    def close(self) -> None:
+        """Drop what is under way and end the thread."""
+        with suppress(TimeoutError):
+            self._run(self._end()).result(CLOSE_S)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(CLOSE_S)
+        self._loop.close()
+        if self._log is not None:
+            self._log.close()
+
+    # internals
+
+    def _made(self, rubric: Rubric) -> list[_JudgeSlot]:
+        check_judge(self.settings)
+        self._evidence.check(rubric)
+        return [self._seat(settings, rubric) for settings in judges_of(self.settings)]
+
+    def _seat(self, settings: JudgeConfig, rubric: Rubric) -> _JudgeSlot:
+        log = self._log
+        limits: dict[str, Any] = {
+            "mode": settings.mode, "seed": self._seed, "max_reads": settings.max_reads,
+            "budget_s": settings.clip_budget_s, "call_plan": settings.call_plan,
+        }
+        if log is None:
+            opened = make_judge(settings, rubric, self._reads)
+            return _JudgeSlot(opened, RewardAgent(opened.judge, rubric, **limits))
+        opened = make_judge(settings, rubric, self._reads, partial(write_exchange, log))
+        return _JudgeSlot(opened, AuditedAgent(opened.judge, rubric, log, **limits))
+
+    def _round(
+        self, seat: _JudgeSlot, jobs: Sequence[ClipJob], first: int, deadline: float | None, check: Callable[[], None],
+        done: Callable[[int, Verdict], None], patience: "_FallbackBudget | None",
+    ) -> list[Verdict]:
+        """The verdicts of one judge; fewer where patience with it is over. first: index of the first job."""
+        if patience is not None and patience.over:
+            return []
+        futures = {self._run(self._judged(seat.agent, job, deadline)): first + index for index, job in enumerate(jobs)}
+        open_ = set(futures)
+        try:
+            while open_ and not (patience is not None and patience.over):
+                check()
+                finished, open_ = wait(open_, POLL_S, FIRST_COMPLETED)
+                for future in finished:
+                    done(futures[future], future.result())
+                    if patience is not None:
+                        patience.record(future.result(), alone=len(jobs) == 1)
+        finally:
+            for future in open_:
+                future.cancel()
+        return [future.result() for future in futures if future not in open_]
+
+    def _run(self, work: Coroutine[Any, Any, T]) -> "Future[T]":
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    async def _judged(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
+        left_s = None if deadline is None else deadline - time.monotonic()
+        try:
+            async with asyncio.timeout(left_s), self._places:
+                bands = agent.rubric.evidence
+                evidence = await asyncio.to_thread(self._evidence.of, agent.rubric, job.clip, job.task) if bands else {}
+                verdict = await agent.evaluate(job.clip, job.task, evidence)
+        except TimeoutError:
+            verdict = _late(agent, job, self._seed)
+        self.tally.add(verdict)
+        return verdict
+
+    async def _ask_health(self, seat: _JudgeSlot) -> None:
+        self.health = await seat.opened.judge.health()
+
+    async def _end(self) -> None:
+        others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+        for seat in self._seats:
+            await seat.opened.close()
+
+
+def _late(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict:
+    """The verdict on a clip that the round did not wait for."""
+    able, now = agent.judge.capabilities, time.time()
+    verdict = Verdict(
+        clip_id=job.clip.clip_id, status=Status.ERROR, reward=math.nan, level=-1,
+        stages=tuple(map(skipped, GATED)), plan=None, reflections=(), hack_flags=(), cost=Cost(),
+        provenance=Provenance(
+            able.judge_id, able.transport, able.model, able.server_version, agent.rubric.version, "", job.clip.sha256,
+            seed, now, now,
+        ),
+        reason="no verdict by the round's deadline",
+    )
+    return replace(verdict, audit_id=content_hash(verdict))
+
+
+def buffer_jobs(
+    frames: Tensor, references: Clips, sha256: str, *, given: int, fps: float, task: str, robot: str
+) -> list[ClipJob]:
+    """One job per clip of a buffer. Frames that the model was given are shown as they were recorded: what its codec
+    makes of them is no work of the model's.
+
+    Args:
+        frames: decoded clips, uint8 (N, F, H, W, 3). references: the recordings of their contexts, a row per clip.
+        sha256: of the buffer's file; names the clips. given: frames. fps: clip frames per second.
+    """
+    shown = torch.cat([references.frames[:, :given], frames[:, given:]], 1).numpy()
+    first = references.frames[:, 0].numpy()
+    actions = references.actions.numpy().astype(np.float32)
+    return [
+        ClipJob(
+            clip_ref(f"{sha256[:12]}/{row}", shown[row], fps),
+            TaskSpec(references.instructions[row], task, robot, first[row], actions=actions[row]),
+        )
+        for row in range(len(shown))
+    ]
+
+
+def agent_scores(verdicts: Sequence[Verdict]) -> dict[str, Tensor]:
+    """The reward of each verdict, float64 (N,), NaN where there is none."""
+    return {AGENT: torch.tensor([verdict.reward for verdict in verdicts], dtype=torch.float64)}
+
+
+def clip_fps(bag: Path, stride: int) -> float:
+    """Frames per second of clips that are cut from a bag at every `stride`-th frame.
+
+    Raises:
+        BagError: an unusable bag.
+    """
+    return 1.0 / (read_spec(bag).control_period_s * stride)

@@ -1,0 +1,1 @@
+"""Training of the embedded judge: data, segmenter, temporal networks, heads."""

@@ -1,0 +1,72 @@
+"""Clips of adversarial sets, several sets at once, with their masks. Specification: section 3.
+
+Shapes: T frames, H W 3 image.
+"""
+
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.judge.agent.types import TaskSpec
+from wm_nodes.judge.dataset.build import clip_path, load_set
+from wm_nodes.judge.dataset.edits import Manifest, ManifestError
+from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
+from wm_nodes.judge.dataset.rows import judged_clip
+
+
+@dataclass(frozen=True, eq=False)
+class SetClip:
+    """One clip of a set. frames: uint8 (T, H, W, 3). masks: uint8 (T, H, W), what belongs where, seen or not."""
+
+    row: ManifestRow
+    frames: UInt8Array
+    masks: UInt8Array
+    task: TaskSpec
+
+
+def load_sets(folders: Sequence[Path]) -> list[tuple[Path, Manifest]]:
+    """Read the manifests of sets that are used together.
+
+    Raises:
+        ManifestError: one is damaged, or they keep different things away from training. OSError: not there.
+    """
+    sets = [(folder, load_set(folder)) for folder in folders]
+    first = sets[0][1].division
+    for folder, manifest in sets:
+        if manifest.division != first:
+            raise ManifestError(
+                f"{folder} holds out {manifest.division}, {sets[0][0]} {first}; use sets of one division"
+            )
+    return sets
+
+
+def rows_of(manifest: Manifest, parts: Sequence[Part]) -> list[ManifestRow]:
+    """The clips of some parts, in the order of the manifest."""
+    return [row for row in manifest.rows if row.part in parts]
+
+
+def set_clips(sets: Sequence[tuple[Path, Manifest]], parts: Sequence[Part]) -> Iterator[SetClip]:
+    """Yield the clips of some parts of all sets.
+
+    Raises:
+        ManifestError: a file is missing or damaged.
+    """
+    for folder, manifest in sets:
+        for row in rows_of(manifest, parts):
+            clip, task = judged_clip(folder, row)
+            yield SetClip(row, clip.frames, _load_masks(folder, row.sha256), task)
+
+
+def _load_masks(folder: Path, sha256: str) -> UInt8Array:
+    path = clip_path(folder, sha256)
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            masks: UInt8Array = arrays["masks"]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ManifestError(f"{path} cannot be read: {error}; build the set again") from error
+    return masks

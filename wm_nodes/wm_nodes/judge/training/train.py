@@ -1,0 +1,220 @@
+"""Make the embedded judge from adversarial sets: segmenter, evidence, heads, limits. Specification: section 4.3.
+
+Finished stages lie in the folder and are taken up again: segmenter.safetensors, evidence-*.npz and sequences-*.npz per
+set and part, and reader-*.safetensors, named by everything they depend on; of these, labels for the readers only.
+"""
+
+import hashlib
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.torch import load_file, save
+from tqdm import tqdm
+
+import wm_nodes.judge.evidence
+from wm_nodes.core.files import write_atomic
+from wm_nodes.core.types import FloatArray
+from wm_nodes.judge.dataset.build import load_frames
+from wm_nodes.judge.dataset.edits import COMPONENTS, TC, Manifest
+from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part, to_bytes
+from wm_nodes.judge.dataset.policy_camera import SEEN
+from wm_nodes.judge.evidence.clip import measured_clip
+from wm_nodes.judge.evidence.head import JudgeHead
+from wm_nodes.judge.evidence.segmentation import Segmenter
+from wm_nodes.judge.evidence.sequence import ObjectSequence, TemporalNetwork, reading_names, readings
+from wm_nodes.judge.evidence.trees import TreeSettings
+from wm_nodes.judge.evidence.window import Window
+from wm_nodes.judge.training.data import load_sets, rows_of, set_clips
+from wm_nodes.judge.training.heads import TARGETS, Examples, conformal_limits, fit_all, fit_familiarity, measured
+from wm_nodes.judge.training.segmenter import overlaps, segmentation_data, train_segmenter
+from wm_nodes.judge.training.temporal_networks import cross_fit, temporal_data
+
+SEGMENTER = "segmenter.safetensors"
+Sets = Sequence[tuple[Path, Manifest]]
+
+
+@dataclass(frozen=True)
+class JudgePlan:
+    """sets: folders of adversarial sets. segmenter_steps: batches. readers: networks over time per half of the
+    recordings. reader_epochs: times that each sees its clips. seed: of everything drawn. window: what the clips show of
+    the pictures that will be judged, of sets that were drawn so (policy_view.py).
+    """
+
+    sets: tuple[Path, ...]
+    segmenter_steps: int = 2800
+    readers: int = 1
+    reader_epochs: int = 16
+    trees: TreeSettings = field(default_factory=TreeSettings)
+    seed: int = 0
+    window: Window | None = None
+
+
+def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> JudgeHead:
+    """Train every part; the head's story holds data, seeds and what the validation part measures, not yet who and when.
+
+    Raises:
+        ManifestError: a damaged set. ValueError: sets too small to learn from. OSError: a full disk.
+    """
+    sets = load_sets(plan.sets)
+    windows = {row.origin.camera == SEEN for _, manifest in sets for row in manifest.rows}
+    if windows != {plan.window is not None}:
+        raise ValueError(
+            "a judge reads either the clips of --policy-view or others: give --policy-view to sets that were made so, "
+            "and to no other"
+        )
+    segmenter, segmenter_story = _segmenter(folder, sets, plan, progress)
+    train, validation = (
+        collect_evidence(folder, sets, part, segmenter, progress=progress) for part in ("train", "validation")
+    )
+    if not len(train.rows) or not len(validation.rows):
+        raise ValueError(f"{len(train.rows)} training and {len(validation.rows)} validation clips; build larger sets")
+    readers: tuple[TemporalNetwork, ...] = ()
+    if plan.readers:
+        data = temporal_data(collect_sequences(folder, sets, "train", segmenter), train.rows)
+        readers, held = cross_fit(
+            folder, data, count=plan.readers, epochs=plan.reader_epochs, seed=plan.seed, progress=progress
+        )
+        train = with_readings(train, held)
+        validation = _read(folder, sets, "validation", segmenter, readers, validation)
+    questions = fit_all(train, validation, plan.trees, plan.seed, progress=progress)
+    low, high = np.quantile(train.evidence[train.clean], (0.05, 0.95), axis=0).astype(np.float32)
+    recorded = [
+        load_frames(path, row.sha256).shape for path, manifest in sets for row in rows_of(manifest, ["train"])
+        if row.sha256 == row.root
+    ]
+    found = [shape[0] for shape in recorded]
+    lengths = (-(-2 * min(found) // 3), 3 * max(found) // 2)
+    story = {
+        "data": [_described(path, manifest) for path, manifest in sets], "seed": plan.seed,
+        "fitted": {"train": len(train.rows), "validation": len(validation.rows)},
+        "segmenter": segmenter_story, "trees": vars(plan.trees), "reader_epochs": plan.reader_epochs,
+        "tasks": sorted({row.origin.task for row in train.rows}),
+        "cameras": sorted({row.origin.camera.split()[0] for row in train.rows}),
+        "validation": {target: measured(questions, target, validation) for target in TARGETS},
+        "conformal": {target: conformal_limits(questions, target, validation) for target in (*COMPONENTS, TC)},
+    }
+    known = fit_familiarity(train, validation)
+    size = (recorded[0][1], recorded[0][2])
+    return JudgeHead(
+        segmenter, train.names, questions, known, low, high, size, lengths, story, window=plan.window, readers=readers
+    )
+
+
+def collect_evidence(
+    folder: Path, sets: Sets, part: Part, segmenter: Segmenter, readers: Sequence[TemporalNetwork] = (), *,
+    progress: bool = True,
+) -> Examples:
+    """Evidence of every clip of a part of all sets, that of readers in the end; kept in `folder` per set."""
+    names: tuple[str, ...] = ()
+    found, rows = [], []
+    for path, manifest in sets:
+        chosen = rows_of(manifest, [part])
+        if not chosen:
+            continue
+        with np.load(_measured(folder, path, manifest, part, segmenter, progress)[0], allow_pickle=False) as arrays:
+            names = tuple(str(name) for name in arrays["names"])
+            found.append(arrays["values"])
+        rows += chosen
+    examples = Examples(names, np.concatenate(found) if found else np.zeros((0, 0), np.float32), rows)
+    return _read(folder, sets, part, segmenter, readers, examples) if readers and rows else examples
+
+
+def collect_sequences(folder: Path, sets: Sets, part: Part, segmenter: Segmenter) -> list[ObjectSequence]:
+    """What a reader reads of every clip of a part of all sets, whose evidence has been collected."""
+    found = []
+    for path, manifest in sets:
+        if rows_of(manifest, [part]):
+            with np.load(_measured(folder, path, manifest, part, segmenter, False)[1], allow_pickle=False) as arrays:
+                ends = np.cumsum(arrays["lengths"])[:-1]
+                both = (np.split(arrays[name], ends) for name in ("crops", "numbers"))
+                found += [ObjectSequence(*pair) for pair in zip(*both, strict=True)]
+    return found
+
+
+def with_readings(examples: Examples, log_odds: FloatArray) -> Examples:
+    """The examples with what the readers answer, (N, K), as their last numbers."""
+    evidence = np.concatenate([examples.evidence, log_odds], 1)
+    return Examples(examples.names + reading_names(), evidence, examples.rows)
+
+
+def _read(
+    folder: Path, sets: Sets, part: Part, segmenter: Segmenter, readers: Sequence[TemporalNetwork], examples: Examples
+) -> Examples:
+    sequences = collect_sequences(folder, sets, part, segmenter)
+    answers = [list(readings(readers, sequence).values()) for sequence in sequences]
+    return with_readings(examples, np.array(answers, np.float32))
+
+
+def _measured(
+    folder: Path, path: Path, manifest: Manifest, part: Part, segmenter: Segmenter, progress: bool
+) -> tuple[Path, Path]:
+    """Evidence and sequences of the clips of a part of a set, in files that are made where they are missing."""
+    chosen = rows_of(manifest, [part])
+    key = _key(chosen, segmenter)
+    evidence, sequences = (folder / f"{name}-{key}.npz" for name in ("evidence", "sequences"))
+    if not evidence.exists() or not sequences.exists():
+        name = f"evidence of {path.name} {part}"
+        clips = tqdm(set_clips([(path, manifest)], [part]), name, len(chosen), disable=not progress)
+        found = [measured_clip(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
+        _keep(
+            sequences, lengths=np.array([len(sequence.crops) for _, sequence in found]),
+            crops=np.concatenate([sequence.crops for _, sequence in found]),
+            numbers=np.concatenate([sequence.numbers for _, sequence in found]),
+        )
+        values = np.array([list(numbers.values()) for numbers, _ in found], np.float32)
+        _keep(evidence, names=np.array(list(found[0][0])), values=values)
+    return evidence, sequences
+
+
+def _keep(path: Path, **arrays: NDArray[Any]) -> None:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    write_atomic(path, buffer.getvalue())
+
+
+def _key(rows: Sequence[ManifestRow], segmenter: Segmenter) -> str:
+    """Of clips, their reference frames, what instructions are made of, weights and code."""
+    shown = "".join(f"{row.sha256} {row.root} {row.origin.task} {row.origin.object_id}\n" for row in rows)
+    return hashlib.sha256(shown.encode() + _state(segmenter) + _sources()).hexdigest()[:16]
+
+
+def _segmenter(folder: Path, sets: Sets, plan: JudgePlan, progress: bool) -> tuple[Segmenter, dict[str, Any]]:
+    """Train the segmenter, or take up the one that lies there; and say how it was made. Weights are float16's."""
+    path = folder / SEGMENTER
+    if not path.exists():
+        images, masks = segmentation_data(set_clips(sets, ["train"]), plan.seed)
+        model = train_segmenter(images, masks, num_steps=plan.segmenter_steps, seed=plan.seed, progress=progress)
+        held = segmentation_data(set_clips(sets, ["validation"]), plan.seed)
+        story = {
+            "sets": [str(folder.name) for folder, _ in sets], "pictures": len(images), "steps": plan.segmenter_steps,
+            "seed": plan.seed, "overlap": {name: round(value, 4) for name, value in overlaps(model, *held).items()},
+        }
+        write_atomic(path.with_suffix(".json"), (json.dumps(story, indent=1) + "\n").encode())
+        write_atomic(path, save({name: tensor.half() for name, tensor in model.state_dict().items()}))
+    segmenter = Segmenter()
+    segmenter.load_state_dict({name: tensor.float() for name, tensor in load_file(path).items()})
+    story = json.loads(path.with_suffix(".json").read_text())
+    return segmenter.eval().requires_grad_(False), story
+
+
+def _described(path: Path, manifest: Manifest) -> dict[str, Any]:
+    parts = {part: sum(row.part == part for row in manifest.rows) for part in ("train", "validation", "test")}
+    return {"set": path.name, "manifest_sha256": hashlib.sha256(to_bytes(manifest)).hexdigest(), "clips": parts}
+
+
+def _state(segmenter: Segmenter) -> bytes:
+    return hashlib.sha256(save(dict(segmenter.state_dict()))).digest()
+
+
+def _sources() -> bytes:
+    """Of the code that computes evidence: a changed number is another number."""
+    folder = Path(str(wm_nodes.judge.evidence.__path__[0]))
+    others = ("__init__", "definitions", "head", "trees", "window")
+    files = (path for path in sorted(folder.glob("*.py")) if path.stem not in others)
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).digest()

@@ -1,0 +1,1 @@
+"""How a graph is started, watched and stopped: scenarios, processes, readiness, launch descriptions."""

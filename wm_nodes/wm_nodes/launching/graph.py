@@ -1,0 +1,139 @@
+"""Processes and their nodes as plain data: no rclpy, no launch, no files read."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+ParameterValue = bool | int | float | str | list[str]
+COMPOSABLE = ("environment", "policy", "reward_evaluator", "learner", "recorder", "evaluation")
+"""Nodes that wm_nodes.nodes.compose can carry."""
+
+
+class GraphError(ValueError):
+    """An argument or scenario that does not exist, or a value that is not allowed."""
+
+
+@dataclass(frozen=True)
+class NodeSpec:
+    """One node.
+
+    namespace: absolute, e.g. /wm. required: its end ends the graph. lifecycle: ready when active, else when visible.
+    ranks: processes under torchrun; rank 0 is the node. environment: variables on top of the graph's.
+    """
+
+    module: str
+    name: str
+    namespace: str = "/wm"
+    parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+    required: bool = True
+    lifecycle: bool = True
+    ranks: int = 1
+    log_level: str = "info"
+    arguments: tuple[str, ...] = ()
+    inside: tuple["NodeSpec", ...] = ()
+    """The nodes that a composed process carries."""
+    parameter_file: str = ""
+    """Where the starter keeps carried_parameters() of a composed process."""
+    extra_parameters: str = ""
+    """A parameter file of the user; read last, so it wins."""
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def full_name(self) -> str:
+        return f"{self.namespace.rstrip('/')}/{self.name}"
+
+    @property
+    def label(self) -> str:
+        """What the starter calls it: the full name without the slash in front."""
+        return self.full_name.lstrip("/")
+
+    def program(self) -> list[str]:
+        """Arguments of the interpreter, without those of ROS."""
+        ranks = ["torch.distributed.run", "--standalone", f"--nproc-per-node={self.ranks}"] if self.ranks > 1 else []
+        return ["-m", *ranks, *(["-m"] if ranks else []), self.module, *self.arguments]
+
+    def carried(self) -> tuple["NodeSpec", ...]:
+        """The ROS nodes of this process."""
+        return self.inside or (self,)
+
+    def ros_arguments(self) -> list[str]:
+        """Name, namespace and parameters as rcl reads them. A composed process keeps its nodes' own names."""
+        names = [] if self.inside else ["-r", f"__node:={self.name}"]
+        log_level = ["--log-level", self.log_level]
+        return ["--ros-args", *names, "-r", f"__ns:={self.namespace}", *log_level, *self.parameter_arguments()]
+
+    def parameter_arguments(self) -> list[str]:
+        """-p name:=value, or the file of a composed process: `-p node:name:=value` misses nodes in a namespace.
+
+        Values are YAML; JSON quoting keeps text a string.
+        """
+        more = ["--params-file", self.extra_parameters] if self.extra_parameters else []
+        if self.inside:
+            return ["--params-file", self.parameter_file, *more]
+        given = [part for key, value in self.parameters.items() for part in ("-p", f"{key}:={json.dumps(value)}")]
+        return [*given, *more]
+
+    def carried_parameters(self) -> str:
+        """The text of parameter_file: JSON, which is YAML."""
+        values = {node.full_name: {"ros__parameters": dict(node.parameters)} for node in self.carried()}
+        return json.dumps(values, indent=1)
+
+
+@dataclass(frozen=True)
+class Graph:
+    """The nodes of one scenario; environment: variables of all of them."""
+
+    name: str
+    nodes: tuple[NodeSpec, ...]
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        labels = [node.label for node in self.nodes]
+        twice = sorted({label for label in labels if labels.count(label) > 1})
+        if twice:
+            raise GraphError(f"graph {self.name!r} has two nodes called {', '.join(twice)}; give one another namespace")
+
+    def node(self, name: str) -> NodeSpec:
+        """The process of a node: by label or, where only one has it, by name; a composed process carries several."""
+        found = [node for node in self.nodes if name.lstrip("/") in [one.label for one in (node, *node.inside)]]
+        found = found or [node for node in self.nodes if name in [one.name for one in (node, *node.inside)]]
+        if len(found) != 1:
+            raise GraphError(
+                f"no single node {name!r} in graph {self.name!r}: {', '.join(n.label for n in self.nodes)}"
+            )
+        return found[0]
+
+    def to_json(self) -> str:
+        return json.dumps(dataclasses.asdict(self), indent=1)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Graph":
+        """The graph that to_json() wrote."""
+        values = json.loads(text)
+        return cls(values["name"], tuple(_node_from(node) for node in values["nodes"]), values["environment"])
+
+
+def _node_from(values: dict[str, Any]) -> NodeSpec:
+    inside = tuple(_node_from(node) for node in values["inside"])
+    return NodeSpec(**{**values, "inside": inside, "arguments": tuple(values["arguments"])})
+
+
+def compose(graph: Graph, parameter_file: str) -> Graph:
+    """The same graph with the nodes of its namespace in one process, where `wm_nodes.nodes.compose` can carry them.
+
+    Nodes of other namespaces, the player, and a learner of several ranks stay processes of their own.
+    """
+    namespace = graph.nodes[0].namespace
+    inside = [
+        node for node in graph.nodes if node.namespace == namespace and node.name in COMPOSABLE and node.ranks == 1
+    ]
+    if len(inside) < 2:
+        return graph
+    one = NodeSpec(
+        "wm_nodes.nodes.compose", "composed", namespace, log_level=inside[0].log_level,
+        arguments=tuple(node.name for node in inside), inside=tuple(inside), parameter_file=parameter_file,
+        extra_parameters=inside[0].extra_parameters,
+    )
+    return dataclasses.replace(graph, nodes=(one, *(node for node in graph.nodes if node not in inside)))

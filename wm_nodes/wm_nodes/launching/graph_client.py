@@ -1,0 +1,134 @@
+"""Steer a running graph from a plain program: send goals, show feedback, fetch results."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from wm_msgs.action import Evaluate, Train, TrainVideo
+from wm_nodes.core.types import BoolArray
+from wm_nodes.ros.clients import run_goal
+from wm_nodes.ros.spin import make_executor, spin
+from wm_nodes.ros.wire import PeerLost
+
+ACCEPT_S = 30.0
+
+
+class GoalFailed(RuntimeError):
+    """A goal ended otherwise than finished; the text is the node's own."""
+
+
+@dataclass(frozen=True)
+class EvaluationOutcome:
+    """success: bool (E,) in seed order. low, high: 95 % Wilson interval. mean_length: steps."""
+
+    success: BoolArray
+    low: float
+    high: float
+    mean_length: float
+    policy_version: int
+
+
+@dataclass(frozen=True)
+class Training:
+    policy_version: int
+    updates: int
+    samples: int
+    success_rate: float
+    checkpoint: str
+
+
+class GraphClient:
+    """Client of one graph's `train`, `evaluate` and `video/train` actions; use as a context manager.
+
+    Args:
+        namespace: of the graph, e.g. "wm".
+        alive: called while waiting; raises when the graph is gone.
+    """
+
+    def __init__(self, namespace: str = "wm", *, alive: Callable[[], None] = lambda: None) -> None:
+        self._alive = alive
+        self._stop = threading.Event()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        self._node = Node("operator", namespace=namespace)
+        self._train = ActionClient(self._node, Train, "train")
+        self._evaluate = ActionClient(self._node, Evaluate, "evaluate")
+        self._train_video = ActionClient(self._node, TrainVideo, "video/train")
+        self._executor = make_executor("events")
+        self._executor.add_node(self._node)
+        self._thread = threading.Thread(target=spin, args=(self._executor, self._stop.is_set), daemon=True)
+        self._thread.start()
+
+    def evaluate(
+        self, *, episodes: int, seed: int, deterministic: bool, label: str, policy_uri: str = "",
+        on_progress: Callable[[int, float], None] = lambda done, rate: None,
+    ) -> EvaluationOutcome:
+        """Play `episodes` with the newest weights (or those of policy_uri).
+
+        Raises:
+            GoalFailed: the evaluation ended early. PeerLost: no evaluation node.
+        """
+        goal = Evaluate.Goal(
+            episodes=episodes, seed=seed, deterministic=deterministic, behaviour=label, policy_uri=policy_uri
+        )
+        result = self._run(
+            self._evaluate, goal, lambda m: on_progress(m.feedback.episodes_done, m.feedback.success_rate)
+        )
+        return EvaluationOutcome(
+            np.asarray(result.success, bool), result.success_low, result.success_high, result.mean_length,
+            result.policy_version,
+        )
+
+    def train(self, updates: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> Training:
+        """Make policy updates; on_progress gets Train.Feedback messages.
+
+        Raises:
+            GoalFailed: the training ended early. PeerLost: no learner.
+        """
+        result = self._run(self._train, Train.Goal(updates=updates), lambda message: on_progress(message.feedback))
+        return Training(
+            result.policy_version, result.updates, result.samples, result.success_rate, result.checkpoint_uri
+        )
+
+    def train_video(self, iterations: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> int:
+        """Post-train the video model on so many buffers; on_progress gets TrainVideo.Feedback. Return the new version.
+
+        Raises:
+            GoalFailed: the training ended early. PeerLost: no learner.
+        """
+        goal = TrainVideo.Goal(iterations=iterations)
+        result = self._run(self._train_video, goal, lambda message: on_progress(message.feedback))
+        return int(result.policy_version)
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._executor.remove_node(self._node)
+        self._node.destroy_node()
+        rclpy.try_shutdown()
+
+    def _run(self, client: ActionClient, goal: Any, on_feedback: Callable[[Any], None]) -> Any:
+        result = run_goal(
+            client, goal, accept_s=ACCEPT_S, check=self._alive, alive=lambda: None, on_feedback=on_feedback
+        )
+        if result.termination_reason != type(result).FINISHED:
+            raise GoalFailed(result.message or f"the goal ended with reason {result.termination_reason}")
+        return result
+
+    def __enter__(self) -> "GraphClient":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+__all__ = ["EvaluationOutcome", "GoalFailed", "GraphClient", "PeerLost", "Training"]

@@ -1,0 +1,102 @@
+"""The face of a scenario for `ros2 launch`: needs the ROS 2 packages launch and launch_ros (apt), nothing of rclpy.
+
+ros2 runs under the system's Python, which has neither our pydantic nor torch: the graph is made by the nodes'
+interpreter (ros.arguments, in a process of its own), and this module imports only the standard library.
+
+PyPI's `launch` 0.1.3 is an unrelated project of the same name.
+"""
+
+import json
+import subprocess
+from collections.abc import Mapping
+from typing import Any
+
+from wm_nodes.launching.domain_lock import DomainLock
+from wm_nodes.launching.environment import graph_environment, interpreter
+from wm_nodes.launching.graph import Graph, NodeSpec
+from wm_nodes.launching.scenarios import argument_table
+
+HELD: list[DomainLock] = []
+"""Of the graphs that this process launched, until it ends: ros2 launch runs nothing of ours at its own end."""
+
+
+def launch_description(scenario: str) -> Any:
+    """Return the launch.LaunchDescription of a scenario.
+
+    Raises:
+        ImportError: where ROS 2's launch is missing, or shadowed by the other project of that name.
+    """
+    import launch
+
+    if not hasattr(launch, "LaunchDescription"):
+        raise ImportError(
+            f"{getattr(launch, '__file__', 'launch')} is not ROS 2's launch but an unrelated project; "
+            f"pip uninstall launch, or start without it: python3 launch_scripts/{scenario}.launch.py"
+        )
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+
+    table = argument_table(scenario)
+    declared = [
+        DeclareLaunchArgument(
+            argument.name, default_value=argument.default, description=argument.help,
+            **({"choices": list(argument.choices)} if argument.choices else {}),
+        )
+        for argument in table
+    ]
+    start = OpaqueFunction(function=lambda context: _start(scenario, context))
+    return launch.LaunchDescription([*declared, start])
+
+
+def _start(scenario: str, context: Any) -> list[Any]:
+    """Raises DomainInUseError where another graph of this host works on the domain, whichever way it was started."""
+    from launch.substitutions import LaunchConfiguration
+
+    given = {
+        argument.name: LaunchConfiguration(argument.name).perform(context) for argument in argument_table(scenario)
+    }
+    python = interpreter(given)
+    graph = prepared(scenario, given, python)
+    domain = int(graph_environment(graph.environment, python=python)["ROS_DOMAIN_ID"])
+    lock = DomainLock(domain, f"graph {graph.name!r}")
+    lock.acquire()
+    HELD.append(lock)
+    return node_actions(graph, python)
+
+
+def prepared(scenario: str, given: Mapping[str, str], python: str) -> Graph:
+    """ros.arguments.prepare in the nodes' interpreter.
+
+    Raises:
+        RuntimeError: its last line of error, and what to set where a module is missing.
+    """
+    command = [python, "-m", "wm_nodes.launching.arguments", scenario]
+    done = subprocess.run(
+        command, input=json.dumps(dict(given)), env=graph_environment(python=python), capture_output=True, text=True,
+        check=False,
+    )
+    if done.returncode:
+        text = (done.stderr.strip().splitlines() or ["no output"])[-1].removeprefix("error: ")
+        hint = "" if done.returncode == 2 else f"; {python} is not the nodes' Python: set WM_PYTHON, or python:="
+        raise RuntimeError(f"{text}{hint}")
+    return Graph.from_json(done.stdout)
+
+
+def node_actions(graph: Graph, python: str) -> list[Any]:
+    """One launch_ros Node per NodeSpec; the end of a required one shuts the launch down."""
+    environment = graph_environment(graph.environment, python=python)
+    return [_action(node, python, {**environment, **node.environment}) for node in graph.nodes]
+
+
+def _action(node: NodeSpec, python: str, environment: dict[str, str]) -> Any:
+    from launch.actions import Shutdown
+    from launch_ros.actions import Node
+
+    files = [node.extra_parameters] if node.extra_parameters else []
+    values = [dict(node.parameters)] if node.parameters else []
+    named = {} if node.inside else {"name": node.name, "parameters": [*values, *files]}
+    by_node = node.parameter_arguments() if node.inside else []
+    return Node(
+        executable=python, arguments=node.program(), namespace=node.namespace,
+        ros_arguments=["--log-level", node.log_level, *by_node], additional_env=environment, output="screen", **named,
+        **({"on_exit": Shutdown(reason=f"{node.label} ended")} if node.required else {}),
+    )

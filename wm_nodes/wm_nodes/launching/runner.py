@@ -1,0 +1,330 @@
+"""Starts a graph as processes, without ROS launch: prefixed logs, readiness, orderly end, first failure as exit code.
+
+with Runner(graph, log_dir=run_dir / "logs") as runner:
+    runner.wait_ready(timeout_s=60)
+    code = runner.wait()
+"""
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import TextIO
+
+from wm_nodes.launching import arguments as launch_arguments
+from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
+from wm_nodes.launching.environment import graph_environment, interpreter
+from wm_nodes.launching.fork_server import ForkServer
+from wm_nodes.launching.graph import Graph, GraphError, NodeSpec
+from wm_nodes.launching.process import NodeProcess
+from wm_nodes.launching.readiness import NotReadyError, activate, wait_ready
+from wm_nodes.launching.scenarios import describe_arguments
+from wm_nodes.ros.middleware import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+LAST_WORDS_S = 0.2
+"""Until what a node wrote before its answer has come through its pipe."""
+GRACE_S = 5.0
+"""Time for an orderly end after SIGINT, and again after SIGTERM."""
+
+
+class NodeDiedError(RuntimeError):
+    """A required node ended; the text names it, its exit code and its log."""
+
+
+class Runner:
+    """The processes of one graph. start() and stop() are called by the context manager.
+
+    Args:
+        env: variables on top of the graph's own.
+        log: where prefixed lines go; None: nowhere.
+        log_dir: folder for one <node>.log each; None: no files.
+        colour: colour the prefixes; None: if `log` is a terminal.
+        python: interpreter of the nodes.
+        use_domain_lock: refuse a domain on which another Runner of this host works.
+    """
+
+    def __init__(
+        self, graph: Graph, *, env: Mapping[str, str] | None = None, log: TextIO | None = sys.stdout,
+        log_dir: Path | None = None, colour: bool | None = None, python: str = sys.executable,
+        use_domain_lock: bool = True,
+    ) -> None:
+        self.graph = graph
+        self.environment = graph_environment({**graph.environment, **(env or {})}, python=python)
+        """Variables that every process gets."""
+        self.domain = _domain(self.environment)
+        self._lock = DomainLock(self.domain, f"graph {graph.name!r}") if use_domain_lock else None
+        self._log = log
+        self._log_dir = log_dir
+        self._colour = (log is not None and log.isatty()) if colour is None else colour
+        self._python = python
+        self._processes: dict[str, NodeProcess] = {}
+        # Linux signals a child when the *thread* that made it ends; this one lives until stop().
+        self._starter: ThreadPoolExecutor | None = None
+        self._forks: ForkServer | None = None
+        self._expected: set[str] = set()
+        self.killed = False
+
+    def start(self) -> None:
+        """Start every process.
+
+        Raises:
+            DomainInUseError: another graph works on the domain.
+        """
+        if self._lock is not None:
+            self._lock.acquire()
+        try:
+            clean_shared_memory(self.environment)
+            self._fit_shared_memory()
+            if self._log_dir is not None:
+                self._log_dir.mkdir(parents=True, exist_ok=True)
+            self._starter = ThreadPoolExecutor(max_workers=1, thread_name_prefix="runner")
+            modules = [node.module for node in self.graph.nodes if _can_fork(node)]
+            if len(modules) > 1:
+                ours = sorted(module for module in {*modules} if module.startswith("wm_nodes."))
+                self._forks = self._starter.submit(ForkServer, self._python, ours, self.environment).result()
+            for index, node in enumerate(self.graph.nodes):
+                self._processes[node.label] = NodeProcess(
+                    node, self._python, self.environment, log=self._log, colour=index if self._colour else None,
+                    width=max(len(other.label) for other in self.graph.nodes),
+                    file=self._log_dir / f"{node.label.replace('/', '.')}.log" if self._log_dir else None,
+                )
+                self._start(node.label)
+        except BaseException:
+            self.stop()
+            raise
+
+    def wait_ready(self, timeout_s: float = 60.0) -> None:
+        """Return when every lifecycle node is active and every other node visible.
+
+        Raises:
+            NodeDiedError: a required node ended meanwhile.
+            NotReadyError: after timeout_s; names the nodes, their states and their last words.
+        """
+        try:
+            wait_ready(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
+        except NotReadyError as error:
+            raise self._with_last_words(error) from None
+
+    def activate(self, timeout_s: float = 60.0) -> None:
+        """Configure and activate the nodes of a graph that was started with autostart false.
+
+        Raises:
+            NodeDiedError: a required node ended meanwhile.
+            NotReadyError: a node refused, or did not answer within timeout_s; with the nodes' last words.
+        """
+        try:
+            activate(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
+        except NotReadyError as error:
+            raise self._with_last_words(error) from None
+
+    def _with_last_words(self, error: NotReadyError) -> NotReadyError:
+        time.sleep(LAST_WORDS_S)
+        words = [
+            process.last_output_line() for process in self._processes.values()
+            if {node.full_name for node in process.spec.carried()} & {*error.nodes}
+        ]
+        return NotReadyError(f"{error}: {'; '.join(words)}", error.nodes)
+
+    def check(self) -> None:
+        """Raise NodeDiedError if a required node has ended without having been told to."""
+        failure = self.failure()
+        if failure is not None:
+            raise NodeDiedError(failure[1])
+
+    def failure(self) -> tuple[int, str] | None:
+        """Exit code (1 to 255) and text of the required node that ended first, or None."""
+        ended = [
+            process for label, process in self._processes.items()
+            if process.spec.required and process.ended_at is not None and label not in self._expected
+        ]
+        if not ended:
+            return None
+        first = min(ended, key=lambda process: process.ended_at or 0.0)
+        return first.exit_code, first.exit_summary()
+
+    def wait(self, timeout_s: float | None = None, until: Callable[[], bool] = lambda: False) -> int:
+        """Return 0 when until() is true, when nothing runs, or after timeout_s; else the exit code of the required node
+        that ended first."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while not until() and (deadline is None or time.monotonic() < deadline):
+            failure = self.failure()
+            if failure is not None:
+                self._say(failure[1])
+                return failure[0]
+            if not any(process.running for process in self._processes.values()):
+                return 0
+            time.sleep(0.1)
+        return 0
+
+    def kill(self, name: str, number: int = signal.SIGKILL) -> None:
+        """Send a signal to a node's process group; its end is then no failure of the graph."""
+        label = self.graph.node(name).label
+        self._expected.add(label)
+        self._processes[label].signal(number)
+        self.killed = self.killed or number == signal.SIGKILL
+
+    def wait_ended(self, name: str, timeout_s: float = 10.0) -> int:
+        """Return the exit code (negative: the signal) of a node once it has ended.
+
+        Raises:
+            TimeoutError: it still runs.
+        """
+        return self._processes[self.graph.node(name).label].wait(timeout_s)
+
+    def restart(self, name: str) -> None:
+        """Start a node again, ending its old process first if it still runs."""
+        label = self.graph.node(name).label
+        if self._processes[label].running:
+            self._expected.add(label)
+            self._end([self._processes[label]])
+        self._expected.discard(label)
+        self._start(label)
+
+    def pid(self, name: str) -> int:
+        return self._processes[self.graph.node(name).label].pid
+
+    def output(self, name: str) -> str:
+        """What a node has written so far (its last 1000 lines)."""
+        return self._processes[self.graph.node(name).label].output()
+
+    def stop(self) -> None:
+        """End everything: SIGINT, 5 s, SIGTERM, 5 s, SIGKILL; then clean shared memory and free the domain."""
+        self._expected |= set(self._processes)
+        self._end(list(self._processes.values()))
+        for process in self._processes.values():
+            process.close()
+        if self._forks is not None:
+            self._forks.close()
+            self._forks = None
+        if self._starter is not None:
+            self._starter.shutdown()
+            self._starter = None
+        if self._processes:
+            clean_shared_memory(self.environment)
+        if self._lock is not None:
+            self._lock.release()
+
+    close = stop
+
+    def __enter__(self) -> "Runner":
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _start(self, label: str) -> None:
+        if self._starter is None:
+            raise RuntimeError("the runner is stopped; make another one")
+        process = self._processes[label]
+        self._starter.submit(process.start, self._forks if _can_fork(process.spec) else None).result()
+
+    def _end(self, processes: Sequence[NodeProcess]) -> None:
+        for number in STOP_SIGNALS:
+            running = [process for process in processes if process.running]
+            for process in running:
+                process.signal(number)
+            if number == signal.SIGKILL and running:
+                self.killed = True
+                self._say(f"killed, because 10 s were not enough: {', '.join(p.spec.label for p in running)}")
+            deadline = time.monotonic() + GRACE_S
+            while any(process.running for process in running) and time.monotonic() < deadline:
+                time.sleep(0.02)
+
+    def _fit_shared_memory(self) -> None:
+        """Leave the big segment out where /dev/shm (64 MiB in many containers) cannot hold one for each process."""
+        if self.environment.get(PROFILE_VARIABLE) != str(PROFILE) or not Path("/dev/shm").is_dir():
+            return
+        free, needed = shutil.disk_usage("/dev/shm").free, SEGMENT_BYTES * len(self.graph.nodes)
+        if free < needed:
+            self.environment[PROFILE_VARIABLE] = ""
+            self._say(
+                f"/dev/shm has {free >> 20} MiB free, {needed >> 20} MiB wanted: going on with small segments; images "
+                "above 300 kB may be lost (docker run --shm-size=1g cures it)"
+            )
+
+    def _say(self, text: str) -> None:
+        if self._log is not None:
+            print(f"[runner] {text}", file=self._log, flush=True)
+
+
+def clean_shared_memory(env: Mapping[str, str]) -> None:
+    """Remove what dead Fast DDS processes left in /dev/shm; files of living ones are locked and stay."""
+    tool = shutil.which("fastdds", path=env.get("PATH"))
+    if tool:
+        subprocess.run([tool, "shm", "clean"], env=dict(env), capture_output=True, timeout=60, check=False)
+
+
+def main(scenario: str, argv: Sequence[str] | None = None) -> int:
+    """`python launch_scripts/<scenario>.launch.py name:=value ... [--show-args] [--compose]`. Return the exit code."""
+    given: dict[str, str] = {}
+    for text in sys.argv[1:] if argv is None else argv:
+        name, separator, value = text.partition(":=")
+        if text in {"--show-args", "-s", "--help", "-h"}:
+            print(describe_arguments(scenario))
+            return 0
+        if text == "--compose":
+            name, separator, value = "compose", ":=", "true"
+        if not separator:
+            print(f"error: expected name:=value, got {text!r}; --show-args lists the names", file=sys.stderr)
+            return 2
+        given[name] = value
+    try:
+        graph, values = launch_arguments.prepare(scenario, given)
+        return run(graph, Path(values["run_dir"]), interpreter(values))
+    except (GraphError, DomainInUseError, ValueError, OSError, NotReadyError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: float = 120.0) -> int:
+    """Run a graph until Ctrl-C, SIGTERM, or the end of a required node."""
+    received: list[int] = []
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+
+    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    reach = graph.environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    if reach not in {"LOCALHOST", "OFF"}:
+        print(f"WARNING: discovery range {reach}: whoever reaches this network can steer the graph", flush=True)
+    try:
+        with Runner(graph, log_dir=run_dir / "logs", python=python) as runner:
+            print(f"[runner] {len(graph.nodes)} processes, domain {runner.domain}, run folder {run_dir}", flush=True)
+            try:
+                wait_ready(graph.nodes, domain=runner.domain, timeout_s=ready_s, check=lambda: _raise(runner, received))
+            except (NodeDiedError, KeyboardInterrupt) as error:
+                print(f"[runner] {error or 'interrupted'}; stopping", flush=True)
+                failure = runner.failure()
+                return failure[0] if failure else 0
+            print("[runner] ready; Ctrl-C stops", flush=True)
+            return runner.wait(until=lambda: bool(received))
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _raise(runner: Runner, received: Sequence[int]) -> None:
+    if received:
+        raise KeyboardInterrupt
+    runner.check()
+
+
+def _can_fork(node: NodeSpec) -> bool:
+    """Whether the node can fork: torchrun starts its own processes, and variables may count from the first moment."""
+    return node.ranks == 1 and not node.environment
+
+
+def _domain(env: Mapping[str, str]) -> int:
+    text = env.get("ROS_DOMAIN_ID") or "0"
+    if not text.isdigit():
+        raise ValueError(f"ROS_DOMAIN_ID must be a number from 0 to 101, got {text!r}")
+    return int(text)

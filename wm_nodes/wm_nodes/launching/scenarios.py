@@ -1,0 +1,346 @@
+"""Which nodes a scenario has: one table of arguments and one function per scenario.
+
+They serve both `ros2 launch` (ros.launch_face) and the plain Python starter (ros.runner); no rclpy, no launch, no files
+read.
+"""
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
+
+TRUTHS = ("true", "false")
+ENVIRONMENT_TOPICS = ("env/spec", "env/image", "env/transition", "env/goal", "episode")
+GRAPH_TOPICS = (
+    *ENVIRONMENT_TOPICS, "reward", "action", "policy/version", "reward/summary", "learner/metrics", "run/state",
+)
+"""What the recorder records of its own namespace: the recorder's default."""
+VERDICT_TOPIC = "reward/verdict"
+VIDEO_TOPICS = ("clips", "clips/image", "clips/scores", "video/version", VERDICT_TOPIC, "run/state")
+AGENT_JOIN_S = 600.0
+"""With the reward agent a learner waits so long for the rewards of a rollout: a judge takes its time."""
+
+
+@dataclass(frozen=True)
+class LaunchArgument:
+    """One `name:=value` argument. choices: allowed values; empty where any text is."""
+
+    name: str
+    default: str
+    help: str
+    choices: tuple[str, ...] = ()
+
+
+ARGUMENTS: tuple[LaunchArgument, ...] = (
+    LaunchArgument("preset", "cpu", "Settings to start from, when config_file is empty: a name or a .yaml file"),
+    LaunchArgument("task", "push_cube", "Task, when config_file is empty", ("reach", "push_cube", "pull_cube")),
+    LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
+    LaunchArgument("run_dir", "", "Folder for weights, bags and logs; empty: runs/<time>-<scenario>"),
+    LaunchArgument("namespace", "wm", "ROS namespace of the graph; several graphs on one host need several domains"),
+    LaunchArgument("model_dir", "", "World-model folder; empty: the one shipped for the task"),
+    LaunchArgument("video_model_dir", "", "Folder of the trained video model"),
+    LaunchArgument("context_bags", "", "Bags of contexts for the clips, separated by commas"),
+    LaunchArgument("heldout_bags", "", "Bags of held-out contexts, separated by commas; empty: no held-out scores"),
+    LaunchArgument("keep_buffers", "4", "Rollout buffers kept in run_dir/buffers; training again needs all of them"),
+    LaunchArgument("tensorboard", "false", "Also write the learner's metrics to run_dir/tensorboard", TRUTHS),
+    LaunchArgument("video_preset", "recommended", "Settings of loop 2: a name, or a .yaml file"),
+    LaunchArgument("starts_file", "", "First frames to imagine from; empty: starts.safetensors in model_dir"),
+    LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
+    LaunchArgument("backend", "world_model", "What the environment node steps",
+                   ("world_model", "maniskill", "factory")),
+    LaunchArgument("backend_factory", "", "module:callable(config, num_envs, seed) -> Environment (backend factory)"),
+    LaunchArgument("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir"),
+    LaunchArgument("reward_factory", "", "module:callable(config) -> RewardModel instead of `reward`"),
+    LaunchArgument("params_file", "", "ROS parameter file (YAML) for all nodes; it wins over the other arguments"),
+    LaunchArgument("mode", "lockstep", "Who keeps time: the policy's steps, or the environment's clock",
+                   ("lockstep", "asynchronous")),
+    LaunchArgument("reward", "", "Reward model; empty: endogenous if imagined, else rule; of the video model: what its "
+                   "settings weigh; agent: a judge's verdict on whole clips", ("", "endogenous", "rule", "agent")),
+    LaunchArgument("judge", "", "reward:=agent: base URLs of the judge's servers with their /v1, separated by commas; "
+                   "or the folder of a trained judge; empty, or embedded: the shipped one"),
+    LaunchArgument("judge_model", "", "reward:=agent: the judge's name on the server"),
+    LaunchArgument("judge_key_env", "", "reward:=agent: environment variable with the server's key; empty: none"),
+    LaunchArgument("rubric", "", "reward:=agent: rubric pack, a name or a .yaml file; empty: the settings'"),
+    LaunchArgument("num_envs", "0", "Environments stepped together; 0: ppo.num_envs of the configuration"),
+    LaunchArgument("simulator_envs", "4", "Environments of the simulator that evaluates"),
+    LaunchArgument("simulator", "true", "Also start the simulator and the evaluation node", TRUTHS),
+    LaunchArgument("seed", "0", "Root seed of the environments"),
+    LaunchArgument("learner_ranks", "1", "Learner processes under torchrun"),
+    LaunchArgument("record", "true", "Also start the recorder", TRUTHS),
+    LaunchArgument("bag_uri", "", "Bag folder to write or to play; empty: <run_dir>/bags/<scenario>"),
+    LaunchArgument("rate", "1.0", "Recorded seconds per second; the learner's pace limits it"),
+    LaunchArgument("train", "true", "Train from what is played; false: only play, training waits for a goal", TRUTHS),
+    LaunchArgument("executor", "events", "Which rclpy executor spins the nodes", ("events", "single", "multi")),
+    LaunchArgument("autostart", "true", "Nodes activate themselves; false: a lifecycle manager does", TRUTHS),
+    LaunchArgument("use_sim_time", "false", "Nodes take their time from /clock", TRUTHS),
+    LaunchArgument("log_level", "info", "Least severity that nodes log", ("debug", "info", "warn", "error")),
+    LaunchArgument("compose", "false", "All nodes in one process: fewer copies, one interpreter", TRUTHS),
+    LaunchArgument("domain_id", "", "ROS domain, 0 to 101; empty: $ROS_DOMAIN_ID, else 0"),
+    LaunchArgument(
+        "discovery_range", "LOCALHOST", "Who may find the nodes; beyond this host nothing is authenticated",
+        ("LOCALHOST", "SUBNET", "OFF", "SYSTEM_DEFAULT"),
+    ),
+    LaunchArgument("python", "", "Interpreter of the nodes; empty: $WM_PYTHON, else the one that starts the graph"),
+)
+"""Every argument of every scenario: the only place with a default."""
+
+_BY_NAME = {argument.name: argument for argument in ARGUMENTS}
+_COMMON = (
+    "preset", "task", "config_file", "run_dir", "namespace", "executor", "autostart", "use_sim_time", "log_level",
+    "compose", "domain_id", "discovery_range", "python", "params_file",
+)
+
+
+def parse_arguments(scenario: str, given: Mapping[str, str]) -> dict[str, str]:
+    """Return every argument of a scenario with its given or default value.
+
+    Raises:
+        GraphError: names the argument and what is allowed.
+    """
+    names = scenario_of(scenario).arguments
+    for name, value in given.items():
+        if name not in names:
+            close = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(names)}"
+            raise GraphError(f"unknown argument {name!r} of {scenario}; {hint}")
+        choices = _BY_NAME[name].choices
+        if choices and value not in choices:
+            raise GraphError(f"{name} must be one of {', '.join(c or '(empty)' for c in choices)}; got {value!r}")
+    return {name: given.get(name, _BY_NAME[name].default) for name in names}
+
+
+def build_graph(scenario: str, arguments: Mapping[str, str]) -> Graph:
+    """Return the graph for resolved arguments (ros.arguments.resolve fills run_dir, config_file and the like)."""
+    graph = scenario_of(scenario).build(arguments)
+    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": arguments["discovery_range"]}
+    if arguments["domain_id"]:
+        environment["ROS_DOMAIN_ID"] = str(_integer(arguments, "domain_id", 0, 101))
+    return dataclasses.replace(graph, environment=environment)
+
+
+def _number(arguments: Mapping[str, str], name: str, low: float, high: float, kind: type = float) -> Any:
+    try:
+        value = kind(arguments[name])
+    except ValueError:
+        what = "a whole number" if kind is int else "a number"
+        raise GraphError(f"{name} must be {what}, got {arguments[name]!r}") from None
+    if not low <= value <= high:
+        raise GraphError(f"{name} must be {low} to {high}, got {arguments[name]}")
+    return value
+
+
+def _integer(arguments: Mapping[str, str], name: str, low: int, high: int = 2**31) -> int:
+    return int(_number(arguments, name, low, high, int))
+
+
+def _node(
+    arguments: Mapping[str, str],
+    name: str,
+    parameters: Mapping[str, ParameterValue],
+    *,
+    below: str = "",
+    ranks: int = 1,
+    module: str = "",
+) -> NodeSpec:
+    """module: of wm_nodes.nodes; empty: the one of the node's name."""
+    namespace = "/" + "/".join(part for part in (arguments["namespace"].strip("/"), below) if part)
+    common: dict[str, ParameterValue] = {
+        "config_file": arguments["config_file"],
+        "run_dir": arguments["run_dir"],
+        "autostart": arguments["autostart"] == "true",
+        "executor": arguments["executor"],
+        "use_sim_time": arguments["use_sim_time"] == "true",
+    }
+    values = {**common, **parameters}
+    return NodeSpec(
+        f"wm_nodes.nodes.{module or f'{name}_node'}", name, namespace, values, ranks=ranks,
+        log_level=arguments["log_level"], extra_parameters=arguments["params_file"],
+    )
+
+
+def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "num_envs", below: str = "") -> NodeSpec:
+    parameters: dict[str, ParameterValue] = {
+        "backend": backend,
+        "num_envs": _integer(arguments, count, 1, 4096),
+        "seed": _integer(arguments, "seed", 0),
+        "mode": arguments.get("mode", "lockstep") if not below else "lockstep",
+    }
+    if backend == "factory":
+        if not arguments["backend_factory"]:
+            raise GraphError("backend:=factory needs backend_factory:=module:callable")
+        parameters["backend_factory"] = arguments["backend_factory"]
+    if backend == "world_model":
+        parameters |= {"model_dir": arguments["model_dir"], "starts_file": arguments["starts_file"]}
+    return _node(arguments, "environment", parameters, below=below)
+
+
+def _simulator_and_evaluation(arguments: Mapping[str, str]) -> list[NodeSpec]:
+    evaluation = {**_weights(arguments), "env_namespace": "sim"}
+    return [
+        _environment(arguments, "maniskill", count="simulator_envs", below="sim"),
+        _node(arguments, "evaluation", evaluation),
+    ]
+
+
+def _recorder(arguments: Mapping[str, str], *, simulator: bool = False) -> list[NodeSpec]:
+    """simulator: also record the episodes of the environment in namespace sim."""
+    if arguments["record"] != "true":
+        return []
+    more = [f"sim/{name}" for name in ENVIRONMENT_TOPICS] if simulator else []
+    more += [VERDICT_TOPIC] if arguments.get("reward") == "agent" else []
+    return [_node(arguments, "recorder", {"bag_uri": arguments["bag_uri"], "topics": [*GRAPH_TOPICS, *more]})]
+
+
+def _weights(arguments: Mapping[str, str]) -> dict[str, ParameterValue]:
+    names = ("model_dir", "initial_policy", "policy_factory")
+    return {name: arguments[name] for name in names}
+
+
+def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[str, ...] = ()) -> list[NodeSpec]:
+    """consumers: further nodes that must not miss the first messages of a rollout."""
+    reward = arguments["reward"] or ("endogenous" if backend == "world_model" else "rule")
+    recorder = _recorder(arguments, simulator=arguments.get("simulator") == "true")
+    policy = {**_weights(arguments), "mode": arguments.get("mode", "lockstep")}
+    awaited = ["environment", "reward_evaluator", *(node.name for node in recorder), *consumers]
+    return [
+        _environment(arguments, backend),
+        _node(
+            arguments,
+            "reward_evaluator",
+            {
+                "reward": reward,
+                "reward_factory": arguments["reward_factory"],
+                "model_dir": arguments["model_dir"],
+            },
+        ),
+        _node(arguments, "policy", {**policy, "await_nodes": awaited}),
+        *recorder,
+    ]
+
+
+def _online_training(arguments: Mapping[str, str]) -> Graph:
+    ranks = _integer(arguments, "learner_ranks", 1, 1024)
+    learner = _weights(arguments)
+    if arguments["reward"] == "agent":
+        learner["join_timeout_s"] = AGENT_JOIN_S
+    nodes = [
+        *_rollout_nodes(arguments, "world_model", ("learner",)),
+        _node(arguments, "learner", learner, ranks=ranks),
+    ]
+    if arguments["simulator"] == "true":
+        nodes += _simulator_and_evaluation(arguments)
+    return Graph("online_training", tuple(nodes))
+
+
+def _rollout_record(arguments: Mapping[str, str]) -> Graph:
+    return Graph("rollout_record", tuple(_rollout_nodes(arguments, arguments["backend"])))
+
+
+def _replay_offline(arguments: Mapping[str, str]) -> Graph:
+    rate = _number(arguments, "rate", 1e-3, 1e6)
+    trains = arguments["train"] == "true"
+    player = _node(arguments, "player", {"bag_uri": arguments["bag_uri"], "play_at_start": not trains, "rate": rate})
+    learner = {**_weights(arguments), "replay_rate": rate, "replay_at_start": arguments["bag_uri"] if trains else ""}
+    return Graph("replay_offline", (player, _node(arguments, "learner", learner)))
+
+
+def _evaluate(arguments: Mapping[str, str]) -> Graph:
+    return Graph("evaluate", (*_simulator_and_evaluation(arguments), *_recorder(arguments, simulator=True)))
+
+
+def _world_model_rl(arguments: Mapping[str, str]) -> Graph:
+    model: dict[str, ParameterValue] = {"video_model_dir": arguments["video_model_dir"]}
+    contexts, heldout = (
+        [text for text in arguments[name].split(",") if text] for name in ("context_bags", "heldout_bags")
+    )
+    if not contexts or not arguments["video_model_dir"]:
+        raise GraphError("world_model_rl needs video_model_dir:=<folder> and context_bags:=<bag>[,<bag> ...]")
+    clips: dict[str, ParameterValue] = {**model, "context_bags": contexts}
+    judge: dict[str, ParameterValue] = {"model_dir": arguments["model_dir"]}
+    watch: dict[str, ParameterValue] = {**judge, "heldout_bags": heldout} if heldout else {}
+    keep = _integer(arguments, "keep_buffers", 1, 100000)
+    learner: dict[str, ParameterValue] = {**model, **watch, "tensorboard": arguments["tensorboard"] == "true"}
+    if arguments["record"] == "true":
+        learner["await_nodes"] = ["recorder"]
+    nodes = [
+        _node(arguments, "video_model", {**clips, "keep_buffers": keep}),
+        _node(arguments, "reward_evaluator", {**clips, **judge}, module="clip_evaluator_node"),
+        _node(arguments, "learner", learner, module="video_learner_node"),
+    ]
+    if arguments["record"] == "true":
+        nodes.append(_node(arguments, "recorder", {"bag_uri": arguments["bag_uri"], "topics": list(VIDEO_TOPICS)}))
+    return Graph("world_model_rl", tuple(nodes))
+
+
+def _judge_clips(arguments: Mapping[str, str]) -> Graph:
+    parameters = {"reward": "agent", "model_dir": arguments["model_dir"], "audit_dir": "audit"}
+    return Graph("judge_clips", (_node(arguments, "reward_evaluator", parameters),))
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A named graph; arguments: names in ARGUMENTS, in the order in which --show-args lists them."""
+
+    name: str
+    summary: str
+    arguments: tuple[str, ...]
+    build: Callable[[Mapping[str, str]], Graph]
+
+
+_JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
+_TRAINING = (
+    *_COMMON, "model_dir", "starts_file", "initial_policy", "reward", "num_envs", "simulator_envs", "simulator", "seed",
+    "learner_ranks", "record", "bag_uri", "policy_factory", "reward_factory", *_JUDGE,
+)
+_ROLLOUT = (
+    "model_dir", "starts_file", "initial_policy", "backend", "mode", "reward", "num_envs", "seed", "record", "bag_uri",
+    "backend_factory", "policy_factory", "reward_factory", *_JUDGE,
+)
+_EVALUATE = (
+    *_COMMON, "model_dir", "initial_policy", "policy_factory", "simulator_envs", "seed", "record", "bag_uri",
+)
+
+SCENARIOS: dict[str, Scenario] = {
+    scenario.name: scenario
+    for scenario in (
+        Scenario("online_training", "Train a policy in the world model; evaluate it in the simulator", _TRAINING,
+                 _online_training),
+        Scenario("rollout_record", "Let a policy act and record it", (*_COMMON, *_ROLLOUT), _rollout_record),
+        Scenario("replay_offline", "Play a bag; the learner trains from what is played",
+                 (*_COMMON, "model_dir", "initial_policy", "policy_factory", "bag_uri", "rate",
+                  "train"), _replay_offline),
+        Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
+        Scenario("world_model_rl", "Post-train the video model by GRPO on clips that it samples",
+                 (*(name for name in _COMMON if name not in ("preset", "task", "compose")), "model_dir",
+                  "video_model_dir", "context_bags", "heldout_bags", "video_preset", "keep_buffers", "tensorboard",
+                  "record", "bag_uri", "reward", *_JUDGE), _world_model_rl),
+        Scenario("judge_clips", "Have the reward agent judge folders of clips (action reward/judge_clips)",
+                 (*(name for name in _COMMON if name != "compose"), "model_dir", *_JUDGE), _judge_clips),
+        Scenario("composed", "online_training with all nodes in one process", _TRAINING, _online_training),
+    )
+}
+
+
+def scenario_of(name: str) -> Scenario:
+    if name not in SCENARIOS:
+        raise GraphError(f"unknown scenario {name!r}; choose one of {', '.join(SCENARIOS)}")
+    return SCENARIOS[name]
+
+
+def describe_arguments(scenario: str) -> str:
+    """The text of --show-args."""
+    lines = [f"{scenario}: {scenario_of(scenario).summary}", "Arguments (name:=value):"]
+    for name in scenario_of(scenario).arguments:
+        argument = _BY_NAME[name]
+        choices = (
+            f" One of: {', '.join(choice or '(empty)' for choice in argument.choices)}." if argument.choices else ""
+        )
+        lines += [f"    {name}:", f"        {argument.help}.{choices} (default: {argument.default!r})"]
+    return "\n".join(lines)
+
+
+def argument_table(scenario: str) -> list[LaunchArgument]:
+    return [_BY_NAME[name] for name in scenario_of(scenario).arguments]

@@ -1,1 +1,0 @@
-"""Learners, rollouts, evaluation, weights and checkpoints. Import from the submodules; nothing is loaded here."""

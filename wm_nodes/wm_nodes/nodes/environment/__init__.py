@@ -1,0 +1,1 @@
+"""Parts of the environment node: lock-step and asynchronous stepping, images, the client of a remote environment."""

@@ -1,0 +1,71 @@
+"""What people watch of an environment: one of N alone, and the mosaic as JPEG. Nothing is made that nobody looks at."""
+
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+from sensor_msgs.msg import CompressedImage, Image
+
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.recording.messages import CAMERA_FRAME
+from wm_nodes.ros import convert
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.params import Param
+from wm_nodes.ros.qos import VIEW, topic
+
+PARAMS = (
+    Param("view_env", -1, "Also publish this environment's image alone on env/image/view while someone looks; -1: none",
+          minimum=-1, maximum=4095),
+    Param("view_period_s", 0.066, "Least time between two env/image/view", "s", minimum=0.0, maximum=10.0),
+    Param("compressed", "subscribed", "When to publish env/image/compressed (JPEG, for remote viewers)",
+          choices=("subscribed", "always", "never")),
+    Param("compressed_period_s", 0.066, "Least time between two env/image/compressed", "s", minimum=0.0, maximum=10.0),
+    Param("compressed_quality", 90, "JPEG quality", minimum=1, maximum=100),
+)
+
+
+def jpeg_msg(mosaic: UInt8Array, stamp_ns: int, quality: int) -> CompressedImage:
+    """uint8 (H, W, 3), RGB, to a JPEG (quality 1 to 100) as image_transport's compressed plug-in would name it."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(mosaic, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise ValueError(f"cannot encode an image of shape {mosaic.shape} as JPEG")
+    message = CompressedImage(header=convert.header(stamp_ns, CAMERA_FRAME), format="rgb8; jpeg compressed bgr8")
+    message.data = convert.to_field(data)
+    return message
+
+
+class ImageViews:
+    """Publishes env/image/view and env/image/compressed until the node's cleanup."""
+
+    def __init__(self, node: ManagedNode) -> None:
+        self._node = node
+        row = topic("env/image/compressed")
+        self._view = node.create_publisher(Image, "env/image/view", VIEW)
+        self._compressed = node.create_publisher(row.type, row.name, row.qos)
+        for publisher in (self._view, self._compressed):
+            node.own(node.destroy_publisher, publisher)
+        self._last_s: dict[str, float] = {}
+
+    def show(self, images: UInt8Array, mosaic: Image) -> None:
+        """Publish what is due. images: uint8 (N, H, W, 3); mosaic: the env/image message of the same observation."""
+        stamp_ns = convert.time_ns(mosaic.header.stamp)
+        shown = int(self._param("view_env"))
+        if 0 <= shown < len(images) and self._view.get_subscription_count() and self._due("view"):
+            self._view.publish(convert.image_msg(images[shown], stamp_ns, mosaic.encoding))
+        when = self._param("compressed")
+        wanted = when == "always" or (when == "subscribed" and self._compressed.get_subscription_count())
+        if wanted and self._due("compressed"):
+            pixels = np.frombuffer(mosaic.data, np.uint8).reshape(mosaic.height, mosaic.width, 3)
+            quality = int(self._param("compressed_quality"))
+            self._compressed.publish(jpeg_msg(pixels, stamp_ns, quality))
+
+    def _due(self, what: str) -> bool:
+        now = time.monotonic()
+        due = now - self._last_s.get(what, -1e9) >= float(self._param(f"{what}_period_s"))
+        if due:
+            self._last_s[what] = now
+        return due
+
+    def _param(self, name: str) -> Any:
+        return self._node.param(name)

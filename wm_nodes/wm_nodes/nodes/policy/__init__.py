@@ -1,0 +1,1 @@
+"""Parts of the policy node: weights by version, asynchronous actions."""

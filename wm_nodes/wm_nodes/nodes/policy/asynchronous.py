@@ -1,0 +1,140 @@
+"""The policy in asynchronous mode: acts on the newest observation, in a thread of its own; older ones are skipped.
+
+Shapes: N environments, S state, H W 3 image.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from sensor_msgs.msg import Image
+
+from wm_msgs.msg import TransitionBatch
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.nodes.learner.rollout_assembler import ImageCache
+from wm_nodes.nodes.policy.weights import PolicyHolder
+from wm_nodes.policy_rl.image_policy import PolicyOutput
+from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.wire import WireError
+
+CAPACITY = 8
+
+
+@dataclass(frozen=True)
+class SyncedObservation:
+    """One observation as the topics brought it. images: (N, H, W, 3). states: (N, S). step_id: of the next step."""
+
+    stamp_ns: int
+    step_id: int
+    images: UInt8Array
+    states: FloatArray
+
+
+class AsynchronousPolicy:
+    """Joins images and states by exact stamp and lets the policy act on the newest pair.
+
+    spec: of the environment, once it is known; nothing is done before.
+
+    Args:
+        node: listens for it; its parameter `deterministic` switches the action noise off.
+        publish: called with (stamp_ns, step_id, output, policy version, seconds of inference).
+    """
+
+    def __init__(
+        self, node: ManagedNode, holder: PolicyHolder, publish: Callable[[int, int, PolicyOutput, int, float], None]
+    ) -> None:
+        self._node, self._holder, self._publish = node, holder, publish
+        self.spec: EnvironmentSpec | None = None
+        self._changed = threading.Condition()
+        self._images = ImageCache(CAPACITY)
+        self._states: dict[int, tuple[int, FloatArray]] = {}
+        self._next: SyncedObservation | None = None
+        self._thread: threading.Thread | None = None
+        self._flying = False
+        self.skipped = 0
+        """Observations that a newer one replaced before they were acted upon."""
+        node.listen("env/image", self._on_image)
+        node.listen("env/transition", self._on_transition)
+
+    def start(self) -> None:
+        self._flying = True
+        self._thread = threading.Thread(target=self._fly, name="pilot")
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread; what was seen is forgotten."""
+        with self._changed:
+            self._flying, self._next = False, None
+            self._changed.notify_all()
+        if self._thread is not None:
+            self._thread.join(5.0)
+            self._thread = None
+        self._images.clear()
+        self._states.clear()
+
+    def _on_image(self, message: Image) -> None:
+        if self.spec is None:
+            return
+        try:
+            images = convert.images_of(message, self.spec)
+        except WireError as error:
+            self._node.diagnostics.count("refused_images", text=str(error))
+            return
+        stamp_ns = convert.time_ns(message.header.stamp)
+        with self._changed:
+            self._images.put(stamp_ns, images)
+            self._join(stamp_ns)
+
+    def _on_transition(self, message: TransitionBatch) -> None:
+        if self.spec is None:
+            return
+        try:
+            states = convert.floats(message.next_state, (self.spec.num_envs, self.spec.state_dim), "next_state")
+        except WireError as error:
+            self._node.diagnostics.count("refused_transitions", text=str(error))
+            return
+        stamp_ns = convert.time_ns(message.next_stamp)
+        with self._changed:
+            self._states[stamp_ns] = message.step_id + 1, states
+            while len(self._states) > CAPACITY:
+                del self._states[next(iter(self._states))]
+            self._join(stamp_ns)
+
+    def _join(self, stamp_ns: int) -> None:
+        images, states = self._images.get(stamp_ns), self._states.get(stamp_ns)
+        if images is None or states is None:
+            return
+        self.skipped += self._next is not None
+        self._next = SyncedObservation(stamp_ns, states[0], images, states[1])
+        self._changed.notify_all()
+
+    def _fly(self) -> None:
+        while True:
+            with self._changed:
+                while self._flying and self._next is None:
+                    self._changed.wait()
+                if not self._flying:
+                    return
+                sight, self._next = self._next, None
+            assert sight is not None
+            try:
+                self._act(sight)
+            except Exception as error:
+                text = f"cannot act on an observation: {type(error).__name__}: {error}"
+                self._node.get_logger().error(text, throttle_duration_sec=1.0)
+                self._node.diagnostics.count("failed_flights", level=diagnostics.ERROR, text=text)
+
+    def _act(self, sight: SyncedObservation) -> None:
+        noise = None
+        if not self._node.param("deterministic"):
+            shape = (len(sight.states), self._holder.action_dim)
+            noise = np.random.default_rng().standard_normal(shape, np.float32)
+        began = time.perf_counter()
+        output, version = self._holder.act(sight.images, sight.states, noise)
+        infer_s = time.perf_counter() - began
+        self._node.diagnostics.latency("infer", infer_s)
+        self._publish(sight.stamp_ns, sight.step_id, output, version, infer_s)

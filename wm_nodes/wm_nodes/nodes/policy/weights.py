@@ -1,0 +1,79 @@
+"""The policy of a node and the version of its weights; weights are swapped between steps, never within one."""
+
+import threading
+from pathlib import Path
+
+from wm_msgs.msg import ErrorCode, PolicyVersion
+from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.policy_rl.image_policy import ImagePolicy, PolicyOutput
+from wm_nodes.ros.wire import WireError
+from wm_nodes.training.weights import WeightsError, arch_hash, load_weights
+
+
+class PolicyHolder:
+    """Thread-safe. version: the learner step of the weights that act; 0 before any."""
+
+    def __init__(self, policy: ImagePolicy) -> None:
+        self._policy = policy
+        self._lock = threading.Lock()
+        self._arch_hash = arch_hash(policy.state_dict())
+        self.version = 0
+        self.sha256 = ""
+
+    @property
+    def state_dim(self) -> int:
+        return self._policy.state_dim
+
+    @property
+    def action_dim(self) -> int:
+        return self._policy.action_dim
+
+    @property
+    def policy(self) -> ImagePolicy:
+        return self._policy
+
+    def act(self, images: UInt8Array, states: FloatArray, noise: FloatArray | None) -> tuple[PolicyOutput, int]:
+        """Return actions for (N, H, W, 3) images and (N, S) states, and the version that chose them."""
+        with self._lock:
+            return self._policy.act(images, states, noise=noise), self.version
+
+    def follow(self, message: PolicyVersion, run_dir: Path) -> bool:
+        """Load an announced version; return False for the one already loaded. The old weights stay on an error.
+
+        Raises:
+            WireError: HASH_MISMATCH for damaged or foreign weights, IO_ERROR for an unreadable file.
+        """
+        if message.sha256 == self.sha256 and message.version == self.version:
+            return False
+        if message.arch_hash and message.arch_hash != self._arch_hash:
+            raise WireError(
+                ErrorCode.HASH_MISMATCH,
+                f"policy version {message.version} has architecture {message.arch_hash[:12]}, this node's policy "
+                f"{self._arch_hash[:12]}; start both with the same config_file and model_dir",
+            )
+        self.load(self._bytes(message, run_dir), message.version, message.sha256)
+        return True
+
+    def load(self, data: bytes, version: int, sha256: str = "") -> None:
+        """Take over safetensors bytes. Raises WireError(HASH_MISMATCH); the old weights stay."""
+        try:
+            with self._lock:
+                load_weights(self._policy, data, sha256=sha256 or None)
+                self.version, self.sha256 = version, sha256
+        except WeightsError as error:
+            raise WireError(ErrorCode.HASH_MISMATCH, f"policy version {version} refused: {error}") from None
+
+    @staticmethod
+    def _bytes(message: PolicyVersion, run_dir: Path) -> bytes:
+        if len(message.inline_data):
+            return bytes(message.inline_data)
+        return read_weights(message.uri, run_dir)
+
+
+def read_weights(uri: str, run_dir: Path) -> bytes:
+    """Read a weights file by absolute path, or by one relative to the run folder. Raises WireError(IO_ERROR)."""
+    path = Path(uri) if Path(uri).is_absolute() else run_dir / uri
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise WireError(ErrorCode.IO_ERROR, f"cannot read weights {path}: {error.strerror}") from None

@@ -1,0 +1,119 @@
+"""Success of a policy on given reset seeds, over a batch of environments. Shapes: E episodes, N environments."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from wm_nodes.core.seeding import torch_stream
+from wm_nodes.core.statistics import wilson_interval
+from wm_nodes.core.types import BoolArray, Environment, UInt64Array
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.rollouts import Canceled
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Arrays in the order of the seeds first_seed, first_seed + 1, ...
+
+    success: bool (E,), the episode terminated before its step limit. length: uint32 (E,), steps made.
+    low, high: 95 % Wilson interval of the success rate.
+    """
+
+    success: BoolArray
+    length: NDArray[np.uint32]
+    first_seed: int
+    low: float
+    high: float
+
+    @property
+    def episodes(self) -> int:
+        return len(self.success)
+
+    @property
+    def successes(self) -> int:
+        return int(self.success.sum())
+
+    @property
+    def success_rate(self) -> float:
+        return self.successes / self.episodes
+
+    @property
+    def mean_length(self) -> float:
+        return float(self.length.mean())
+
+
+def evaluate(
+    policy: ImagePolicy,
+    env: Environment,
+    episodes: int,
+    first_seed: int,
+    deterministic: bool = True,
+    *,
+    should_stop: Callable[[], bool] | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> EvaluationResult:
+    """Play one episode per seed. Environments that finish take the next seed, so none waits for the slowest.
+
+    Action noise, where not deterministic, comes from the stream (episode seed, step): the result does not depend on
+    which environment played an episode.
+
+    Args:
+        on_progress: called with (episodes done, successes).
+
+    Raises:
+        Canceled: should_stop, asked before every lock-step, returned True.
+        ValueError: episodes < 1.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be >= 1, got {episodes}; see evaluation.episodes in presets/base.yaml")
+    num_envs = env.spec.num_envs
+    playing = np.where(np.arange(num_envs) < episodes, np.arange(num_envs), -1)
+    next_episode = min(num_envs, episodes)
+    success = np.zeros(episodes, np.bool_)
+    length = np.zeros(episodes, np.uint32)
+    done = 0
+    observation = env.reset(None, _seeds(first_seed, playing))
+    while done < episodes:
+        if should_stop is not None and should_stop():
+            raise Canceled(f"evaluation stopped after {done} of {episodes} episodes")
+        noise = None
+        if not deterministic:
+            noise = np.stack(
+                [
+                    _noise(first_seed + max(int(episode), 0), int(step), env.spec.action_dim)
+                    for episode, step in zip(playing, observation.episode_step, strict=True)
+                ]
+            )
+        result = env.step(policy.act(observation.image, observation.state, noise=noise).actions)
+        observation = result.observation
+        ended = (result.terminated | result.truncated) & result.valid & (playing >= 0)
+        if not ended.any():
+            continue
+        success[playing[ended]] = result.terminated[ended]
+        length[playing[ended]] = observation.episode_step[ended]
+        done += int(ended.sum())
+        waiting = np.flatnonzero(ended)
+        refilled = waiting[: episodes - next_episode]
+        playing[waiting] = -1
+        playing[refilled] = np.arange(next_episode, next_episode + len(refilled))
+        next_episode += len(refilled)
+        if len(refilled):
+            mask = np.zeros(num_envs, np.bool_)
+            mask[refilled] = True
+            observation = env.reset(mask, _seeds(first_seed, playing))
+        if on_progress is not None:
+            on_progress(done, int(success.sum()))
+    low, high = wilson_interval(int(success.sum()), episodes)
+    return EvaluationResult(success, length, first_seed, low, high)
+
+
+def _seeds(first_seed: int, playing: NDArray[np.int64]) -> UInt64Array:
+    return (first_seed + np.maximum(playing, 0)).astype(np.uint64)
+
+
+def _noise(seed: int, step: int, action_dim: int) -> NDArray[np.float32]:
+    noise: NDArray[np.float32] = torch.randn(action_dim, generator=torch_stream(seed, "evaluation_noise", step)).numpy()
+    return noise

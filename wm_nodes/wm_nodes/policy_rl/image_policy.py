@@ -1,0 +1,220 @@
+"""A Gaussian policy and a critic on frozen image features. Shapes: B batch, H W 3 image, F features, S state, A action.
+
+The encoder is frozen, shared with the world model, and not part of the weights: they stay below 1 MB and travel inside
+one message.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from wm_nodes.config.schema import PolicyConfig
+from wm_nodes.core.seeding import stream_seed
+from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.policy_rl.gaussian import DiagonalGaussian
+
+TOOL_CENTER_M = (0.6, 0.0, 0.15)
+TOOL_SCALE_M = 0.2
+"""The commanded tool position in the robot base frame lies within about one scale of the centre, m."""
+
+_FEATURE_LIMIT = 5.0
+_RELATIVE_STD_FLOOR = 0.1
+
+
+@dataclass(frozen=True)
+class ImageEncoder:
+    """A frozen image encoder.
+
+    function: uint8 (B, H, W, 3) -> float (B, F). sha256: of the weights behind it; "" when it has none.
+    """
+
+    function: Callable[[Tensor], Tensor]
+    feature_dim: int
+    sha256: str = ""
+
+    def __call__(self, images_BHWC: Tensor) -> Tensor:
+        with torch.no_grad():
+            features_BF = self.function(images_BHWC).float()
+        if features_BF.shape != (images_BHWC.shape[0], self.feature_dim):
+            raise ValueError(
+                f"encoder gave features {tuple(features_BF.shape)} for images {tuple(images_BHWC.shape)}, expected "
+                f"({images_BHWC.shape[0]}, {self.feature_dim}); the camera differs from the tokenizer's"
+            )
+        return features_BF
+
+
+@dataclass(frozen=True)
+class PolicyOutput:
+    """actions: float32 (B, A) in [-1, 1], to execute. logprobs: float32 (B,), nats. values: float32 (B,)."""
+
+    actions: FloatArray
+    logprobs: FloatArray
+    values: FloatArray
+
+
+class ImagePolicy(nn.Module):
+    """Separate actor and critic networks on encoder features and robot state.
+
+    Args:
+        encoder: frozen; see ImageEncoder.
+        state_dim: S. The state is shifted and scaled by fixed constants.
+        action_dim: A.
+        config: sizes and the initial log standard deviation.
+        seed: of the initial weights (stream `policy_init`).
+        state_center, state_scale: per-dimension constants; default for S = 3 a tool position in m, else 0 and 1.
+    """
+
+    def __init__(
+        self,
+        encoder: ImageEncoder,
+        state_dim: int,
+        action_dim: int,
+        config: PolicyConfig,
+        *,
+        seed: int = 0,
+        state_center: Sequence[float] | None = None,
+        state_scale: float | None = None,
+    ) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.state_dim, self.action_dim, self.config = state_dim, action_dim, config
+        is_tool = state_dim == len(TOOL_CENTER_M)
+        center = state_center if state_center is not None else TOOL_CENTER_M if is_tool else (0.0,) * state_dim
+        scale = state_scale if state_scale is not None else TOOL_SCALE_M if is_tool else 1.0
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(stream_seed(seed, "policy_init"))
+            self.actor = _Network(encoder.feature_dim, state_dim, action_dim, config, output_gain=0.01)
+            self.critic = _Network(encoder.feature_dim, state_dim, 1, config, output_gain=1.0)
+        self.log_std_A = nn.Parameter(torch.full((action_dim,), config.init_log_std))
+        self.register_buffer("feature_shift_F", torch.zeros(encoder.feature_dim))
+        self.register_buffer("feature_scale_F", torch.ones(encoder.feature_dim))
+        self.register_buffer("state_shift_S", torch.tensor(center, dtype=torch.float32))
+        self.register_buffer("state_scale_S", torch.full((state_dim,), scale, dtype=torch.float32))
+
+    @property
+    def device(self) -> torch.device:
+        return self.log_std_A.device
+
+    def clone(self) -> "ImagePolicy":
+        """Return a copy with its own weights and the same encoder, without gradients: a reference policy."""
+        copy = ImagePolicy(self.encoder, self.state_dim, self.action_dim, self.config).to(self.device)
+        copy.load_state_dict(self.state_dict())
+        return copy.requires_grad_(False)
+
+    def features(self, images: UInt8Array | Tensor, *, batch_size: int = 256) -> Tensor:
+        """Return (B, F) features without gradient; compute them once per image and reuse them over the epochs.
+
+        images: uint8 (B, H, W, 3). batch_size: images per encoder call.
+        """
+        images_BHWC = torch.from_numpy(np.ascontiguousarray(images)) if isinstance(images, np.ndarray) else images
+        if images_BHWC.dtype != torch.uint8 or images_BHWC.ndim != 4 or images_BHWC.shape[-1] != 3:
+            raise ValueError(f"images must be uint8 (B, H, W, 3), got {images_BHWC.dtype} {tuple(images_BHWC.shape)}")
+        if len(images_BHWC) == 0:
+            return torch.empty(0, self.encoder.feature_dim, device=self.device)
+        starts = range(0, len(images_BHWC), batch_size)
+        return torch.cat([self.encoder(images_BHWC[start : start + batch_size].to(self.device)) for start in starts])
+
+    def fit_normaliser(self, features_BF: Tensor) -> None:
+        """Set shift and scale of every feature from (B, F) features of real frames, before any training.
+
+        Features of the static background hardly vary: the scale is at least a tenth of the mean one, so that their
+        noise is not blown up.
+        """
+        if features_BF.ndim != 2 or len(features_BF) < 2:
+            raise ValueError(f"normalisation needs features of at least 2 frames, got {tuple(features_BF.shape)}")
+        std_F = features_BF.std(0, correction=0)
+        floor = max(float(std_F.mean()) * _RELATIVE_STD_FLOOR, 1e-6)
+        self._buffer("feature_shift_F").copy_(features_BF.mean(0))
+        self._buffer("feature_scale_F").copy_(std_F.clamp(min=floor))
+
+    def distribution(self, features_BF: Tensor, states_BS: Tensor) -> DiagonalGaussian:
+        """Return the action distribution; the mean is not squashed."""
+        mean_BA = self.actor(*self._normalised(features_BF, states_BS))
+        return DiagonalGaussian(mean_BA, self.log_std_A)
+
+    def value(self, features_BF: Tensor, states_BS: Tensor) -> Tensor:
+        """Return the critic's values, (B,)."""
+        return cast(Tensor, self.critic(*self._normalised(features_BF, states_BS))).squeeze(-1)
+
+    @torch.no_grad()
+    def act(
+        self,
+        images: UInt8Array,
+        states: FloatArray,
+        generator: torch.Generator | None = None,
+        *,
+        noise: FloatArray | None = None,
+    ) -> PolicyOutput:
+        """Choose actions for uint8 (B, H, W, 3) images and float32 (B, S) states.
+
+        Args:
+            generator: CPU generator of the action noise; None acts deterministically: clamp(mean).
+            noise: standard-normal (B, A) instead of a generator, where every row has its own stream.
+
+        Raises:
+            ValueError: wrong shapes or dtypes, or a state that is not finite.
+        """
+        if states.shape != (len(images), self.state_dim):
+            raise ValueError(f"states must be ({len(images)}, {self.state_dim}), got {states.shape}")
+        if not np.isfinite(states).all():
+            raise ValueError(f"states must be finite, got {states[~np.isfinite(states)][0]}")
+        states_BS = torch.from_numpy(np.ascontiguousarray(states, dtype=np.float32)).to(self.device)
+        features_BF = self.features(images)
+        noise_BA: Tensor | None = None
+        if noise is not None:
+            noise_BA = torch.from_numpy(np.ascontiguousarray(noise, dtype=np.float32)).to(self.device)
+        elif generator is not None:
+            noise_BA = torch.randn(len(images), self.action_dim, generator=generator).to(self.device)
+        distribution = self.distribution(features_BF, states_BS)
+        actions_BA = distribution.executed(noise_BA)
+        return PolicyOutput(
+            _to_numpy(actions_BA),
+            _to_numpy(distribution.logprob(actions_BA)),
+            _to_numpy(self.value(features_BF, states_BS)),
+        )
+
+    def _normalised(self, features_BF: Tensor, states_BS: Tensor) -> tuple[Tensor, Tensor]:
+        scaled_BF = (features_BF - self._buffer("feature_shift_F")) / self._buffer("feature_scale_F")
+        scaled_BS = (states_BS - self._buffer("state_shift_S")) / self._buffer("state_scale_S")
+        return scaled_BF.clamp(-_FEATURE_LIMIT, _FEATURE_LIMIT), scaled_BS
+
+    def _buffer(self, name: str) -> Tensor:
+        return cast(Tensor, getattr(self, name))
+
+
+class _Network(nn.Module):
+    """Features -> LayerNorm -> projection; with the state -> MLP of `depth` hidden layers -> output."""
+
+    def __init__(
+        self, feature_dim: int, state_dim: int, output_dim: int, config: PolicyConfig, *, output_gain: float
+    ) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(feature_dim)
+        self.projection = _linear(feature_dim, config.projection)
+        sizes = [config.projection + state_dim, *[config.width] * config.depth]
+        self.hidden = nn.ModuleList([_linear(i, o) for i, o in pairwise(sizes)])
+        self.output = _linear(config.width, output_dim, gain=output_gain)
+
+    def forward(self, features_BF: Tensor, states_BS: Tensor) -> Tensor:
+        projected = nn.functional.silu(self.projection(self.norm(features_BF)))
+        hidden = torch.cat([projected, states_BS], dim=-1)
+        for layer in self.hidden:
+            hidden = nn.functional.silu(layer(hidden))
+        return cast(Tensor, self.output(hidden))
+
+
+def _linear(input_dim: int, output_dim: int, *, gain: float = 2**0.5) -> nn.Linear:
+    layer = nn.Linear(input_dim, output_dim)
+    nn.init.orthogonal_(layer.weight, gain)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def _to_numpy(tensor: Tensor) -> NDArray[np.float32]:
+    return tensor.float().cpu().numpy()

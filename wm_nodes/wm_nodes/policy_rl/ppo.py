@@ -1,0 +1,266 @@
+"""Proximal policy optimisation on rollouts, eq. (10). Shapes: T time, N environments, B samples of a minibatch,
+F features, S state, A action.
+
+loss = E10b clipped policy + value_weight * E10c value - entropy_weight * entropy
+       + kl_reference_weight * KL(policy || SFT policy), summed over valid samples and divided by their number.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load, save
+from torch import Tensor
+from torch.nn.utils import clip_grad_norm_
+
+from wm_nodes.config.schema import PpoConfig
+from wm_nodes.core.files import write_atomic
+from wm_nodes.core.seeding import torch_stream
+from wm_nodes.core.types import Rollout
+from wm_nodes.policy_rl.advantages import explained_variance, gae, masked_normalise
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.losses import approximate_kl, clip_fraction, clipped_policy_loss, value_loss
+from wm_nodes.policy_rl.rollouts import Canceled
+from wm_nodes.training.checkpoint import metadata_of, optimizer_tensors, restore_optimizer, section
+from wm_nodes.training.ranks import Ranks
+from wm_nodes.training.weights import check_same_layout
+
+
+@dataclass(frozen=True)
+class PpoMetrics:
+    """Means over the samples of the update's minibatches; see docs/metrics.md.
+
+    approx_kl, kl_reference, entropy: nats. epochs: passes made before target_kl stopped them (fractional).
+    """
+
+    loss_policy: float
+    loss_value: float
+    entropy: float
+    approx_kl: float
+    kl_reference: float
+    clip_fraction: float
+    grad_norm: float
+    learning_rate: float
+    explained_variance: float
+    mean_advantage_std: float
+    epochs: float
+    samples: int
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """The valid samples of one rollout, flattened to (B, ...)."""
+
+    features: Tensor
+    states: Tensor
+    actions: Tensor
+    logprobs: Tensor
+    values: Tensor
+    advantages: Tensor
+    returns: Tensor
+
+
+class PpoLearner:
+    """Trains `policy` in place.
+
+    Args:
+        reference: the policy that kl_reference_weight keeps it close to; None: `policy` as it is now.
+        seed: of the minibatch order (stream `ppo_order`).
+        ranks: this process's place among the learner's processes.
+    """
+
+    def __init__(
+        self, policy: ImagePolicy, config: PpoConfig, *, seed: int, reference: ImagePolicy | None = None,
+        ranks: Ranks | None = None,
+    ) -> None:
+        self.policy, self.config, self.seed = policy, config, seed
+        self.reference = reference if reference is not None else policy.clone()
+        self.ranks = ranks or Ranks()
+        self.updates = 0
+        critic = list(policy.critic.parameters())
+        actor = [p for p in policy.parameters() if all(p is not c for c in critic)]
+        self._optimizer = torch.optim.Adam(
+            [
+                {"params": actor, "lr": config.learning_rate},
+                {"params": critic, "lr": config.value_learning_rate},
+            ],
+            eps=1e-5,
+        )
+
+    def update(self, rollout: Rollout, *, should_stop: Callable[[], bool] | None = None) -> PpoMetrics:
+        """Train on one rollout.
+
+        Raises:
+            Canceled: should_stop, asked before every minibatch, said so on some rank; nothing has changed then.
+            FloatingPointError: a loss, a gradient or a new weight is not finite; nothing has changed then.
+            ValueError: no valid sample, or samples whose log_prob or value is unknown (NaN).
+        """
+        before = {name: tensor.clone() for name, tensor in self.policy.state_dict().items()}
+        optimizer_before = {name: t.clone() for name, t in optimizer_tensors(self._optimizer).items()}
+        try:
+            metrics = self._update(rollout, should_stop)
+        except (Canceled, FloatingPointError):
+            self.policy.load_state_dict(before)
+            restore_optimizer(self._optimizer, optimizer_before)
+            raise
+        self.updates += 1
+        return metrics
+
+    def save(self, path: Path) -> None:
+        """Write optimiser, reference policy and counters, atomically."""
+        tensors = {f"optimizer.{name}": tensor for name, tensor in optimizer_tensors(self._optimizer).items()}
+        tensors |= {f"reference.{name}": tensor for name, tensor in self.reference.state_dict().items()}
+        tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+        write_atomic(path, save(tensors, {"updates": str(self.updates), "seed": str(self.seed)}))
+
+    def load(self, path: Path) -> None:
+        """Continue exactly from save().
+
+        Raises:
+            ValueError: the file is of another architecture or seed.
+        """
+        data = path.read_bytes()
+        metadata = metadata_of(data)
+        if int(metadata["seed"]) != self.seed:
+            raise ValueError(
+                f"{path} was made with seed {metadata['seed']}, this run has {self.seed}; use a new run folder"
+            )
+        tensors = load(data)
+        reference = section(tensors, "reference.")
+        check_same_layout(self.reference.state_dict(), reference, what=str(path))
+        self.reference.load_state_dict(reference)
+        restore_optimizer(self._optimizer, section(tensors, "optimizer."))
+        self.updates = int(metadata["updates"])
+
+    def _update(self, rollout: Rollout, should_stop: Callable[[], bool] | None) -> PpoMetrics:
+        config = self.config
+        samples = self._samples(rollout)
+        count = len(samples.actions)
+        totals: dict[str, float] = {}
+        trained = 0
+        policy_frozen = self.updates < config.value_warmup_updates
+        num_minibatches = max(1, round(count / config.minibatch_size))
+        stop = False
+        for epoch in range(config.epochs):
+            order = torch.randperm(count, generator=torch_stream(self.seed, "ppo_order", self.updates, epoch))
+            for index in order.chunk(num_minibatches):
+                if self.ranks.agree(should_stop is not None and should_stop()):
+                    raise Canceled(f"update {self.updates} stopped after {trained} samples")
+                terms = self._minibatch(samples, index, policy_frozen)
+                for name, value in terms.items():
+                    totals[name] = totals.get(name, 0.0) + value * len(index)
+                trained += len(index)
+                stop = 0 < config.target_kl < terms["approx_kl"]
+                if stop:
+                    break
+            if stop:
+                break
+        if not all(bool(torch.isfinite(parameter).all()) for parameter in self.policy.parameters()):
+            raise self._not_finite("weight")
+        return PpoMetrics(
+            **{name: value / trained for name, value in totals.items()},
+            learning_rate=config.learning_rate,
+            explained_variance=explained_variance(samples.values, samples.returns, torch.ones(count, dtype=torch.bool)),
+            mean_advantage_std=float(samples.advantages.std(correction=0)),
+            epochs=trained / count,
+            samples=count,
+        )
+
+    def _minibatch(self, samples: _Samples, index: Tensor, policy_frozen: bool) -> dict[str, float]:
+        """One gradient step on the samples `index`, this rank computing its share; returns means over all of them."""
+        config, own = self.config, self.ranks.share(index)
+        features, states = samples.features[own], samples.states[own]
+        distribution = self.policy.distribution(features, states)
+        with torch.no_grad():
+            reference = self.reference.distribution(features, states)
+        logprobs = distribution.logprob(samples.actions[own])
+        old = samples.logprobs[own]
+        values = self.policy.value(features, states)
+        policy_losses = clipped_policy_loss(logprobs, old, samples.advantages[own], clip=config.clip)
+        value_losses = value_loss(values, samples.values[own], samples.returns[own], clip=config.value_clip)
+        entropies, kls = distribution.entropy(), distribution.kl(reference)
+        loss = config.value_weight * value_losses.sum()
+        if not policy_frozen:
+            loss = loss + (policy_losses - config.entropy_weight * entropies + config.kl_reference_weight * kls).sum()
+        self._optimizer.zero_grad(set_to_none=True)
+        (loss / len(index)).backward()  # type: ignore[no-untyped-call]
+        self.ranks.sum_gradients(self.policy)
+        norm = clip_grad_norm_(self.policy.parameters(), config.max_grad_norm)
+        if not torch.isfinite(norm):
+            raise self._not_finite("gradient")
+        with torch.no_grad():
+            sums = torch.stack([
+                policy_losses.sum(), value_losses.sum(), entropies.sum(), approximate_kl(logprobs, old).sum(),
+                kls.sum(), clip_fraction(logprobs, old, clip=config.clip).sum(),
+            ])
+        self.ranks.sum_(sums)
+        names = ("loss_policy", "loss_value", "entropy", "approx_kl", "kl_reference", "clip_fraction")
+        means = dict(zip(names, (sums / len(index)).tolist(), strict=True))
+        if not all(math.isfinite(means[name]) for name in ("loss_policy", "loss_value", "entropy", "kl_reference")):
+            raise self._not_finite("loss")
+        self._optimizer.step()
+        return means | {"grad_norm": float(norm)}
+
+    def _not_finite(self, what: str) -> FloatingPointError:
+        return FloatingPointError(
+            f"a PPO {what} is not finite in update {self.updates}, which was undone; lower ppo.learning_rate"
+        )
+
+    @torch.no_grad()
+    def _samples(self, rollout: Rollout) -> _Samples:
+        steps, num_envs = rollout.valid_TN.shape
+        valid_TN = torch.from_numpy(rollout.valid_TN)
+        if not bool(valid_TN.any()):
+            raise ValueError(
+                "the rollout has no valid transition: every reward or step was invalid; see the reward's reason"
+            )
+        unknown = rollout.valid_TN & ~(np.isfinite(rollout.logprobs_TN) & np.isfinite(rollout.values_TN))
+        if unknown.any():
+            raise ValueError(
+                f"{unknown.sum()} of {rollout.valid_TN.sum()} valid transitions have no log_prob or value; PPO trains "
+                "on rollouts of a policy that publishes both"
+            )
+        flat = (steps * num_envs, -1)
+        features = self.policy.features(rollout.images_TN.reshape(-1, *rollout.images_TN.shape[2:]))
+        states = torch.from_numpy(rollout.states_TN).reshape(flat)
+        next_values = self._next_values(rollout)
+        rewards = torch.from_numpy(np.where(rollout.valid_TN, rollout.rewards_TN, 0.0).astype(np.float32))
+        values = torch.from_numpy(rollout.values_TN)
+        advantages, returns = gae(
+            rewards, values, next_values, torch.from_numpy(rollout.terminated_TN),
+            torch.from_numpy(rollout.truncated_TN), valid_TN, gamma=self.config.gamma, lambda_=self.config.gae_lambda,
+        )
+        advantages = masked_normalise(advantages, valid_TN)
+        chosen = valid_TN.reshape(-1)
+        return _Samples(
+            features=features[chosen],
+            states=states[chosen],
+            actions=torch.from_numpy(rollout.actions_TN).reshape(flat)[chosen],
+            logprobs=torch.from_numpy(rollout.logprobs_TN).reshape(-1)[chosen],
+            values=values.reshape(-1)[chosen],
+            advantages=advantages.reshape(-1)[chosen],
+            returns=returns.reshape(-1)[chosen],
+        )
+
+    def _next_values(self, rollout: Rollout) -> Tensor:
+        """Values (T, N) of the observations that steps reached: the next row's where the episode goes on, else the
+        critic's own, computed only where a bootstrap needs it."""
+        steps = rollout.valid_TN.shape[0]
+        following = np.concatenate([rollout.values_TN[1:], np.zeros_like(rollout.values_TN[:1])])
+        needed = (
+            rollout.valid_TN
+            & ~rollout.terminated_TN
+            & (rollout.truncated_TN | (np.arange(steps)[:, None] == steps - 1))
+        )
+        values = torch.from_numpy(np.where(rollout.valid_TN, following, 0.0).astype(np.float32))
+        if needed.any():
+            features = self.policy.features(rollout.next_images_TN[needed])
+            states = torch.from_numpy(rollout.next_states_TN[needed])
+            values[torch.from_numpy(needed)] = self.policy.value(features, states)
+        return values
+
+
+METRIC_NAMES = tuple(field.name for field in fields(PpoMetrics))

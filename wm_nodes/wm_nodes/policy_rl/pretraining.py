@@ -1,0 +1,150 @@
+"""Everything before RL: simulator episodes in, a world-model folder out. Resumable: finished stages are kept."""
+
+import platform
+from datetime import date
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.environments.maniskill.collection import CollectionPlan
+from wm_nodes.environments.maniskill.tasks import instruction, success
+from wm_nodes.environments.record import (
+    HELDOUT_SEEDS,
+    TRAINING_SEEDS,
+    collect_heldout_data,
+    collect_plan,
+    collect_training_data,
+    demonstration_plan,
+)
+from wm_nodes.policy_rl.factories import ACTION_DIM, STATE_DIM, policy_actor
+from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, STARTS, train_weak_policy, write_starts
+from wm_nodes.recording import read_episodes
+from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model_folder, save_model_folder
+from wm_nodes.world_model.folder import action_model_class
+from wm_nodes.world_model.token_dynamics import TokenActionModel
+from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
+from wm_nodes.world_model.training.position_probe import train_position_probe
+from wm_nodes.world_model.training.text import DEMONSTRATORS, train_text_model
+from wm_nodes.world_model.training.token_dynamics import train_token_model
+from wm_nodes.world_model.training.tokenizer import train_tokenizer
+from wm_nodes.world_model.validation.acceptance import model_metrics
+
+MODEL_TASKS = {"reach": ("reach", "push_cube"), "push_cube": ("reach", "push_cube"), "pull_cube": ("pull_cube",)}
+"""Tasks that one world model serves, because they share a scene: one done output each."""
+WEAK_POLICIES = (
+    ("push_cube", 3, 0.25),
+    ("reach", 8, 0.25),
+    ("push_cube", 4, 0.4),
+    ("reach", 4, 0.4),
+    ("pull_cube", 4, 0.3),
+)
+"""(task, demonstrations cloned, exploration noise) of the policies whose episodes the action model learns from too."""
+POLICY_SEEDS = 300_000
+
+
+def load_arrays(bags: list[Path], config: RunConfig) -> EpisodeArrays:
+    """Stack every episode of the bags, labelled for all tasks of the scene."""
+    episodes = (episode for bag in bags for episode in read_episodes(bag))
+    return stack_episodes(episodes, MODEL_TASKS[config.task], success, num_steps=config.simulation.max_episode_steps)
+
+
+def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, command: str = "") -> Path:
+    """Collect, train tokenizer, action model and text model, measure on held-out episodes; returns run_dir/model.
+
+    tokenizer.kind lfq has no text model, so no goals: set reward.dense_weight to 0 there.
+    """
+    folder = run_dir / "model"
+    if (folder / "manifest.json").exists():
+        return folder
+    bags = collect_training_data(config, run_dir / "data" / "train", progress=progress)
+    heldout_bags = collect_heldout_data(config, run_dir / "data" / "heldout", progress=progress)
+    episodes = load_arrays(bags, config)
+    tokenizer, tokenizer_metrics = train_tokenizer(episodes, config, config.seed, run_dir, progress=progress)
+    if config.data.policy_episodes:
+        policy_bags = _policy_bags(config, run_dir, tokenizer, progress)
+        episodes = EpisodeArrays.concatenate([episodes, load_arrays(policy_bags, config)])
+    probe, probe_metrics = train_position_probe(episodes, config, config.seed, run_dir, progress=progress)
+    data = tokenise_episodes(tokenizer, episodes)
+    action: ActionModel | TokenActionModel
+    text, text_metrics = None, dict[str, float]()
+    if config.tokenizer.kind == "lfq":
+        action, action_metrics = train_token_model(tokenizer, data, config, config.seed, run_dir, progress=progress)
+    else:
+        first, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir, progress=progress)
+        golden = episodes.select([i for i, behaviour in enumerate(episodes.behaviours) if behaviour in DEMONSTRATORS])
+        texts = tuple(instruction(task) for task in MODEL_TASKS[config.task])
+        text, text_metrics = train_text_model(
+            tokenizer, first, golden, tokenise_episodes(tokenizer, golden), texts, config, config.seed, run_dir,
+            progress=progress,
+        )
+        action = first
+    story: dict[str, Any] = {
+        "made": {
+            "command": command, "date": date.today().isoformat(), "seed": config.seed, "torch": torch.__version__,
+            "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        },
+        "data": {
+            "episodes": len(episodes), "policy_episodes": len(episodes) - config.data.num_episodes,
+            "training_seeds": [TRAINING_SEEDS, TRAINING_SEEDS + config.data.num_episodes - 1],
+            "behaviours": config.data.behaviours,
+            "heldout_seeds": [HELDOUT_SEEDS, HELDOUT_SEEDS + config.data.num_heldout - 1],
+        },
+        "training": {
+            "tokenizer": tokenizer_metrics, "action": action_metrics, "text": text_metrics, "probe": probe_metrics,
+        },
+    }
+    arguments: dict[str, Any] = {
+        "tokenizer_config": config.tokenizer, "world_model_config": config.world_model, "simulation": config.simulation,
+        "tasks": MODEL_TASKS[config.task],
+    }
+    models = WorldModels(tokenizer, action, text, MODEL_TASKS[config.task], config.simulation, {}, probe)
+    story["heldout"] = model_metrics(models, load_arrays(heldout_bags, config), config)
+    write_starts(bags, folder / STARTS, MODEL_STARTS)
+    save_model_folder(folder, tokenizer, action, text, story=story, probe=probe, **arguments)
+    load_model_folder(folder)
+    return folder
+
+
+def _policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer, progress: bool) -> list[Path]:
+    """Simulator episodes of a few policies cloned from a few demonstrations, acting with exploration noise.
+
+    They need the tokenizer only, so they are collected before the action model is trained and belong to its data.
+    """
+    bags = list[Path]()
+    for number, (task, demonstrations, noise) in enumerate(WEAK_POLICIES):
+        if task not in MODEL_TASKS[config.task]:
+            continue
+        chosen = config.model_copy(
+            update={"task": task, "sft": config.sft.model_copy(update={"num_demonstrations": demonstrations})}
+        )
+        folder = _tokenizer_folder(config, run_dir, tokenizer)
+        weights = run_dir / "policies" / f"weak_{number}.safetensors"
+        if not weights.exists():
+            plan = demonstration_plan(chosen, demonstrations + 3, POLICY_SEEDS + 1000 * number)
+            train_weak_policy(chosen, folder, collect_plan(plan, config, run_dir / "data" / "demos", progress), weights)
+        plan = CollectionPlan(
+            MODEL_TASKS[config.task][-1], config.simulation, config.data.policy_episodes,
+            POLICY_SEEDS + 10_000 * (number + 1), {}, make_policy=partial(policy_actor, chosen, folder, weights, noise),
+        )
+        bags += collect_plan(plan, config, run_dir / "data" / "policy", progress)
+    return bags
+
+
+def _tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenizer) -> Path:
+    """A model folder for policies, which read the tokenizer alone: its action model is untrained."""
+    folder = run_dir / "tokenizer_only"
+    if not (folder / "manifest.json").exists():
+        tasks = MODEL_TASKS[config.task]
+        untrained = action_model_class(config.tokenizer.kind)(
+            config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
+            action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),
+        )
+        save_model_folder(
+            folder, tokenizer, untrained, None, tokenizer_config=config.tokenizer,
+            world_model_config=config.world_model, simulation=config.simulation, tasks=tasks, story={},
+        )
+    return folder

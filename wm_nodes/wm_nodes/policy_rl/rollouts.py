@@ -1,0 +1,168 @@
+"""Collects rollouts in lock-step inside one process, step for step as the graph does over DDS.
+
+Shapes: T time, N environments. An environment that has ended is reset in the next lock-step instead of stepped, so that
+column of the rollout is invalid there. Seeds of resets and action noise depend on (seed, policy version, lock-step)
+only.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.core.types import BoolArray, Environment, FloatArray, Observation, Rollout, StepResult, UInt64Array
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.reward import RewardInput, RewardModel
+
+TRAINING_SEED_LIMIT = 1_000_000
+"""Reset seeds of training lie below it; evaluation seeds (presets: evaluation.first_seed) start at it."""
+
+
+class Canceled(Exception):
+    """The caller's should_stop said so; nothing half-done was kept."""
+
+
+@dataclass(frozen=True)
+class RolloutStatistics:
+    """Of the episodes that ended inside a rollout that began with a reset. NaN means without episodes.
+
+    successes: episodes that terminated (the environment's own done signal). mean_length: steps. cut: further episodes,
+    which the rollout's end cut short: in none of the other numbers.
+    """
+
+    episodes: int
+    successes: int
+    mean_return: float
+    mean_length: float
+    cut: int = 0
+
+    @property
+    def success_rate(self) -> float:
+        return self.successes / self.episodes if self.episodes else float("nan")
+
+
+def reset_seeds(seed: int, policy_version: int, step: int, num_envs: int) -> UInt64Array:
+    """Return the (N,) reset seeds of lock-step `step` (stream `reset`); entry i is used where environment i resets."""
+    stream = numpy_stream(seed, "reset", policy_version, step)
+    return stream.integers(0, TRAINING_SEED_LIMIT, num_envs, dtype=np.uint64)
+
+
+def action_noise(seed: int, policy_version: int, step: int, num_envs: int, action_dim: int) -> FloatArray:
+    """Return the (N, A) standard-normal action noise of lock-step `step` (stream `action_noise`)."""
+    generator = torch_stream(seed, "action_noise", policy_version, step)
+    noise: FloatArray = torch.randn(num_envs, action_dim, generator=generator).numpy()
+    return noise
+
+
+def collect_rollout(
+    env: Environment,
+    policy: ImagePolicy,
+    reward: RewardModel,
+    steps: int,
+    seed: int,
+    policy_version: int,
+    *,
+    deterministic: bool = False,
+    should_stop: Callable[[], bool] | None = None,
+) -> Rollout:
+    """Reset all environments and make `steps` lock-steps.
+
+    Args:
+        seed: root of the streams `reset` and `action_noise`.
+        policy_version: learner step whose weights act.
+        should_stop: asked before every lock-step.
+
+    Raises:
+        Canceled: should_stop returned True.
+        ValueError: steps < 1.
+    """
+    if steps < 1:
+        raise ValueError(f"steps must be >= 1, got {steps}; see ppo.num_steps in presets/base.yaml")
+    num_envs, action_dim = env.spec.num_envs, env.spec.action_dim
+    observation = env.reset(None, reset_seeds(seed, policy_version, 0, num_envs))
+    ended = np.zeros(num_envs, np.bool_)
+    columns: dict[str, list[NDArray[Any]]] = {}
+    for step in range(steps):
+        if should_stop is not None and should_stop():
+            raise Canceled(f"rollout stopped at lock-step {step} of {steps}")
+        noise = None if deterministic else action_noise(seed, policy_version, step, num_envs, action_dim)
+        output = policy.act(observation.image, observation.state, noise=noise)
+        goals = env.goals()
+        result = env.step(output.actions)
+        judged = reward.evaluate(reward_input(observation, result, goals))
+        row: dict[str, NDArray[Any]] = {
+            "images_TN": observation.image,
+            "states_TN": observation.state,
+            "next_images_TN": result.observation.image,
+            "next_states_TN": result.observation.state,
+            "actions_TN": output.actions,
+            "logprobs_TN": output.logprobs,
+            "values_TN": output.values,
+            "rewards_TN": judged.total,
+            "terminated_TN": result.terminated & result.valid,
+            "truncated_TN": result.truncated & result.valid,
+            "valid_TN": result.valid & judged.valid,
+        }
+        for name, array in row.items():
+            columns.setdefault(name, []).append(array)
+        observation = result.observation
+        if ended.any():
+            observation = env.reset(ended, reset_seeds(seed, policy_version, step, num_envs))
+        ended = (result.terminated | result.truncated) & result.valid
+    return Rollout(policy_version=policy_version, **{name: np.stack(rows) for name, rows in columns.items()})
+
+
+def reward_input(
+    observation: Observation, result: StepResult, goals: tuple[NDArray[np.uint8], BoolArray] | None
+) -> RewardInput:
+    """Return what a reward model needs of one lock-step. goals: env.goals() as of before the step."""
+    return RewardInput(
+        images=observation.image,
+        next_images=result.observation.image,
+        success_probability=result.success_probability,
+        valid=result.valid,
+        uncertainty=result.uncertainty,
+        goals=None if goals is None else goals[0],
+        goal_found=None if goals is None else goals[1],
+    )
+
+
+def terminate_at_episode_end(rollout: Rollout) -> Rollout:
+    """The rollout as PPO must see it where an episode is paid once, at its last step: no value lies beyond that step.
+
+    A truncated episode got its verdict as a terminated one did. The critic's value on top of it would pay it twice, and
+    an episode that fails until its time is over could be worth more than one that succeeds.
+    """
+    ended = rollout.terminated_TN | rollout.truncated_TN
+    return replace(rollout, terminated_TN=ended, truncated_TN=np.zeros_like(ended))
+
+
+def rollout_statistics(rollout: Rollout) -> RolloutStatistics:
+    """Return counts and means of the episodes that ended inside the rollout.
+
+    The return of an episode with an invalid step in its middle leaves that step out.
+    """
+    returns: list[float] = []
+    lengths: list[int] = []
+    successes = cut = 0
+    for n in range(rollout.valid_TN.shape[1]):
+        total, length = 0.0, 0
+        for t in range(rollout.valid_TN.shape[0]):
+            is_last = bool(rollout.terminated_TN[t, n] or rollout.truncated_TN[t, n])
+            if not rollout.valid_TN[t, n] and not is_last:
+                continue
+            length += 1
+            total += float(rollout.rewards_TN[t, n]) if rollout.valid_TN[t, n] else 0.0
+            if is_last:
+                returns.append(total)
+                lengths.append(length)
+                successes += int(rollout.terminated_TN[t, n])
+                total, length = 0.0, 0
+        cut += length > 0
+    if not returns:
+        return RolloutStatistics(0, 0, float("nan"), float("nan"), cut)
+    return RolloutStatistics(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)), cut)

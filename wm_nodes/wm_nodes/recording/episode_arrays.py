@@ -1,0 +1,104 @@
+"""Recorded episodes stacked for training. Shapes: E episodes, T steps, H W 3 image, J tasks, P truths."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
+
+TaskLabels = Callable[[str, FloatArray], BoolArray]
+"""(task name, ground truth (..., P)) -> success (...,), e.g. simulation.tasks.success."""
+
+
+@dataclass(frozen=True)
+class EpisodeArrays:
+    """E episodes padded to T steps by repeating their last frame; only the first `lengths` steps are real.
+
+    images: uint8 (E, T + 1, H, W, 3). states: float32 (E, T + 1, S). actions: float32 (E, T, A), 0 where padded.
+    ground_truth: float32 (E, T + 1, P). success: bool (E, T + 1, J), column j for tasks[j]. lengths: int64 (E,).
+    """
+
+    images: UInt8Array
+    states: FloatArray
+    actions: FloatArray
+    ground_truth: FloatArray
+    success: BoolArray
+    lengths: NDArray[np.int64]
+    tasks: tuple[str, ...]
+    instructions: tuple[str, ...]
+    behaviours: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def num_steps(self) -> int:
+        return self.actions.shape[1]
+
+    @property
+    def step_mask(self) -> BoolArray:
+        """(E, T), True where the step was recorded."""
+        return np.arange(self.num_steps) < self.lengths[:, None]
+
+    @property
+    def frame_mask(self) -> BoolArray:
+        """(E, T + 1), True where the frame was recorded."""
+        return np.arange(self.num_steps + 1) <= self.lengths[:, None]
+
+    def select(self, rows: Sequence[int] | NDArray[Any]) -> "EpisodeArrays":
+        index = np.asarray(rows, np.int64)
+        return EpisodeArrays(
+            self.images[index], self.states[index], self.actions[index], self.ground_truth[index], self.success[index],
+            self.lengths[index], self.tasks, tuple(self.instructions[i] for i in index),
+            tuple(self.behaviours[i] for i in index),
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["EpisodeArrays"]) -> "EpisodeArrays":
+        """All episodes of parts that have the same tasks and number of steps."""
+        if len({(part.tasks, part.num_steps) for part in parts}) != 1:
+            raise ValueError(f"parts differ in tasks or steps: {[(part.tasks, part.num_steps) for part in parts]}")
+        arrays = ("images", "states", "actions", "ground_truth", "success", "lengths")
+        return cls(
+            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays},
+            tasks=parts[0].tasks,
+            instructions=tuple(text for part in parts for text in part.instructions),
+            behaviours=tuple(text for part in parts for text in part.behaviours),
+        )
+
+
+def stack_episodes(
+    episodes: Iterable[Episode], tasks: Sequence[str], labels: TaskLabels, *, num_steps: int | None = None
+) -> EpisodeArrays:
+    """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides).
+
+    Raises:
+        ValueError: no episodes, or episodes of different image, state or action sizes.
+    """
+    listed = list(episodes)
+    if not listed:
+        raise ValueError("no episodes to train on; collect some first (data.num_episodes) or check the bag path")
+    shapes = {(e.images.shape[1:], e.states.shape[1:], e.actions.shape[1:]) for e in listed}
+    if len(shapes) > 1:
+        raise ValueError(f"episodes of different image, state or action sizes cannot be mixed: {sorted(shapes)}")
+    steps = num_steps or max(e.num_steps for e in listed)
+    frame_rows = [np.minimum(np.arange(steps + 1), e.num_steps) for e in listed]
+    lengths = np.array([min(e.num_steps, steps) for e in listed], np.int64)
+    actions = np.zeros((len(listed), steps, listed[0].actions.shape[1]), np.float32)
+    for row, episode in enumerate(listed):
+        actions[row, : lengths[row]] = episode.actions[: lengths[row]]
+    truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
+    return EpisodeArrays(
+        images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
+        states=np.stack([e.states[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
+        actions=actions,
+        ground_truth=truth,
+        success=np.stack([np.asarray(labels(task, truth), bool) for task in tasks], -1),
+        lengths=lengths,
+        tasks=tuple(tasks),
+        instructions=tuple(e.instruction for e in listed),
+        behaviours=tuple(e.behaviour for e in listed),
+    )

@@ -1,0 +1,186 @@
+"""Who is connected to whom: every node says on run/links which of its topics are matched, so that a data flow can wait
+until nobody misses its first message.
+
+A publisher does not know a subscription that DDS discovery has not brought yet, and what it sends before is lost to it.
+Both ends of a pair must see each other, and only the two nodes can tell; so each tells all, at once and then once a
+second, so that a node that comes late or was busy has the whole book within that time.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from wm_msgs.msg import NodeLinks
+from wm_nodes.ros.publishing import StampedPublisher
+from wm_nodes.ros.qos import topic
+
+if TYPE_CHECKING:
+    from wm_nodes.ros.actions import Work
+    from wm_nodes.ros.lifecycle import ManagedNode
+
+Ends = Callable[[str], set[str]]
+"""Topic name to the nodes (fully qualified) whose end of it is known."""
+
+
+@dataclass(frozen=True)
+class _Peer:
+    session: int
+    active: bool
+    publishes: frozenset[str]
+    subscribes: frozenset[str]
+    linked: frozenset[tuple[str, int]]
+
+
+class EndpointTable:
+    """What this node knows about the links of all nodes of its namespace. Thread-safe.
+
+    Args:
+        own_name: fully qualified name of this node.
+        session: of this node.
+    """
+
+    def __init__(self, own_name: str, session: int) -> None:
+        self._own_name, self._session = own_name, session
+        self._lock = threading.Lock()
+        self._peers: dict[str, _Peer] = {}
+        self._ever: set[str] = set()
+        self._lost: set[str] = set()
+        self._own = _Peer(session, False, frozenset(), frozenset(), frozenset())
+
+    def note(self, message: NodeLinks) -> None:
+        """Take in what another node says."""
+        if message.node == self._own_name:
+            return
+        linked = frozenset(zip(message.linked, message.linked_sessions, strict=True))
+        with self._lock:
+            self._ever.add(message.node)
+            self._lost.discard(message.node)
+            self._peers[message.node] = _Peer(
+                message.session, message.active, frozenset(message.publishes), frozenset(message.subscribes), linked
+            )
+
+    def forget(self, name: str, *, lost: bool = False) -> None:
+        """A node stopped, and is not waited for until it speaks again; or it is lost, and may come back."""
+        with self._lock:
+            self._peers.pop(name, None)
+            if lost:
+                self._lost.add(name)
+
+    def refresh(
+        self, publishes: Collection[str], subscribes: Collection[str], active: bool, readers: Ends, writers: Ends
+    ) -> bool:
+        """Look at the graph again; return whether this node's announcement has changed.
+
+        Args:
+            publishes, subscribes: this node's topics, absolute.
+            readers, writers: the nodes whose subscription to, or publisher of, a topic this node has discovered.
+        """
+        outgoing, incoming = frozenset(publishes), frozenset(subscribes)
+        with self._lock:
+            peers = dict(self._peers)
+        same = (outgoing, incoming) == (self._own.publishes, self._own.subscribes)
+        linked = set()
+        for name, peer in peers.items():
+            key = (name, peer.session)
+            if not peer.active:
+                continue
+            if (same and key in self._own.linked) or (
+                all(name in readers(topic) for topic in outgoing & peer.subscribes)
+                and all(name in writers(topic) for topic in incoming & peer.publishes)
+            ):
+                linked.add(key)
+        own = _Peer(self._session, active, outgoing, incoming, frozenset(linked))
+        changed = own != self._own
+        with self._lock:
+            self._own = own
+        return changed
+
+    def announcement(self) -> NodeLinks:
+        """What this node knows of itself since the last refresh()."""
+        own, names = self._own, sorted(self._own.linked)
+        return NodeLinks(
+            session=self._session, node=self._own_name, active=own.active, publishes=sorted(own.publishes),
+            subscribes=sorted(own.subscribes), linked=[name for name, _ in names],
+            linked_sessions=[session for _, session in names],
+        )
+
+    def missing(self, awaited: Iterable[str] = ()) -> list[str]:
+        """Return what still lacks until all active nodes know each other; empty: data may flow.
+
+        Args:
+            awaited: fully qualified names of nodes that must be there; one that was there and stopped need not.
+        """
+        with self._lock:
+            nodes = {self._own_name: self._own, **self._peers}
+            ever, lost = set(self._ever), set(self._lost)
+        lacking = [f"{name} has not been heard" for name in awaited if name not in nodes and name not in ever]
+        lacking += [f"{name} is lost" for name in awaited if name in lost]
+        lacking += [f"{name} is not active" for name in awaited if name in nodes and not nodes[name].active]
+        group = {name: node for name, node in nodes.items() if node.active}
+        for name, node in group.items():
+            for other, peer in group.items():
+                if other != name and (other, peer.session) not in node.linked:
+                    lacking.append(f"{name} has not matched {other}")
+        return lacking
+
+
+class Links:
+    """The part of a node that keeps its EndpointTable and talks on run/links."""
+
+    def __init__(self, node: "ManagedNode") -> None:
+        self._node = node
+        self.book = EndpointTable(node.get_fully_qualified_name(), node.session)
+        self._publisher = StampedPublisher(node, "run/links", node.session)
+        row = topic("run/links")
+        self._subscription = node.create_subscription(row.type, row.name, self._on_links, row.reader_qos)
+
+    def announce(self, *, again: bool = False) -> None:
+        """Tell the others when this node has come to see more, or less, of them; again: in any case."""
+        node = self._node
+        changed = self.book.refresh(
+            {publisher.topic_name for publisher in node.publishers},
+            {subscription.topic_name for subscription in node.subscriptions}, node.active,
+            lambda name: _nodes_of(node.get_subscriptions_info_by_topic(name)),
+            lambda name: _nodes_of(node.get_publishers_info_by_topic(name)),
+        )
+        if changed or again:
+            message = self.book.announcement()
+            message.header.stamp = node.get_clock().now().to_msg()
+            self._publisher.publish(message)
+
+    def _on_links(self, message: NodeLinks) -> None:
+        self.book.note(message)
+        self.announce()
+
+
+class StartBarrier:
+    """Holds a data flow back until no node of the graph can miss its first messages; once for each lack.
+
+    node: has the parameters await_nodes and match_timeout_s.
+    """
+
+    def __init__(self, node: "ManagedNode") -> None:
+        self._node = node
+        self._given_up: set[str] = set()
+
+    def wait(self, work: "Work") -> None:
+        """Return when all active nodes know each other, or, with a warning, after match_timeout_s."""
+        node, book = self._node, self._node.links.book
+        namespace = node.get_namespace().rstrip("/")
+        awaited = [f"{namespace}/{name}" for name in node.param("await_nodes") if name]
+        deadline = time.monotonic() + float(node.param("match_timeout_s"))
+        self._given_up &= set(book.missing(awaited))
+        while lacking := set(book.missing(awaited)) - self._given_up:
+            if time.monotonic() >= deadline:
+                text = f"data flow although {'; '.join(sorted(lacking))}: first messages may be missed"
+                node.get_logger().warning(text)
+                node.diagnostics.count("unmatched_nodes", len(lacking), text=text)
+                self._given_up |= lacking
+                return
+            work.sleep(0.02)
+
+
+def _nodes_of(ends: Sequence[Any]) -> set[str]:
+    return {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}

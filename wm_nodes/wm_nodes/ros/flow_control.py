@@ -1,0 +1,124 @@
+"""Back-pressure for keep-all streams: a consumer grants sequence numbers, the producer does not run ahead of them."""
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rclpy.clock import Clock, ClockType
+
+from wm_msgs.msg import Credit
+from wm_nodes.ros.qos import CREDIT_WINDOW, topic
+from wm_nodes.ros.sequence_numbers import GapTracker
+
+if TYPE_CHECKING:
+    from wm_nodes.ros.lifecycle import ManagedNode
+
+SILENT_S = 5.0
+"""A consumer that has held the producer up for so long without a word is dropped."""
+
+REPEAT_S = 1.0
+
+
+@dataclass
+class _Consumer:
+    granted_seq: int
+    received_seq: int
+    lost_total: int
+    heard: float
+
+
+class ProducerCredits:
+    """The producer's side for one stream: who may be waited for, and whether the next message may go out.
+
+    With no consumers there is nothing to wait for. Times are monotonic, in s; pass `now` in tests.
+    """
+
+    def __init__(self, topic_name: str, session: int) -> None:
+        self._topic_name, self._session = topic_name, session
+        self._consumers: dict[str, _Consumer] = {}
+
+    def note(self, message: Credit, now: float | None = None) -> None:
+        """Take in a Credit message; those of other streams or sessions are ignored."""
+        if message.topic != self._topic_name or message.stream_session != self._session:
+            return
+        now = time.monotonic() if now is None else now
+        self._consumers[message.consumer] = _Consumer(
+            message.granted_seq, message.received_seq, message.lost_total, now
+        )
+
+    def remove(self, consumer: str) -> None:
+        self._consumers.pop(consumer, None)
+
+    def holding(self, next_seq: int, now: float | None = None) -> list[str]:
+        """Return the consumers that have not granted `next_seq` yet; empty: publish."""
+        return [name for name, consumer in self._consumers.items() if consumer.granted_seq < next_seq]
+
+    def drop_silent(self, next_seq: int, now: float | None = None) -> list[str]:
+        """Drop and return the consumers that hold the producer up and were silent for SILENT_S."""
+        now = time.monotonic() if now is None else now
+        gone = [name for name in self.holding(next_seq) if now - self._consumers[name].heard > SILENT_S]
+        for name in gone:
+            del self._consumers[name]
+        return gone
+
+    @property
+    def consumers(self) -> dict[str, int]:
+        """Name to lost_total as the consumer reports it."""
+        return {name: consumer.lost_total for name, consumer in self._consumers.items()}
+
+
+class ConsumerCredits:
+    """The consumer's side for one stream: grants a window ahead of what was consumed.
+
+    below: relative namespace of the producer with a slash at its end, e.g. "sim/"; empty: the node's own.
+
+    Grants go out each quarter window, and once a second, so that a restarted producer learns of its consumers.
+    While `withheld`, the newest grant of the session is repeated: the producer waits and knows that someone is there.
+    """
+
+    def __init__(self, node: "ManagedNode", topic_name: str, window: int = CREDIT_WINDOW, *, below: str = "") -> None:
+        self._node, self._topic_name, self._window = node, topic_name, window
+        row = topic("flow/credit")
+        self._publisher = node.create_publisher(Credit, below + row.name, row.qos)
+        self._timer = node.create_timer(REPEAT_S, self._repeat, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._tracker: GapTracker | None = None
+        self._since_grant = 0
+        self._granted: tuple[int, int] | None = None
+        self.withheld = False
+
+    def consumed(self, tracker: GapTracker) -> None:
+        """Note that one message of the stream was dealt with; `tracker` has already observed it."""
+        first = self._tracker is None or tracker.sessions == 0 or tracker.received <= 1
+        self._tracker = tracker
+        self._since_grant += 1
+        if first or self._since_grant >= self._window // 4:
+            self.grant()
+
+    def withhold(self, withheld: bool) -> None:
+        """Stop granting more, or go on."""
+        if withheld != self.withheld:
+            self.withheld = withheld
+            self.grant()
+
+    def grant(self) -> None:
+        """Publish the present grant; nothing before the first message."""
+        if self._tracker is None or self._tracker.session is None:
+            return
+        self._since_grant = 0
+        session = self._tracker.session
+        if not (self.withheld and self._granted is not None and self._granted[0] == session):
+            self._granted = session, self._tracker.last_seq + self._window
+        message = Credit(
+            consumer=self._node.get_fully_qualified_name(), topic=self._topic_name,
+            stream_session=session, received_seq=self._tracker.last_seq, granted_seq=self._granted[1],
+            lost_total=self._tracker.lost,
+        )
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+    def close(self) -> None:
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_publisher(self._publisher)
+
+    def _repeat(self) -> None:
+        self.grant()

@@ -1,0 +1,1 @@
+"""What every training shares: optimisation loop, checkpoint, weights file, ranks of a process group, metrics."""

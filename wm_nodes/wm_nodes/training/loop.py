@@ -1,0 +1,156 @@
+"""One optimisation loop for the tokenizer and both world models: warm-up and cosine, EMA, metrics, exact resume.
+
+Every random number of iteration i comes from a stream named by i, so a run that is stopped and resumed takes the same
+steps as one that was not.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors.torch import load, save
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from wm_nodes.core.files import write_atomic
+from wm_nodes.training.checkpoint import metadata_of, optimizer_tensors, restore_optimizer, section
+
+CHECKPOINT_PERIOD_S = 240.0
+WARMUP_FRACTION = 0.03
+EMA_DECAY = 0.998
+METRICS_EVERY = 20
+
+LossFunction = Callable[[int], dict[str, Tensor]]
+"""iteration -> named terms; "loss" is minimised, the others are logged."""
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """max_seconds: stop early (with a checkpoint) after this much wall time; 0: never."""
+
+    num_iterations: int
+    learning_rate: float
+    weight_decay: float = 0.01
+    max_grad_norm: float = 1.0
+    max_seconds: float = 0.0
+
+
+class TrainingLoop:
+    """Trains `model` in place; `averaged` is its exponential moving average, the weights to keep.
+
+    Args:
+        run_dir: metrics_<name>.jsonl and checkpoints go here; an existing checkpoint is resumed. None: neither.
+    """
+
+    def __init__(self, name: str, model: nn.Module, settings: LoopSettings, run_dir: Path | None) -> None:
+        self.name, self.model, self.settings, self.run_dir = name, model, settings, run_dir
+        self.iteration = 0
+        self.optimizer = torch.optim.AdamW(
+            [p for p in model.parameters() if p.requires_grad],
+            lr=settings.learning_rate, betas=(0.9, 0.95), weight_decay=settings.weight_decay, fused=True,
+        )
+        self.averaged = {name: tensor.detach().clone() for name, tensor in model.state_dict().items()}
+        if self.checkpoint_path is not None and self.checkpoint_path.exists():
+            self._resume(self.checkpoint_path)
+
+    @property
+    def checkpoint_path(self) -> Path | None:
+        return None if self.run_dir is None else self.run_dir / f"checkpoint_{self.name}.safetensors"
+
+    def learning_rate(self, iteration: int) -> float:
+        """Linear warm-up, then a half cosine down to 2 % of the peak."""
+        warmup = max(1, int(WARMUP_FRACTION * self.settings.num_iterations))
+        if iteration < warmup:
+            return self.settings.learning_rate * (iteration + 1) / warmup
+        share = (iteration - warmup) / max(1, self.settings.num_iterations - warmup)
+        return self.settings.learning_rate * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * share)))
+
+    def run(self, loss_function: LossFunction, *, progress: bool = True) -> dict[str, float]:
+        """Train to the last iteration, load the averaged weights into the model, and return the last metrics."""
+        start = last_saved = time.monotonic()
+        metrics = self._logged()
+        bar = tqdm(total=self.settings.num_iterations, initial=self.iteration, desc=self.name, disable=not progress)
+        self.model.train()
+        while self.iteration < self.settings.num_iterations:
+            terms = self._step(loss_function)
+            bar.update()
+            if self.iteration % METRICS_EVERY == 0 or self.iteration == self.settings.num_iterations:
+                metrics = {key: float(value) for key, value in terms.items()}
+                bar.set_postfix({key: f"{value:.4f}" for key, value in metrics.items()}, refresh=False)
+                self._log(metrics, time.monotonic() - start)
+            if time.monotonic() - last_saved > CHECKPOINT_PERIOD_S:
+                self.save()
+                last_saved = time.monotonic()
+            if 0 < self.settings.max_seconds < time.monotonic() - start:
+                break
+        bar.close()
+        self.save()
+        self.model.load_state_dict(self.averaged)
+        self.model.eval()
+        return metrics
+
+    def _step(self, loss_function: LossFunction) -> dict[str, Tensor]:
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate(self.iteration)
+        terms = loss_function(self.iteration)
+        terms["loss"].backward()  # type: ignore[no-untyped-call]
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.settings.max_grad_norm)
+        if not torch.isfinite(norm):
+            raise FloatingPointError(
+                f"{self.name}: gradient is not finite at iteration {self.iteration}; lower the learning rate"
+            )
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        self.iteration += 1
+        decay = min(EMA_DECAY, (1 + self.iteration) / (10 + self.iteration))
+        with torch.no_grad():
+            for key, tensor in self.model.state_dict().items():
+                if tensor.is_floating_point():
+                    self.averaged[key].lerp_(tensor, 1 - decay)
+                else:
+                    self.averaged[key].copy_(tensor)
+        return {key: value.detach() for key, value in terms.items()} | {"grad_norm": norm.detach()}
+
+    def save(self) -> None:
+        """Write model, average, optimiser and iteration, atomically; nothing without a run_dir."""
+        if self.checkpoint_path is None:
+            return
+        tensors = {f"model.{key}": value for key, value in self.model.state_dict().items()}
+        tensors |= {f"averaged.{key}": value for key, value in self.averaged.items()}
+        tensors |= {f"optimizer.{key}": value for key, value in optimizer_tensors(self.optimizer).items()}
+        tensors = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
+        write_atomic(self.checkpoint_path, save(tensors, {"iteration": str(self.iteration)}))
+
+    def _resume(self, path: Path) -> None:
+        data = path.read_bytes()
+        tensors = load(data)
+        try:
+            self.model.load_state_dict(section(tensors, "model."))
+        except RuntimeError as error:
+            raise ValueError(
+                f"{path} belongs to another architecture or configuration; give a fresh run folder, or delete the file "
+                f"to start over ({error})"
+            ) from None
+        self.averaged = {key: value.clone() for key, value in section(tensors, "averaged.").items()}
+        restore_optimizer(self.optimizer, section(tensors, "optimizer."))
+        self.iteration = int(metadata_of(data)["iteration"])
+
+    def _logged(self) -> dict[str, float]:
+        """The last metrics of a run that is resumed; empty at its start."""
+        path = None if self.run_dir is None else self.run_dir / f"metrics_{self.name}.jsonl"
+        if self.iteration == 0 or path is None or not path.exists():
+            return {}
+        last: dict[str, float] = json.loads(path.read_text().splitlines()[-1])
+        return {key: value for key, value in last.items() if key not in ("iteration", "seconds")}
+
+    def _log(self, metrics: Mapping[str, float], seconds: float) -> None:
+        if self.run_dir is None:
+            return
+        self.run_dir.mkdir(parents=True, exist_ok=True)
+        line = {"iteration": self.iteration, "seconds": round(seconds, 2), **metrics}
+        with open(self.run_dir / f"metrics_{self.name}.jsonl", "a") as file:
+            file.write(json.dumps(line) + "\n")

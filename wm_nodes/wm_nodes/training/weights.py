@@ -1,0 +1,116 @@
+"""Weights as safetensors bytes: named, hashed, checked against the architecture before they are used. No pickle."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+from wm_nodes.core.files import write_atomic
+
+INLINE_LIMIT_BYTES = 1 << 20
+"""Weights up to this size travel inside PolicyVersion.inline_data."""
+
+_METADATA_KEY = "wm_nodes"
+
+
+class WeightsError(ValueError):
+    """Weights that are damaged, are not the expected ones, or belong to another architecture."""
+
+
+@dataclass(frozen=True)
+class PackedWeights:
+    """data: the safetensors file. sha256: of data. arch_hash: see arch_hash()."""
+
+    data: bytes
+    sha256: str
+    arch_hash: str
+    metadata: Mapping[str, str]
+
+
+def arch_hash(tensors: Mapping[str, Tensor]) -> str:
+    """Return the sha256 over sorted names, shapes and dtypes of a state dictionary."""
+    return hashlib.sha256(json.dumps(_layout(tensors)).encode()).hexdigest()
+
+
+def pack_weights(module: nn.Module, metadata: Mapping[str, str] | None = None) -> PackedWeights:
+    """Return the module's parameters and buffers as bytes; equal weights and metadata give equal bytes."""
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in module.state_dict().items()}
+    texts = {**(metadata or {}), "arch_hash": arch_hash(tensors)}
+    data = save(tensors, {_METADATA_KEY: json.dumps(texts, sort_keys=True)})
+    return PackedWeights(data, hashlib.sha256(data).hexdigest(), texts["arch_hash"], texts)
+
+
+def unpack_weights(data: bytes, *, sha256: str | None = None) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return (tensors, metadata) after checking the sha256, where given, and the architecture hash.
+
+    Raises:
+        WeightsError: damaged or foreign data; says what was expected and found.
+    """
+    found = hashlib.sha256(data).hexdigest()
+    if sha256 is not None and found != sha256:
+        raise WeightsError(f"weights have sha256 {found}, expected {sha256}; transfer or write them again")
+    try:
+        tensors = load(data)
+        length = int.from_bytes(data[:8], "little")
+        header: dict[str, Any] = json.loads(data[8 : 8 + length])
+    except (SafetensorError, ValueError) as error:
+        raise WeightsError(f"weights are no safetensors file or are cut short ({len(data)} bytes): {error}") from None
+    text = header.get("__metadata__", {}).get(_METADATA_KEY)
+    if text is None:
+        raise WeightsError("weights carry no wm_nodes metadata; write them with learning.weights.pack_weights")
+    metadata: dict[str, str] = json.loads(text)
+    if metadata.get("arch_hash") != arch_hash(tensors):
+        raise WeightsError(f"weights say arch_hash {metadata.get('arch_hash')}, but hold {arch_hash(tensors)}")
+    return tensors, metadata
+
+
+def load_weights(module: nn.Module, data: bytes, *, sha256: str | None = None) -> dict[str, str]:
+    """Copy weights into the module and return their metadata. The module is unchanged when an error is raised.
+
+    Raises:
+        WeightsError: damaged data, or another architecture (names the first difference).
+    """
+    tensors, metadata = unpack_weights(data, sha256=sha256)
+    check_same_layout(module.state_dict(), tensors, what="weights")
+    module.load_state_dict(tensors)
+    return metadata
+
+
+def save_weights(module: nn.Module, path: Path, metadata: Mapping[str, str] | None = None) -> PackedWeights:
+    """Write the weights to `path` atomically and return them."""
+    packed = pack_weights(module, metadata)
+    write_atomic(path, packed.data)
+    return packed
+
+
+def check_same_layout(expected: Mapping[str, Tensor], found: Mapping[str, Tensor], *, what: str) -> None:
+    """Raise WeightsError that names the first parameter, in sorted order, that is missing, extra or of another kind."""
+    for name in sorted(set(expected) | set(found)):
+        if name not in found:
+            raise WeightsError(
+                f"{what} of another architecture: {name} is missing; use the configuration it was made by"
+            )
+        if name not in expected:
+            raise WeightsError(
+                f"{what} of another architecture: {name} is unknown; use the configuration it was made by"
+            )
+        (_, shape, dtype), (_, other_shape, other_dtype) = _entry(name, expected[name]), _entry(name, found[name])
+        if (shape, dtype) != (other_shape, other_dtype):
+            raise WeightsError(
+                f"{what} of another architecture: {name} is {other_dtype}{other_shape}, expected {dtype}{shape}; "
+                "use the configuration it was made by"
+            )
+
+
+def _layout(tensors: Mapping[str, Tensor]) -> list[tuple[str, list[int], str]]:
+    return [_entry(name, tensors[name]) for name in sorted(tensors)]
+
+
+def _entry(name: str, tensor: Tensor) -> tuple[str, list[int], str]:
+    return name, list(tensor.shape), str(tensor.dtype).removeprefix("torch.")

@@ -1,0 +1,74 @@
+"""Recorded episodes as clips of latents.
+
+Shapes: E episodes, F frames, H W 3 image, C h w latents, A action, P simulator state.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wm_nodes.core.types import FloatArray
+from wm_nodes.environments.maniskill.tasks import success
+from wm_nodes.recording import read_episodes
+from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.video_model import Condition
+from wm_nodes.video_model.conditions import hashed_words
+from wm_nodes.video_model.tokenizer_codec import Codec
+
+
+@dataclass(frozen=True)
+class Clips:
+    """frames: uint8 (E, F, H, W, 3). actions: (E, F - 1, stride A), the recorded actions between two frames, one after
+    the other. ground_truth: (E, F, P) simulator state. instructions: one each.
+    """
+
+    frames: Tensor
+    actions: Tensor
+    ground_truth: FloatArray
+    instructions: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def select(self, index: Tensor) -> "Clips":
+        return Clips(
+            self.frames[index], self.actions[index], self.ground_truth[index.numpy()],
+            tuple(self.instructions[int(i)] for i in index),
+        )
+
+    def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:
+        """The first frames, the actions and the instruction."""
+        first = codec.encode(self.frames[:, :num_conditioning])
+        return Condition(first, self.actions, hashed_words(self.instructions, text_dim))
+
+
+def load_clips(bags: Sequence[Path], stride: int) -> Clips:
+    """The episodes of the bags, in order, as clips.
+
+    Raises:
+        BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, or of different sizes.
+    """
+    episodes = (episode for bag in bags for episode in read_episodes(bag))
+    return cut_clips(stack_episodes(episodes, ("push_cube",), success), stride)
+
+
+def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
+    """Every stride-th frame of each episode, from its first one.
+
+    Raises:
+        ValueError: the episodes' steps are no multiple of the stride.
+    """
+    steps = episodes.num_steps
+    if steps % stride:
+        raise ValueError(f"episodes of {steps} steps cannot be cut at every {stride}th frame; choose a divisor")
+    actions = episodes.actions.reshape(len(episodes), steps // stride, -1)
+    return Clips(
+        frames=torch.from_numpy(np.ascontiguousarray(episodes.images[:, ::stride])),
+        actions=torch.from_numpy(np.ascontiguousarray(actions)),
+        ground_truth=episodes.ground_truth[:, ::stride],
+        instructions=episodes.instructions,
+    )

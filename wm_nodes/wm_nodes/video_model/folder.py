@@ -1,0 +1,91 @@
+"""A video model on disk: codec.safetensors, network.safetensors, and a manifest that says how they were made.
+
+A folder inside a world model's folder whose codec is that model's tokenizer may leave codec.safetensors out.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from wm_nodes.config.schema import TokenizerConfig
+from wm_nodes.core.files import write_atomic
+from wm_nodes.training.weights import WeightsError, load_weights, pack_weights
+from wm_nodes.video_model import NetworkSettings, VideoNetwork
+from wm_nodes.video_model.codec import PatchCodec
+from wm_nodes.video_model.tokenizer_codec import Codec, TokenizerCodec, codec_of_world_model
+
+MANIFEST, CODEC, NETWORK = "manifest.json", "codec.safetensors", "network.safetensors"
+FORMAT = 2
+KINDS = {PatchCodec: "patch", TokenizerCodec: "tokenizer"}
+
+
+@dataclass(frozen=True)
+class VideoFolder:
+    """clip: how episodes are cut, {"stride": recorded steps between frames, "num_conditioning": given frames}."""
+
+    codec: Codec
+    network: VideoNetwork
+    clip: Mapping[str, int]
+    manifest: Mapping[str, Any]
+
+
+def save_video_folder(
+    folder: Path, codec: Codec, network: VideoNetwork, clip: Mapping[str, int], story: Mapping[str, Any]
+) -> Path:
+    """Write the folder; the manifest, which names the files' sha256, comes last."""
+    hashes = {}
+    for name, module in ((CODEC, codec), (NETWORK, network)):
+        packed = pack_weights(module)
+        write_atomic(folder / name, packed.data)
+        hashes[name] = packed.sha256
+    manifest = {
+        "format": FORMAT, "codec": {"kind": KINDS[type(codec)], **codec.settings()},
+        "network": asdict(network.settings), "clip": dict(clip), "sha256": hashes, **story,
+    }
+    write_atomic(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
+    return folder
+
+
+def load_video_folder(folder: Path) -> VideoFolder:
+    """Load and verify a folder, in evaluation mode.
+
+    Raises:
+        WeightsError: names the file, what is wrong, and the remedy.
+    """
+    path = Path(folder) / MANIFEST
+    if not path.is_file():
+        raise WeightsError(f"{folder} holds no {MANIFEST}; name the folder of a trained video model")
+    manifest: dict[str, Any] = json.loads(path.read_text())
+    if manifest.get("format") != FORMAT:
+        raise WeightsError(f"{path}: format {manifest.get('format')!r}, this version reads {FORMAT}; train it anew")
+    network = VideoNetwork(NetworkSettings(**manifest["network"]))
+    _load(Path(folder) / NETWORK, network, manifest["sha256"][NETWORK])
+    codec = _codec(Path(folder), manifest["sha256"][CODEC], **manifest["codec"])
+    return VideoFolder(codec, network, manifest["clip"], manifest)
+
+
+def _codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Codec:
+    if kind == "tokenizer" and not (folder / CODEC).is_file() and (folder.parent / MANIFEST).is_file():
+        shared = codec_of_world_model(folder.parent)
+        if pack_weights(shared).sha256 != sha256:
+            raise WeightsError(f"{folder} was made with another tokenizer than that of {folder.parent}; train it anew")
+        return shared
+    codec: Codec
+    if kind == "patch":
+        codec = PatchCodec(**settings)
+    else:
+        config = TokenizerConfig.model_validate(settings["config"])
+        codec = TokenizerCodec(config, settings["height"], settings["width"])
+    _load(folder / CODEC, codec, sha256)
+    return codec
+
+
+def _load(path: Path, module: nn.Module, sha256: str) -> None:
+    if not path.is_file():
+        raise WeightsError(f"{path} is missing; copy the whole model folder")
+    load_weights(module, path.read_bytes(), sha256=sha256)
+    module.eval()

@@ -1,0 +1,185 @@
+"""What must hold on any video model before GRPO trains it. Each check states what it found, and what to do if it fails.
+
+Shapes: N videos (a few), C channels, F latent frames, H W latent grid.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from wm_nodes.video_model import (
+    Condition,
+    RolloutBuffer,
+    RolloutSettings,
+    StepContext,
+    VideoRollout,
+    config_hash,
+    guided_velocity,
+    initial_noise,
+    sample_videos,
+    step,
+)
+from wm_nodes.video_model.kernels import with_conditioning
+from wm_nodes.video_rl.grpo import GrpoLearner
+from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings
+
+RATIO_LIMIT, ODE_LIMIT, KL_LIMIT = 1e-5, 1e-4, 1e-10
+ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT = 1e-4, 3e-6
+"""Where the noise is kept in bfloat16; the mean ratio's error falls with the root of the elements."""
+FLAT_LIMIT = 1.5
+"""The 95 % quantile of a useful mask lies at least this many times above its 20 % quantile."""
+MIB = 2**20
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """One check. value: what was measured, as text. remedy: what to do where it failed."""
+
+    name: str
+    passed: bool
+    value: str
+    remedy: str
+
+
+def examine(
+    model: nn.Module, condition: Condition, shape: tuple[int, int, int, int], rollout: RolloutSettings,
+    grpo: GrpoSettings, *, seed: int = 0, buffer_videos: int = 0,
+) -> list[CheckResult]:
+    """Sample a few videos of shape (C, F, H, W) and check them; the model's weights are as before afterwards.
+
+    Args:
+        condition: of N >= 2 videos; two of them at least should move.
+        buffer_videos: of one buffer in training, for its memory; 0: as many as are sampled here.
+
+    Raises:
+        ValueError: nothing can be trained with these settings: a sampler without noise, no step that can train, an
+            anchor lora_off without an adapter.
+    """
+    seeds = torch.arange(len(condition.actions)) + seed
+    noise = initial_noise(shape, seeds).to(next(model.parameters()).device)
+    model.eval()
+    sampled = sample_videos(model, condition, noise, seeds, rollout)
+    if not bool(sampled.latents.isfinite().all()):
+        return [_not_finite(sampled)]
+    buffer, asked = _buffer(sampled, condition, rollout), [p.requires_grad for p in model.parameters()]
+    try:
+        learner = GrpoLearner(model, _still(grpo, rollout), rollout, seed=seed)
+        first = _first_update(learner, buffer)
+    finally:
+        for parameter, trains in zip(model.parameters(), asked, strict=True):
+            parameter.requires_grad_(trains)
+            parameter.grad = None
+        model.eval()
+    return [
+        *first,
+        _ode(model, condition, noise, seeds, rollout),
+        _mask(sampled, condition.num_conditioning, rollout),
+        _round_trip(buffer),
+        _memory(learner, sampled, buffer_videos or len(seeds)),
+    ]
+
+
+def _not_finite(sampled: VideoRollout) -> CheckResult:
+    broken = int((~sampled.latents.isfinite()).flatten(1).any(1).sum())
+    return CheckResult(
+        "sampled videos are finite", False, f"{broken} of {len(sampled.latents)} are not",
+        "float16 overflows where bfloat16 does not; check the weights, and the latents' scale",
+    )
+
+
+def _ode(model: nn.Module, condition: Condition, noise: Tensor, seeds: Tensor, rollout: RolloutSettings) -> CheckResult:
+    """The sampler's own arm at eta = 0, at every step, and the ODE rollout, against plain Euler sums x + (s - t) v."""
+    quiet, given = replace(rollout.sampler, eta=0.0), condition.frames.float()
+    context = StepContext(given, float(rollout.times[1]))
+    x, error, spread = with_conditioning(noise.float(), given), 0.0, 0.0
+    with torch.no_grad():
+        for t, s in pairwise(rollout.times):
+            times, ends = t.expand(len(x)), s.expand(len(x))
+            v = guided_velocity(model, x, times, condition, rollout.cfg).float()
+            law, euler = step(x, v, times, ends, context, quiet), with_conditioning(x + float(s - t) * v, given)
+            error = max(error, _off(with_conditioning(law.mean, given), euler))
+            spread, x = max(spread, float(law.std.max())), euler
+    error = max(error, _off(sample_videos(model, condition, noise, seeds, rollout, []).latents, x))
+    return CheckResult(
+        "eta = 0 is the Euler ODE step", error < ODE_LIMIT and spread == 0,
+        f"{rollout.sampler.arm}: largest relative difference {error:.1e}, deviation {spread:.1g}",
+        "make equal calls of the model give equal results: dropout off, deterministic kernels; else report a bug",
+    )
+
+
+def _off(found: Tensor, wanted: Tensor) -> float:
+    return float((found - wanted).abs().max() / wanted.abs().max())
+
+
+def _mask(sampled: VideoRollout, num_conditioning: int, rollout: RolloutSettings) -> CheckResult:
+    name = "the mask is not flat"
+    if rollout.sampler.arm != "dyndiff":
+        return CheckResult(name, True, f"arm {rollout.sampler.arm} has none", "")
+    if sampled.latents.shape[2] == 1:
+        return CheckResult(name, True, "1 everywhere: a single frame has no motion", "")
+    cells = sampled.mask[:, :, :, num_conditioning:].flatten().float()
+    low, high = (float(cells.kthvalue(max(1, int(q * len(cells)))).values) for q in (0.2, 0.95))
+    return CheckResult(
+        name, high > FLAT_LIMIT * low, f"20 % quantile {low:.2f}, 95 % quantile {high:.2f}",
+        "no motion was seen: take contexts that move, check that given frames are clean, raise mask.quantile",
+    )
+
+
+def _round_trip(buffer: RolloutBuffer) -> CheckResult:
+    again = RolloutBuffer.from_bytes(buffer.to_bytes())
+    equal, size = again.to_bytes() == buffer.to_bytes(), f"{buffer.num_bytes / MIB:.1f} MiB"
+    return CheckResult("a saved buffer comes back equal", equal, size, "report this as a bug")
+
+
+def _memory(learner: GrpoLearner, sampled: VideoRollout, videos: int) -> CheckResult:
+    """What each KL anchor keeps beside the weights, for a buffer of so many videos."""
+    weights = sum(p.nbytes for p in learner.parameters)
+    kept, scale = sampled.zeta, videos / len(sampled.latents) / MIB
+    noise = "only seeds" if kept is None else f"{kept.nbytes * scale:.2f} MiB of noise"
+    text = (
+        f"frozen, moving: {weights / MIB:.2f} MiB of weights that train; buffer: {noise} and "
+        f"{sampled.mask.nbytes * scale:.2f} MiB of masks for {videos} videos; dual: both; lora_off: nothing; chosen: "
+        f"{learner.settings.kl.anchor}"
+    )
+    return CheckResult("memory of the KL anchors", True, text, "")
+
+
+def _limits(rollout: RolloutSettings) -> tuple[float, float]:
+    """Of the ratio's distance from 1, and of the KL."""
+    if rollout.noise_store == "zeta_bfloat16":
+        return ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT
+    return RATIO_LIMIT, KL_LIMIT
+
+
+def _still(grpo: GrpoSettings, rollout: RolloutSettings) -> GrpoSettings:
+    """Of one update that moves nothing, whose clipped transitions are those off the limit of the ratio."""
+    limit, _ = _limits(rollout)
+    return replace(
+        grpo, updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0, ratio_norm=False,
+        kl=replace(grpo.kl, mode="mean", beta=1.0), clip_low=limit, clip_high=limit, advantage=AdvantageSettings(),
+    )
+
+
+def _first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[CheckResult, CheckResult]:
+    (update,) = learner.train(buffer.with_rewards({"total": torch.arange(len(buffer), dtype=torch.float64)})).updates
+    ratio_limit, kl_limit = _limits(learner.rollout)
+    off, outside = abs(update.ratio_mean - 1), update.clip_low_share + update.clip_high_share
+    return CheckResult(
+        "ratio is 1 on the first update", off < ratio_limit and outside == 0,
+        f"mean ratio differs from 1 by {off:.1e}, {outside:.0%} of the transitions by more than {ratio_limit:g}",
+        "make rollout and training pass alike: rollout.cfg and grpo.cfg, dtype, micro_batch, dropout off, attention "
+        "kernels; noise_store zeta",
+    ), CheckResult(
+        "KL is 0 at the anchor", update.kl < kl_limit, f"{update.kl:.1e} to {learner.settings.kl.anchor}",
+        "as for the ratio",
+    )
+
+
+def _buffer(sampled: VideoRollout, condition: Condition, rollout: RolloutSettings) -> RolloutBuffer:
+    count = len(sampled.latents)
+    return RolloutBuffer(
+        sampled, condition, torch.zeros(count, dtype=torch.int64), torch.arange(count), {},
+        torch.ones(count, dtype=torch.bool), 0, 0, config_hash(rollout),
+    )

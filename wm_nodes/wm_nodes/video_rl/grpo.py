@@ -1,0 +1,386 @@
+"""GRPO of a flow-matching video model on a rollout buffer, equations (13) to (18), (20).
+
+Shapes: N videos, S stochastic steps, M transitions (video, step) of one network call, U generated elements.
+
+One buffer serves `updates_per_buffer` optimizer steps. Each one accumulates over every kept (video, step) pair, divided
+by their number, so that micro-batches and ranks do not change it. On the first one the ratio is 1 and the KL of (20) 0.
+"""
+
+import copy
+import json
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_
+
+from wm_nodes.core.files import write_atomic
+from wm_nodes.training.checkpoint import metadata_of, optimizer_tensors, restore_optimizer, section
+from wm_nodes.training.ranks import Ranks
+from wm_nodes.training.weights import WeightsError, check_same_layout
+from wm_nodes.video_model.buffer import RolloutBuffer
+from wm_nodes.video_model.sampling import RolloutSettings
+from wm_nodes.video_model.step_window import select_steps
+from wm_nodes.video_rl.group_advantages import (
+    GroupAdvantages,
+    RunningStd,
+    best_of_n,
+    group_advantages,
+    mixed_advantages,
+    trainable,
+    win_rates,
+)
+from wm_nodes.video_rl.grpo_math import clip_tails, clipped_objective
+from wm_nodes.video_rl.grpo_settings import GrpoSettings
+from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """One optimizer step; see docs/metrics.md. clip_low_share, clip_high_share: of transitions, by tail.
+
+    *_seconds: forward of the weights that train; the anchor's forward and the KL; backward of both.
+    """
+
+    objective: float
+    kl: float
+    ratio_mean: float
+    clip_low_share: float
+    clip_high_share: float
+    grad_norm: float
+    transitions: int
+    forward_seconds: float
+    kl_seconds: float
+    backward_seconds: float
+
+
+@dataclass(frozen=True)
+class BufferReport:
+    """What one buffer gave. updates: one report per optimizer step, in order (index 0 is on-policy). dropped_groups:
+    those with fewer valid videos than contract.trainable asks for; they are in zero_std_ratio too. raw_rewards: mean of
+    each score beside the total over the videos that have it, NaN where none has. step_noise: noise_share of each
+    stochastic sampler step.
+    """
+
+    updates: tuple[UpdateReport, ...]
+    reward_mean: float
+    advantage_abs_mean: float
+    zero_std_ratio: float
+    invalid: int
+    dropped_groups: int
+    kept: int
+    group_size: float
+    noise_share: float
+    raw_rewards: Mapping[str, float]
+    step_noise: Mapping[int, float]
+
+
+class GrpoLearner:
+    """Trains `model` in place; with settings.trains condition its other parameters no longer ask for a gradient.
+
+    Args:
+        seed: of the step selection (stream `step_selection`).
+        reward_weights: of the buffer's raw rewards, for advantage.mix advantage; their `total` is then only reported.
+        ranks: this process's place among the learner's processes; all hold the whole buffer.
+    """
+
+    def __init__(
+        self,
+        model: nn.Module,
+        settings: GrpoSettings,
+        rollout: RolloutSettings,
+        *,
+        seed: int,
+        ranks: Ranks | None = None,
+        reward_weights: Mapping[str, float] | None = None,
+    ) -> None:
+        if rollout.sampler.arm == "ode" or rollout.sampler.eta == 0:
+            raise ValueError("an ODE rollout has no likelihood to train on; choose a stochastic arm and eta > 0")
+        if settings.advantage.mix == "advantage" and settings.advantage.std_scope == "running":
+            raise ValueError("advantage.std_scope running is of one reward; with advantage.mix advantage take group")
+        if settings.mask_source == "recompute":
+            warnings.warn(
+                "grpo.mask_source recompute is an ablation: mask cells that flip throw the ratio out of its clip "
+                "range. Otherwise take cached",
+                stacklevel=2,
+            )
+        if settings.trains == "condition":
+            _train_condition(model)
+        self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
+        self.ranks, self.reward_weights = ranks or Ranks(), dict(reward_weights or {})
+        self.version = 0
+        """Optimizer steps made so far: the policy version of the weights."""
+        self.parameters = [p for p in model.parameters() if p.requires_grad]
+        self._optimizer = torch.optim.AdamW(
+            self.parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay
+        )
+        self._running = RunningStd()
+        self._terms = GrpoTerms(model, settings, rollout)
+        self.averaged = {name: p.detach().clone() for name, p in _trained(model)} if settings.ema_decay > 0 else {}
+
+    def train(self, buffer: RolloutBuffer) -> BufferReport:
+        """Make `updates_per_buffer` optimizer steps; nothing has changed when it raises.
+
+        Raises:
+            RolloutBufferError: another sampler configuration, or a stale buffer.
+            ValueError: no video that can train (every reward invalid or every group without spread), or no generated
+                frame.
+            FloatingPointError: a loss or gradient is not finite.
+        """
+        buffer.check(self.rollout, self.version, self.settings.max_staleness)
+        if buffer.condition.num_conditioning >= buffer.rollout.latents.shape[2]:
+            raise ValueError(
+                f"all {buffer.rollout.latents.shape[2]} frames of these videos are given: nothing was generated that "
+                f"could be learned from; give fewer"
+            )
+        rewards, before = mixed_reward(buffer), self._snapshot()
+        trains = torch.from_numpy(trainable(buffer.valid.numpy(), buffer.group_ids.numpy()))
+        advantages = self._advantages(rewards, buffer, trains)
+        invalid = int((~buffer.valid).sum())
+        dropped = advantages.num_groups - len(set(buffer.group_ids[trains].tolist()))
+        kept = best_of_n(
+            advantages.advantages_N, buffer.group_ids, advantages.kept_N, self.settings.advantage.best_of_n
+        )
+        if not bool(kept.any()):
+            raise ValueError(
+                f"nothing to learn from: {invalid} of {len(buffer)} rewards are invalid, {dropped} of "
+                f"{advantages.num_groups} groups have too few valid ones and {advantages.num_zero_std - dropped} no "
+                "spread; look at the reward"
+            )
+        try:
+            updates = tuple(self._update(buffer, rows, advantages) for rows in self._passes(buffer, kept))
+        except BaseException:
+            self._restore(before)
+            raise
+        return BufferReport(
+            updates=updates,
+            reward_mean=float(rewards[buffer.valid].mean()),
+            advantage_abs_mean=float(advantages.advantages_N[kept].abs().mean()),
+            zero_std_ratio=advantages.num_zero_std / advantages.num_groups,
+            invalid=invalid,
+            dropped_groups=dropped,
+            kept=int(kept.sum()),
+            group_size=len(buffer) / advantages.num_groups,
+            noise_share=buffer.rollout.spent_noise,
+            raw_rewards={
+                name: float(values[torch.isfinite(values)].mean())
+                for name, values in buffer.rewards.items() if name != "total"
+            },
+            step_noise=dict(zip(buffer.rollout.steps, buffer.rollout.noise_share.tolist(), strict=True)),
+        )
+
+    def gradients(self, buffer: RolloutBuffer, rows: "Rows", advantages: GroupAdvantages) -> dict[str, float]:
+        """Accumulate the gradient of L = -J + beta KL over the rows into .grad; return the sums for a report."""
+        device, total = next(self.model.parameters()).device, len(rows)
+        sums = dict.fromkeys(("objective", "kl", "ratio", "low", "high", "forward_s", "kl_s", "backward_s"), 0.0)
+        weights = self._terms.step_weights(buffer, rows.videos[:1]) if self.settings.equalise else None
+        limits = {"clip_low": self.settings.clip_low, "clip_high": self.settings.clip_high}
+        own = self.ranks.share(torch.arange(total))
+        for index in torch.split(own, self.settings.micro_batch):  # type: ignore[no-untyped-call]
+            start, part = time.perf_counter(), rows.part(index)
+            found = self._terms.ratio(buffer, part)
+            ratio, signal = found.log_ratio, advantages.advantages_N[part.videos].to(device, torch.float32)
+            objective = clipped_objective(ratio, signal, **limits)
+            if weights is not None:
+                objective = objective * weights[part.positions].to(device)
+            forward_end = time.perf_counter()
+            kl = self._terms.kl(found, buffer, part, self.version)
+            kl_end = time.perf_counter()
+            loss = (self.settings.kl.beta * kl - objective).sum() / total
+            loss.backward()  # type: ignore[no-untyped-call]
+            sums["forward_s"] += forward_end - start
+            sums["kl_s"] += kl_end - forward_end
+            sums["backward_s"] += time.perf_counter() - kl_end
+            low, high = clip_tails(ratio.detach(), **limits)
+            sums["objective"] += float(objective.detach().sum())
+            sums["kl"] += float(kl.detach().sum())
+            sums["ratio"] += float(ratio.detach().exp().sum())
+            sums["low"] += low * len(index) if len(index) else 0.0  # a share of none is not a number
+            sums["high"] += high * len(index) if len(index) else 0.0
+        values = torch.tensor(list(sums.values()), dtype=torch.float64)
+        self.ranks.sum_(values)
+        return dict(zip(sums, values.tolist(), strict=True))
+
+    def averaged_weights(self) -> AbstractContextManager[None]:
+        """A context in which the model has its averaged weights, for evaluation; without EMA, its own."""
+        return _Swapped(self.model, self.averaged) if self.averaged else nullcontext()
+
+    # internals
+
+    def _advantages(self, rewards: Tensor, buffer: RolloutBuffer, trains: Tensor) -> GroupAdvantages:
+        """trains: bool (N,), the videos that may be compared; see reward.agent.contract."""
+        settings = self.settings.advantage
+
+        def signal(values: Tensor) -> Tensor:
+            return win_rates(values, buffer.group_ids, trains) if settings.source == "win_rate" else values
+
+        if settings.mix == "advantage":
+            return mixed_advantages(
+                {name: signal(values) for name, values in buffer.rewards.items()}, self.reward_weights,
+                buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope, ddof=settings.ddof,
+                floor=settings.floor,
+            )
+        return group_advantages(
+            signal(rewards), buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope,
+            ddof=settings.ddof, floor=settings.floor,
+            running=self._running if settings.std_scope == "running" else None,
+        )
+
+    def _passes(self, buffer: RolloutBuffer, kept: Tensor) -> Iterator[Rows]:
+        chosen = select_steps(
+            self.rollout.times, list(buffer.rollout.steps), len(buffer), fraction=self.settings.step_fraction,
+            select=self.settings.step_select, min_s=self.settings.min_s, seed=self.seed, iteration=buffer.iteration,
+        )
+        chosen &= kept.unsqueeze(1)
+        count = self.settings.updates_per_buffer
+        for update in range(count):
+            rows = chosen
+            if self.settings.passes == "parts":
+                rows = chosen & (torch.arange(len(buffer)) % count == update).unsqueeze(1)
+            videos, positions = torch.nonzero(rows, as_tuple=True)
+            if len(videos):
+                yield Rows(videos, positions)
+
+    def _update(self, buffer: RolloutBuffer, rows: Rows, advantages: GroupAdvantages) -> UpdateReport:
+        if self.settings.kl.anchor == "moving" and self.version % self.settings.kl.moving_updates == 0:
+            self._terms.move_anchor()
+        self.model.train()
+        self._optimizer.zero_grad(set_to_none=True)
+        sums = self.gradients(buffer, rows, advantages)
+        self.ranks.sum_gradients(self.model)
+        norm = clip_grad_norm_(self.parameters, self.settings.max_grad_norm)
+        if not bool(torch.isfinite(norm)):
+            raise FloatingPointError(
+                f"GRPO: the gradient is not finite at version {self.version}; lower the learning rate"
+            )
+        self._optimizer.step()
+        self.version += 1
+        decay = min(self.settings.ema_decay, (1 + self.version) / (10 + self.version))
+        for name, parameter in _trained(self.model):
+            if name in self.averaged:
+                self.averaged[name].lerp_(parameter.detach(), 1 - decay)
+        total = len(rows.videos)
+        return UpdateReport(
+            objective=sums["objective"] / total, kl=sums["kl"] / total, ratio_mean=sums["ratio"] / total,
+            clip_low_share=sums["low"] / total, clip_high_share=sums["high"] / total, grad_norm=float(norm),
+            transitions=total, forward_seconds=sums["forward_s"],
+            kl_seconds=sums["kl_s"], backward_seconds=sums["backward_s"],
+        )
+
+    def _snapshot(self) -> dict[str, Any]:
+        """In the host's memory: what a failed train() puts back."""
+        return {
+            "model": {name: _kept(p) for name, p in _trained(self.model)},
+            "optimizer": {key: _kept(value) for key, value in optimizer_tensors(self._optimizer).items()},
+            "averaged": {name: _kept(value) for name, value in self.averaged.items()},
+            "anchor": self._terms.anchor,  # replaced, never changed
+            "running": copy.copy(self._running),
+            "version": self.version,
+        }
+
+    def _restore(self, before: dict[str, Any]) -> None:
+        _set_trained(self.model, before["model"])
+        restore_optimizer(self._optimizer, before["optimizer"])
+        for name, value in before["averaged"].items():
+            self.averaged[name].copy_(value)
+        self._terms.anchor, self.version, self._running = before["anchor"], before["version"], before["running"]
+
+    # checkpoints
+
+    def save(self, path: Path, *, iteration: int) -> None:
+        """Write everything that train() depends on, atomically: trained weights, EMA, anchor, optimizer, counters."""
+        tensors = {f"model.{name}": p for name, p in _trained(self.model)}
+        tensors |= {f"averaged.{name}": value for name, value in self.averaged.items()}
+        tensors |= {f"anchor.{name}": value for name, value in self._terms.anchor.items()}
+        tensors |= {f"optimizer.{key}": value for key, value in optimizer_tensors(self._optimizer).items()}
+        header = {"version": self.version, "seed": self.seed, "iteration": iteration}
+        header |= {f.name: getattr(self._running, f.name) for f in fields(self._running)}
+        tensors = {name: _kept(tensor).contiguous() for name, tensor in tensors.items()}
+        write_atomic(path, save(tensors, {"grpo": json.dumps(header)}))
+
+    def load(self, path: Path) -> int:
+        """Continue exactly from save(); return its iteration.
+
+        Raises:
+            ValueError: the file is damaged, or of another architecture, seed, KL anchor or EMA.
+        """
+        data = path.read_bytes()
+        try:
+            tensors, header = load(data), json.loads(metadata_of(data)["grpo"])
+        except (SafetensorError, KeyError, ValueError) as error:
+            raise WeightsError(f"{path} is no complete checkpoint of GRPO ({error}); use a new run folder") from error
+        if header["seed"] != self.seed:
+            raise ValueError(
+                f"{path} was made with seed {header['seed']}, this run has {self.seed}; use a new run folder"
+            )
+        weights = section(tensors, "model.")
+        check_same_layout(dict(_trained(self.model)), weights, what=str(path))
+        own = {"averaged.": (self.averaged, "ema_decay"), "anchor.": (self._terms.anchor, "kl.anchor")}
+        for prefix, (kept, knob) in own.items():
+            if bool(kept) != bool(section(tensors, prefix)):
+                raise ValueError(f"{path} was made with another grpo.{knob}; resume with its settings")
+        _set_trained(self.model, weights)
+        device = next(self.model.parameters()).device
+        self.averaged = {name: value.to(device) for name, value in section(tensors, "averaged.").items()}
+        self._terms.anchor = {name: value.to(device) for name, value in section(tensors, "anchor.").items()}
+        restore_optimizer(self._optimizer, section(tensors, "optimizer."))
+        self._running = RunningStd(header["sum_of_squares"], header["count"])
+        self.version = header["version"]
+        return int(header["iteration"])
+
+
+def _train_condition(model: nn.Module) -> None:
+    found: Any = getattr(model, "condition_parameters", None)
+    if found is None:
+        raise ValueError(
+            f"grpo.trains condition is of the embedded video model; {type(model).__name__} takes grpo.trains all, or a "
+            "LoRA adapter"
+        )
+    model.requires_grad_(False)
+    for parameter in found():
+        parameter.requires_grad_(True)
+
+
+def mixed_reward(buffer: RolloutBuffer) -> Tensor:
+    """The reward that trains, float64 (N,): the buffer's `total`, or its only reward."""
+    if "total" in buffer.rewards:
+        return buffer.rewards["total"]
+    if len(buffer.rewards) == 1:
+        return next(iter(buffer.rewards.values()))
+    raise ValueError(f"the buffer holds rewards {', '.join(buffer.rewards) or '(none)'} and no `total`; mix them first")
+
+
+class _Swapped(AbstractContextManager[None]):
+    """The model with other values of its trained parameters, for a while."""
+
+    def __init__(self, model: nn.Module, values: dict[str, Tensor]) -> None:
+        self._model, self._values = model, values
+
+    def __enter__(self) -> None:
+        self._own = {name: p.detach().clone() for name, p in _trained(self._model)}
+        _set_trained(self._model, self._values)
+
+    def __exit__(self, *_: object) -> None:
+        _set_trained(self._model, self._own)
+
+
+def _trained(model: nn.Module) -> Iterator[tuple[str, Tensor]]:
+    return ((name, p) for name, p in model.named_parameters() if p.requires_grad)
+
+
+def _kept(tensor: Tensor) -> Tensor:
+    return tensor.detach().to("cpu", copy=True)
+
+
+@torch.no_grad()
+def _set_trained(model: nn.Module, values: dict[str, Tensor]) -> None:
+    for name, parameter in _trained(model):
+        parameter.copy_(values[name])

@@ -1,0 +1,131 @@
+"""From clips to a video model: codec, flow matching, held-out scores. Resumable; what is finished is kept."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.seeding import numpy_stream, stream_seed
+from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
+from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.codec import PatchCodec
+from wm_nodes.video_model.flow_matching import train_video_model
+from wm_nodes.video_model.folder import MANIFEST, VideoFolder, load_video_folder, save_video_folder
+from wm_nodes.video_model.tokenizer_codec import Codec, codec_of_world_model
+from wm_nodes.video_rl.reference_reward import score_clips
+from wm_nodes.video_rl.settings import VideoRlConfig
+from wm_nodes.video_rl.validation import kept_scores
+from wm_nodes.world_model.position_probe import PositionProbe
+
+CODEC_FRAMES = 2000
+CELLS = {"patch": 2, "tokenizer": 1}
+"""Side of the square of latent cells that the network works on at a time."""
+BEFORE = Path("evaluations") / "before.json"
+
+
+def make_video_model(
+    config: VideoRlConfig, clips: Clips, heldout: Clips, probe: PositionProbe, run_dir: Path, *,
+    shipped: VideoFolder | None = None, progress: bool = True, command: str = "",
+) -> VideoFolder:
+    """The shipped video model, or without one a model trained on the clips, with its held-out scores.
+
+    Kept in run_dir/video_model, and loaded from there; the scores of each held-out context are kept in
+    run_dir/evaluations/before.json.
+
+    Args:
+        shipped: what shipped_video_model() gives; None: train one.
+    """
+    folder = run_dir / "video_model"
+    if (folder / MANIFEST).is_file():
+        return load_video_folder(folder)
+    story: dict[str, Any]
+    if shipped is not None:
+        made = shipped
+        story = {"shipped": {name: made.manifest[name] for name in ("command", "date", "seed", "episodes", "training")}}
+    else:
+        made, losses = _trained(config, clips, run_dir, progress)
+        story = {
+            "command": command, "date": date.today().isoformat(), "seed": config.seed, "task": config.task,
+            "episodes": len(clips), "training": losses,
+        }
+    scores = kept_scores(run_dir / BEFORE, made, heldout, probe, config)
+    story |= {"model": asdict(config.model), "heldout": {**_means(scores), **_baselines(made, heldout, probe, config)}}
+    save_video_folder(folder, made.codec, made.network, made.clip, story)
+    return load_video_folder(folder)
+
+
+def shipped_video_model(config: VideoRlConfig) -> VideoFolder | None:
+    """The video model that is shipped with the task's world model; None where there is none of these settings."""
+    try:
+        folder = shipped_model(config.task) / "video_model"
+    except FileNotFoundError:
+        return None
+    if not (folder / MANIFEST).is_file():
+        return None
+    found = load_video_folder(folder)
+    return found if found.manifest["model"] == asdict(config.model) else None
+
+
+def _trained(
+    config: VideoRlConfig, clips: Clips, run_dir: Path, progress: bool
+) -> tuple[VideoFolder, dict[str, float]]:
+    """Codec and network, and the last training losses."""
+    settings, K = config.model, config.model.num_conditioning
+    codec = _codec(config, clips)
+    latents, condition = codec.encode(clips.frames), clips.condition(codec, K, settings.text_dim)
+    sizes = NetworkSettings(
+        codec.channels, clips.actions.shape[2], settings.text_dim, settings.width, settings.depth,
+        patch=CELLS[settings.codec], change_std=change_std(latents, K),
+    )
+    torch.manual_seed(stream_seed(config.seed, "video_network") % 2**32)
+    network = VideoNetwork(sizes)
+
+    def batch(iteration: int) -> tuple[Tensor, Condition]:
+        drawn = numpy_stream(config.seed, "video_batches", iteration).choice(len(clips), settings.batch_size)
+        rows = torch.from_numpy(drawn)
+        return latents[rows], condition.rows(rows)
+
+    losses = train_video_model(network, batch, settings.training, seed=config.seed, run_dir=run_dir, progress=progress)
+    return VideoFolder(codec, network, {"stride": settings.stride, "num_conditioning": K}, {}), losses
+
+
+def _baselines(folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig) -> dict[str, float]:
+    """Mean scores of what needs no sampling. `copy_*`: of repeating the first frame. `codec_psnr_db`: of the codec."""
+    some = heldout.select(torch.arange(min(config.evaluation.contexts, len(heldout))))
+    K = folder.clip["num_conditioning"]
+    copied = some.frames[:, :1].expand_as(some.frames)
+    coded = folder.codec.decode(folder.codec.encode(some.frames))
+    found = {f"copy_{name}": float(v.mean()) for name, v in score_clips(copied, some, probe, K).named().items()}
+    return found | {"codec_psnr_db": float(score_clips(coded, some, probe, K).psnr_db.mean())}
+
+
+def _means(scores: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    return {name: sum(values) / len(values) for name, values in scores.items()}
+
+
+def _codec(config: VideoRlConfig, clips: Clips) -> Codec:
+    settings = config.model
+    if settings.codec == "tokenizer":
+        return codec_of_world_model(Path(shipped_model(config.task)))
+    codec = PatchCodec(settings.patch, settings.channels)
+    codec.fit(_some_frames(clips, config.seed))
+    return codec
+
+
+def change_std(latents: Tensor, num_conditioning: int) -> float:
+    """Root mean square of what changes after the last given frame of clips (B, C, F, h, w); without one, of all."""
+    if num_conditioning == 0:
+        return float(latents.square().mean().sqrt())
+    given = latents[:, :, num_conditioning - 1 : num_conditioning]
+    return float((latents[:, :, num_conditioning:] - given).square().mean().sqrt())
+
+
+def _some_frames(clips: Clips, seed: int) -> Tensor:
+    frames = clips.frames.flatten(0, 1)
+    count = min(CODEC_FRAMES, len(frames))
+    return frames[torch.from_numpy(numpy_stream(seed, "codec_frames").choice(len(frames), count, replace=False))]

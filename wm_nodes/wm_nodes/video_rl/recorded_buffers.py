@@ -1,0 +1,257 @@
+"""The clips and scores that a run of loop 2 recorded: score them again from their pictures, train on them again.
+
+Shapes: N clips of a buffer, F frames, H W 3 image.
+"""
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wm_nodes.config.schema import AGENT
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.recording import Bag, BagError, topics
+from wm_nodes.recording.layout import Tiles
+from wm_nodes.recording.messages import stamp_ns
+from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
+from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_rl.reference_reward import mixed, score_clips
+from wm_nodes.video_rl.training_run import rewarded
+from wm_nodes.world_model.position_probe import PositionProbe
+
+
+@dataclass(frozen=True)
+class RecordedClips:
+    """One ClipBatch with its ClipScores. contexts: rows of the context bags' clips, one per clip (N,). scores, total:
+    float64 (N,), NaN where missing. valid: bool (N,). picture: uint8 (N H, F W, 3), or None where not asked for.
+    weights: of the scores in the total. audit_ids: of the agent's verdicts (N,), "" where no answer came; () where it
+    was not asked. judge_id: of who gave them; "" where nobody did.
+    """
+
+    iteration: int
+    policy_version: int
+    contexts: Tensor
+    num_frames: int
+    uri: str
+    sha256: str
+    scores: Mapping[str, Tensor]
+    total: Tensor
+    valid: Tensor
+    picture: UInt8Array | None
+    weights: Mapping[str, float] = field(default_factory=dict)
+    audit_ids: tuple[str, ...] = ()
+    judge_id: str = ""
+
+    def frames(self, height: int, width: int) -> Tensor:
+        """The clips, uint8 (N, F, H, W, 3), cut out of the picture.
+
+        Raises:
+            BagError: the picture is missing, or of another size.
+        """
+        count = len(self.contexts)
+        tiles = Tiles(count, self.num_frames, height, width)
+        if self.picture is None or self.picture.shape[:2] != tiles.mosaic_shape:
+            found = "not in the bag" if self.picture is None else f"{self.picture.shape[:2]} px"
+            raise BagError(
+                f"the picture of iteration {self.iteration} is {found}; {count} clips of {self.num_frames} frames need "
+                f"{tiles.mosaic_shape} px: record {topics.CLIP_IMAGES.name}, and name the context bags of that run"
+            )
+        cut = tiles.untile(self.picture, count * self.num_frames)
+        return torch.from_numpy(np.ascontiguousarray(cut)).view(count, self.num_frames, height, width, 3)
+
+
+@dataclass(frozen=True)
+class Rescored:
+    """A buffer scored again. different: names of scores, `total`, `valid` or `verdicts` whose bits are not the recorded
+    ones. same_reward: the total was recorded by the same rewards; else it is not compared. verdicts: the agent's, if it
+    was asked; a clip that got no answer then is not compared.
+    """
+
+    recorded: RecordedClips
+    total: Tensor
+    different: tuple[str, ...]
+    same_reward: bool = True
+    verdicts: tuple[Mapping[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class JudgedBuffer:
+    """What a judge says of N clips. scores: float64 (N,) by name. verdicts: a row per clip, with its `audit_id`."""
+
+    scores: Mapping[str, Tensor]
+    verdicts: tuple[Mapping[str, Any], ...]
+
+
+BufferJudge = Callable[[RecordedClips, Tensor, Clips], JudgedBuffer]
+"""Judges a buffer's clips, uint8 (N, F, H, W, 3), given the recordings of their contexts."""
+
+
+def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
+    """Yield the scored clips of a live recording, in the order of their scores; unscored ones are left out.
+
+    Raises:
+        BagError: an unusable bag, or one without clips and scores.
+    """
+    wanted = (topics.CLIPS, topics.CLIP_SCORES, *((topics.CLIP_IMAGES,) if pictures else ()))
+    rows = {topics.absolute(topics.DEFAULT_NAMESPACE, topic): topic for topic in wanted}
+    with Bag(bag) as opened:
+        opened.check_types()
+        verdicts = _verdicts(opened)
+        for name in rows:
+            if not opened.count(name):
+                raise BagError(f"bag {bag} has no message on {name}; name a run of world_model_rl.py that was recorded")
+        clips, shown = dict[str, Any](), dict[int, UInt8Array]()
+        for name, _, data in opened.messages(list(rows)):
+            topic, message = rows[name], opened.decode(data, rows[name].msgtype)
+            if topic is topics.CLIP_IMAGES:
+                shown[stamp_ns(message.header.stamp)] = np.asarray(message.data).reshape(
+                    message.height, message.width, 3
+                )
+            elif topic is topics.CLIPS:
+                clips[message.sha256] = message
+            elif (batch := clips.pop(message.buffer_sha256, None)) is not None:
+                picture = shown.pop(stamp_ns(batch.header.stamp), None)
+                yield _joined(batch, message, picture, *_audit_ids(verdicts, message))
+
+
+def rescore(
+    recorded: RecordedClips, contexts: Clips, probe: PositionProbe, rewards: Mapping[str, float], num_conditioning: int,
+    judge: BufferJudge | None = None,
+) -> Rescored:
+    """Score the pictures against the recordings of their contexts and compare with the recorded scores, bit for bit.
+
+    Args:
+        rewards: weights of the total; where other scores are weighed than were recorded, the total is not compared.
+        judge: asked where the agent is among the rewards.
+
+    Raises:
+        BagError: no picture, or scores that nobody can give again.
+        ValueError: a context that the bags do not hold.
+    """
+    if int(recorded.contexts.max()) >= len(contexts):
+        raise ValueError(
+            f"iteration {recorded.iteration} is of context {int(recorded.contexts.max())}, the bags hold "
+            f"{len(contexts)}; name the folder of the run that recorded it"
+        )
+    references = contexts.select(recorded.contexts)
+    frames = recorded.frames(*references.frames.shape[2:4])
+    found = score_clips(frames, references, probe, num_conditioning).named()
+    foreign, verdicts = sorted(set(recorded.scores) - set(found) - {AGENT}), tuple[Mapping[str, Any], ...]()
+    if judge is not None and rewards.get(AGENT):
+        judged = judge(recorded, frames, references)
+        verdicts = judged.verdicts
+        found |= judged.scores
+    if foreign:
+        raise BagError(f"{', '.join(foreign)} cannot be scored again from pictures; only {', '.join(found)} can")
+    total = mixed(found, rewards)
+    valid = torch.isfinite(total)
+    total = torch.where(valid, total, torch.nan)
+    same_reward = _weighed(recorded.weights) == _weighed(rewards)
+    pairs = {name: (values, found[name].double()) for name, values in recorded.scores.items() if name in found}
+    if same_reward:
+        pairs |= {"total": (recorded.total, total), "valid": (recorded.valid, valid)}
+    ids, answered = recorded.audit_ids, torch.ones(len(total), dtype=torch.bool)
+    if verdicts and ids:
+        answered = torch.tensor([bool(audit_id) for audit_id in ids])
+    different = [name for name, (old, new) in pairs.items() if not _bit_equal(old[answered], new[answered])]
+    if any(old and old != verdict["audit_id"] for old, verdict in zip(ids, verdicts)):
+        different.append("verdicts")
+    return Rescored(recorded, total, tuple(different), same_reward, verdicts)
+
+
+def recorded_buffer(
+    run_dir: Path, recorded: RecordedClips, rewards: Mapping[str, float] | None = None
+) -> RolloutBuffer:
+    """The kept rollout buffer with its recorded scores. rewards: weights to mix them anew; None: the recorded total.
+
+    Raises:
+        RolloutBufferError: the buffer was not kept, or is another one; names the remedy.
+    """
+    path = run_dir / recorded.uri
+    if not path.is_file():
+        raise RolloutBufferError(
+            f"{path} is gone: the run kept only its newest rollout buffers, and training again needs all of them; "
+            "start a run with --keep-buffers as large as its iterations"
+        )
+    data = path.read_bytes()
+    found = hashlib.sha256(data).hexdigest()
+    if found != recorded.sha256:
+        raise RolloutBufferError(
+            f"{path} has sha256 {found[:12]}, the bag says {recorded.sha256[:12]}: it is damaged or of another run; "
+            "restore it, or train again from another run"
+        )
+    total = recorded.total if rewards is None else mixed(recorded.scores, rewards)
+    return rewarded(RolloutBuffer.from_bytes(data), recorded.scores, total)
+
+
+def trained_clips(bags: Sequence[Path], iterations: int) -> list[RecordedClips]:
+    """The clips of iterations 0, 1, ... without pictures; of one that was sampled twice (a resumed run) the later ones.
+
+    Raises:
+        BagError: an unusable bag, or an iteration that none of them holds.
+    """
+    found = {recorded.iteration: recorded for bag in bags for recorded in read_clips(bag)}
+    missing = [iteration for iteration in range(iterations) if iteration not in found]
+    if missing:
+        raise BagError(
+            f"{len(missing)} of {iterations} iterations, from {missing[0]} on, have no scored clips in "
+            f"{', '.join(map(str, bags)) or 'any bag'}; train again from a run that was recorded to its end"
+        )
+    return [found[iteration] for iteration in range(iterations)]
+
+
+def _verdicts(bag: Bag) -> dict[tuple[str, int], list[tuple[int, str, str]]]:
+    """(stamp in ns, audit id, judge id) of every verdict on a clip (sha256 of its buffer, row), in the order of their
+    stamps; the audit id is "" where no answer came."""
+    found = defaultdict[tuple[str, int], list[tuple[int, str, str]]](list)
+    name = topics.absolute(topics.DEFAULT_NAMESPACE, topics.VERDICT)
+    for _, _, data in bag.messages([name]) if bag.count(name) else ():
+        message = bag.decode(data, topics.VERDICT.msgtype)
+        audit_id = "" if message.status == message.ERROR else str(message.audit_id)
+        key = message.buffer_sha256, int(message.clip)
+        found[key].append((stamp_ns(message.header.stamp), audit_id, str(message.judge_id)))
+    return {key: sorted(values) for key, values in found.items()}
+
+
+def _audit_ids(
+    verdicts: Mapping[tuple[str, int], list[tuple[int, str, str]]], scores: Any
+) -> tuple[tuple[str, ...], str]:
+    """Of the verdicts behind a ClipScores, on each clip the newest one before it, and their judge, who is one for all.
+    Empty where a verdict is missing."""
+    until, found = stamp_ns(scores.header.stamp), list[tuple[str, str]]()
+    for clip in range(int(scores.num_clips)):
+        before = [told for stamp, *told in verdicts.get((scores.buffer_sha256, clip), ()) if stamp <= until]
+        found += [(audit_id, judge_id) for audit_id, judge_id in before[-1:]]
+    if not found or len(found) != int(scores.num_clips):
+        return (), ""
+    return tuple(audit_id for audit_id, _ in found), found[0][1]
+
+
+def _weighed(weights: Mapping[str, float]) -> set[str]:
+    return {name for name, weight in weights.items() if weight}
+
+
+def _joined(
+    batch: Any, scores: Any, picture: UInt8Array | None, audit_ids: tuple[str, ...], judge_id: str
+) -> RecordedClips:
+    count = int(scores.num_clips)
+    values = torch.from_numpy(np.array(scores.values, np.float64)).view(len(scores.names), count)
+    valid = torch.from_numpy(np.array(scores.valid, np.uint8)).bool()
+    total = torch.from_numpy(np.array(scores.total, np.float64))
+    contexts = torch.from_numpy(np.array(batch.contexts, np.int64)).repeat_interleave(int(batch.group_size))
+    return RecordedClips(
+        int(batch.iteration), int(batch.policy_version), contexts, int(batch.num_frames), batch.buffer_uri,
+        batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), valid,
+        picture, dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
+        judge_id,
+    )
+
+
+def _bit_equal(theirs: Tensor, ours: Tensor) -> bool:
+    return theirs.dtype == ours.dtype and theirs.numpy().tobytes() == ours.numpy().tobytes()

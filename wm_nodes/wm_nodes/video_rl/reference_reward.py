@@ -1,0 +1,117 @@
+"""What sampled clips are worth, against the recorded episode they should have shown.
+
+Shapes: N clips, F frames, H W 3 image. Positions are read off the decoded pictures by the judge's probe
+(world_model/position_probe.py), which shares nothing with the video model; the truth is the simulator's. Nothing here
+is a learned preference: these are the verifiable rewards, and the held-out metrics beside which a judge's reward is
+watched (equation (2)).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from wm_nodes.core.types import FloatArray
+from wm_nodes.video_model.clips import Clips
+from wm_nodes.world_model import load_model_folder
+from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.training.tokenizer import probe_targets
+from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL
+
+TRACKING_SCALE_M = 0.03
+"""An error of this much takes the tracking score to 1 / e."""
+SEEN_MOTION = 12
+"""A pixel counts as scenery while no recorded frame differs from the first one by more than this, of 255."""
+ERRORS = ("scenery", "object_cm", "tool_cm")
+"""Scores of which less is better."""
+
+
+@dataclass(frozen=True)
+class ClipScores:
+    """Per clip, float64 (N,). tracking: mean exp(-error / 3 cm) of object and tool over generated frames, in (0, 1].
+    scenery: mean absolute error, [0, 1], where the recording stands still. psnr_db: of generated frames. object_cm,
+    tool_cm: mean position errors. motion: object path length, share of the recorded one, at most 2; 1 where the
+    recorded object stands still.
+    """
+
+    tracking: Tensor
+    scenery: Tensor
+    psnr_db: Tensor
+    object_cm: Tensor
+    tool_cm: Tensor
+    motion: Tensor
+
+    def named(self) -> dict[str, Tensor]:
+        return dict(vars(self))
+
+
+def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_conditioning: int) -> ClipScores:
+    """Score decoded clips, uint8 (N, F, H, W, 3), against the recordings of their contexts.
+
+    Raises:
+        ValueError: clips and recordings differ in number or size.
+    """
+    if frames.shape != references.frames.shape:
+        raise ValueError(f"clips are {tuple(frames.shape)}, their recordings {tuple(references.frames.shape)}")
+    generated = slice(num_conditioning, None)
+    found = probe.read(frames[:, generated])
+    truth = probe_targets(references.ground_truth[:, generated])
+    object_m = np.linalg.norm(found[..., OBJECT] - truth[..., OBJECT], axis=-1)
+    tool_m = np.linalg.norm(found[..., TOOL] - truth[..., TOOL], axis=-1)
+    tracking = (np.exp(-object_m / TRACKING_SCALE_M) + np.exp(-tool_m / TRACKING_SCALE_M)) / 2
+    error = (frames[:, generated].float() - references.frames[:, generated].float()) / 255
+    changed = (references.frames.int() - references.frames[:, :1].int()).abs().amax((1, 4)) > SEEN_MOTION
+    still = (~changed)[:, None, :, :, None].float()
+    weight = still.sum((1, 2, 3, 4)).clamp_min(1) * error.shape[1] * error.shape[4]
+    return ClipScores(
+        tracking=torch.from_numpy(tracking.mean(1)).double(),
+        scenery=((error.abs() * still).sum((1, 2, 3, 4)) / weight).double(),
+        psnr_db=(-10 * error.square().mean((1, 2, 3, 4)).clamp_min(1e-8).log10()).double(),
+        object_cm=torch.from_numpy(100 * object_m.mean(1)).double(),
+        tool_cm=torch.from_numpy(100 * tool_m.mean(1)).double(),
+        motion=torch.from_numpy(_path_share(found[..., OBJECT], truth[..., OBJECT])).double(),
+    )
+
+
+def more_is_better(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """A score turned so that more is better: errors negated, motion as -|1 - motion|, others as they are."""
+    turned: NDArray[np.float64] = np.asarray(values, np.float64)
+    if name == "motion":
+        turned = -np.abs(1 - turned)
+    return -turned if name in ERRORS else turned
+
+
+def load_probe(folder: Path) -> PositionProbe:
+    """The judge's probe of a world model's folder.
+
+    Raises:
+        ValueError: it has none.
+    """
+    probe = load_model_folder(folder).probe
+    if probe is None:
+        raise ValueError(f"{folder} has no position probe to judge with; take the shipped world model")
+    return probe
+
+
+def mixed(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
+    """Return sum over names of weight x value, float64 (N,).
+
+    Raises:
+        ValueError: a weight for something that was not scored, or no weight at all.
+    """
+    unknown = sorted(set(weights) - set(values))
+    if unknown or not weights:
+        raise ValueError(f"unknown rewards {unknown}; weigh some of {', '.join(sorted(values))}")
+    return torch.stack([weight * values[name].double() for name, weight in weights.items()]).sum(0)
+
+
+def _path_share(found: FloatArray, truth: FloatArray) -> FloatArray:
+    """Distance between first and last generated frame, found over true, limited to 2; 1 where nothing should move."""
+    went = np.linalg.norm(found[:, -1] - found[:, 0], axis=-1)
+    should = np.linalg.norm(truth[:, -1] - truth[:, 0], axis=-1)
+    share: FloatArray = np.where(should > 0.01, np.minimum(went / np.maximum(should, 1e-6), 2.0), 1.0)
+    return share

@@ -1,0 +1,107 @@
+"""Groups of clips for GRPO: contexts in, a rollout buffer out. Shapes: N clips of a buffer, E of an evaluation."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from wm_nodes.core.seeding import numpy_stream, stream_seed
+from wm_nodes.video_model import (
+    Condition,
+    RolloutBuffer,
+    RolloutSettings,
+    config_hash,
+    initial_noise,
+    sample_videos,
+    stochastic_steps,
+)
+from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.settings import VideoRlConfig
+
+
+@dataclass(frozen=True)
+class GroupRequest:
+    """What to sample. contexts: rows of the generator's clips. iteration, policy_version: of the learner."""
+
+    contexts: tuple[int, ...]
+    group_size: int
+    iteration: int
+    policy_version: int
+    shared_noise: bool = False
+
+
+class ClipGenerator:
+    """Samples clips of recorded contexts (first frames, actions, instruction) from the video model.
+
+    Args:
+        folder: codec and network; the network is used as it is, so loading newer weights into it is enough.
+        contexts: the recorded clips to draw contexts from.
+    """
+
+    def __init__(self, folder: VideoFolder, contexts: Clips, config: VideoRlConfig) -> None:
+        self.folder, self.contexts, self.config = folder, contexts, config
+
+    def request(self, iteration: int, policy_version: int) -> GroupRequest:
+        """The contexts of an iteration, drawn without replacement from stream `contexts`."""
+        groups = self.config.groups
+        count = min(groups.contexts, len(self.contexts))
+        drawn = numpy_stream(self.config.seed, "contexts", iteration).choice(len(self.contexts), count, replace=False)
+        return GroupRequest(
+            tuple(int(i) for i in drawn), groups.group_size, iteration, policy_version, groups.shared_noise
+        )
+
+    def sample(
+        self, request: GroupRequest, on_progress: Callable[[int, int], None] = lambda done, total: None
+    ) -> RolloutBuffer:
+        """A buffer of len(contexts) x group_size clips without rewards; equal requests and weights give equal bytes.
+
+        on_progress: called with (clips sampled, of how many); may raise to stop.
+        """
+        group = torch.arange(len(request.contexts)).repeat_interleave(request.group_size)
+        sample = torch.arange(request.group_size).repeat(len(request.contexts))
+        rows = torch.tensor(request.contexts)[group]
+        settings, seed = self.config.rollout, self.config.seed
+        seeds = _seeds(seed, "clip_steps", request.iteration, group, sample)
+        noises = torch.zeros_like(sample) if request.shared_noise else sample
+        drawn = _seeds(seed, "clip_noise", request.iteration, group, noises)
+        steps = stochastic_steps(settings.num_steps, self.config.window, request.iteration, seed)
+        condition = self._condition(rows)
+        rollout = sample_videos(
+            self.folder.network, condition, initial_noise(self._shape(), drawn), seeds, settings, steps,
+            on_progress,
+        )
+        return RolloutBuffer(
+            rollout, condition, group, sample, {}, torch.ones(len(group), dtype=torch.bool),
+            request.policy_version, request.iteration, config_hash(settings),
+        )
+
+    def evaluate(self, contexts: Clips, num_steps: int) -> Tensor:
+        """One clip of each context by ODE, decoded: uint8 (E, F, H, W, 3)."""
+        generator = ClipGenerator(self.folder, contexts, self.config)
+        rows = torch.arange(len(contexts))
+        seeds = _seeds(self.config.seed, "clip_evaluation", 0, rows, torch.zeros_like(rows))
+        settings = RolloutSettings(num_steps, self.config.rollout.shift, self.config.rollout.cfg)
+        noise = initial_noise(generator._shape(), seeds)
+        rollout = sample_videos(self.folder.network, generator._condition(rows), noise, seeds, settings, [])
+        return self.folder.codec.decode(rollout.latents)
+
+    def references(self, request: GroupRequest) -> Clips:
+        """The recordings that the request's clips are scored against, one row per clip."""
+        return self.contexts.select(torch.tensor(request.contexts).repeat_interleave(request.group_size))
+
+    def _condition(self, rows: Tensor) -> Condition:
+        return self.contexts.select(rows).condition(
+            self.folder.codec, self.folder.clip["num_conditioning"], self.folder.network.settings.text_dim
+        )
+
+    def _shape(self) -> tuple[int, ...]:
+        _, F, H, W, _ = self.contexts.frames.shape
+        codec = self.folder.codec
+        return codec.channels, F, H // codec.patch, W // codec.patch
+
+
+def _seeds(seed: int, name: str, iteration: int, group: Tensor, sample: Tensor) -> Tensor:
+    pairs = zip(group.tolist(), sample.tolist(), strict=True)
+    return torch.tensor([stream_seed(seed, name, iteration, g, s) for g, s in pairs])

@@ -1,0 +1,166 @@
+"""A toy world for GRPO of video models: a disc on a texture, told where to go. Section 5.1 of the specification.
+
+Shapes: B scenes, C = 2 channels, F = 6 frames, H = W = 16 cells, or the same scene in more of them. A "latent" video is
+the picture itself. In the training videos the disc obeys its action with probability OBEDIENCE and else takes a random
+direction, so a trained model knows the right motion and reinforcement learning has something to teach. Scores come from
+the pixels alone; lengths are in cells of the 16 x 16 picture at every resolution.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from wm_nodes.config.shipped import PRETRAINED
+from wm_nodes.core.seeding import torch_stream
+from wm_nodes.training.weights import check_same_layout, unpack_weights
+from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
+
+CHANNELS, FRAMES, SIDE = 2, 6, 16
+NUM_ACTIONS = 4
+OBEDIENCE = 0.4
+RADIUS = 1.7
+DIRECTIONS = torch.tensor([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
+"""(row, column) of actions 0 to 3: right, left, down, up."""
+BASE = PRETRAINED / "moving_disc" / "video_model.safetensors"
+NETWORK = NetworkSettings(channels=CHANNELS, action_dim=NUM_ACTIONS, width=32, depth=5)
+COLOUR = torch.tensor([2.0, -2.0])
+MOVED_CELLS = 2.0
+"""A disc that went further than this the commanded way obeyed."""
+NEAR = 3.0
+"""Cells further than NEAR radii from the disc are background."""
+CHANGE = 0.02
+"""Mean square change from frame to frame at which `consistency` is 1 / e; a moving disc makes about 0.025."""
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """background: (B, C, H, W), H = W. start: (B, 2) row, column. speed: (B,) pixels per frame. action: int64 (B,)."""
+
+    background: Tensor
+    start: Tensor
+    speed: Tensor
+    action: Tensor
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    @property
+    def side(self) -> int:
+        return self.background.shape[-1]
+
+    @property
+    def scale(self) -> float:
+        """Pixels per cell."""
+        return self.side / SIDE
+
+    def path(self, direction: Tensor) -> Tensor:
+        """Centres (B, F, 2) of discs that go in `direction`, int64 (B,)."""
+        steps = torch.arange(FRAMES, dtype=torch.float32)
+        return self.start[:, None] + steps[None, :, None] * self.speed[:, None, None] * DIRECTIONS[direction][:, None]
+
+    def videos(self, direction: Tensor) -> Tensor:
+        """Render (B, C, F, H, W)."""
+        alpha = self.opacity_at(self.path(direction))[:, None]
+        return self.background[:, :, None] * (1 - alpha) + COLOUR.view(1, 2, 1, 1, 1) * alpha
+
+    def opacity_at(self, centres: Tensor, radius: float = RADIUS) -> Tensor:
+        """A Gaussian disc of `radius` cells at each centre (B, F, 2) in pixels: (B, F, H, W), 1 in its middle."""
+        return opacity_at(centres, radius * self.scale, self.side)
+
+    def condition(self) -> Condition:
+        """The clean first frame and the commanded action, one-hot on every frame."""
+        actions = F.one_hot(self.action, NUM_ACTIONS).float()[:, None].expand(-1, FRAMES - 1, -1).contiguous()
+        return Condition(self.videos(self.action)[:, :, :1].contiguous(), actions, torch.zeros(len(self), 1, 0))
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Per video, float64 (B,). task: mean exp(-path error / 2), in (0, 1]. mass: opacity kept, 1 is all of it.
+    background: mean square error away from the disc. obeyed: 1 where the disc went more than MOVED_CELLS the
+    commanded way. consistency: exp(-change from frame to frame / CHANGE), 1 for a picture that stands still.
+    """
+
+    task: Tensor
+    mass: Tensor
+    background: Tensor
+    obeyed: Tensor
+    consistency: Tensor
+
+    @property
+    def reward(self) -> Tensor:
+        """The training reward: task + 0.3 mass - 10 background."""
+        return self.task + 0.3 * self.mass - 10 * self.background
+
+
+def draw_scenes(count: int, seed: int, name: str, index: int = 0, side: int = SIDE) -> Scenes:
+    """Draw scenes of side x side pixels; the same scenes at every resolution."""
+    generator, scale = torch_stream(seed, f"moving_disc_{name}", index), side / SIDE
+    coarse = 0.5 * torch.randn(count, CHANNELS, 4, 4, generator=generator)
+    return Scenes(
+        background=F.interpolate(coarse, size=(side, side), mode="bilinear", align_corners=True),
+        start=(side - 1) / 2 + 2 * scale * torch.rand(count, 2, generator=generator) - scale,
+        speed=scale * (0.9 + 0.2 * torch.rand(count, generator=generator)),
+        action=torch.randint(NUM_ACTIONS, (count,), generator=generator),
+    )
+
+
+def training_batch(count: int, seed: int, iteration: int) -> tuple[Tensor, Condition]:
+    """Videos (B, C, F, H, W) in which the action is obeyed with probability OBEDIENCE, and their condition."""
+    scenes = draw_scenes(count, seed, "training", iteration)
+    generator = torch_stream(seed, "moving_disc_obedience", iteration)
+    obeys = torch.rand(count, generator=generator) < OBEDIENCE
+    direction = torch.where(obeys, scenes.action, torch.randint(NUM_ACTIONS, (count,), generator=generator))
+    return scenes.videos(direction), scenes.condition()
+
+
+def score(videos: Tensor, scenes: Scenes) -> Scores:
+    """Score videos (B, C, F, H, W) of the scenes, from their pixels and the known background."""
+    contrast = (COLOUR.view(1, 2, 1, 1) - scenes.background)[:, :, None]
+    seen = ((videos.float() - scenes.background[:, :, None]) * contrast).sum(1) / contrast.square().sum(1)
+    alpha = seen.clamp(0, 1)
+    alpha = torch.where(alpha > 0.15, alpha, 0.0)  # texture errors are no disc
+    rows = torch.arange(scenes.side, dtype=torch.float32)
+    weight = alpha.sum((2, 3)).clamp_min(1e-6)
+    centre = torch.stack([(alpha.sum(3) * rows).sum(2) / weight, (alpha.sum(2) * rows).sum(2) / weight], 2)
+    wanted = scenes.path(scenes.action)
+    lost = alpha.sum((2, 3)) < 0.5 * scenes.scale**2
+    distance = (centre - wanted).norm(dim=2) / scenes.scale
+    error = torch.where(lost, torch.full_like(distance, SIDE), distance)
+    near = torch.maximum(scenes.opacity_at(centre, NEAR * RADIUS), scenes.opacity_at(wanted, NEAR * RADIUS))
+    away = (near < 0.6)[:, None]
+    wrong = (videos.float() - scenes.background[:, :, None]).square() * away
+    travelled = ((centre[:, -1] - centre[:, 0]) * DIRECTIONS[scenes.action]).sum(1) / scenes.scale
+    change = videos.float().diff(dim=2).square().mean((1, 2, 3, 4))
+    return Scores(
+        task=torch.exp(-error[:, 1:] / 2).mean(1).double(),
+        mass=(alpha[:, 1:].sum((2, 3)).mean(1) / alpha[:, 0].sum((1, 2)).clamp_min(1e-6)).double(),
+        background=(wrong[:, :, 1:].sum((1, 2, 3, 4)) / (2 * away[:, :, 1:].sum((1, 2, 3, 4))).clamp_min(1)).double(),
+        obeyed=((travelled > MOVED_CELLS) & ~lost[:, -1]).double(),
+        consistency=torch.exp(-change / CHANGE).double(),
+    )
+
+
+def centred_pixels(videos: Tensor) -> Tensor:
+    """Features of generated frames, (n, F - 1, C H W): pixels less their frame's mean, so that motion shows."""
+    frames = videos[:, :, 1:].transpose(1, 2)
+    return (frames - frames.mean((3, 4), keepdim=True)).flatten(2)
+
+
+def opacity_at(centres: Tensor, radius: float = RADIUS, side: int = SIDE) -> Tensor:
+    """A Gaussian disc at each centre (B, F, 2): (B, F, side, side), 1 in its middle."""
+    rows = torch.arange(side, dtype=torch.float32)
+    down = (rows - centres[..., :1]).square()[..., :, None]
+    across = (rows - centres[..., 1:]).square()[..., None, :]
+    return torch.exp(-(down + across) / (2 * radius**2))
+
+
+def load_base(path: Path | None = None) -> VideoNetwork:
+    """The base model: the one at `path`, or the shipped one."""
+    model = VideoNetwork(NETWORK)
+    tensors, _ = unpack_weights((path or BASE).read_bytes())
+    check_same_layout(model.state_dict(), tensors, what=str(path or BASE))
+    model.load_state_dict(tensors)
+    return model.eval()

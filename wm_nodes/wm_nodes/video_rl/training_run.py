@@ -1,0 +1,203 @@
+"""A run folder of loop 2: the learner with its versions, checkpoint and metrics, resumed where it stopped.
+
+versions: run_dir/video_policies/video_<optimizer steps>.safetensors; version 0 is the model's own folder. With
+grpo.ema_decay > 0, averaged_<optimizer steps>.safetensors beside each: the weights that are evaluated.
+
+Staleness: by default buffer i is sampled by the version that trains on it. Where grpo.max_staleness covers the
+optimizer steps of one buffer it may be sampled while the learner trains on buffer i - 1, so by the version before.
+sampling_version follows from the run folder alone: a resumed run asks for what an undisturbed one had.
+"""
+
+import hashlib
+import json
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+
+from wm_nodes.training.checkpoint import metadata_of
+from wm_nodes.training.metrics import MetricsWriter, read_metrics
+from wm_nodes.training.ranks import Ranks, broadcast_bytes
+from wm_nodes.training.weights import PackedWeights, save_weights, unpack_weights
+from wm_nodes.video_model import RolloutBuffer, VideoNetwork
+from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
+from wm_nodes.video_rl.reward_hacking import HackedMetric
+from wm_nodes.video_rl.settings import VideoRlConfig
+from wm_nodes.video_rl.validation import SECTION, HeldoutScores, alarm_scalars, hacked_now
+
+CHECKPOINT = "checkpoints/video_learner.safetensors"
+
+
+def version_uri(version: int) -> str:
+    """File name of a version of the network, relative to the run folder."""
+    return f"video_policies/video_{version:06d}.safetensors"
+
+
+def evaluated_uri(version: int, config: VideoRlConfig) -> str:
+    """File name of the weights of a version that are evaluated: the averaged ones where the run keeps an average."""
+    return _averaged_uri(version) if config.grpo.ema_decay > 0 else version_uri(version)
+
+
+def progress(run_dir: Path) -> tuple[int, int]:
+    """Version and buffers trained on, as the learner's checkpoint says; (0, 0) where there is none."""
+    path = run_dir / CHECKPOINT
+    if not path.is_file():
+        return 0, 0
+    with open(path, "rb") as file:
+        size = file.read(8)
+        header = json.loads(metadata_of(size + file.read(int.from_bytes(size, "little")))["grpo"])
+    return int(header["version"]), int(header["iteration"])
+
+
+class VideoRun:
+    """Trains `network` on buffers; every buffer leaves a version, a checkpoint and a line of metrics.
+
+    Args:
+        keep_versions: files kept in run_dir/video_policies, at least 2.
+        ranks: this process's place; rank 0 calls train() and close(), the others follow().
+        heldout: scores of held-out contexts by the network's weights, asked for by rank 0 after every
+            `evaluation.every`-th buffer while the network has its averaged weights; None: never.
+    """
+
+    def __init__(
+        self, network: VideoNetwork, config: VideoRlConfig, run_dir: Path, *, keep_versions: int = 20,
+        tensorboard: bool = False, ranks: Ranks | None = None, heldout: HeldoutScores | None = None,
+    ) -> None:
+        self.network, self.config, self.run_dir, self._keep = network, config, run_dir, keep_versions
+        self._heldout = heldout
+        self._ranks, self._training = ranks or Ranks(), threading.Lock()
+        self.learner = GrpoLearner(
+            network, config.grpo, config.rollout, seed=config.seed, ranks=ranks, reward_weights=config.rewards
+        )
+        self.iterations = 0
+        """Buffers trained on in the run folder."""
+        if (run_dir / CHECKPOINT).is_file():
+            self.iterations = self.learner.load(run_dir / CHECKPOINT)
+        self.previous_version = max((v for v in self._versions() if v < self.version), default=self.version)
+        """The version before the last training; before any, that of now."""
+        self.staleness = 0
+        """Optimizer steps between sampling and training of the last buffer."""
+        self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self._ranks.rank == 0 else None
+
+        self.packed: PackedWeights | None = None
+        """The weights of `version`, once their files are written."""
+        self.hacked: list[HackedMetric] = []
+        """What the newest held-out evaluation says of reward hacking, equation (2)."""
+
+    @property
+    def version(self) -> int:
+        return self.learner.version
+
+    @property
+    def prefetches(self) -> bool:
+        """Whether the next buffer may be sampled while this one is trained on."""
+        return self.config.grpo.max_staleness >= self.config.grpo.updates_per_buffer
+
+    @property
+    def sampling_version(self) -> int:
+        """The version that samples the next buffer, number `iterations`."""
+        return self.previous_version if self.prefetches else self.version
+
+    def train(self, buffer: RolloutBuffer, check: Callable[[], None] = lambda: None) -> BufferReport:
+        """Train on one buffer with rewards, then save.
+
+        Args:
+            check: called before every call of the network; what it raises ends the training with nothing changed. With
+                several ranks it is not called: one that stopped would leave the others waiting.
+
+        Raises:
+            As GrpoLearner.train; or OSError where saving fails: the training was then made, and save() tries again.
+        """
+        with self._training:
+            if self._ranks.size > 1 and self._ranks.rank == 0:
+                broadcast_bytes(buffer.to_bytes(), self._ranks)
+            before, self.staleness = self.version, self.version - buffer.policy_version
+            with self.network.register_forward_pre_hook(lambda *_: check() if self._ranks.size == 1 else None):
+                report = self.learner.train(buffer)
+            self.iterations += 1
+            self.previous_version, self.packed = before, None
+            if self._metrics is not None:
+                self.save()
+                self._metrics.write("grpo", self.iterations, {**flat_metrics(report), "staleness": self.staleness})
+                self._watch(self._metrics)
+            return report
+
+    def follow(self) -> None:
+        """Be a rank other than 0: make rank 0's training until it closes."""
+        while (data := broadcast_bytes(None, self._ranks)) is not None:
+            with suppress(ValueError, FloatingPointError):  # rank 0 has raised and reported the same
+                self.train(RolloutBuffer.from_bytes(data))
+
+    def save(self) -> PackedWeights:
+        """Write the version and the checkpoint, the checkpoint last; return the version's weights."""
+        path = self.run_dir / version_uri(self.version)
+        packed = save_weights(self.network, path, {"version": str(self.version)})
+        if self.learner.averaged:
+            with self.learner.averaged_weights():
+                path = self.run_dir / _averaged_uri(self.version)
+                save_weights(self.network, path, {"version": f"{self.version}, averaged"})
+        self.learner.save(self.run_dir / CHECKPOINT, iteration=self.iterations)
+        for old in self._versions()[: -self._keep]:
+            for uri in (version_uri(old), _averaged_uri(old)):
+                (self.run_dir / uri).unlink(missing_ok=True)
+        self.packed = packed
+        return packed
+
+    def weights_of(self, version: int) -> PackedWeights:
+        """The weights of the newest version, written first where they are not, or of an older one from its file.
+
+        Raises:
+            OSError: no such file, or the newest one cannot be written.
+        """
+        if version == self.version:
+            return self.packed or self.save()
+        data = (self.run_dir / version_uri(version)).read_bytes()
+        _, metadata = unpack_weights(data)
+        return PackedWeights(data, hashlib.sha256(data).hexdigest(), metadata["arch_hash"], metadata)
+
+    def close(self) -> None:
+        """Wait for the training at hand; let the other ranks end."""
+        with self._training:
+            if self._metrics is not None:
+                self._metrics.close()
+                broadcast_bytes(None, self._ranks)
+
+    def _watch(self, metrics: MetricsWriter) -> None:
+        every = self.config.evaluation.every
+        if self._heldout is None or not every or self.iterations % every:
+            return
+        with self.learner.averaged_weights():
+            scores = self._heldout()
+        lines = [*read_metrics(self.run_dir), {"section": SECTION, "step": self.iterations, **scores}]
+        self.hacked = hacked_now(lines, self.config.evaluation.window)
+        metrics.write(SECTION, self.iterations, {**scores, **alarm_scalars(self.hacked)})
+
+    def _versions(self) -> list[int]:
+        """The versions in the run folder, ascending."""
+        names = (path.stem for path in (self.run_dir / "video_policies").glob("video_*.safetensors"))
+        return sorted(int(name.removeprefix("video_")) for name in names)
+
+
+def _averaged_uri(version: int) -> str:
+    return f"video_policies/averaged_{version:06d}.safetensors"
+
+
+def flat_metrics(report: BufferReport) -> dict[str, float]:
+    """One number per name; those of the k-th optimizer step on a buffer end in _<k>, from 1."""
+    values = asdict(report)
+    updates, rewards, noise = (values.pop(name) for name in ("updates", "raw_rewards", "step_noise"))
+    found = {name: float(value) for name, value in values.items()}
+    found |= {f"reward_{name}": value for name, value in rewards.items()}
+    found |= {f"noise_share_step_{k}": value for k, value in noise.items()}
+    for index, update in enumerate(updates, 1):
+        found |= {f"{name}_{index}": float(value) for name, value in update.items()}
+    return found
+
+
+def rewarded(buffer: RolloutBuffer, scores: Mapping[str, torch.Tensor], total: torch.Tensor) -> RolloutBuffer:
+    """The buffer with raw scores and the mixed reward `total`; a clip whose total is NaN is left out of training."""
+    raw = {name: values.double() for name, values in scores.items()}
+    return replace(buffer.with_rewards({"total": total}), rewards={**raw, "total": total.double()})

@@ -1,0 +1,119 @@
+"""Held-out contexts beside the training reward: their scores, one ODE clip each, and the alarm of equation (2).
+
+Shapes: E contexts.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from wm_nodes.core.files import write_atomic
+from wm_nodes.training.weights import pack_weights
+from wm_nodes.video_model.clips import Clips, load_clips
+from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.reference_reward import ClipScores, load_probe, mixed, more_is_better, score_clips
+from wm_nodes.video_rl.reward_hacking import HackedMetric, hacked_metrics
+from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.settings import VideoRlConfig
+from wm_nodes.world_model.position_probe import PositionProbe
+
+SECTION = "heldout"
+"""Of metrics.jsonl: scores by name, mean over the contexts, at the number of buffers trained on."""
+WATCHED = tuple(ClipScores.__dataclass_fields__)
+
+HeldoutScores = Callable[[], Mapping[str, float]]
+"""The held-out scores of a network's weights at the moment of the call."""
+
+
+def context_scores(
+    folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
+) -> dict[str, Tensor]:
+    """Score one ODE clip of each of the first `evaluation.contexts` held-out contexts, by name, float64 (E,)."""
+    some = heldout.select(torch.arange(min(config.evaluation.contexts, len(heldout))))
+    folder.network.eval()
+    frames = ClipGenerator(folder, some, config).evaluate(some, config.evaluation.num_steps)
+    return score_clips(frames, some, probe, folder.clip["num_conditioning"]).named()
+
+
+def kept_scores(
+    path: Path, folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
+) -> dict[str, list[float]]:
+    """context_scores() from `path` where they are of the same weights, else measured and written there."""
+    sha256 = pack_weights(folder.network).sha256
+    if path.is_file() and (kept := json.loads(path.read_text()))["sha256"] == sha256:
+        return dict(kept["scores"])
+    scores = {name: values.tolist() for name, values in context_scores(folder, heldout, probe, config).items()}
+    write_atomic(path, json.dumps({"sha256": sha256, "scores": scores}).encode())
+    return scores
+
+
+def validation_scores(
+    folder: VideoFolder, bags: Sequence[Path], model_dir: Path, config: VideoRlConfig
+) -> HeldoutScores:
+    """The scores of whatever weights folder.network has when asked; `reward` too, where the rewards are such scores.
+
+    Raises:
+        BagError: an unusable bag. ValueError: model_dir has no position probe.
+    """
+    clips, probe = load_clips(bags, folder.clip["stride"]), load_probe(model_dir)
+
+    def scores() -> dict[str, float]:
+        found = context_scores(folder, clips, probe, config)
+        if config.rewards.keys() <= found.keys():
+            found["reward"] = mixed(found, config.rewards)
+        return {name: float(values.mean()) for name, values in found.items()}
+
+    return scores
+
+
+def hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[HackedMetric]:
+    """Equation (2) on lines of metrics.jsonl: the scores that got worse over the newest `window` evaluations while the
+    training reward rose, [] while there are fewer. The reward of an evaluation is that of the buffers since the one
+    before; slopes are per evaluation, of scores turned so that more is better. Other scores are not watched.
+    """
+    rewards = {_step(line): line["reward_mean"] for line in lines if line["section"] == "grpo"}
+    evaluations = {_step(line): line for line in lines if line["section"] == SECTION}
+    proxy, rows, begin = list[float](), list[Mapping[str, object]](), 0
+    for step in sorted(evaluations):
+        since = [float(str(value)) for at, value in rewards.items() if begin < at <= step and value is not None]
+        begin = step
+        if since:
+            proxy.append(sum(since) / len(since))
+            rows.append(evaluations[step])
+    names = [name for name in WATCHED if all(row.get(name) is not None for row in rows)]
+    curves = {name: [float(more_is_better(name, float(str(row[name])))) for row in rows] for name in names}
+    return hacked_metrics(proxy, curves, window=window)
+
+
+def alarm_scalars(alarms: Sequence[HackedMetric]) -> dict[str, float]:
+    """What metrics.jsonl says of the alarms: their number, and the slopes of the reward and of each score."""
+    found = {"hacked": float(len(alarms))}
+    for alarm in alarms:
+        found |= {"reward_slope": alarm.proxy_slope, f"hacked_{alarm.metric}": alarm.true_slope}
+    return found
+
+
+def alarms_of(line: Mapping[str, object]) -> list[HackedMetric]:
+    """The alarms in a line of metrics.jsonl."""
+    return [
+        HackedMetric(name, float(str(line["reward_slope"])), float(str(line[f"hacked_{name}"])))
+        for name in WATCHED if line.get(f"hacked_{name}") is not None
+    ]
+
+
+def alarm_text(alarms: Sequence[HackedMetric]) -> str:
+    """One sentence for the alarms of an evaluation; empty where there are none."""
+    if not alarms:
+        return ""
+    worse = ", ".join(f"{alarm.metric} by {-alarm.true_slope:.3g}" for alarm in alarms)
+    return (
+        f"the training reward rises by {alarms[0].proxy_slope:.3g} per evaluation while held-out scores get worse: "
+        f"{worse}; weigh them in, or stop earlier"
+    )
+
+
+def _step(line: Mapping[str, object]) -> int:
+    return int(str(line["step"]))

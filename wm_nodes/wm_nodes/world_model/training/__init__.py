@@ -1,0 +1,1 @@
+"""Training of the world models from demonstrations: tokenizer, dynamics, text model, position probe."""

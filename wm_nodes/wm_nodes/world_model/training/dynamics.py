@@ -1,0 +1,288 @@
+"""Train the world models by rolling them out. Shapes: B episodes, T steps, S tokens, D values per token, K done heads,
+J tasks, P probed values, R decoded frames.
+
+Multi-step training: from real frames the model runs on its own predictions, back-propagating through every step, and is
+compared with the recorded frames all along. A frame is real at the start and then every `rollout_steps` steps, at a
+phase of its own in each episode, so every recorded frame is used in every iteration whatever the rollout length.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.training.loop import LoopSettings, TrainingLoop
+from wm_nodes.world_model.conditions import ActionCondition
+from wm_nodes.world_model.dynamics import ActionModel
+from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.training.tokenizer import foreground_weight, probe_loss, probe_targets
+
+INPUT_NOISE = 0.05
+"""Standard deviation of noise on real input frames, against copying tokenizer detail."""
+HUBER_DELTA = 0.5
+MAX_TOKEN_WEIGHT = 4.0
+BOOTSTRAP_SHARE = 0.7
+"""Each done head learns from its own random share of the episodes, so that heads disagree where data are thin."""
+ENCODING_BATCH = 256
+DECODED_FRAMES = 2
+"""Predicted frames of each episode that are decoded and encoded again in an iteration (decoded_losses)."""
+
+
+@dataclass(frozen=True)
+class LatentEpisodes:
+    """Tokenised episodes.
+
+    latents: float16 (E, T + 1, S, D). mean_change_S: float32 (S,), mean absolute change of each token since the first
+    frame. images, states, actions, success, step_mask: as in EpisodeArrays. truth: float32 (E, T + 1, P), m.
+    """
+
+    images: Tensor
+    latents: Tensor
+    mean_change_S: Tensor
+    states: Tensor
+    actions: Tensor
+    success: Tensor
+    truth: Tensor
+    step_mask: Tensor
+
+    def __len__(self) -> int:
+        return len(self.latents)
+
+
+@dataclass(frozen=True)
+class RolloutTerms:
+    """What a training rollout gave, of frames 1..T.
+
+    next_latents (B, T, S, D). positions (B, T, P), in the probe's units. done_logits (B, T, K, J).
+    """
+
+    next_latents: Tensor
+    positions: Tensor
+    done_logits: Tensor
+
+
+def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEpisodes:
+    """Encode every frame once."""
+    flat = episodes.images.reshape(-1, *episodes.images.shape[2:])
+    pieces = [tokenizer.encode(flat[i : i + ENCODING_BATCH]).half() for i in range(0, len(flat), ENCODING_BATCH)]
+    latents = torch.cat(pieces).clone().reshape(*episodes.images.shape[:2], *pieces[0].shape[1:])
+    change = (latents[:, 1:].float() - latents[:, :1].float()).abs().mean(-1).mean((0, 1))
+    return LatentEpisodes(
+        images=torch.from_numpy(episodes.images),
+        latents=latents,
+        mean_change_S=change,
+        states=torch.from_numpy(episodes.states),
+        actions=torch.from_numpy(episodes.actions),
+        success=torch.from_numpy(episodes.success),
+        truth=torch.from_numpy(probe_targets(episodes.ground_truth)),
+        step_mask=torch.from_numpy(episodes.step_mask),
+    )
+
+
+def train_action_model(
+    tokenizer: Tokenizer,
+    episodes: EpisodeArrays | LatentEpisodes,
+    config: RunConfig,
+    seed: int,
+    run_dir: Path | None,
+    *,
+    progress: bool = True,
+    max_seconds: float = 0.0,
+    model: ActionModel | None = None,
+    done_loss: str = "bce",
+    name: str = "action_model",
+) -> tuple[ActionModel, dict[str, float]]:
+    """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
+
+    Loss (E4): latents + world_model.done_weight * done + world_model.state_weight * positions (those the model says,
+    and those the tokenizer's frozen probe reads off the predicted latents) + world_model.decoded_weight *
+    decoded_losses. `model` continues from given weights (online rounds).
+    """
+    data = episodes if isinstance(episodes, LatentEpisodes) else tokenise_episodes(tokenizer, episodes)
+    settings = config.world_model
+    if model is None:
+        model = new_action_model(tokenizer, data, config, seed)
+    tokenizer.requires_grad_(False)
+    trained = model
+    heads = bootstrap_masks(len(data), settings.num_done_heads, seed)
+
+    def loss(iteration: int) -> dict[str, Tensor]:
+        rows = numpy_stream(seed, f"{name}_batch", iteration).integers(0, len(data), settings.batch_size)
+        steps = rollout_steps_at(iteration, settings.num_iterations, settings.rollout_steps)
+        index = torch.from_numpy(rows)
+        with compute_context(tokenizer.device):
+            terms = unroll(trained, tokenizer, data, index, steps, torch_stream(seed, f"{name}_noise", iteration))
+            losses = rollout_losses(terms, tokenizer, data, index, heads[index], config, done_loss)
+            if settings.decoded_weight:
+                generator = torch_stream(seed, f"{name}_decoded", iteration)
+                losses |= decoded_losses(terms, tokenizer, data, index, config, generator)
+                losses["loss"] = losses["loss"] + settings.decoded_weight * sum(
+                    losses[key] for key in ("pixel", "recoded", "recoded_state")
+                )
+            return losses | {"rollout_steps": torch.tensor(float(steps))}
+
+    loop = TrainingLoop(
+        name, trained, LoopSettings(settings.num_iterations, settings.learning_rate, max_seconds=max_seconds), run_dir
+    )
+    metrics = loop.run(loss, progress=progress)
+    return trained, metrics
+
+
+def new_action_model(tokenizer: Tokenizer, data: LatentEpisodes, config: RunConfig, seed: int) -> ActionModel:
+    """A freshly initialised model whose state normalisation fits the data."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(numpy_stream(seed, "action_model_init").integers(2**31))
+        model = ActionModel(
+            config.world_model,
+            num_tokens=tokenizer.num_tokens,
+            latent_dim=tokenizer.latent_dim,
+            action_dim=data.actions.shape[-1],
+            state_dim=data.states.shape[-1],
+            num_tasks=data.success.shape[-1],
+        )
+    fit_state_range(model.condition, data)
+    return model
+
+
+def fit_state_range(condition: ActionCondition, data: LatentEpisodes) -> None:
+    """Let the condition's states span [-1, 1] over the data."""
+    states = data.states.flatten(0, 1)
+    condition.state_mean.copy_((states.amax(0) + states.amin(0)) / 2)
+    condition.state_scale.copy_(((states.amax(0) - states.amin(0)) / 2).clamp_min(1e-3))
+
+
+def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> int:
+    """Imagined steps between real frames at this iteration: the stages in equal shares of the training."""
+    return stages[min(len(stages) - 1, iteration * len(stages) // max(1, num_iterations))]
+
+
+def unroll(
+    model: ActionModel,
+    tokenizer: Tokenizer,
+    data: LatentEpisodes,
+    index: Tensor,
+    rollout_steps: int,
+    generator: torch.Generator,
+) -> RolloutTerms:
+    """Roll the model out over whole episodes `index`, on its own predictions between real frames."""
+    real = data.latents[index].float()
+    states, actions = data.states[index], data.actions[index]
+    num_steps = actions.shape[1]
+    noisy = tokenizer.normalise(real[:, :-1] + INPUT_NOISE * torch.randn(real[:, :-1].shape, generator=generator))
+    phase = torch.randint(0, rollout_steps, (len(index), 1), generator=generator)
+    anchors = (torch.arange(num_steps) + phase) % rollout_steps == 0
+    if rollout_steps >= num_steps:
+        anchors = torch.zeros_like(anchors)
+    anchors[:, 0] = True
+    condition = model.condition(actions, states[:, :-1], states[:, 1:])
+    if bool(anchors.all()):
+        prediction = model.predict(noisy, condition)
+        one_step = tokenizer.normalise(noisy + prediction.change_BTSD)
+        return RolloutTerms(one_step, prediction.positions_BTQ, prediction.done_logits_BTKJ)
+    caches = model.trunk.new_caches()
+    frames, positions, logits = list[Tensor](), list[Tensor](), list[Tensor]()
+    current = noisy[:, :1]
+    for t in range(num_steps):
+        prediction = model.predict(current, condition[:, t : t + 1], caches)
+        frame = tokenizer.normalise(current + prediction.change_BTSD)
+        frames.append(frame)
+        positions.append(prediction.positions_BTQ)
+        logits.append(prediction.done_logits_BTKJ)
+        if t + 1 < num_steps:
+            current = torch.where(anchors[:, t + 1, None, None, None], noisy[:, t + 1 : t + 2], frame)
+    return RolloutTerms(torch.cat(frames, 1), torch.cat(positions, 1), torch.cat(logits, 1))
+
+
+def rollout_losses(
+    terms: RolloutTerms,
+    tokenizer: Tokenizer,
+    data: LatentEpisodes,
+    index: Tensor,
+    head_mask_BK: Tensor,
+    config: RunConfig,
+    done_loss: str = "bce",
+) -> dict[str, Tensor]:
+    """The training losses (E2 for continuous latents, E3, E4) over the recorded steps."""
+    target = data.latents[index].float()
+    mask = data.step_mask[index].float()
+    weight = token_weights(target, data.mean_change_S) * mask[..., None]
+    errors = F.huber_loss(terms.next_latents, target[:, 1:], delta=HUBER_DELTA, reduction="none").mean(-1)
+    losses = {"latent": (errors * weight).sum() / weight.sum()}
+    labels = data.success[index][:, 1:].float()
+    losses["done"] = done_losses(terms.done_logits, labels, mask[:, :, None] * head_mask_BK[:, None], done_loss)
+    probed = tokenizer.read_state_normalised(terms.next_latents.flatten(0, 1))
+    truth = torch.where(mask[..., None] > 0, data.truth[index][:, 1:], torch.nan).flatten(0, 1)
+    losses["state"] = probe_loss(tokenizer, probed, truth)
+    losses["position"] = probe_loss(tokenizer, terms.positions.flatten(0, 1), truth)
+    settings = config.world_model
+    losses["loss"] = (
+        losses["latent"]
+        + settings.done_weight * losses["done"]
+        + settings.state_weight * (losses["state"] + losses["position"])
+    )
+    return losses
+
+
+def decoded_losses(
+    terms: RolloutTerms,
+    tokenizer: Tokenizer,
+    data: LatentEpisodes,
+    index: Tensor,
+    config: RunConfig,
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """What the policy will see: DECODED_FRAMES predicted frames of each episode are decoded and encoded again.
+
+    pixel: foreground-weighted L1 against the recorded image. recoded: as the latent loss, after the round trip.
+    recoded_state: positions that the frozen probe reads after the round trip. Between encoder images, latents that
+    predict well may still decode to a blur from which nobody can read positions.
+    """
+    steps = (
+        torch.rand(len(index), DECODED_FRAMES, generator=generator) * data.step_mask[index].sum(1, keepdim=True)
+    ).long()
+    rows = torch.arange(len(index)).unsqueeze(1).expand_as(steps).flatten()
+    steps, episodes = steps.flatten(), index[rows]
+    wanted = tokenizer.to_pixels(data.images[episodes, steps + 1])
+    pixels_R3HW = tokenizer.decode_pixels(terms.next_latents[rows, steps])
+    weight = foreground_weight(wanted, tokenizer.background, config.tokenizer.foreground_weight)
+    recoded = tokenizer.bottleneck(tokenizer.features(pixels_R3HW.clamp(0, 1)))
+    errors = F.huber_loss(recoded, data.latents[episodes, steps + 1].float(), delta=HUBER_DELTA, reduction="none")
+    probed = tokenizer.read_state_normalised(recoded)
+    return {
+        "pixel": (weight * (pixels_R3HW - wanted).abs()).mean() / weight.mean(),
+        "recoded": errors.mean(),
+        "recoded_state": probe_loss(tokenizer, probed, data.truth[episodes, steps + 1]),
+    }
+
+
+def token_weights(latents_BTSD: Tensor, mean_change_S: Tensor) -> Tensor:
+    """(B, T, S) weights of the tokens of frames 1..T: up to MAX_TOKEN_WEIGHT where a token has changed, since the first
+    frame, more than it does on average."""
+    change = (latents_BTSD[:, 1:] - latents_BTSD[:, :1]).abs().mean(-1)
+    return 0.5 + 0.5 * (change / mean_change_S.clamp_min(1e-3)).clamp(max=2 * MAX_TOKEN_WEIGHT)
+
+
+def done_losses(logits_BTKJ: Tensor, labels_BTJ: Tensor, mask_BTK: Tensor, kind: str = "bce") -> Tensor:
+    """kind "rmse": E3, the root of the mean squared error; "bce": binary cross-entropy on the same labels."""
+    labels = labels_BTJ.unsqueeze(2).expand_as(logits_BTKJ)
+    weight = mask_BTK.unsqueeze(-1).expand_as(logits_BTKJ)
+    if kind == "rmse":
+        squared = (logits_BTKJ.sigmoid() - labels).square()
+        return ((squared * weight).sum() / weight.sum().clamp_min(1) + 1e-8).sqrt()
+    if kind != "bce":
+        raise ValueError(f"done_loss must be 'bce' or 'rmse', got {kind!r}")
+    entropy = F.binary_cross_entropy_with_logits(logits_BTKJ, labels, reduction="none")
+    return (entropy * weight).sum() / weight.sum().clamp_min(1)
+
+
+def bootstrap_masks(num_episodes: int, num_heads: int, seed: int) -> Tensor:
+    """Float (E, K), 1 where head k learns from episode e; with one head every episode counts."""
+    if num_heads == 1:
+        return torch.ones(num_episodes, 1)
+    return (torch.rand(num_episodes, num_heads, generator=torch_stream(seed, "bootstrap")) < BOOTSTRAP_SHARE).float()

@@ -1,0 +1,57 @@
+"""Train the judge's position probe on recorded images. Shapes: B images, P positions (PROBE_NAMES)."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.training.loop import LoopSettings, TrainingLoop
+from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.training.tokenizer import probe_targets
+
+LEARNING_RATE = 1.0e-3
+PIXEL_NOISE = 0.02
+HUBER_DELTA = 0.5
+
+
+def train_position_probe(
+    episodes: EpisodeArrays, config: RunConfig, seed: int, run_dir: Path | None, *, progress: bool = True
+) -> tuple[PositionProbe, dict[str, float]]:
+    """As many iterations as the tokenizer; half of each batch is blurred, as imagined frames are, so that a blur alone
+    does not read as a wrong place. Returns the probe (averaged weights) and its last metrics (m).
+
+    Raises:
+        ValueError: a position is unknown (NaN) in every recorded frame.
+    """
+    height, width = episodes.images.shape[2:4]
+    images = episodes.images.reshape(-1, height, width, 3)
+    truth = probe_targets(episodes.ground_truth.reshape(len(images), -1))
+    frames = np.flatnonzero(episodes.frame_mask.reshape(-1) & np.isfinite(truth).all(-1))
+    if not len(frames):
+        raise ValueError("no recorded frame has ground truth; the judge's probe needs simulator episodes")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(numpy_stream(seed, "position_probe_init").integers(2**31))
+        probe = PositionProbe(height, width)
+    probe.mean.copy_(torch.from_numpy(truth[frames].mean(0)))
+    probe.std.copy_(torch.from_numpy(truth[frames].std(0)).clamp_min(1e-4))
+
+    def loss(iteration: int) -> dict[str, Tensor]:
+        rows = numpy_stream(seed, "position_probe_batch", iteration).choice(frames, config.tokenizer.batch_size)
+        pixels = torch.from_numpy(images[rows]).permute(0, 3, 1, 2).float() / 255
+        half = len(rows) // 2
+        pixels = torch.cat((pixels[:half], F.avg_pool2d(pixels[half:], 3, 1, 1, count_include_pad=False)))
+        noise = torch.randn(pixels.shape, generator=torch_stream(seed, "position_probe_noise", iteration))
+        wanted = (torch.from_numpy(truth[rows]) - probe.mean) / probe.std
+        read = probe(pixels + PIXEL_NOISE * noise)
+        return {
+            "loss": F.huber_loss(read, wanted, delta=HUBER_DELTA),
+            "error_m": ((read.detach() - wanted) * probe.std).abs().mean(),
+        }
+
+    loop = TrainingLoop("position_probe", probe, LoopSettings(config.tokenizer.num_iterations, LEARNING_RATE), run_dir)
+    return probe, loop.run(loss, progress=progress)

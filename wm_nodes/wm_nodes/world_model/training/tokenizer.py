@@ -1,0 +1,116 @@
+"""Train the frame codec. Shapes: B frames, H W 3 image, S tokens, D values per token, P probed values."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.core.specs import GROUND_TRUTH_NAMES
+from wm_nodes.core.types import FloatArray
+from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.training.loop import LoopSettings, TrainingLoop
+from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.quantizer import entropy_loss
+from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
+
+LATENT_NOISE = 0.1
+"""Standard deviation of the noise on continuous latents while training; their own is 1."""
+BACKGROUND_FRAMES = 256
+FOREGROUND_CONTRAST = 0.25
+"""A pixel counts as fully foreground when a channel differs from the background by this much, of [0, 1]."""
+PROBE_WEIGHT = 0.1
+
+
+def train_tokenizer(
+    episodes: EpisodeArrays,
+    config: RunConfig,
+    seed: int,
+    run_dir: Path | None,
+    *,
+    progress: bool = True,
+    max_seconds: float = 0.0,
+    tokenizer: Tokenizer | None = None,
+) -> tuple[Tokenizer, dict[str, float]]:
+    """Train on every recorded frame; returns the tokenizer (averaged weights) and its last metrics.
+
+    Loss: L1 + 2 L2 on pixels, foreground weighed 1 + tokenizer.foreground_weight; a probe that reads object and tool
+    positions off the latents (its gradient reaches the encoder, so small objects stay encoded); for lfq the entropy and
+    commitment terms.
+    """
+    settings = config.tokenizer
+    height, width = episodes.images.shape[2:4]
+    frames = np.flatnonzero(episodes.frame_mask)
+    images = episodes.images.reshape(-1, height, width, 3)
+    truth = probe_targets(episodes.ground_truth.reshape(len(images), -1))
+    if tokenizer is None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(numpy_stream(seed, "tokenizer_init").integers(2**31))
+            tokenizer = Tokenizer(settings, height, width)
+        _set_statistics(tokenizer, images[frames], truth[frames], seed)
+    codec = tokenizer
+
+    def loss(iteration: int) -> dict[str, Tensor]:
+        rows = numpy_stream(seed, "tokenizer_batch", iteration).choice(frames, settings.batch_size)
+        pixels = codec.to_pixels(images[rows])
+        noise = torch.randn(
+            (len(rows), codec.num_tokens, codec.latent_dim), generator=torch_stream(seed, "latent_noise", iteration)
+        )
+        with compute_context(codec.device):
+            features = codec.features(pixels)
+            latents = codec.bottleneck(features)
+            noisy = latents + LATENT_NOISE * noise.to(latents.device) if codec.kind == "continuous" else latents
+            reconstruction = codec.decode_pixels(noisy)
+            probed = codec.read_state_normalised(noisy)
+        error = reconstruction - pixels
+        weight = foreground_weight(pixels, codec.background, settings.foreground_weight)
+        terms = {"pixel": (weight * (error.abs() + 2 * error.square())).mean() / weight.mean()}
+        terms["probe"] = probe_loss(codec, probed, torch.from_numpy(truth[rows]).to(codec.device))
+        terms["loss"] = terms["pixel"] + PROBE_WEIGHT * terms["probe"]
+        if codec.kind == "lfq":
+            terms["entropy"] = entropy_loss(features)
+            terms["commitment"] = (features - latents.detach()).square().mean()
+            terms["loss"] = (
+                terms["loss"]
+                + settings.entropy_weight * terms["entropy"]
+                + settings.commitment_weight * terms["commitment"]
+            )
+        terms["psnr_db"] = -10 * error.detach().square().mean().log10()
+        return terms
+
+    schedule = LoopSettings(settings.num_iterations, settings.learning_rate, max_seconds=max_seconds)
+    loop = TrainingLoop("tokenizer", codec, schedule, run_dir)
+    metrics = loop.run(loss, progress=progress)
+    return codec, metrics
+
+
+def foreground_weight(pixels_B3HW: Tensor, background_3HW: Tensor, extra: float) -> Tensor:
+    """(B, 1, H, W): 1 on the background, up to 1 + extra where a pixel differs from it."""
+    contrast = (pixels_B3HW - background_3HW).abs().amax(1, keepdim=True) / FOREGROUND_CONTRAST
+    return 1 + extra * contrast.clamp(max=1)
+
+
+def probe_targets(ground_truth: FloatArray) -> FloatArray:
+    """The values of PROBE_NAMES (..., P), in m, out of ground truth in the order of GROUND_TRUTH_NAMES."""
+    return np.ascontiguousarray(ground_truth[..., [GROUND_TRUTH_NAMES.index(name) for name in PROBE_NAMES]])
+
+
+def probe_loss(tokenizer: Tokenizer, probed_BP: Tensor, targets_BP: Tensor) -> Tensor:
+    """Huber loss of normalised positions; unknown (NaN) and constant values do not count."""
+    wanted = (targets_BP - tokenizer.probe_mean) / tokenizer.probe_std
+    known = torch.isfinite(wanted)
+    losses = torch.nn.functional.huber_loss(probed_BP, wanted.nan_to_num(), delta=0.5, reduction="none")
+    return (losses * known).sum() / known.sum().clamp_min(1)
+
+
+def _set_statistics(tokenizer: Tokenizer, images: np.ndarray, truth: FloatArray, seed: int) -> None:  # type: ignore[type-arg]
+    rows = numpy_stream(seed, "background").choice(len(images), min(BACKGROUND_FRAMES, len(images)), replace=False)
+    median = np.median(images[rows].astype(np.float32), 0) / 255
+    tokenizer.background.copy_(torch.from_numpy(median.astype(np.float32)).permute(2, 0, 1))
+    known = np.where(np.isfinite(truth), truth, np.nan)
+    if np.isfinite(known).any():
+        tokenizer.probe_mean.copy_(torch.from_numpy(np.nan_to_num(np.nanmean(known, 0)).astype(np.float32)))
+        spread = np.nan_to_num(np.nanstd(known, 0), nan=1.0).astype(np.float32)
+        tokenizer.probe_std.copy_(torch.from_numpy(np.where(spread < 1e-4, 1.0, spread)))

@@ -1,0 +1,208 @@
+"""Does the action model deserve to be trained in? Open-loop rollouts of held-out episodes against what really happened.
+
+Shapes: E episodes, T steps, S tokens, D values per token, J tasks, P probed values (PROBE_NAMES).
+
+Positions are read off pictures, by the judge's own probe (world_model/position_probe.py), which was trained on real
+frames only and through which no loss of the world model ever passed. Where a model folder has none, predicted frames
+are encoded again and read by the tokenizer's probe. The reader's own error on real held-out frames is reported as the
+floor, and copying the first frame is measured in the same way.
+"""
+
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
+from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.world_model.dynamics import ActionModel, done_signal
+from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.token_dynamics import TokenActionModel
+from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
+from wm_nodes.world_model.training.tokenizer import probe_targets
+
+HORIZONS = (1, 2, 4, 8, 12, 16)
+MOVED_M = 0.01
+"""An object counts as moved when it ends this far from where it began."""
+BATCH = 64
+OBJECT = [PROBE_NAMES.index(name) for name in ("cube_x", "cube_y")]
+TOOL = [PROBE_NAMES.index(name) for name in ("tool_x", "tool_y", "tool_z")]
+
+
+@dataclass(frozen=True)
+class ImaginedEpisodes:
+    """Rollouts of recorded actions from recorded first frames.
+
+    frames: uint8 (E, T, H, W, 3), frames 1..T. signals: float32 (E, T, J), pessimistic done probability of frames 1..T.
+    uncertainty: float32 (E, T, J).
+    """
+
+    frames: UInt8Array
+    signals: FloatArray
+    uncertainty: FloatArray
+
+
+@torch.inference_mode()
+def imagine_episodes(
+    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays
+) -> ImaginedEpisodes:
+    """Roll the recorded actions out from the recorded first frames, in batches."""
+    images, actions, states = episodes.images[:, 0], episodes.actions, episodes.states
+    rows = [slice(i, i + BATCH) for i in range(0, len(episodes), BATCH)]
+    parts = [imagine(tokenizer, model, images[row], actions[row], states[row]) for row in rows]
+    names = [field.name for field in fields(ImaginedEpisodes)]
+    return ImaginedEpisodes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+@torch.inference_mode()
+def imagine(
+    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, images: UInt8Array, actions: FloatArray,
+    states: FloatArray,
+) -> ImaginedEpisodes:
+    """Roll actions out, all at once.
+
+    Args:
+        images: uint8 (E, H, W, 3), first frames. actions: (E, T, A). states: (E, T + 1, S), commanded.
+    """
+    told, commanded = torch.from_numpy(actions), torch.from_numpy(states)
+    current = tokenizer.encode(images)
+    caches = model.trunk.new_ring_caches(len(images), current.device)
+    frames, signals, spreads = list[Tensor](), list[Tensor](), list[Tensor]()
+    for t in range(actions.shape[1]):
+        with compute_context(current.device):
+            current, logits = model.advance(current, told[:, t], commanded[:, t], commanded[:, t + 1], caches)
+        signal, spread = done_signal(logits)
+        frames.append(tokenizer.decode(current))
+        signals.append(signal)
+        spreads.append(spread)
+    return ImaginedEpisodes(*(torch.stack(listed, 1).numpy() for listed in (frames, signals, spreads)))
+
+
+def evaluate_rollouts(
+    tokenizer: Tokenizer,
+    model: ActionModel | TokenActionModel,
+    episodes: EpisodeArrays,
+    *,
+    threshold: float = 0.7,
+    probe: PositionProbe | None = None,
+) -> dict[str, float]:
+    """Metrics by name (see docs/metrics.md); positions in cm, PSNR in dB, `_hNN` at step NN.
+
+    object_/tool_: mean error of `rollout`, of the probe on real frames (`floor`), of the first frame (`copy`), and
+    rollout / copy (`ratio`). object_moved_: over the episodes whose object moved. done_<task>_: episodes counted as
+    successful when the signal exceeds `threshold` anywhere, against success anywhere in the recording.
+    """
+    imagined = imagine_episodes(tokenizer, model, episodes)
+    truth = probe_targets(episodes.ground_truth)
+    read = probe.read if probe else partial(_read_frames, tokenizer)
+    real, told = read(episodes.images), read(imagined.frames)
+    moved = np.linalg.norm(truth[:, -1, OBJECT] - truth[:, 0, OBJECT], axis=-1) > MOVED_M
+    metrics: dict[str, float] = {"episodes": float(len(episodes)), "moved_share": float(moved.mean())}
+    for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
+        rows = episodes.lengths >= horizon
+        if not rows.any():
+            continue
+        label = f"h{horizon:02d}"
+        metrics |= _picture_metrics(tokenizer, imagined, episodes, rows, horizon, label)
+        estimates = {"rollout": told[:, horizon - 1], "floor": real[:, horizon], "copy": real[:, 0]}
+        for name, columns, chosen in (
+            ("object", OBJECT, rows), ("object_moved", OBJECT, rows & moved), ("tool", TOOL, rows),
+        ):
+            metrics |= _position_metrics(estimates, truth[:, horizon], columns, chosen, f"{name}_{{}}_{label}")
+    frame_mask = episodes.step_mask
+    for j, task in enumerate(episodes.tasks):
+        happened = (episodes.success[:, 1:, j] & frame_mask).any(1)
+        signal = np.where(frame_mask, imagined.signals[..., j], 0).max(1)
+        found = detection_metrics(signal, happened, threshold)
+        metrics |= {f"done_{task}_{key}": value for key, value in found.items()}
+        metrics[f"done_{task}_uncertainty_p99"] = float(np.quantile(imagined.uncertainty[..., j][frame_mask], 0.99))
+    return metrics
+
+
+def detection_metrics(scores: FloatArray, positive: BoolArray, threshold: float) -> dict[str, float]:
+    """Precision, recall and agreement of scores > threshold, AUC, and both rates; NaN where undefined."""
+    fired = scores > threshold
+    hits = float((fired & positive).sum())
+    return {
+        "precision": hits / fired.sum() if fired.any() else float("nan"),
+        "recall": hits / positive.sum() if positive.any() else float("nan"),
+        "agreement": float((fired == positive).mean()),
+        "auc": auc(scores, positive),
+        "imagined_rate": float(fired.mean()),
+        "real_rate": float(positive.mean()),
+    }
+
+
+def auc(scores: NDArray[np.floating[Any]], positive: BoolArray) -> float:
+    """Probability that a positive outscores a negative, ties counting half; NaN without both kinds."""
+    if positive.all() or not positive.any():
+        return float("nan")
+    above, below = scores[positive][:, None], scores[~positive][None]
+    return float((above > below).mean() + 0.5 * (above == below).mean())
+
+
+def format_rollouts(metrics: dict[str, float]) -> str:
+    """The metrics as a small text table, one line per step."""
+    labels = sorted({key.rsplit("_", 1)[1] for key in metrics if key.startswith("object_rollout_cm")})
+    lines = ["step   PSNR roll/recon/copy    object cm roll/floor/copy   moved roll/copy   tool cm roll/floor/copy"]
+    for label in labels:
+        m = {key.removesuffix(f"_{label}"): value for key, value in metrics.items() if key.endswith(label)}
+        lines.append(
+            f"{label}    {m['psnr_rollout_db']:5.1f} {m['psnr_recon_db']:5.1f} {m['psnr_copy_db']:5.1f}       "
+            f"{m['object_rollout_cm']:5.2f} {m['object_floor_cm']:5.2f} {m['object_copy_cm']:5.2f}          "
+            f"{m['object_moved_rollout_cm']:5.2f} {m['object_moved_copy_cm']:5.2f}      "
+            f"{m['tool_rollout_cm']:5.2f} {m['tool_floor_cm']:5.2f} {m['tool_copy_cm']:5.2f}"
+        )
+    for key in sorted(key for key in metrics if key.startswith("done_")):
+        lines.append(f"{key} {metrics[key]:.3f}")
+    return "\n".join(lines)
+
+
+def _position_metrics(
+    estimates: dict[str, FloatArray], truth_EP: FloatArray, columns: list[int], rows: BoolArray, pattern: str
+) -> dict[str, float]:
+    name, label = pattern.split("_{}_")
+    errors = {
+        key: 100 * np.linalg.norm(value[rows][:, columns] - truth_EP[rows][:, columns], axis=-1)
+        for key, value in estimates.items()
+    }
+    metrics = {f"{name}_{key}_cm_{label}": _mean(value) for key, value in errors.items()}
+    metrics[f"{name}_rollout_median_cm_{label}"] = float(np.median(errors["rollout"])) if rows.any() else float("nan")
+    copied = metrics[f"{name}_copy_cm_{label}"]
+    metrics[f"{name}_ratio_{label}"] = metrics[f"{name}_rollout_cm_{label}"] / copied if copied > 0 else float("nan")
+    return metrics
+
+
+def _picture_metrics(
+    tokenizer: Tokenizer, imagined: ImaginedEpisodes, episodes: EpisodeArrays, rows: BoolArray, horizon: int, label: str
+) -> dict[str, float]:
+    wanted = episodes.images[rows, horizon]
+    shown = {
+        "rollout": imagined.frames[rows, horizon - 1],
+        "recon": tokenizer.decode(tokenizer.encode(wanted)).numpy(),
+        "copy": episodes.images[rows, 0],
+    }
+    return {f"psnr_{key}_db_{label}": psnr(value, wanted) for key, value in shown.items()}
+
+
+def psnr(images: UInt8Array, others: UInt8Array) -> float:
+    """Peak signal-to-noise ratio in dB, mean over images (B, H, W, 3)."""
+    squared = ((images.astype(np.float32) - others.astype(np.float32)) ** 2).reshape(len(images), -1).mean(1)
+    return float((10 * np.log10(255**2 / np.maximum(squared, 1e-3))).mean())
+
+
+def _read_frames(tokenizer: Tokenizer, images_ETHW3: UInt8Array) -> FloatArray:
+    flat = images_ETHW3.reshape(-1, *images_ETHW3.shape[2:])
+    with torch.inference_mode():
+        parts = [tokenizer.read_state(tokenizer.encode(flat[i : i + 256])) for i in range(0, len(flat), 256)]
+    positions: FloatArray = torch.cat(parts).numpy().reshape(*images_ETHW3.shape[:2], -1)
+    return positions
+
+
+def _mean(values: NDArray[np.floating[Any]]) -> float:
+    return float(values.mean()) if len(values) else float("nan")
