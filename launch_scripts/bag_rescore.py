@@ -3,9 +3,9 @@
 
 import sys
 
-import wm_setup
+from setup.entry import ensure
 
-wm_setup.ensure()
+ensure()
 
 from wm_nodes.apps.rescore_rewards import main  # noqa: E402
 

@@ -6,10 +6,10 @@ python3 launch_scripts/benchmark_dyndiff.py CLAIM [--json FILE]      # the claim
 
 import sys
 
-import wm_setup
+from setup.entry import ensure
 
 if __name__ == "__main__":
-    wm_setup.ensure()
+    ensure()
     from benchmarks.video_rl.cli import main
 
     raise SystemExit(main(sys.argv[1:]))

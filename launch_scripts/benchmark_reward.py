@@ -5,10 +5,10 @@ python3 launch_scripts/benchmark_reward.py table|efficiency|hacking|comparisons 
 
 import sys
 
-import wm_setup
+from setup.entry import ensure
 
 if __name__ == "__main__":
-    wm_setup.ensure()
+    ensure()
     from benchmarks.judge.cli import main
 
     raise SystemExit(main(sys.argv[1:]))

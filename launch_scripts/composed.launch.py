@@ -8,9 +8,9 @@ def generate_launch_description():
 
 
 if __name__ == "__main__":
-    import wm_setup
+    from setup.entry import ensure
 
-    wm_setup.ensure()
+    ensure()
     from wm_nodes.launching.runner import main
 
     raise SystemExit(main("composed"))

@@ -5,10 +5,10 @@ python3 launch_scripts/doctor.py [--video-model FOLDER --context-bags BAG ... | 
 
 import sys
 
-import wm_setup
+from setup.entry import ensure
 
 if __name__ == "__main__":
-    wm_setup.ensure()
+    ensure()
     from wm_nodes.apps.check_video_model import main
 
     raise SystemExit(main(sys.argv[1:]))

@@ -5,10 +5,10 @@ python3 launch_scripts/make_adversarial_set.py FOLDER --benchmark
 
 import sys
 
-import wm_setup
+from setup.entry import ensure
 
 if __name__ == "__main__":
-    wm_setup.ensure()
+    ensure()
     from wm_nodes.judge.dataset.build import main
 
     raise SystemExit(main(sys.argv[1:]))

@@ -5,10 +5,10 @@ python3 launch_scripts/online_rl.py [--preset P] [--task T] ...     # --help lis
 
 import sys
 
-import wm_setup
+from setup.entry import ensure
 
 if __name__ == "__main__":
-    wm_setup.ensure()
+    ensure()
     from wm_nodes.apps.train_policy import main
 
     raise SystemExit(main(sys.argv[1:]))

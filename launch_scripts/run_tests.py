@@ -16,8 +16,8 @@ import sys
 import time
 from pathlib import Path
 
-import wm_setup
-from setup_steps import system
+from setup import system
+from setup.entry import ensure
 
 ROOT = Path(__file__).resolve().parents[1]
 LAST_FAILED = Path(".pytest_cache/v/cache/lastfailed")
@@ -86,5 +86,5 @@ def _environment():
 if __name__ == "__main__":
     if {"-h", "--help"} & {*sys.argv[1:]}:
         raise SystemExit(print(__doc__.rstrip()))
-    wm_setup.ensure()
+    ensure()
     raise SystemExit(main(sys.argv[1:]))

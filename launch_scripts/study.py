@@ -5,10 +5,10 @@ python3 launch_scripts/study.py [--tasks ...] [--seeds ...] [--arms ...]     # -
 
 import sys
 
-import wm_setup
+from setup.entry import ensure
 
 if __name__ == "__main__":
-    wm_setup.ensure()
+    ensure()
     from wm_nodes.apps.seed_study import main
 
     raise SystemExit(main(sys.argv[1:]))

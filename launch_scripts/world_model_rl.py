@@ -7,10 +7,10 @@ python3 launch_scripts/world_model_rl.py retrain RUN          # train on them ag
 
 import sys
 
-import wm_setup
+from setup.entry import ensure
 
 if __name__ == "__main__":
-    wm_setup.ensure()
+    ensure()
     from wm_nodes.apps.train_video_model import main
 
     raise SystemExit(main(sys.argv[1:]))

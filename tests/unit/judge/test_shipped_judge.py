@@ -36,7 +36,7 @@ def test_it_is_small_says_how_it_was_made_and_knows_its_evidence() -> None:
     assert set(head.names) == {*EVIDENCE, *reading_names()} and len(head.readers) == FOLDS
     assert set(head.story["tasks"]) == set(TASKS)
     assert {"made", "data", "seed", "segmenter", "trees", "validation"} <= head.story.keys()
-    assert head.story["made"]["command"].startswith("python -m wm_nodes.learning.train_judge"), "of the commit that made it"
+    assert head.story["made"]["command"].startswith("python -m wm_nodes.learning.train_judge"), "of its commit"
     card = EmbeddedJudge(head).card
     assert "96 x 96 px" in card and all(name in card for name in head.questions)
 

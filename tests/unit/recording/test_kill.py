@@ -75,7 +75,8 @@ def credit(number: int) -> bytes:
 
 def kill_while_it_writes(script: str, bag: Path, seconds: float) -> list[str]:
     """Run the script, kill -9 after its first line plus `seconds`; return its lines."""
-    environment = {**os.environ, "PYTHONPATH": f"{TESTS}:{TESTS / 'unit' / 'recording'}:{os.environ.get('PYTHONPATH', '')}"}
+    folders = f"{TESTS}:{TESTS / 'unit' / 'recording'}"
+    environment = {**os.environ, "PYTHONPATH": f"{folders}:{os.environ.get('PYTHONPATH', '')}"}
     with subprocess.Popen(
         [sys.executable, "-c", script, str(bag)], env=environment, stdout=subprocess.PIPE, text=True
     ) as process:

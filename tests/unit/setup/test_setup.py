@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 import run_tests
 
-import wm_setup
-from setup_steps import interpreter, messages, packages, stamp
-from setup_steps.console import SetupError, isolated_environment, run
+from setup import entry, interpreter, messages, packages, stamp
+from setup.console import SetupError, isolated_environment, run
 
 
 def test_cmake_repair_replaces_the_wheel_builders_folders_and_nothing_else(tmp_path: Path) -> None:
@@ -71,42 +70,42 @@ def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name, text in {
         "requirements/core.txt": "numpy\n", "msgs_schema/CMakeLists.txt": "", "msgs_schema/package.xml": "",
         "msgs_schema/msg/A.msg": "uint8 a\n", "wm_nodes/setup.py": "", "wm_nodes/setup.cfg": "",
-        "wm_nodes/pyproject.toml": "", "launch_scripts/setup_steps/system.py": "", ".venv/bin/python": "",
+        "wm_nodes/pyproject.toml": "", "launch_scripts/setup/system.py": "", ".venv/bin/python": "",
         "ros2_ws/install/wm_msgs/share/wm_msgs/package.xml": "",
     }.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text(text)
-    monkeypatch.setattr(wm_setup, "ROOT", root)
-    monkeypatch.setattr(wm_setup, "REQUIREMENTS", root / "requirements")
-    monkeypatch.setattr(wm_setup, "MESSAGES", root / "msgs_schema")
-    monkeypatch.setattr(wm_setup, "PACKAGE", root / "wm_nodes")
-    monkeypatch.setattr(wm_setup, "WORKSPACE", root / "ros2_ws")
+    monkeypatch.setattr(entry, "ROOT", root)
+    monkeypatch.setattr(entry, "REQUIREMENTS", root / "requirements")
+    monkeypatch.setattr(entry, "MESSAGES", root / "msgs_schema")
+    monkeypatch.setattr(entry, "PACKAGE", root / "wm_nodes")
+    monkeypatch.setattr(entry, "WORKSPACE", root / "ros2_ws")
     venv = root / ".venv"
-    stamp.write_stamp(venv / "wm_setup_stamp.json", wm_setup._wanted(venv))
-    assert wm_setup.pending(venv) == []
+    stamp.write_stamp(venv / "wm_setup_stamp.json", entry._wanted(venv))
+    assert entry.pending(venv) == []
     return root
 
 
 def test_new_message_rebuilds_messages_only(tree: Path) -> None:
     (tree / "msgs_schema/msg/B.msg").write_text("uint8 b\n")
-    assert wm_setup.pending(tree / ".venv") == ["messages"]
+    assert entry.pending(tree / ".venv") == ["messages"]
 
 
 def test_new_requirement_redoes_all_that_stands_on_it(tree: Path) -> None:
     (tree / "requirements/core.txt").write_text("numpy\nscipy\n")
-    assert wm_setup.pending(tree / ".venv") == ["packages", "messages", "wm_nodes"]
+    assert entry.pending(tree / ".venv") == ["packages", "messages", "wm_nodes"]
 
 
 def test_lost_build_is_noticed_despite_the_stamp(tree: Path) -> None:
     (tree / "ros2_ws/install/wm_msgs/share/wm_msgs/package.xml").unlink()
-    assert wm_setup.pending(tree / ".venv") == ["messages"]
+    assert entry.pending(tree / ".venv") == ["messages"]
 
 
 def test_absent_renderer_is_not_tried_again_at_every_start(tree: Path) -> None:
     file = tree / ".venv/wm_setup_stamp.json"
     values = json.loads(file.read_text())
-    file.write_text(json.dumps({**values, "renderer": values["renderer"] + wm_setup.MISSING}))
-    assert wm_setup.pending(tree / ".venv") == []
+    file.write_text(json.dumps({**values, "renderer": values["renderer"] + entry.MISSING}))
+    assert entry.pending(tree / ".venv") == []
 
 
 def test_unsupported_python_is_named_with_the_remedy() -> None:
@@ -132,7 +131,7 @@ def test_a_pyenv_version_is_found_where_the_shim_on_path_does_not_work(tmp_path:
 def test_entry_points_are_readable_for_old_pythons(repository: Path) -> None:
     import ast
 
-    for name in ("wm_setup.py", "online_rl.py", "run_tests.py", "benchmark.py", "setup_steps/interpreter.py"):
+    for name in ("setup/entry.py", "online_rl.py", "run_tests.py", "setup/__main__.py", "setup/interpreter.py"):
         ast.parse((repository / "launch_scripts" / name).read_text(), feature_version=(3, 8))
 
 
@@ -197,7 +196,7 @@ def test_torch_version_is_compared_as_numbers(text: str, expected: tuple[int, in
 
 
 def test_check_of_the_live_tree_answers_quickly_and_changes_nothing(repository: Path) -> None:
-    command = [sys.executable, str(repository / "launch_scripts/wm_setup.py"), "--check"]
+    command = [sys.executable, str(repository / "launch_scripts/setup"), "--check"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.stdout.strip(), done.stderr
     assert "missing" in done.stdout or done.stdout.strip() == "complete"

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from setup_steps import system
-from setup_steps.console import SetupError
+from setup import system
+from setup.console import SetupError
 
 BOOKWORM = {"ID": "debian", "VERSION_CODENAME": "bookworm"}
 NOBLE = {"ID": "ubuntu", "VERSION_CODENAME": "noble"}

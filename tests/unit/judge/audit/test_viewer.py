@@ -14,7 +14,7 @@ from audit_logs import JudgeByClip, judge_all, moving_squares
 from browser import Page, browser
 from scripted_judge import BORDERLINE, CLEAN, POOR, UNUSABLE, WRONG, FaultyJudge, ScriptedJudge, clean_table
 
-from setup_steps.system import find_browser
+from setup.system import find_browser
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import Read, ReadRequest
 from wm_nodes.judge.audit.commands import main

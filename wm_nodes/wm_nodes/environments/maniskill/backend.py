@@ -98,5 +98,5 @@ def render_backend(device: str) -> str:
     raise NoRendererError(
         f"no renderer at {' or '.join(candidates)}: Vulkan finds no device. On a machine without a GPU install Mesa's "
         "lavapipe 24.3 or newer (Debian 12: mesa-vulkan-drivers from bookworm-backports) and libvulkan1; "
-        "launch_scripts/wm_setup.py does it when it may"
+        "launch_scripts/setup does it when it may"
     )

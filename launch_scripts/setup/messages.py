@@ -8,7 +8,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from setup_steps.console import SetupError, isolated_environment, run, say
+from setup.console import SetupError, isolated_environment, run, say
 
 WHEEL_INCLUDE = re.compile(r"/opt/python/cp3\d+-cp3\d+/include/python3\.\d+")
 WHEEL_NUMPY = re.compile(r"/opt/python/cp3\d+-cp3\d+/lib/python3\.\d+/site-packages/numpy/_?core/include")

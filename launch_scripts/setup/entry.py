@@ -1,9 +1,9 @@
 """Set up everything that the entry points of this folder need, once; later starts only compare a stamp.
 
-    python3 launch_scripts/wm_setup.py            # set up what is missing, then say what is there
-    python3 launch_scripts/wm_setup.py --check    # only say what is missing; exit code 1 if anything is
+    python3 launch_scripts/setup            # set up what is missing, then say what is there
+    python3 launch_scripts/setup --check    # only say what is missing; exit code 1 if anything is
 
-An entry point calls `wm_setup.ensure()` first: it returns inside the virtual environment's Python, starting the same
+An entry point calls `ensure()` first: it returns inside the virtual environment's Python, starting the same
 script again there if need be. $WM_VENV names another virtual environment than <repository>/.venv.
 """
 
@@ -14,7 +14,11 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+from setup import interpreter
+from setup.console import SetupError, isolated_environment, say
+from setup.stamp import fingerprint, python_version, read_stamp, write_stamp
+
+ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = ROOT / "requirements"
 MESSAGES = ROOT / "msgs_schema"
 PACKAGE = ROOT / "wm_nodes"
@@ -22,12 +26,6 @@ WORKSPACE = ROOT / "ros2_ws"
 MISSING = ":missing"
 """Suffix of the renderer's stamp where this user may not install system packages."""
 
-if str(ROOT / "launch_scripts") not in sys.path:
-    sys.path.insert(0, str(ROOT / "launch_scripts"))
-
-from setup_steps import interpreter  # noqa: E402  (the folder must be on sys.path first)
-from setup_steps.console import SetupError, isolated_environment, say  # noqa: E402
-from setup_steps.stamp import fingerprint, python_version, read_stamp, write_stamp  # noqa: E402
 
 
 def venv_folder():
@@ -78,7 +76,7 @@ def pending(venv):
 
 
 def _wanted(venv):
-    from setup_steps.messages import message_sources
+    from setup.messages import message_sources
 
     packages = fingerprint(REQUIREMENTS.glob("*.txt"), str(venv), python_version(venv))
     build_files = [PACKAGE / name for name in ("setup.py", "setup.cfg", "pyproject.toml")]
@@ -86,12 +84,12 @@ def _wanted(venv):
         "packages": packages,
         "messages": fingerprint(message_sources(MESSAGES), packages, str(ROOT)),
         "wm_nodes": fingerprint(build_files, packages, str(ROOT)),
-        "renderer": fingerprint([ROOT / "launch_scripts" / "setup_steps" / "system.py"]),
+        "renderer": fingerprint([ROOT / "launch_scripts" / "setup" / "system.py"]),
     }
 
 
 def _set_up(venv):
-    from setup_steps import messages, packages, system
+    from setup import messages, packages, system
 
     steps = pending(venv)
     if not steps:
@@ -117,11 +115,11 @@ def _set_up(venv):
 
 def _recheck_renderer(venv):
     """The last set-up could not install system packages: look whether they have arrived, and say so if not."""
-    from setup_steps import system
+    from setup import system
 
     plan = system.current_plan(system.nvidia_vulkan())
     if plan.packages:
-        say(f"still without {', '.join(plan.packages)}; `python3 launch_scripts/wm_setup.py --system` says what to do")
+        say(f"still without {', '.join(plan.packages)}; `python3 launch_scripts/setup --system` says what to do")
         return
     stamp = read_stamp(_stamp_file(venv))
     write_stamp(_stamp_file(venv), {**stamp, "renderer": stamp["renderer"].removesuffix(MISSING)})
@@ -154,7 +152,7 @@ def main():
         print("missing or out of date: " + ", ".join(steps) if steps else "complete")
         return int(bool(steps))
     if arguments.system:
-        from setup_steps import system
+        from setup import system
 
         log = ROOT / ".venv_setup.log"
         return int(not system.install(system.current_plan(system.nvidia_vulkan()), log))
@@ -169,7 +167,3 @@ def main():
     print(f"rclpy from {Path(rclpy.__file__).parent}, wm_msgs from {Path(wm_msgs.msg.__file__).parents[1]}")
     print(f"activate: source {venv_folder() / 'bin' / 'activate'}")
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -31,7 +31,7 @@ def unsupported_message(version: tuple[int, ...]) -> str:
         f"Python 3.11 or 3.12 is needed (the ROS 2 Jazzy wheels exist for these two), but this is {found} "
         f"({sys.executable}), and neither python3.11 nor python3.12 is on PATH or in ~/.pyenv/versions.\n"
         "  Debian 12 and Ubuntu 24.04 have a right one: apt-get install python3 python3-venv\n"
-        "  elsewhere, for example: pyenv install 3.12 && python3.12 launch_scripts/wm_setup.py"
+        "  elsewhere, for example: pyenv install 3.12 && python3.12 launch_scripts/setup"
     )
 
 

@@ -8,9 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from setup_steps.console import SetupError, isolated_environment, run, say
-from setup_steps.interpreter import supported
-from setup_steps.stamp import python_version
+from setup.console import SetupError, isolated_environment, run, say
+from setup.interpreter import supported
+from setup.stamp import python_version
 
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 MIN_TORCH = (2, 8)

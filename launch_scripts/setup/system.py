@@ -11,7 +11,7 @@ import sysconfig
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from setup_steps.console import SetupError, run, say
+from setup.console import SetupError, run, say
 
 MIN_MESA = (24, 3)
 """The first Mesa whose software renderer (lavapipe) has VK_KHR_external_memory_fd, which SAPIEN needs."""

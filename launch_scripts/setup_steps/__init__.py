@@ -1,1 +1,0 @@
-"""The steps of wm_setup.py, standard library only: interpreter, system packages, Python packages, messages, stamp."""
