@@ -1,15 +1,14 @@
-"""msgs_schema/README.md says what every field of every interface means, and READMEs link to what exists.
-
-`python tests/unit/test_setup_messages_readme.py` writes the README's tables anew from the interface files.
-"""
+"""msgs_schema/README.md has every interface with its QoS; interface files explain every field; links lead somewhere."""
 
 import re
 from pathlib import Path
 
 import pytest
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-KINDS = {"msg": "Messages", "srv": "Services", "action": "Actions"}
-PARTS = {"msg": (), "srv": ("Request", "Response"), "action": ("Goal", "Result", "Feedback")}
+from wm_nodes.ros.qos import TOPICS
+
+KINDS = ("msg", "srv", "action")
 FIELD = re.compile(r"^([\w/]+(?:\[\])?)\s+(\w+(?:=\S+)?)\s*(?:#\s*(.*))?$")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 NOT_OURS = {".venv", ".git", "runs", "build", "install", "log", "node_modules"}
@@ -32,32 +31,34 @@ def fields(path: Path) -> list[list[tuple[str, str, str]]]:
     return parts
 
 
-def page(path: Path, kind: str) -> str:
-    """One interface's section: its leading comment, then a row per field."""
-    lines = path.read_text().splitlines()
-    length = next((i for i, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    intro = " ".join(line.removeprefix("#").strip() for line in lines[:length])
-    rows = ["| Field | Type | Meaning |", "| --- | --- | --- |"]
-    for title, part in zip(PARTS[kind] or ("",), fields(path), strict=True):
-        if title:
-            rows.append(f"| **{title}** | | {'' if part else 'empty'} |")
-        for name, type_name, meaning in part:
-            rows.append(f"| `{name}` | `{type_name}` | " + meaning.replace("|", r"\|") + " |")
-    return "\n\n".join(text for text in (f"### {path.stem}", intro, "\n".join(rows)) if text)
+def table(repository: Path) -> list[list[str]]:
+    """Cells of the README's table, a row per interface."""
+    lines = (repository / "msgs_schema" / "README.md").read_text().splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|")]
+    return rows[2:]
 
 
-def tables(folder: Path) -> str:
-    """All of the README from its heading "Messages" on."""
-    sections = []
-    for kind, title in KINDS.items():
-        sections += [f"## {title}", *(page(path, kind) for path in interfaces(folder, kind))]
-    return "\n\n".join(sections) + "\n"
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_interface_file_is_in_the_table(repository: Path, kind: str) -> None:
+    named = {word for row in table(repository) for word in re.findall(r"\b[A-Z]\w+", row[1])}
+    assert {path.stem for path in interfaces(repository / "msgs_schema", kind)} <= named
 
 
-def test_the_readme_is_what_the_interface_files_say(repository: Path) -> None:
-    folder = repository / "msgs_schema"
-    text = (folder / "README.md").read_text()
-    assert text[text.index("## Messages") :] == tables(folder), "run python tests/unit/test_setup_messages_readme.py"
+def qos_text(qos: QoSProfile) -> str:
+    """The README's words for a profile."""
+    words = [str(qos.depth) if qos.history is HistoryPolicy.KEEP_LAST else "all"]
+    words += ["latched"] if qos.durability is DurabilityPolicy.TRANSIENT_LOCAL else []
+    words += ["best effort"] if qos.reliability is ReliabilityPolicy.BEST_EFFORT else []
+    lease = qos.liveliness_lease_duration.nanoseconds
+    return ", ".join([*words, *([f"liveliness lease {lease / 1e9:g} s"] if 0 < lease < 1e18 else [])])
+
+
+def test_the_table_has_every_topic_with_its_type_and_qos(repository: Path) -> None:
+    listed = {row[0].strip("`"): row for row in table(repository)}
+    for name, row in TOPICS.items():
+        package = row.type.__module__.split(".")[0]
+        kind = row.type.__name__ if package == "wm_msgs" else f"{package}/{row.type.__name__}"
+        assert (listed[name][1], listed[name][5]) == (kind, qos_text(row.qos)), name
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -94,9 +95,3 @@ def test_links_of_the_workspace_are_relative_and_lead_to_the_packages(repository
         assert str(link.readlink()) == f"../../{target}"
         assert f"<name>{name}</name>" in (link / "package.xml").read_text()
 
-
-if __name__ == "__main__":
-    schema = Path(__file__).resolve().parents[3] / "msgs_schema"
-    readme = schema / "README.md"
-    old = readme.read_text()
-    readme.write_text(old[: old.index("## Messages")] + tables(schema))
