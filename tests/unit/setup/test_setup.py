@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -216,3 +217,28 @@ def test_installed_package_brings_every_data_file(repository: Path, tmp_path: Pa
     files = [path for path in (source / "wm_nodes").rglob("*") if path.suffix in kinds]
     absent = [str(path.relative_to(source)) for path in files if not (built / path.relative_to(source)).exists()]
     assert not absent
+
+
+def test_uv_sees_the_indexes_that_pip_is_configured_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("PIP_INDEX_URL", "PIP_EXTRA_INDEX_URL", "PIP_FIND_LINKS", "UV_DEFAULT_INDEX", "UV_FIND_LINKS"):
+        monkeypatch.delenv(name, raising=False)
+    file = tmp_path / "pip.conf"
+    file.write_text("[global]\nindex-url = https://mirror/simple\nfind-links =\n    /a\n    /b\n")
+    monkeypatch.setenv("PIP_CONFIG_FILE", str(file))
+    monkeypatch.setenv("UV_INDEX", "https://mine/simple")
+    seen = packages._indexes(sys.executable)
+    assert seen["UV_DEFAULT_INDEX"] == "https://mirror/simple" and seen["UV_FIND_LINKS"] == "/a,/b"
+    assert "UV_INDEX" not in seen, "what the user set for uv stays"
+
+
+def test_the_lock_pins_what_the_requirements_name_and_leaves_torch_to_the_machine(repository: Path) -> None:
+    folder = repository / "requirements"
+    lock = {line.split(";")[0].strip().lower() for line in (folder / "lock.txt").read_text().splitlines()}
+    named = [
+        re.sub(r"\[.*\]", "", line).strip().lower()
+        for name in ("core", "ros", "dev", "video", "judge")
+        for line in (folder / f"{name}.txt").read_text().splitlines()
+        if "==" in line
+    ]
+    assert len(named) > 40 and set(named) <= lock
+    assert not any(line.startswith(("torch==", "opencv-python==", "nvidia-cu")) for line in lock)

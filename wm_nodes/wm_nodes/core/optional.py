@@ -22,5 +22,5 @@ def optional_package(name: str, *, needed_by: str, requirements: str) -> Any:
     except ModuleNotFoundError as error:
         raise MissingPackageError(
             f"{needed_by} the package {error.name or name}, which is not installed; run: "
-            f"pip install -c requirements/constraints.txt -r requirements/{requirements}"
+            f"pip install -c requirements/lock.txt -r requirements/{requirements}"
         ) from error
