@@ -1,4 +1,4 @@
-"""The command that trains the embedded judge: what it keeps, what it refuses. On a toy set; section 4.3."""
+"""The command that trains the embedded judge: what it keeps, what it refuses. On a toy set."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Advantages and losses against numbers worked by hand and a brute-force sum. Equations: E10a to E10c."""
+"""Advantages and losses against numbers worked by hand and a brute-force sum. RS-10a to RS-10c."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The Gaussian in closed form, and the image policy: sizes, determinism, normalisation, clear errors. E10d."""
+"""The Gaussian in closed form, and the image policy: sizes, determinism, normalisation, clear errors. RS-10d."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Rewards against numbers worked by hand; missing is missing. Equations: E5, E7, E8."""
+"""Rewards against numbers worked by hand; missing is missing. RS-5, RS-7, RS-8."""
 
 import pickle
 from dataclasses import replace

@@ -64,12 +64,11 @@ def test_no_step_and_a_shift_that_is_not_positive_are_refused(num_steps: int, sh
         flow_times(num_steps, shift)
 
 
-# T1 to T4: algebra of one step
+# algebra of one step
 
 
 @pytest.mark.parametrize("t", [1.0, 0.7, 0.2, 0.01])
 def test_clean_and_noise_estimate_mix_back_to_the_state(t: float) -> None:
-    """T1."""
     x, v = cells()
     x0, eps = estimates(x, v, times(t))
     assert_close((1 - t) * x0 + t * eps, x, atol=1e-6, rtol=0)
@@ -79,7 +78,7 @@ def test_clean_and_noise_estimate_mix_back_to_the_state(t: float) -> None:
 @pytest.mark.parametrize("arm", NOISY)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.float64, 1e-14)])
 def test_without_noise_every_arm_takes_the_euler_step(arm: str, dtype: torch.dtype, tolerance: float) -> None:
-    """T2. Values stay within [-1, 1], where the tolerance is a few units in the last place."""
+    """Values stay within [-1, 1], where the tolerance is a few units in the last place."""
     x, v = torch.tanh(randn(*BIG, seed=1, dtype=dtype)), torch.tanh(randn(*BIG, seed=2, dtype=dtype))
     for t, s in PAIRS:
         law = step(x, v, times(t), times(s), nothing_given(x), SamplerSettings(arm, eta=0.0))  # type: ignore[arg-type]
@@ -95,7 +94,7 @@ def test_the_ode_arm_equals_every_arm_without_noise_and_has_no_spread() -> None:
 
 
 def test_at_full_noise_only_the_clean_estimate_survives_a_step() -> None:
-    """T3. (x, v) and (x + a, v + a / t) have one clean estimate, so they share x_s for the same noise."""
+    """(x, v) and (x + a, v + a / t) have one clean estimate, so they share x_s for the same noise."""
     x, v, z = randn(*BIG, seed=1), randn(*BIG, seed=2), randn(*BIG, seed=3)
     a = 0.5 * randn(*BIG, seed=4)
     for t, s in [(0.9, 0.5), (0.5, 0.4), (0.8, 0.1)]:
@@ -112,7 +111,7 @@ def test_at_full_noise_only_the_clean_estimate_survives_a_step() -> None:
 @pytest.mark.parametrize("mask_on", ["std", "var", "eta"])
 @pytest.mark.parametrize("sigma_map", ["sin", "linear"])
 def test_kept_and_fresh_noise_have_the_power_of_s_in_every_cell_for_any_mask(mask_on: str, sigma_map: str) -> None:
-    """T4. The kept coefficient is read off the mean: (mean - (1 - s) x0) / eps."""
+    """The kept coefficient is read off the mean: (mean - (1 - s) x0) / eps."""
     x, v = cells()
     mask = torch.rand(1, 1, *BIG[2:], generator=torch.Generator().manual_seed(0))
     mask[0, 0, 0, 0, :2] = torch.tensor([0.0, 1.0])
@@ -135,7 +134,7 @@ def test_kept_and_fresh_noise_have_the_power_of_s_in_every_cell_for_any_mask(mas
      ("std", "linear", 0.12), ("var", "linear", 0.26833), ("eta", "linear", 0.12)],
 )
 def test_a_mask_of_one_fifth_scales_the_deviation_its_square_or_eta(mask_on: str, sigma_map: str, share: float) -> None:
-    """Equation (5) at eta = 0.6: 0.162 s, 0.362 s, 0.187 s."""
+    """DD-5 at eta = 0.6: 0.162 s, 0.362 s, 0.187 s."""
     x, v = cells((1, 1, 2, 2, 2))
     settings = SamplerSettings("dyndiff", 0.6, sigma_map, mask_on=mask_on)  # type: ignore[arg-type]
     law = step(x, v, times(0.8), times(0.5), nothing_given(x, mask=torch.full((1, 1, 2, 2, 2), 0.2)), settings)
@@ -150,7 +149,7 @@ def test_a_mask_above_one_never_takes_all_of_the_noise() -> None:
         assert_close(law.std, torch.full((1, 1, 2, 2, 2), 0.5 * SIGMA_LIMIT))
 
 
-# T5: noise power with an exact model
+# noise power with an exact model
 
 
 @pytest.mark.parametrize(
@@ -160,7 +159,7 @@ def test_a_mask_above_one_never_takes_all_of_the_noise() -> None:
 def test_a_preserving_step_keeps_the_noise_power_and_an_euler_sde_step_exceeds_it_by_the_known_amount(
     arm: str, eta: float, excess: float
 ) -> None:
-    """T5, exactly: all data is 0, x = t eps, v = eps; t = 0.5, s = 0.4. The numbers are those of section 2.1."""
+    """Exactly: all data is 0, x = t eps, v = eps; t = 0.5, s = 0.4. DD-21."""
     eps = torch.ones(1, 1, 2, 1, 1, dtype=torch.float64)
     settings = SamplerSettings(arm, eta)  # type: ignore[arg-type]
     law = step(0.5 * eps, eps, times(0.5), times(0.4), nothing_given(eps), settings)
@@ -170,7 +169,7 @@ def test_a_preserving_step_keeps_the_noise_power_and_an_euler_sde_step_exceeds_i
 
 @pytest.mark.parametrize(("arm", "eta"), [("cps", 0.6), ("dyndiff", 0.6), ("flow", 0.7), ("sage", 0.7), ("dance", 0.6)])
 def test_the_variance_of_400_000_sampled_cells_is_the_predicted_one(arm: str, eta: float) -> None:
-    """T5, sampled; the masked arm keeps it in every cell because its two coefficients do."""
+    """Sampled; the masked arm keeps it in every cell because its two coefficients do."""
     shape, t, s = (1, 1, 10, 200, 200), 0.5, 0.4
     eps, z = randn(*shape, seed=1), randn(*shape, seed=2)
     mask = 0.2 + 0.8 * torch.rand(shape, generator=torch.Generator().manual_seed(3))
@@ -182,7 +181,7 @@ def test_the_variance_of_400_000_sampled_cells_is_the_predicted_one(arm: str, et
     assert arm not in ("flow", "sage", "dance") or excess > 0.03 * s * s, "or the check could not fail"
 
 
-# T6, T7: the baselines in their own words
+# the baselines in their own words
 
 
 def flow_grpo(x: Tensor, v: Tensor, t: float, s: float, level: float, first: float) -> tuple[Tensor, float]:
@@ -213,7 +212,6 @@ def sage_grpo(x: Tensor, v: Tensor, t: float, s: float, level: float, first: flo
 def test_the_common_euler_sde_form_equals_the_repository_s_own(
     arm: str, own: object, eta: float, t: float, s: float
 ) -> None:
-    """T6."""
     x, v = cells()
     mean, std = own(x.double(), v.double(), t, s, eta, 0.9)  # type: ignore[operator]
     law = step(x, v, times(t), times(s), nothing_given(x), SamplerSettings(arm, eta))  # type: ignore[arg-type]
@@ -223,7 +221,6 @@ def test_the_common_euler_sde_form_equals_the_repository_s_own(
 
 @pytest.mark.parametrize(("t", "s"), [(0.997, 0.9), (0.9, 0.5), (0.5, 0.4), (0.3, 0.01)])
 def test_the_variance_of_sage_is_the_integral_of_its_diffusion(t: float, s: float) -> None:
-    """T7."""
     nodes, quadrature = np.polynomial.legendre.leggauss(200)
     tau = (t - s) / 2 * nodes + (t + s) / 2
     integral = 0.5**2 * float((quadrature * tau / (1 - tau)).sum()) * (t - s) / 2
@@ -232,11 +229,10 @@ def test_the_variance_of_sage_is_the_integral_of_its_diffusion(t: float, s: floa
     assert float(law.std.square()) == pytest.approx(integral, rel=1e-6)
 
 
-# T8, T9: the density
+# the density
 
 
 def test_the_log_probability_is_that_of_a_normal_distribution() -> None:
-    """T8."""
     x, mean = randn(3, 8192, seed=1), randn(3, 8192, seed=2)
     std = 0.2 + torch.rand(3, 8192, generator=torch.Generator().manual_seed(3))
     assert_close(gaussian_logprob(x, mean, std), Normal(mean, std).log_prob(x).mean(1), rtol=1e-6, atol=1e-6)
@@ -249,7 +245,7 @@ def test_one_cell_one_deviation_off_has_the_log_probability_worked_by_hand() -> 
 
 @pytest.mark.parametrize("std", [0.1, 0.5, 0.8])
 def test_the_full_likelihood_is_that_of_cps_divided_by_twice_the_variance_plus_constants(std: float) -> None:
-    """T9, where errors are those of a float64 sum; cps is minus the mean square error."""
+    """Where errors are those of a float64 sum; cps is minus the mean square error."""
     x, mean = randn(2, 8192, seed=1, dtype=torch.float64), randn(2, 8192, seed=2, dtype=torch.float64)
     cps = -(x - mean).square().mean(1)
     full = gaussian_logprob(x, mean, torch.full_like(x, std))
@@ -259,13 +255,12 @@ def test_the_full_likelihood_is_that_of_cps_divided_by_twice_the_variance_plus_c
                  rtol=1e-6, atol=1e-6)
 
 
-# T16: what carries gradient
+# what carries gradient
 
 
 @pytest.mark.parametrize("arm", ["ode", *NOISY])
 @pytest.mark.parametrize("given", [0, 1])
 def test_only_the_mean_carries_gradient_and_its_slope_in_v_is_the_closed_form(arm: str, given: int) -> None:
-    """T16, the kernel's half."""
     x, v = randn(2, 3, 4, 5, 7, seed=1), randn(2, 3, 4, 5, 7, seed=2).requires_grad_()
     context = StepContext(randn(2, 3, given, 5, 7, seed=3), first_time=0.9)
     t, s = times(1.0, 0.4), times(0.9, 0.1)
@@ -290,7 +285,7 @@ def test_at_full_noise_the_gradient_stays_finite() -> None:
     assert bool(torch.isfinite(gradient).all())
 
 
-# T29, T30: whole samplings
+# whole samplings
 
 
 def sampled(settings: RolloutSettings, shape: tuple[int, int, int, int] = (2, 3, 4, 4), given: int = 1, count: int = 1):  # type: ignore[no-untyped-def]
@@ -318,7 +313,6 @@ def assert_finite_and_trainable(settings: RolloutSettings) -> None:
 def test_every_number_of_steps_from_1_to_50_samples_finite_videos_and_never_trains_the_last_step(
     shift: float, m_min: float
 ) -> None:
-    """T29."""
     for num_steps in range(1, 51):
         assert_finite_and_trainable(toy_rollout_settings(num_steps=num_steps, shift=shift, mask=MaskSettings(m_min)))
 
@@ -326,7 +320,6 @@ def test_every_number_of_steps_from_1_to_50_samples_finite_videos_and_never_trai
 @pytest.mark.parametrize("arm", NOISY)
 @pytest.mark.parametrize("shift", [1.0, 3.0, 5.0])
 def test_every_arm_samples_finite_videos_from_few_steps_to_many(arm: str, shift: float) -> None:
-    """T29."""
     for num_steps in (1, 2, 3, 10, 50):
         assert_finite_and_trainable(toy_rollout_settings(num_steps=num_steps, shift=shift, arm=arm))
 
@@ -334,7 +327,6 @@ def test_every_arm_samples_finite_videos_from_few_steps_to_many(arm: str, shift:
 @pytest.mark.parametrize("shift", [1.0, 3.0, 5.0])
 @pytest.mark.parametrize("m_min", [0.05, 0.2, 0.5, 1.0])
 def test_every_shift_and_floor_of_the_mask_samples_finite_videos(shift: float, m_min: float) -> None:
-    """T29."""
     for num_steps in (1, 2, 3, 16, 50):
         assert_finite_and_trainable(toy_rollout_settings(num_steps=num_steps, shift=shift, mask=MaskSettings(m_min)))
 
@@ -342,7 +334,6 @@ def test_every_shift_and_floor_of_the_mask_samples_finite_videos(shift: float, m
 @pytest.mark.parametrize("combine", ["gated", "sparse", "convex", "max"])
 @pytest.mark.parametrize("given", [0, 1])
 def test_a_mask_floor_of_one_is_coefficient_preserving_sampling_bit_for_bit(combine: str, given: int) -> None:
-    """T30."""
     mask = MaskSettings(m_min=1.0, combine=combine)  # type: ignore[arg-type]
     masked = sampled(toy_rollout_settings(arm="dyndiff", mask=mask), given=given, count=3)
     plain = sampled(toy_rollout_settings(arm="cps"), given=given, count=3)

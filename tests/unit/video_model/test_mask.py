@@ -33,11 +33,11 @@ def moving_blob() -> tuple[Tensor, Tensor]:
     return scenes.videos(scenes.action), opacity_at(scenes.path(scenes.action))[0] > 0.5
 
 
-# (6) to (9), by hand
+# DD-6 to DD-9, by hand
 
 
 def test_the_residual_of_one_changed_corner_is_3_there_and_minus_1_elsewhere_in_both_frames() -> None:
-    """T11, equation (6): the first frame takes the second one's residual."""
+    """DD-6: the first frame takes the second one's residual."""
     frame = torch.tensor([[3.0, -1.0], [-1.0, -1.0]])
     assert_close(residual(one_hot_corner()), torch.stack([frame, frame])[None, None])
 
@@ -49,7 +49,7 @@ def test_the_residual_of_one_changed_corner_is_3_there_and_minus_1_elsewhere_in_
 def test_the_mask_of_one_changed_corner_is_the_one_worked_by_hand(
     combine: str, corner: float, elsewhere: float
 ) -> None:
-    """T11: intensity (1, 1/3, 1/3, 1/3) in both frames, threshold 0.5 at q = 0.75."""
+    """Intensity (1, 1/3, 1/3, 1/3) in both frames, threshold 0.5 at q = 0.75."""
     settings = MaskSettings(m_min=0.2, quantile=0.75, combine=combine)  # type: ignore[arg-type]
     frame = torch.tensor([[corner, elsewhere], [elsewhere, elsewhere]])
     assert_close(
@@ -60,7 +60,7 @@ def test_the_mask_of_one_changed_corner_is_the_one_worked_by_hand(
 
 
 def test_a_cell_that_reaches_the_threshold_counts_as_dynamic() -> None:
-    """Equation (8) says >=: with q = 1 the largest cell alone is left."""
+    """DD-8 says >=: with q = 1 the largest cell alone is left."""
     settings = MaskSettings(quantile=1.0)
     assert dynamic_mask(one_hot_corner(), 0, settings)[0, 0, 1].flatten().tolist() == pytest.approx([1, 0.2, 0.2, 0.2])
 
@@ -109,13 +109,9 @@ def test_the_quantile_is_torch_s(q: float, count: int) -> None:
         assert_close(quantile(some, q), torch.quantile(some, q, dim=1))
 
 
-# T10, T12 to T15
-
-
 @pytest.mark.parametrize("combine", COMBINES)
 @pytest.mark.parametrize("given", [0, 1, 3, 8])
 def test_the_mask_lies_between_its_floor_and_one_and_is_zero_on_given_frames(combine: str, given: int) -> None:
-    """T10."""
     settings = MaskSettings(m_min=0.3, combine=combine)  # type: ignore[arg-type]
     mask = dynamic_mask(randn(*BIG), given, settings)
     assert mask.shape == (2, 1, 8, 16, 16) and not mask.requires_grad
@@ -127,7 +123,6 @@ def test_the_mask_lies_between_its_floor_and_one_and_is_zero_on_given_frames(com
 
 
 def test_every_channel_of_a_cell_has_the_same_deviation() -> None:
-    """T10."""
     x, v = randn(*BIG, seed=1), randn(*BIG, seed=2)
     law = step(x, v, times(0.8, 0.8), times(0.5, 0.5), StepContext(x[:, :, :1], 0.9), SamplerSettings())
     assert law.std.shape == law.mask.shape == (2, 1, 8, 16, 16)
@@ -137,7 +132,6 @@ def test_every_channel_of_a_cell_has_the_same_deviation() -> None:
 @pytest.mark.parametrize("given", [0, 1])
 @pytest.mark.parametrize("budget", ["literal", "rms", "peak"])
 def test_a_still_video_and_one_that_only_brightens_explore_everywhere(given: int, budget: str) -> None:
-    """T12."""
     settings = MaskSettings(budget=budget)  # type: ignore[arg-type]
     still = randn(2, 3, 1, 8, 8, seed=4).expand(2, 3, 5, 8, 8)
     brighter = still + torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0]).view(1, 1, 5, 1, 1)
@@ -150,7 +144,6 @@ def test_a_still_video_and_one_that_only_brightens_explore_everywhere(given: int
 
 
 def test_stillness_is_judged_video_by_video() -> None:
-    """T12."""
     x0 = randn(2, 3, 5, 8, 8, seed=4)
     x0[0] = x0[0, :, :1]
     mask = dynamic_mask(x0, 0, PAPER)
@@ -160,7 +153,6 @@ def test_stillness_is_judged_video_by_video() -> None:
 @pytest.mark.parametrize("combine", COMBINES)
 @pytest.mark.parametrize("given", [0, 2])
 def test_the_mask_ignores_still_images_and_scale_and_follows_flips_and_shifts(combine: str, given: int) -> None:
-    """T13."""
     settings = MaskSettings(combine=combine)  # type: ignore[arg-type]
     x0 = randn(*BIG, seed=8)
     mask = dynamic_mask(x0, given, settings)
@@ -177,7 +169,7 @@ def test_the_mask_ignores_still_images_and_scale_and_follows_flips_and_shifts(co
 def test_a_moving_blob_is_explored_at_least_1_8_times_as_much_as_its_still_surroundings(
     combine: str, given: int
 ) -> None:
-    """T14, from the exact clean estimate."""
+    """From the exact clean estimate."""
     x0, inside = moving_blob()
     mask = dynamic_mask(x0, given, MaskSettings(combine=combine))[0, 0, given:]  # type: ignore[arg-type]
     assert float(mask[inside[given:]].mean()) >= 1.8 * float(mask[~inside[given:]].mean())
@@ -194,7 +186,6 @@ def test_frames_without_any_motion_are_not_dynamic_even_when_most_frames_have_no
 
 @pytest.mark.parametrize("arm", ["dyndiff"])
 def test_what_a_network_says_about_given_frames_does_not_change_the_mask(arm: str) -> None:
-    """T15."""
     x, v = randn(*BIG, seed=1), randn(*BIG, seed=2)
     context = StepContext(randn(2, 4, 2, 16, 16, seed=3), 0.9)
     t, s = times(0.8, 0.4), times(0.5, 0.1)
@@ -207,7 +198,7 @@ def test_what_a_network_says_about_given_frames_does_not_change_the_mask(arm: st
 
 
 def test_the_first_generated_frame_is_compared_with_the_clean_given_one() -> None:
-    """Finding 8: a video that stands still from its given frame on is still, whatever noise the given frame had."""
+    """A video that stands still from its given frame on is still, whatever noise the given frame had."""
     clean = randn(1, 2, 4, 8, 8, seed=1)[:, :, :1].expand(1, 2, 4, 8, 8)
     t, x = times(0.5), 0.5 * clean + 0.5 * randn(1, 2, 4, 8, 8, seed=2)
     v = (x - clean) / 0.5
@@ -270,13 +261,13 @@ def test_a_mask_kept_in_half_precision_is_rounded_before_it_is_used() -> None:
     assert torch.equal(again.std, law.std) and torch.equal(again.mean, law.mean)
 
 
-# T32: budget
+# budget
 
 
 @pytest.mark.parametrize("combine", COMBINES)
 @pytest.mark.parametrize("given", [0, 2])
 def test_an_rms_budget_gives_the_generated_cells_a_mean_square_of_one(combine: str, given: int) -> None:
-    """T32. The cell ratios stay those of the literal mask."""
+    """The cell ratios stay those of the literal mask."""
     x0 = randn(*BIG, seed=8)
     literal = dynamic_mask(x0, given, MaskSettings(combine=combine))[:, :, given:]  # type: ignore[arg-type]
     mask = dynamic_mask(x0, given, MaskSettings(combine=combine, budget="rms"))[:, :, given:]  # type: ignore[arg-type]
@@ -286,7 +277,7 @@ def test_an_rms_budget_gives_the_generated_cells_a_mean_square_of_one(combine: s
 
 
 def test_an_rms_budget_spends_the_noise_of_coefficient_preserving_sampling() -> None:
-    """T32, on a step of eta 0.3, where no cell is clamped."""
+    """On a step of eta 0.3, where no cell is clamped."""
     x, v = randn(*BIG, seed=1), randn(*BIG, seed=2)
     context = StepContext(x[:, :, :1], 0.9)
     t, s = times(0.8, 0.8), times(0.5, 0.5)
@@ -313,7 +304,7 @@ def test_a_peak_budget_gives_dynamic_cells_the_noise_of_coefficient_preserving_s
     assert float(literal[dynamic].square().mean()) < 0.95
 
 
-# T31: why the mask is cached
+# why the mask is cached
 
 
 @pytest.mark.parametrize(("source", "low", "high"), [("recompute", 0.5, 1.0), ("cached", 0.0, 0.1)])
@@ -321,7 +312,7 @@ def test_a_peak_budget_gives_dynamic_cells_the_noise_of_coefficient_preserving_s
 def test_a_recomputed_mask_throws_most_ratios_out_of_the_clip_range_and_a_cached_one_few(
     source: str, low: float, high: float, combine: str
 ) -> None:
-    """T31: the velocity changes by 1e-3 at random, t >= 0.5, D = 8192."""
+    """The velocity changes by 1e-3 at random, t >= 0.5, D = 8192."""
     shape = (1, 33, 16, 16)
     settings = toy_rollout_settings(num_steps=10, mask=MaskSettings(combine=combine))  # type: ignore[arg-type]
     change = [0.0]
@@ -351,7 +342,7 @@ def test_a_recomputed_mask_of_unchanged_weights_leaves_the_ratio_at_one(mask_on:
 @pytest.mark.parametrize("mask_on", ["std", "var", "eta"])
 @pytest.mark.parametrize("budget", ["literal", "rms"])
 def test_a_recomputed_ratio_and_kl_are_those_of_the_two_normal_distributions(mask_on: str, budget: str) -> None:
-    """The old density has the cached mask, the new one its own; the KL is (17) with the anchor's deviation."""
+    """The old density has the cached mask, the new one its own; the KL is DD-17 with the anchor's deviation."""
     settings = toy_rollout_settings(num_steps=2, shift=1.0, eta=0.8, mask_on=mask_on, mask=MaskSettings(budget=budget))  # type: ignore[arg-type]
     speed = [0.3]
     model = Analytic(lambda x, t: torch.sin(x.roll(1, 3)) + speed[0] * x)

@@ -71,13 +71,13 @@ def first_transition(buffer: RolloutBuffer, settings: RolloutSettings, position:
     )
 
 
-# T22: what gives the mean back
+# what gives the mean back
 
 
 @pytest.mark.parametrize("arm", ["cps", "dyndiff"])
 @pytest.mark.parametrize("store", ["zeta", "seed"])
 def test_the_stored_noise_or_its_seed_gives_the_mean_of_every_step_back(arm: str, store: str) -> None:
-    """T22. x_s - sigma zeta = mean; from the seed it holds for float32 states."""
+    """The mean is x_s - sigma zeta; from the seed it holds for float32 states."""
     settings, model = toy_rollout_settings(arm=arm, noise_store=store), Analytic(swirl)
     buffer = toy_buffer(model, settings, groups=1, size=2, shape=WIDE)
     for position, k in enumerate(buffer.rollout.steps):
@@ -95,7 +95,7 @@ def test_the_stored_noise_or_its_seed_gives_the_mean_of_every_step_back(arm: str
 
 @pytest.mark.parametrize("t", [0.9, 0.5, 0.2])
 def test_noise_kept_in_bfloat16_costs_a_kl_below_3e_6_and_a_mean_kept_so_more_than_ten_times_that(t: float) -> None:
-    """T22. The noise is that of a step whose end was rounded to bfloat16 first."""
+    """The noise is that of a step whose end was rounded to bfloat16 first."""
     x, v, z = (randn(1, 8, 4, 16, 16, seed=seed) for seed in (2, 3, 1))
     law = step(x, v, times(t), times(0.8 * t), StepContext(x[:, :, :0], 0.9), SamplerSettings())
     zeta = normalised_noise((law.mean + law.std * z).bfloat16().float(), law, 0).flatten(1)
@@ -106,7 +106,7 @@ def test_noise_kept_in_bfloat16_costs_a_kl_below_3e_6_and_a_mean_kept_so_more_th
 
 
 def test_a_rollout_keeps_its_noise_in_bfloat16_where_asked_and_nothing_else_of_it_changes() -> None:
-    """T22; the default for large models."""
+    """The default for large models."""
     model = Analytic(swirl)
     exact, rounded = (
         toy_buffer(model, toy_rollout_settings(storage_dtype="bfloat16", noise_store=store), groups=1, size=2)
@@ -120,7 +120,7 @@ def test_a_rollout_keeps_its_noise_in_bfloat16_where_asked_and_nothing_else_of_i
 
 
 def test_a_mask_and_seeds_take_less_than_a_tenth_of_a_mask_and_the_noise_at_16_channels() -> None:
-    """T22, in bytes."""
+    """In bytes."""
     small, large = (
         toy_buffer(
             Analytic(swirl), toy_rollout_settings(noise_store=store), groups=1, size=2, shape=(16, 3, 4, 4), given=0
@@ -138,13 +138,13 @@ def test_seeds_cannot_stand_for_noise_that_was_rounded_to_bfloat16() -> None:
         toy_rollout_settings(noise_store="seed", storage_dtype="bfloat16")
 
 
-# T27: bf16 storage
+# bf16 storage
 
 
 @pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow"])
 @pytest.mark.parametrize("mask_dtype", ["float32", "float16"])
 def test_what_is_stored_in_bfloat16_has_the_log_probability_it_had_at_rollout(arm: str, mask_dtype: str) -> None:
-    """T27: the state is rounded before its density is taken, so training sees the same numbers."""
+    """The state is rounded before its density is taken, so training sees the same numbers."""
     settings = toy_rollout_settings(arm=arm, storage_dtype="bfloat16", mask_dtype=mask_dtype)
     model = tiny_network()
     buffer = toy_buffer(model, settings)
@@ -160,11 +160,10 @@ def test_what_is_stored_in_bfloat16_has_the_log_probability_it_had_at_rollout(ar
         assert float(log_ratio(unrounded, old).abs().max()) > 1e-6, "or the check could not fail"
 
 
-# T34: reproducible
+# reproducible
 
 
 def test_the_same_seeds_give_the_same_buffer_bit_for_bit_and_others_another() -> None:
-    """T34."""
     settings, model = toy_rollout_settings(), tiny_network()
     first, second = toy_buffer(model, settings), toy_buffer(model, settings)
     assert_same(first, second)
@@ -232,7 +231,7 @@ def test_a_file_that_lacks_one_tensor_is_refused_by_its_name(name: str) -> None:
         RolloutBuffer.from_bytes(save(tensors, header))
 
 
-# T33: refusals
+# refusals
 
 
 CHANGES = [
@@ -244,7 +243,6 @@ CHANGES = [
 
 @pytest.mark.parametrize("changes", CHANGES)
 def test_a_buffer_of_another_sampler_is_refused(changes: dict[str, object]) -> None:
-    """T33."""
     settings, other = toy_rollout_settings(), toy_rollout_settings(**changes)
     buffer = toy_buffer(Analytic(swirl), settings)
     buffer.check(settings, 0, 0)
@@ -269,7 +267,6 @@ def test_how_a_rollout_is_batched_or_its_noise_is_kept_does_not_make_it_another_
 def test_a_buffer_that_is_too_old_or_from_the_future_is_refused(
     made: int, now: int, limit: int, staleness: int
 ) -> None:
-    """T33."""
     settings = toy_rollout_settings()
     buffer = toy_buffer(Analytic(swirl), settings, version=made)
     with pytest.raises(RolloutBufferError, match=f"staleness {staleness} is outside 0 to {limit}"):
@@ -322,7 +319,6 @@ def test_rows_of_a_condition_are_repeated_in_groups() -> None:
 
 
 def test_a_transition_carries_gradient_in_its_noise_only() -> None:
-    """T16."""
     settings, model = toy_rollout_settings(), tiny_network()
     buffer = toy_buffer(model, settings)
     new = first_transition(buffer, settings, 1, model)

@@ -79,13 +79,10 @@ def assert_equal(first: dict[str, Tensor], second: dict[str, Tensor]) -> None:
         assert torch.equal(tensor, second[name]), name
 
 
-# T16 to T20
-
-
 @pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow", "dance", "sage"])
 @pytest.mark.parametrize("storage", ["float32", "bfloat16"])
 def test_before_any_update_the_ratio_is_exactly_one_and_the_kl_exactly_zero(arm: str, storage: str) -> None:
-    """T17, T20, T27: the network is called with as many rows as at rollout."""
+    """The network is called with as many rows as at rollout."""
     learner = make(toy_rollout_settings(micro_batch=8, arm=arm, storage_dtype=storage), updates_per_buffer=2)
     first, second = learner.train(buffer_of(learner)).updates
     assert first.transitions == 8 * 4
@@ -95,7 +92,7 @@ def test_before_any_update_the_ratio_is_exactly_one_and_the_kl_exactly_zero(arm:
 
 @pytest.mark.parametrize("size", [1, 3, 5, 1000])
 def test_in_micro_batches_of_another_size_the_ratio_is_one_to_five_digits(size: int) -> None:
-    """T18; the clip range is the tolerance."""
+    """The clip range is the tolerance."""
     learner = make(micro_batch=size, clip_low=1e-5, clip_high=1e-5)
     first = learner.train(buffer_of(learner)).updates[0]
     assert first.ratio_mean == pytest.approx(1.0, abs=1e-5) and first.clip_low_share == first.clip_high_share == 0.0
@@ -103,7 +100,6 @@ def test_in_micro_batches_of_another_size_the_ratio_is_one_to_five_digits(size: 
 
 
 def test_from_seeds_alone_the_ratio_is_one_to_five_digits() -> None:
-    """T22."""
     learner = make(toy_rollout_settings(micro_batch=8, noise_store="seed"), clip_low=1e-5, clip_high=1e-5)
     buffer = buffer_of(learner)
     assert buffer.rollout.zeta is None
@@ -112,7 +108,7 @@ def test_from_seeds_alone_the_ratio_is_one_to_five_digits() -> None:
 
 
 def test_from_noise_kept_in_bfloat16_no_ratio_leaves_the_clip_range_and_the_kl_is_below_3e_6() -> None:
-    """T22, D = 8192; a clip range of 1e-6 would be left."""
+    """D = 8192; a clip range of 1e-6 would be left."""
     settings = toy_rollout_settings(micro_batch=8, storage_dtype="bfloat16", noise_store="zeta_bfloat16")
     for clip, left in ((1e-4, False), (1e-6, True)):
         learner = make(settings, network=tiny_network(8), clip_low=clip, clip_high=clip)
@@ -130,7 +126,7 @@ def test_guidance_in_rollout_and_training_is_the_same_model_and_in_one_of_them_i
 
 
 def logprob_gradient(learner: GrpoLearner, buffer: RolloutBuffer, kind: str) -> Tensor:
-    """Of the mean over all transitions of -A l, from the kernel and (12), without the learner."""
+    """Of the mean over all transitions of -A l, from the kernel and DD-12, without the learner."""
     model, times, total = learner.model, learner.rollout.times, torch.zeros(())
     rows = all_rows(buffer)
     for video, position in zip(rows.videos.tolist(), rows.positions.tolist(), strict=True):
@@ -155,7 +151,6 @@ def logprob_gradient(learner: GrpoLearner, buffer: RolloutBuffer, kind: str) -> 
 
 @pytest.mark.parametrize("clip", [1e-8, 1e-4, 0.2])
 def test_the_first_gradient_is_the_advantage_times_that_of_the_log_probability_for_every_clip(clip: float) -> None:
-    """T19."""
     learner = make(clip_low=clip, clip_high=clip)
     buffer = buffer_of(learner)
     wanted = logprob_gradient(learner, buffer, "full")
@@ -165,7 +160,7 @@ def test_the_first_gradient_is_the_advantage_times_that_of_the_log_probability_f
 @pytest.mark.parametrize("kind", ["cps", "base", "ratio_norm"])
 @pytest.mark.parametrize("arm", ["cps", "dyndiff"])
 def test_every_likelihood_weight_has_the_first_gradient_of_its_formula(kind: str, arm: str) -> None:
-    """T19; (14c), (15b): the drift of the normalised ratio has no gradient where nothing has moved."""
+    """DD-14c, DD-15b: the drift of the normalised ratio has no gradient where nothing has moved."""
     changes = {"ratio_norm": True} if kind == "ratio_norm" else {"logprob_weight": kind}
     learner = make(toy_rollout_settings(micro_batch=8, arm=arm), **changes)
     buffer = buffer_of(learner)
@@ -192,7 +187,7 @@ def test_the_equaliser_gives_every_step_the_median_sensitivity_s_share() -> None
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("anchor", ["buffer", "frozen", "moving", "dual"])
 def test_the_kl_has_no_gradient_at_its_anchor(mode: str, anchor: str) -> None:
-    """T20: with no advantage nothing else is left."""
+    """With no advantage nothing else is left."""
     learner = make(kl=KlSettings(mode, 10.0, anchor))  # type: ignore[arg-type]
     buffer = buffer_of(learner)
     assert not gradient(learner, buffer, signal=known([0.0] * 8)).any()
@@ -200,7 +195,6 @@ def test_the_kl_has_no_gradient_at_its_anchor(mode: str, anchor: str) -> None:
 
 
 def test_training_leaves_no_gradient_on_what_was_stored() -> None:
-    """T16."""
     learner = make()
     buffer = buffer_of(learner)
     before = buffer.to_bytes()
@@ -283,7 +277,7 @@ def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mode", [*MODES, "none"])
 def test_every_kl_is_zero_on_the_first_update_of_a_buffer_and_then_its_own_size(mode: str) -> None:
-    """T20; the log-space forms are far weaker."""
+    """The log-space forms are far weaker."""
     learner = make(kl=KlSettings(mode), updates_per_buffer=2)  # type: ignore[arg-type]
     for iteration in range(2):
         first, second = learner.train(buffer_of(learner, iteration=iteration)).updates
@@ -408,7 +402,7 @@ def test_a_model_that_does_not_say_which_weights_are_its_condition_is_refused_an
 
 @pytest.mark.parametrize("mode", ["logk2", "logk3"])
 def test_a_log_space_kl_measures_against_its_own_anchor(mode: str) -> None:
-    """From (12): log r of the weights now to those of the anchor, at the stored x_s; not to those that sampled."""
+    """From DD-12: log r of the weights now to those of the anchor, at the stored x_s; not to those that sampled."""
     learner = make(kl=KlSettings(mode, 0.5, "frozen"))  # type: ignore[arg-type]
     anchor = tiny_network()
     with torch.no_grad():
@@ -424,7 +418,7 @@ def test_a_log_space_kl_measures_against_its_own_anchor(mode: str) -> None:
 
 
 def _logprob(model: torch.nn.Module, learner: GrpoLearner, buffer: RolloutBuffer, row: int) -> Tensor:
-    """(14) of one stored transition under `model`, float64."""
+    """DD-14 of one stored transition under `model`, float64."""
     rows, times = all_rows(buffer), learner.rollout.times
     video, position = int(rows.videos[row]), int(rows.positions[row])
     k, one = buffer.rollout.steps[position], slice(video, video + 1)
@@ -644,7 +638,6 @@ STATEFUL = [
 
 @pytest.mark.parametrize("changes", STATEFUL)
 def test_the_same_seeds_give_the_same_update_bit_for_bit(changes: dict[str, Any]) -> None:
-    """T34."""
     first, second = make(**changes), make(**changes)
     for learner in (first, second):
         train_rounds(learner, range(2))
@@ -777,7 +770,6 @@ def test_a_buffer_of_videos_that_are_given_whole_is_one_clear_error() -> None:
 
 
 def test_stale_buffers_and_those_of_another_sampler_are_refused() -> None:
-    """T33."""
     learner = make(updates_per_buffer=2)
     buffer = buffer_of(learner)
     learner.train(buffer)

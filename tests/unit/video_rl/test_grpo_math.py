@@ -53,18 +53,18 @@ def gaussians() -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return old + std * randn(M, U, seed=3, dtype=torch.float64), old, new, std
 
 
-# (13): advantages
+# DD-13: advantages
 
 
 def test_an_advantage_is_the_distance_from_the_group_s_mean_in_its_deviations() -> None:
-    """T23: (1, 2, 3) has population deviation sqrt(2/3) and sample deviation 1."""
+    """(1, 2, 3) has population deviation sqrt(2/3) and sample deviation 1."""
     wanted = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
     assert_close(advantages([1, 2, 3]).advantages_N, wanted / math.sqrt(2 / 3))
     assert_close(advantages([1, 2, 3], ddof=1).advantages_N, wanted)
 
 
 def test_groups_do_not_see_each_other() -> None:
-    """T23; interleaved groups of scales that differ by a thousand."""
+    """Interleaved groups of scales that differ by a thousand."""
     found = advantages([1, 1000, 3, 3000, 2, 2000], [7, 3, 7, 3, 7, 3])
     high = math.sqrt(1.5)
     assert_close(found.advantages_N, torch.tensor([-high, -high, high, high, 0, 0], dtype=torch.float64))
@@ -73,7 +73,7 @@ def test_groups_do_not_see_each_other() -> None:
 
 
 def test_before_the_clip_every_group_has_mean_zero_and_deviation_one_and_the_clip_keeps_the_order() -> None:
-    """T23, 4 groups of 16."""
+    """4 groups of 16."""
     rewards = randn(64, seed=5).exp().exp().tolist()
     groups = torch.arange(4).repeat_interleave(16)
     free = advantages(rewards, groups.tolist(), clip=1e9).advantages_N.view(4, 16)
@@ -89,7 +89,7 @@ def test_before_the_clip_every_group_has_mean_zero_and_deviation_one_and_the_cli
 @pytest.mark.parametrize("size", [12, 16, 24])
 @pytest.mark.parametrize("ddof", [0, 1])
 def test_equal_float32_rewards_of_0_7_have_no_advantage_at_all(size: int, ddof: int) -> None:
-    """T24; the usual float32 form gives up to 0.89."""
+    """The usual float32 form gives up to 0.89."""
     rewards = torch.full((size,), 0.7)
     found = group_advantages(rewards, torch.zeros(size), torch.ones(size), clip=2.5, ddof=ddof)
     assert not found.advantages_N.any() and not found.kept_N.any() and found.num_zero_std == 1
@@ -103,7 +103,7 @@ def test_a_spread_below_the_floor_is_none_and_the_floor_grows_with_the_mean() ->
 
 
 def test_the_largest_advantage_of_a_group_is_the_root_of_its_size_less_one() -> None:
-    """Finding 10: a clip of 5 cannot fire up to G = 26."""
+    """A clip of 5 cannot fire up to G = 26."""
     for size, high in ((8, math.sqrt(7)), (26, 5.0)):
         found = advantages([1.0] + [0.0] * (size - 1), clip=100.0).advantages_N
         assert float(found[0]) == pytest.approx(high)
@@ -149,7 +149,6 @@ def test_a_valid_reward_that_is_not_finite_is_an_error_that_names_the_video() ->
 
 
 def test_best_of_8_of_16_keeps_the_4_best_and_the_4_worst_of_each_group() -> None:
-    """T25."""
     order = torch.randperm(16, generator=torch.Generator().manual_seed(0))
     signal = torch.cat([order.double() - 7.5, -(order.double() - 7.5)])
     kept = best_of_n(signal, torch.arange(2).repeat_interleave(16), torch.ones(32, dtype=torch.bool), 8)
@@ -188,7 +187,6 @@ def test_a_mix_of_nothing_or_of_an_unknown_reward_is_refused(weights: dict[str, 
 
 
 def test_equal_advantages_are_kept_by_their_index() -> None:
-    """T25."""
     kept = best_of_n(torch.zeros(6), torch.zeros(6), torch.ones(6, dtype=torch.bool), 4)
     assert kept.tolist() == [True, True, False, False, True, True]
 
@@ -214,7 +212,7 @@ def test_a_win_rate_is_the_share_of_the_others_that_are_beaten_and_a_tie_is_half
     assert rates[:2].tolist() == [0, 1] and math.isnan(rates[2])
 
 
-# (15): ratio
+# DD-15: ratio
 
 
 def test_the_ratio_from_normalised_noise_is_the_difference_of_two_log_probabilities() -> None:
@@ -232,7 +230,7 @@ def test_one_cell_moved_by_a_quarter_deviation_has_the_ratio_worked_by_hand() ->
 
 
 def test_unmoved_noise_has_a_ratio_of_exactly_one_under_every_weight() -> None:
-    """T17, equation (15)."""
+    """DD-15."""
     zeta = randn(M, U, seed=4)
     for weight in (1.0, torch.rand(M, U)):
         assert log_ratio(zeta, zeta.clone(), weight).tolist() == [0.0] * M
@@ -256,7 +254,7 @@ def test_the_base_weight_scales_every_cell_by_its_mask_squared() -> None:
 
 
 def test_the_normalised_ratio_of_a_scalar_deviation_is_the_mean_of_noise_times_move() -> None:
-    """(15b): exp(mean_u z delta)."""
+    """DD-15b: exp(mean_u z delta)."""
     x, old, new, _ = gaussians()
     std = torch.full_like(x, 0.3)
     z, delta = (x - old) / std, new - old
@@ -270,7 +268,7 @@ def test_the_normalised_ratio_under_a_mask_uses_the_root_mean_square_deviation()
     assert_close(normalised_log_ratio((x - new) / std, (x - old) / std, std), wanted, atol=1e-12, rtol=1e-9)
 
 
-# (16): objective
+# DD-16: objective
 
 
 def test_the_objective_takes_the_smaller_of_the_plain_and_the_clipped_term() -> None:
@@ -287,7 +285,6 @@ def test_the_objective_takes_the_smaller_of_the_plain_and_the_clipped_term() -> 
 def test_a_ratio_that_has_gone_far_enough_in_its_direction_has_no_gradient(
     ratio: float, advantage: float, moves: bool
 ) -> None:
-    """T26."""
     logs = torch.tensor([math.log(ratio)], dtype=torch.float64, requires_grad=True)
     clipped_objective(
         logs, torch.tensor([advantage], dtype=torch.float64), clip_low=EPS, clip_high=EPS
@@ -298,7 +295,6 @@ def test_a_ratio_that_has_gone_far_enough_in_its_direction_has_no_gradient(
 
 @pytest.mark.parametrize("clip", [1e-9, 1e-4, 0.2])
 def test_at_a_ratio_of_one_the_gradient_is_the_advantage_for_every_clip(clip: float) -> None:
-    """T19, the objective's half."""
     logs = torch.zeros(2, requires_grad=True)
     clipped_objective(logs, torch.tensor([1.5, -0.5]), clip_low=clip, clip_high=clip).sum().backward()
     assert logs.grad is not None
@@ -310,11 +306,10 @@ def test_the_tails_are_counted_apart() -> None:
     assert clip_tails(logs, clip_low=0.07, clip_high=0.1) == (1 / 8, 4 / 8)
 
 
-# (17): KL
+# DD-17: KL
 
 
 def test_the_mean_space_kl_is_that_of_two_normals_of_one_deviation() -> None:
-    """T21."""
     x, old, new, std = gaussians()
     assert_close(
         mean_kl((x - new) / std, (x - old) / std),
@@ -324,7 +319,6 @@ def test_the_mean_space_kl_is_that_of_two_normals_of_one_deviation() -> None:
 
 
 def test_the_kl_at_its_anchor_is_zero_with_zero_gradient() -> None:
-    """T20, the kernel's half."""
     target = randn(M, U, seed=4)
     zeta = target.clone().requires_grad_()
     ones = torch.ones(M, U)
@@ -362,11 +356,10 @@ def test_the_equaliser_weighs_a_step_by_the_median_sensitivity_over_its_own() ->
     assert_close(step_equaliser(torch.tensor([1.0, 2.0, 4.0])), torch.tensor([2.0, 1.0, 0.5]))
 
 
-# (19): diversity
+# DD-19: diversity
 
 
 def test_identical_videos_have_diversity_zero_and_opposite_ones_two() -> None:
-    """T28."""
     video = randn(1, 4, 16, seed=1)
     assert rollout_diversity(video.repeat(5, 1, 1)) == pytest.approx(0.0, abs=1e-6)
     assert rollout_diversity(torch.cat([video, -3 * video])) == pytest.approx(2.0, abs=1e-6)
@@ -374,7 +367,7 @@ def test_identical_videos_have_diversity_zero_and_opposite_ones_two() -> None:
 
 
 def test_diversity_is_one_less_the_mean_over_frames_and_pairs_of_the_cosine() -> None:
-    """T28; frames of very different lengths count alike."""
+    """Frames of very different lengths count alike."""
     features = randn(4, 5, 16, seed=2) * torch.tensor([1.0, 100, 0.01, 3, 7]).view(1, 5, 1)
     pairs = [(i, j) for i in range(4) for j in range(i)]
     cosines = [torch.cosine_similarity(features[i], features[j], dim=1).mean() for i, j in pairs]
@@ -382,7 +375,6 @@ def test_diversity_is_one_less_the_mean_over_frames_and_pairs_of_the_cosine() ->
 
 
 def test_diversity_does_not_depend_on_the_order_of_the_videos() -> None:
-    """T28."""
     features = randn(6, 3, 8, seed=3)
     assert rollout_diversity(features) == pytest.approx(rollout_diversity(features[torch.tensor([3, 0, 5, 1, 4, 2])]))
 

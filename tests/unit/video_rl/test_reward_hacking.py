@@ -1,4 +1,4 @@
-"""The detector of reward hacking, equation (2)."""
+"""The detector of reward hacking, DD-2."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A run folder of loop 2: averaged weights, progress, held-out scores and the alarm of equation (2)."""
+"""A run folder of loop 2: averaged weights, progress, held-out scores and the alarm of DD-2."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Goals imagined by the text model (E6)."""
+"""Goals imagined by the text model (RS-6)."""
 
 import numpy as np
 import pytest

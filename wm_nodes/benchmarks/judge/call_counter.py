@@ -1,7 +1,7 @@
 """What a judge is asked per clip, counted in front of it, so that judges that bill differently can be compared.
 
 Calls are counted as a chat judge makes them in the plan `pack`: JSON votes of a request in one call, label votes one
-per component (judges/openai_client.py). Tokens are an estimate: section 2.4's 16-px patches merged 2 x 2 and 250 tokens
+per component (judges/openai_client.py). Tokens are an estimate: 16-px patches merged 2 x 2 and 250 tokens
 of text per call. What a server billed is beside it, in Verdict.cost.
 """
 

@@ -1,7 +1,7 @@
 """What planning, early exits and voting by need save, at which agreement: four ways of judging the same clips.
 
 agent: reward mode. everything: the same without early exits. voted: every component voted on besides. exhaustive: that
-on dense frames, which is what is left when all of the paper's measures of section 3.2 (efficiency) are taken away.
+on dense frames, which is what is left when all of the paper's measures of efficiency are taken away.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Clips optimised against a reward, the truth beside it: equation (2) of the paper with edits in place of a policy.
+"""Clips optimised against a reward, the truth beside it: DD-2 of the paper with edits in place of a policy.
 
 A search edits a clip that is good but for a physical defect: it cannot make it true, it can only make it look better.
 So the truth never rises, and a reward that does was hacked. Cheap: edits of pixels and time, no rendering.
@@ -170,7 +170,7 @@ def _children(chain: Sequence[LabelledClip], plan: SearchPlan, rng: np.random.Ge
 
 @dataclass(frozen=True)
 class Curve:
-    """Means over the searches of one reward, and what the detector (2) says of them. clean: mean reward of the
+    """Means over the searches of one reward, and what the detector (DD-2) says of them. clean: mean reward of the
     recordings. wins: share of searches that end at or above their recording's reward; before: that begin there.
     """
 

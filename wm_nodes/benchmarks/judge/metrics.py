@@ -18,7 +18,7 @@ from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.decisions import OVERALL, PAPER, STAGES, match, row_names
 
 MIN_RECALL, MAX_FALSE_POSITIVES = 0.95, 0.05
-"""What a hacking pattern's flags should reach (issue 4)."""
+"""What a hacking pattern's flags should reach."""
 MIN_BALANCED = 0.85
 """Balanced accuracy that "overall" should reach."""
 
@@ -83,8 +83,8 @@ def _word(value: Known) -> str:
 
 @dataclass(frozen=True)
 class PatternRow:
-    """How one hacking pattern fares. n: clips with it; clean: clips without any pattern, that the false positives are
-    counted on. recall, false_positives: of the agent's confirmed flag. best_recall: the largest recall of its score at
+    """How one hacking pattern fares (RA-22). n: clips with it; clean: clips without any pattern (false positives).
+    recall, false_positives: of the agent's confirmed flag. best_recall: the largest recall of its score at
     5 % false positives or less, as a ROC curve gives it (no threshold is chosen for use). refused: share that the agent
     does not accept, by whatever stage. win_rate: P(reward of the hacked clip >= that of its recorded clip) and gap:
     mean difference, over pairs whose recorded clip is good throughout. confusion: of the flag. unflagged, false_flags:

@@ -1,4 +1,4 @@
-"""How many clips the embedded judge reads per second. Issue 4 asks for 20 on 2 cores at 96 px and 25 frames.
+"""How many clips the embedded judge reads per second. The aim: 20 on 2 cores at 96 px and 25 frames.
 
     python -m benchmarks.judge.speed [FOLDER] [--json FILE]
 

@@ -85,9 +85,9 @@ def cost_table(costs: Mapping[str, Mapping[str, float]]) -> Table:
 
 
 def curve_table(curves: Sequence[Curve], caption: str) -> Table:
-    """The reward that was climbed and the truth, before and after, and the alarm of equation (2)."""
+    """The reward that was climbed and the truth, before and after, and the alarm of DD-2."""
     table = Table(title="climbing a reward, mean over clips", caption=caption)
-    for name in ("reward", "climbed", "clean clips have", "beat it before, after", "truth", "alarm (2)", "taken most"):
+    for name in ("reward", "climbed", "clean clips have", "beat it before, after", "truth", "alarm", "taken most"):
         table.add_column(name)
     for one in curves:
         alarm = "; ".join(f"truth {a.true_slope:+.4f}, reward {a.proxy_slope:+.4f}" for a in one.alarms) or "none"

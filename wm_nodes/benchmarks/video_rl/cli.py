@@ -1,6 +1,6 @@
 """DynDiff-GRPO against its rivals on the moving disc: claims A (diversity), B (learning) and C (cost of the KL), the
-choices of the paper's section 5.4, and a reward that can be hacked; claims A and B on clips of recorded episodes, and
-their picture's size.
+paper's ablations, and a reward that can be hacked; claims A and B on clips of recorded episodes, and their picture's
+size.
 
 Every --json file holds the command, the settings of each arm, and the sha256 of the weights that were measured; a
 picture is drawn beside it (of ablations from two seeds on).
@@ -375,8 +375,8 @@ def _parser() -> argparse.ArgumentParser:
     diversity.add_argument("--contexts", type=_positive, default=100)
     diversity.add_argument("--group-size", type=_positive, default=8)
     learning = claims.add_parser("learning", help="claim B: reward against model calls, every arm on one learner")
-    ablations = claims.add_parser("ablations", help="section 5.4: KL, advantage clip, guidance, resolution, in pairs")
-    hacking = claims.add_parser("hacking", help="a reward that can be hacked, and the detector of (2) on both")
+    ablations = claims.add_parser("ablations", help="in pairs: KL, advantage clip, guidance, resolution")
+    hacking = claims.add_parser("hacking", help="a reward that can be hacked, and the detector of DD-2 on both")
     for claim, iterations in ((learning, 40), (ablations, 12), (hacking, 25)):
         claim.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
         claim.add_argument("--iterations", type=_positive, default=iterations)

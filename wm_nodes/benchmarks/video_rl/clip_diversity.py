@@ -1,6 +1,6 @@
 """Claim A on clips of recorded contexts: how far the videos of one context spread, and at which cost in quality.
 
-Shapes: n videos of a context, F frames, H W 3 image. Equation (19), section 1.7.
+Shapes: n videos of a context, F frames, H W 3 image. DD-19.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +37,7 @@ def measure_clips(
 ) -> dict[str, Any]:
     """Sample a group of each context with the arm; lists of one value per context.
 
-    diversity, diversity_dynamic: (19) of whole pictures, and of what moves in the recording. object_spread_cm: rms
+    diversity, diversity_dynamic: DD-19 of whole pictures, and of what moves in the recording. object_spread_cm: rms
     distance of the last frames' object positions from their mean. reward, reward_std: of config.rewards.
     """
     rollout = replace(arm.rollout, micro_batch=config.rollout.micro_batch)
@@ -66,7 +66,7 @@ def measure_clips(
 
 
 def group_diversity(frames: Tensor, features: FrameFeatures) -> float:
-    """(19) of uint8 videos (n, F, H, W, 3)."""
+    """DD-19 of uint8 videos (n, F, H, W, 3)."""
     return rollout_diversity(features(frames.flatten(0, 1)).view(*frames.shape[:2], -1))
 
 

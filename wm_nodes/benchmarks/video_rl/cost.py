@@ -1,5 +1,5 @@
 """Claim C: what each KL anchor costs in seconds and bytes, side by side on the same buffers, and what the mask and
-caching add to a rollout. Sections 1.6, 5.4.
+caching add to a rollout. DD-20.
 """
 
 import time

@@ -1,4 +1,4 @@
-"""Claim A: how far the videos of one context spread, at which cost in quality. Sections 1.7, 5.2, equation (19).
+"""Claim A: how far the videos of one context spread, at which cost in quality. DD-19.
 
 Shapes: N videos in groups of one scene, F frames, C channels, H W cells.
 """

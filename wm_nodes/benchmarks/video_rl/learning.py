@@ -1,4 +1,4 @@
-"""Claim B: what each sampler makes of the same number of model calls, on the moving disc. Section 5.3.
+"""Claim B: what each sampler makes of the same number of model calls, on the moving disc.
 
 Shapes: N videos of one iteration, in groups of one scene each.
 """
@@ -60,7 +60,7 @@ def train_sampler(
     model: VideoNetwork, arm: SamplerSetup, plan: LearningPlan, seed: int,
     on_iteration: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
-    """Post-train `model` in place; return follow_training's row, and what equation (2) names."""
+    """Post-train `model` in place; return follow_training's row, and what DD-2 names."""
 
     def sample(iteration: int, version: int) -> tuple[RolloutBuffer, Callable[[], dict[str, float]]]:
         scenes = draw_scenes(plan.scenes, seed, "rollouts", iteration, plan.side)
@@ -105,7 +105,7 @@ def follow_training(
 
 
 def hacked(evaluations: list[dict[str, float]], proxy: str) -> list[str]:
-    """Held-out truths that got worse while the training reward rose, equation (2), over all evaluations.
+    """Held-out truths that got worse while the training reward rose, DD-2, over all evaluations.
 
     Worse is less obedience, a mass further from 1 (too much is as wrong as too little), more background error.
     """
@@ -178,7 +178,7 @@ def _means(scores: Scores, prefix: str = "") -> dict[str, float]:
 def group_spread(buffer: RolloutBuffer, group_size: int) -> dict[str, float]:
     """How far the videos of a scene spread while an arm trains, mean over the buffer's scenes.
 
-    rollout_diversity: (19) of centred pixels. rollout_reward_std: of the training reward.
+    rollout_diversity: DD-19 of centred pixels. rollout_reward_std: of the training reward.
     """
     latents = buffer.rollout.latents
     groups = latents.view(-1, group_size, *latents.shape[1:])
@@ -188,6 +188,6 @@ def group_spread(buffer: RolloutBuffer, group_size: int) -> dict[str, float]:
 
 
 def _largest_advantage(buffer: RolloutBuffer) -> float:
-    """The largest |A| of (13) before it is clipped."""
+    """The largest |A| of DD-13 before it is clipped."""
     unclipped = group_advantages(buffer.rewards["total"], buffer.group_ids, buffer.valid, clip=math.inf)
     return float(unclipped.advantages_N.abs().max())

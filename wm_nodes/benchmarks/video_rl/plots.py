@@ -30,11 +30,11 @@ SMOOTHED = 5
 
 
 def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> None:
-    """Diversity (19) with its 95 % interval against the noise an arm spends; the two regimes of initial noise."""
+    """Diversity (DD-19) with its 95 % interval against the noise an arm spends; the two regimes of initial noise."""
     figure = figure_of(10.5, 4.2)
     for axes, shared in zip(figure.subplots(1, 2, sharey=True), (False, True), strict=True):
         whose = "shared" if shared else "own"
-        style_axes(axes, f"{whose} initial noise", "noise spent, rms(std) / s", "diversity (19)")
+        style_axes(axes, f"{whose} initial noise", "noise spent, rms(std) / s", "diversity (DD-19)")
         for (family, marker), colour in zip(FAMILIES.items(), COLOURS, strict=True):
             points = sorted(
                 (np.mean(row["noise_share"]), *bootstrap_mean(row["diversity"], seed=seed))
@@ -82,7 +82,7 @@ def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
         right.plot(np.mean(values), place, "|", color="black", markersize=13, markeredgewidth=1.8)
     right.set_yticks(range(len(arms)), arms, fontsize=8)
     for axes in more:
-        style_axes(axes, f"rollouts, mean of {SMOOTHED} buffers and over seeds", "buffers", "diversity (19)")
+        style_axes(axes, f"rollouts, mean of {SMOOTHED} buffers and over seeds", "buffers", "diversity (DD-19)")
         for place, arm in enumerate(dict.fromkeys(row["arm"] for row in spread)):
             mean = np.mean([row["buffers"]["rollout_diversity"] for row in spread if row["arm"] == arm], 0)
             size = min(SMOOTHED, len(mean))

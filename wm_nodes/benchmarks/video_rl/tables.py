@@ -17,7 +17,7 @@ LAST_UPDATE = ("clip_low_share_2", "clip_high_share_2", "kl_2")
 
 def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     table = _table(
-        "diversity (19) and quality, mean over contexts with 95 % bootstrap interval",
+        "diversity (DD-19) and quality, mean over contexts with 95 % bootstrap interval",
         ("arm", "initial noise"), ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"),
     )
     for row in rows:
@@ -34,7 +34,7 @@ def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
 def clip_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     table = _table(
         f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("arm", "initial noise"),
-        ("noise rms/s", "diversity (19)", "moving part", "object spread, cm", "reward std", "tracking", "scenery"),
+        ("noise rms/s", "diversity (DD-19)", "moving part", "object spread, cm", "reward std", "tracking", "scenery"),
     )
     for row in rows:
         mean, low, high = bootstrap_mean(row["diversity"], seed=seed)
@@ -49,7 +49,7 @@ def clip_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
 def clip_comparison_table(comparisons: Sequence[dict[str, Any]]) -> Table:
     table = _table(
         "DynDiff - CPS, paired over contexts, 95 % bootstrap interval", ("arm", "base", "initial noise"),
-        ("noise", "diversity (19)", "moving part", "object spread, cm", "tracking"),
+        ("noise", "diversity (DD-19)", "moving part", "object spread, cm", "tracking"),
     )
     for row in comparisons:
         shown = ("diversity", "diversity_dynamic", "object_spread_cm", "tracking")
@@ -136,9 +136,9 @@ def resolution_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 
 def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Per training: the reward that trained it and the truths, before and after, and what the detector (2) names."""
+    """Per training: the reward that trained it and the truths, before and after, and what the detector (DD-2) names."""
     table = _table(
-        "reward hacking (2), held-out scenes", ("trained on",),
+        "reward hacking (DD-2), held-out scenes", ("trained on",),
         ("seed", "that reward", "obeyed", "mass", "background", "falls while it rises"),
     )
     for row in rows:

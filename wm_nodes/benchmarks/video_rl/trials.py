@@ -1,4 +1,4 @@
-"""What is trained to answer one question each: the choices of the paper's section 5.4, and a reward that can be hacked.
+"""What is trained to answer one question each: the paper's ablations, and a reward that can be hacked.
 
 Each ablation is a pair on one learner and one arm, with equal model calls.
 """

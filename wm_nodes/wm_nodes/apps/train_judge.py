@@ -1,4 +1,4 @@
-"""Train the embedded judge from adversarial sets, or measure a trained one. Specification: sections 4.2 and 4.3.
+"""Train the embedded judge from adversarial sets, or measure a trained one (RA-17 to RA-20).
 
 The sets' own division says which episodes train, which calibrate, and which nobody has seen. Started again, it takes up
 finished stages that lie in OUT.

@@ -85,7 +85,7 @@ class WorldModelConfig(SettingsSection):
     rollout_steps: list[PositiveInt]
     """Curriculum: imagined steps unrolled and back-propagated through, raised in equal stages over the training."""
     done_weight: NonNegativeFloat
-    """Weight of the done loss (E4)."""
+    """Weight of the done loss (RS-4)."""
     num_done_heads: PositiveInt
     """Independent done heads; their minimum is the done signal, their spread the uncertainty."""
     decoding_steps: PositiveInt
@@ -100,13 +100,13 @@ class WorldModelConfig(SettingsSection):
 
 class RewardConfig(SettingsSection):
     mode: Literal["delta", "abs", "progress"]
-    """Dense reward (E5): change of the goal distance, its level, or progress along the golden trajectory."""
+    """Dense reward (RS-5): change of the goal distance, its level, or progress along the golden trajectory."""
     dense_weight: NonNegativeFloat
     sparse_weight: NonNegativeFloat
     success_threshold: Fraction
-    """tau_s of E7: the done signal above which the sparse reward is paid and the episode terminates."""
+    """tau_s of RS-7: the done signal above which the sparse reward is paid and the episode terminates."""
     goal_threshold: Fraction
-    """tau_goal of E6: the text model's done signal above which its frame is the goal."""
+    """tau_goal of RS-6: the text model's done signal above which its frame is the goal."""
     dense_clip: PositiveFloat
     """The dense reward of one step is clipped to [-dense_clip, dense_clip]."""
     uncertainty_limit: NonNegativeFloat

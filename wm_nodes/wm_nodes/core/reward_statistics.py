@@ -1,4 +1,4 @@
-"""How well a judge's answers match known labels. Specification: sections 2.8 and 3.3. Shapes: N labelled decisions.
+"""How well a judge's answers match known labels (RA-24). Shapes: N labelled decisions.
 
 True is a pass. A decision that nobody made is left out before these functions are called.
 """

@@ -1,4 +1,4 @@
-"""The specification of an environment: what fixes shapes, units and order on the wire and in a bag."""
+"""What an environment is: what fixes shapes, units and order on the wire and in a bag."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""The controller's rule, equal in every environment: which actions are legal, and where they command the tool."""
+"""The controller's rule, equal in every environment (RS-9): legal actions, and where they command the tool."""
 
 import numpy as np
 

@@ -2,7 +2,7 @@
 
 A decision is True (passes), False, or a planning level; a row that a verdict leaves open is missing. Stages are decided
 as the agent's gates decide them, TC as completion (level 3 or more): its gate asks for visible progress only. Overall
-is what a trainer would accept: every gate passed and the task completed. [inferred], the paper does not say it.
+is what a trainer would accept: every gate passed and the task completed (RA-24). Our choice, the paper does not say it.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,5 @@
-"""The reward agent as reward of a policy: an episode is judged as a clip at its end, and paid at its last step.
+"""The reward agent as reward of a policy: an episode is judged as a clip at its end, and paid at its last step
+(RA-15).
 
 Every rollout begins with a reset, so an episode that the rollout's end cuts short never goes on and is never judged.
 Its 0 at each step is exact, for what it is worth would come with its last step only; for the rest the critic stands,

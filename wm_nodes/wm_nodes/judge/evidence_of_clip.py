@@ -1,4 +1,4 @@
-"""Endogenous evidence of a clip, as far as a rubric's bands ask for it. Specification: sections 2.3, 2.7 and 4.1.
+"""Endogenous evidence of a clip, as far as a rubric's bands ask for it (RA-13, RA-17).
 
 Pixels need nothing; what a world model says needs one that was trained in the clip's cameras, and the clip's actions.
 Evidence causes votes and second looks of the agent, and never adds reward.

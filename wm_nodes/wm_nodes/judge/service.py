@@ -1,4 +1,4 @@
-"""The reward agent at work on many clips, for callers that do not await. Specification: sections 2.3, 2.6.
+"""The reward agent at work on many clips, for callers that do not await (RA-1, RA-15).
 
 Shapes: N clips, F frames, H W 3 image, A action.
 """

@@ -1,4 +1,4 @@
-"""Advantages and value targets over rollouts of lock-steps. Shapes: T time, N environments. Equations: E10a."""
+"""Advantages and value targets over rollouts of lock-steps. Shapes: T time, N environments. RS-10a."""
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ def gae(
     gamma: float,
     lambda_: float,
 ) -> tuple[Tensor, Tensor]:
-    """Return (advantages_TN, returns_TN) by generalised advantage estimation (E10a), working back from the last step.
+    """Return (advantages_TN, returns_TN) by generalised advantage estimation (RS-10a), working back from the last step.
 
     delta_t = r_t + gamma (1 - terminated_t) V(x_{t+1}) - V(x_t);  A_t = delta_t + gamma lambda c_t A_{t+1};
     c_t = 1 where step t + 1 continues the same episode. Returns are A_t + V(x_t). Both are 0 where valid is False.

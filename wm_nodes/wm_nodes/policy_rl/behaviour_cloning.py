@@ -1,4 +1,4 @@
-"""Behaviour cloning: the weak policy that reinforcement learning starts from. Shapes: B batch, F features, A action."""
+"""Behaviour cloning (RS-11): the weak policy that RL starts from. Shapes: B batch, F features, A action."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -70,7 +70,7 @@ def make_reconstruct(model_dir: Path) -> Callable[[UInt8Array], UInt8Array]:
 
 
 def make_endogenous_reward(config: RunConfig, model_dir: Path) -> EndogenousReward:
-    """Reward E8 with the distance of the frozen tokenizer's features.
+    """Reward RS-8 with the distance of the frozen tokenizer's features.
 
     Raises:
         ValueError: reward.mode progress, whose golden trajectories no environment publishes: env/goal holds one frame.

@@ -1,4 +1,4 @@
-"""Diagonal Gaussian over actions. Shapes: B samples, A action. Equations: E10d.
+"""Diagonal Gaussian over actions. Shapes: B samples, A action. RS-10d.
 
 Actions are executed inside [-1, 1]. The sample is clamped first and the plain Gaussian density is taken at the clamped
 action, when acting and when learning alike; no tanh squashing, no mass at the limits. The ratio of two such densities
@@ -36,7 +36,7 @@ class DiagonalGaussian:
         return (self.log_std_A + 0.5 + _LOG_SQRT_2PI).sum().expand(self.mean_BA.shape[0])
 
     def kl(self, other: "DiagonalGaussian") -> Tensor:
-        """Return KL(self || other) in closed form (E10d), nats, (B,).
+        """Return KL(self || other) in closed form (RS-10d), nats, (B,).
 
         sum_a log(s2 / s1) + (s1^2 + (m1 - m2)^2) / (2 s2^2) - 1/2
         """

@@ -1,4 +1,4 @@
-"""Losses of proximal policy optimisation, one value per sample. Shapes: B samples. Equations: E10b, E10c.
+"""Losses of proximal policy optimisation, one value per sample. Shapes: B samples. RS-10b, RS-10c.
 
 Nothing is averaged here: the learner divides by the sample count of the whole minibatch, which may be spread over
 several ranks.
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def clipped_policy_loss(logprobs_B: Tensor, old_logprobs_B: Tensor, advantages_B: Tensor, *, clip: float) -> Tensor:
-    """Return -min(rho A, clamp(rho, 1 - clip, 1 + clip) A), rho = exp(logprob - old logprob) (E10b), shape (B,).
+    """Return -min(rho A, clamp(rho, 1 - clip, 1 + clip) A), rho = exp(logprob - old logprob) (RS-10b), shape (B,).
 
     old_logprobs_B: nats, of the executed action under the policy that acted. clip: > 0.
     """
@@ -22,7 +22,7 @@ def clipped_policy_loss(logprobs_B: Tensor, old_logprobs_B: Tensor, advantages_B
 def value_loss(
     values_B: Tensor, old_values_B: Tensor, returns_B: Tensor, *, clip: float, huber_delta: float = 10.0
 ) -> Tensor:
-    """Return the Huber loss of the critic (E10c), shape (B,): half the squared error up to huber_delta.
+    """Return the Huber loss of the critic (RS-10c), shape (B,): half the squared error up to huber_delta.
 
     With clip > 0 it is the larger of this loss and that of values kept within clip of old_values_B. clip 0: off.
     huber_delta: math.inf gives half the squared error everywhere.

@@ -1,7 +1,7 @@
-"""Proximal policy optimisation on rollouts, eq. (10). Shapes: T time, N environments, B samples of a minibatch,
+"""Proximal policy optimisation on rollouts (RS-10). Shapes: T time, N environments, B samples of a minibatch,
 F features, S state, A action.
 
-loss = E10b clipped policy + value_weight * E10c value - entropy_weight * entropy
+loss = RS-10b clipped policy + value_weight * RS-10c value - entropy_weight * entropy
        + kl_reference_weight * KL(policy || SFT policy), summed over valid samples and divided by their number.
 """
 

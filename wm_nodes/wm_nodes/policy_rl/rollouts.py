@@ -1,4 +1,4 @@
-"""Collects rollouts in lock-step inside one process, step for step as the graph does over DDS.
+"""Collects rollouts in lock-step inside one process (RS-9), step for step as the graph does over DDS.
 
 Shapes: T time, N environments. An environment that has ended is reset in the next lock-step instead of stepped, so that
 column of the rollout is invalid there. Seeds of resets and action noise depend on (seed, policy version, lock-step)

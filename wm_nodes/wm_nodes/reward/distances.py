@@ -1,4 +1,4 @@
-"""Perceptual distances between images: zero for equal images, symmetric, 0.5 to 1 for a typical start and goal.
+"""Perceptual distances between images (RS-5a): zero for equal images, symmetric, 0.5 to 1 for a typical start and goal.
 Shapes: N pairs, H W 3 image, F features.
 """
 

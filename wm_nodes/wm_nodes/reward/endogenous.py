@@ -1,5 +1,5 @@
 """The reward that the world model gives itself: goal distance plus done signal. Shapes: N environments, K golden
-frames. Equations: E5, E7, E8.
+frames. RS-5, RS-7, RS-8.
 """
 
 from typing import Any
@@ -22,13 +22,13 @@ from wm_nodes.reward.distances import Distance
 
 
 class EndogenousReward:
-    """r = w_d r^d + w_s r^s (E8).
+    """r = w_d r^d + w_s r^s (RS-8).
 
-    Dense (E5), with Phi(x) = 1 - Perc(x, goal):
+    Dense (RS-5), with Phi(x) = 1 - Perc(x, goal):
         delta: Phi(x_{t+1}) - Phi(x_t), clipped: pays for coming closer, nothing for staying close.
         abs: Phi(x_{t+1}), not clipped: its level is the signal.
         progress: index of the nearest golden frame over that of the goal, difference over the step, clipped.
-    Sparse (E7): 1 where the done signal is strictly above the threshold; nothing above the uncertainty limit. It is
+    Sparse (RS-7): 1 where the done signal is strictly above the threshold; nothing above the uncertainty limit. It is
     paid once because the environment terminates on the crossing and later steps are invalid.
 
     A goal is needed only while dense_weight > 0; without one the step is invalid, never worth 0.

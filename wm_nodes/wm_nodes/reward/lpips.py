@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018) from a local folder: a frozen AlexNet or VGG16 with learned channel weights.
+"""LPIPS (Zhang et al. 2018; RS-5a) from a local folder: a frozen AlexNet or VGG16 with learned channel weights.
 Shapes: N images, C channels.
 
 Nothing is downloaded. The folder holds one backbone file with torchvision's parameter names (`features.0.weight`, ...)

@@ -1,4 +1,4 @@
-"""A flow-matching video model, its stochastic samplers, and what GRPO stores of them. Equations (3) to (12)."""
+"""A flow-matching video model, its stochastic samplers, and what GRPO stores of them. DD-3 to DD-12."""
 
 from wm_nodes.video_model.buffer import RolloutBuffer, RolloutBufferError, concatenate_buffers, config_hash
 from wm_nodes.video_model.conditions import Condition, concatenate

@@ -1,4 +1,4 @@
-"""The rollout buffer of GRPO: sampled groups, their rewards, and everything a training step needs. Section 1.8.
+"""The rollout buffer of GRPO: sampled groups, their rewards, and everything a training step needs.
 
 Shapes: N videos, S stochastic steps. The file is one safetensors; nothing in it is executed on load.
 """

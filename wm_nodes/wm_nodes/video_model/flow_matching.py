@@ -1,4 +1,5 @@
-"""Flow matching: how the embedded video model learns. Shapes: B videos, C channels, F latent frames, H W grid, K given.
+"""Flow matching: how the embedded video model learns (DD-3c). Shapes: B videos, C channels, F latent frames,
+H W grid, K given.
 
 x_t = (1 - t) x_0 + t eps on generated frames, clean on given ones; loss = mean over generated elements of
 |v(x_t, t, c) - (eps - x_0)|^2. Half of the times are shifted by SHIFT, towards the noise, where motion is decided.

@@ -1,4 +1,5 @@
-"""One step of every sampler: (x, v, t, s, context) -> Gaussian of x_s. Equations (3) to (5), (10), (11) and section 2.
+"""One step of every sampler: the Gaussian of x_s given x_t = x and the velocity v (DD-3 to DD-5, DD-10,
+DD-11), and that of the rival samplers (DD-21 to DD-24).
 
 Shapes: B batch, C channels, F latent frames, H W latent grid; t, s: float64 (B,), with 1 >= t > s >= 0.
 Every kernel returns mean and standard deviation; std is 0 (an ODE step) where s = 0. Coefficients are computed in
@@ -88,7 +89,7 @@ def step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, setti
 
 
 def estimates(x: Tensor, v: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (3): the clean estimate x0 = x - t v and the noise estimate eps = x + (1 - t) v."""
+    """Return DD-3: the clean estimate x0 = x - t v and the noise estimate eps = x + (1 - t) v."""
     return x - _rows(t, x) * v, x + _rows(1 - t, x) * v
 
 
@@ -106,12 +107,12 @@ def ode_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, s
 
 
 def cps_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerSettings) -> Step:
-    """Coefficient-preserving sampling, (4) with the same sigma in every cell."""
+    """Coefficient-preserving sampling: DD-4 with the same sigma in every cell."""
     return _preserving_step(*estimates(x, v, t), t, s, _generated(x, context), settings)
 
 
 def dyndiff_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerSettings) -> Step:
-    """(4) with sigma(u) = sigma_base M(u), (5)."""
+    """DD-4 with the sigma of DD-5."""
     x0, eps = estimates(x, v, t)
     mask = context.mask
     if mask is None:
@@ -124,7 +125,7 @@ def dyndiff_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContex
 
 @torch.no_grad()
 def rollout_mask(x0: Tensor, t: Tensor, context: StepContext, settings: SamplerSettings) -> Tensor:
-    """Return the mask of a step, (B, 1, F, H, W), from its clean estimate: (9) up to time_limit, 1 above; rounded."""
+    """Return the mask of a step, (B, 1, F, H, W), from its clean estimate: DD-9 up to time_limit, 1 above; rounded."""
     mask = dynamic_mask(with_conditioning(x0, context.conditioning), context.num_conditioning, settings.mask)
     if settings.mask.time_limit < 1:
         late = (t <= settings.mask.time_limit).view(-1, 1, 1, 1, 1).to(mask.device)
@@ -133,7 +134,7 @@ def rollout_mask(x0: Tensor, t: Tensor, context: StepContext, settings: SamplerS
 
 
 def _preserving_step(x0: Tensor, eps: Tensor, t: Tensor, s: Tensor, mask: Tensor, settings: SamplerSettings) -> Step:
-    """(10), (11): mean (1 - s) x0 + sqrt(s^2 - sigma^2) eps; the squared noise coefficients add up to s^2."""
+    """DD-10, DD-11: mean (1 - s) x0 + sqrt(s^2 - sigma^2) eps; the squared noise coefficients add up to s^2."""
     with torch.no_grad():
         base, sigma = _rows(_sigma_base(s, settings.eta, settings.sigma_map), x0), masked_deviation(mask, s, settings)
         kept = (_rows(s, x0).square() - sigma.square()).clamp_min(0).sqrt()
@@ -142,7 +143,7 @@ def _preserving_step(x0: Tensor, eps: Tensor, t: Tensor, s: Tensor, mask: Tensor
 
 
 def masked_deviation(mask: Tensor, s: Tensor, settings: SamplerSettings) -> Tensor:
-    """Return sigma of (5), (B, 1, F, H, W), in the dtype of the mask."""
+    """Return sigma of DD-5, (B, 1, F, H, W), in the dtype of the mask."""
     base, s_rows = _rows(_sigma_base(s, settings.eta, settings.sigma_map), mask), _rows(s, mask)
     if settings.mask_on == "std":
         sigma = base * mask
@@ -155,7 +156,7 @@ def masked_deviation(mask: Tensor, s: Tensor, settings: SamplerSettings) -> Tens
 
 
 def _euler_sde(x: Tensor, v: Tensor, t: Tensor, s: Tensor, variance: Tensor, context: StepContext) -> Step:
-    """mean x + (s - t) v - Sigma^2 / (2 t) eps, std Sigma: the common form of Flow-GRPO, DanceGRPO and SAGE."""
+    """mean x + (s - t) v - Sigma^2 / (2 t) eps, std Sigma: the common form of Flow-GRPO, DanceGRPO and SAGE (DD-21)."""
     _, eps = estimates(x, v, t)
     variance = torch.where(s > 0, variance, 0.0)
     std = _rows(variance.sqrt(), x)
@@ -166,18 +167,18 @@ def _euler_sde(x: Tensor, v: Tensor, t: Tensor, s: Tensor, variance: Tensor, con
 
 
 def flow_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerSettings) -> Step:
-    """Flow-GRPO: Sigma^2 = a^2 t / (1 - t~) (t - s), where t~ = t_1 at the first step (in the denominator only)."""
+    """Flow-GRPO (DD-22): Sigma^2 = a^2 t / (1 - t~) (t - s), t~ = t_1 at the first step (in the denominator only)."""
     denominator = 1 - torch.where(t >= 1, torch.full_like(t, context.first_time), t)
     return _euler_sde(x, v, t, s, settings.eta**2 * t / denominator * (t - s), context)
 
 
 def dance_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerSettings) -> Step:
-    """DanceGRPO: Sigma^2 = eta^2 (t - s)."""
+    """DanceGRPO (DD-23): Sigma^2 = eta^2 (t - s)."""
     return _euler_sde(x, v, t, s, settings.eta**2 * (t - s), context)
 
 
 def sage_step(x: Tensor, v: Tensor, t: Tensor, s: Tensor, context: StepContext, settings: SamplerSettings) -> Step:
-    """SAGE: Sigma^2 = eta^2 (ln((1 - s) / (1 - t~)) - (t - s)), t~ = min(t, 0.997).
+    """SAGE (DD-24): Sigma^2 = eta^2 (ln((1 - s) / (1 - t~)) - (t - s)), t~ = min(t, 0.997).
 
     Up to t = 0.997 this is the integral of eta^2 tau / (1 - tau) from s to t.
     """

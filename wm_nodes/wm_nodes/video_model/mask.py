@@ -1,4 +1,4 @@
-"""Where a video moves: the dynamics-aware exploration mask of DynDiff-GRPO, equations (6) to (9b).
+"""Where a video moves: the dynamics-aware exploration mask of DynDiff-GRPO, DD-6 to DD-9b.
 
 Shapes: B batch, C channels, F latent frames, H W latent grid. The mask is (B, 1, F, H, W), broadcast over channels.
 Everything is computed without gradient from the clean estimate x0 of the same forward pass.
@@ -22,16 +22,16 @@ class MaskSettings:
     """Knobs of the mask.
 
     m_min: exploration left where nothing moves, in (0, 1]; a cell without any has no density.
-    quantile: q of (8); cells whose intensity reaches it count as dynamic.
-    combine: how intensity I and sparse prior P become the mask (9). gated: m_min + (1 - m_min) I P, the paper's
+    quantile: q of DD-8; cells whose intensity reaches it count as dynamic.
+    combine: how intensity I and sparse prior P become the mask (DD-9). gated: m_min + (1 - m_min) I P, the paper's
         reading; sparse: m_min + (1 - m_min) P; convex: m_min + (1 - m_min)(a I + (1 - a) P); max: max(m_min, I P).
     convex_share: a of `convex`.
-    channel_norm: how a residual's channels become one intensity (7).
+    channel_norm: how a residual's channels become one intensity (DD-7).
     norm: what an intensity is divided by; q99 is the 0.99 quantile, less sensitive to one hot cell.
     norm_scope: over the whole sample, or per frame (gives still frames full exploration).
-    diff: temporal difference of (6).
-    budget: (9b) literal: as is; rms: the mask's mean square over generated cells becomes 1; peak: its mean square over
-        dynamic cells does.
+    diff: temporal difference of DD-6.
+    budget: DD-9b; literal: as is; rms: the mask's mean square over generated cells becomes 1; peak: that over dynamic
+        cells does.
     time_limit: above this t the mask is 1 everywhere (x0 says little about motion near pure noise).
     """
 
@@ -57,10 +57,10 @@ class MaskSettings:
 
 @torch.no_grad()
 def dynamic_mask(x0_BCFHW: Tensor, num_conditioning: int, settings: MaskSettings) -> Tensor:
-    """Return the mask M of (9), budgeted by (9b): 0 on conditioning frames, positive on generated ones.
+    """Return the mask M of DD-9, budgeted by DD-9b: 0 on conditioning frames, positive on generated ones.
 
     Args:
-        x0_BCFHW: clean estimate with the *clean* conditioning frames already put in (equation (6) is wrong without).
+        x0_BCFHW: clean estimate with the *clean* conditioning frames already put in (DD-6 is wrong without).
         num_conditioning: leading frames that are given, 0 to F.
 
     It runs at every step of a rollout, so it makes few passes, and none over booleans, which are slow.
@@ -85,7 +85,7 @@ def dynamic_mask(x0_BCFHW: Tensor, num_conditioning: int, settings: MaskSettings
 
 
 def residual(x0_BCFHW: Tensor, diff: str = "backward", num_conditioning: int = 0) -> Tensor:
-    """Return r of (6) for the frames after the conditioning ones: the temporal difference less its mean over the frame.
+    """Return r of DD-6 for the frames after the conditioning ones: temporal difference less its mean over the frame.
 
     A first frame has no predecessor and takes the second one's residual. The spatial mean removes a change of global
     brightness; a pan over a textured scene still lights up the whole frame.
@@ -116,7 +116,7 @@ def quantile(values_BU: Tensor, q: float) -> Tensor:
 
 
 def _channel_norm(residual_BCFHW: Tensor, kind: str) -> Tensor:
-    """(7), in place of the residual."""
+    """DD-7, in place of the residual."""
     if kind == "rms":
         return residual_BCFHW.square_().mean(1, keepdim=True).sqrt_()
     magnitude = residual_BCFHW.abs_()

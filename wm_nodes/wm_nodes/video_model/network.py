@@ -152,7 +152,7 @@ def _last_given(x: Tensor, condition: Condition) -> Tensor:
 
 
 def _around_last_given(out: Tensor, x: Tensor, t: Tensor, condition: Condition, change_std: float) -> Tensor:
-    """Return v (B, C, F, H, W) from a network output (B, 2C, F, H, W) that says how each cell changes.
+    """Return v (B, C, F, H, W) of DD-3d from a network output (B, 2C, F, H, W) that says how each cell changes.
 
     Its halves give mean m and deviation d of the change r = x_0 - g from the last given frame g, as if r were Gaussian.
     From y = x_t - (1 - t) g = (1 - t) r + t eps the least-squares estimate of eps - r is then
@@ -179,7 +179,7 @@ def _places(x: Tensor, num_conditioning: int) -> Tensor:
 
 
 def guided_velocity(model: VelocityModel, x: Tensor, t: Tensor, condition: Condition, cfg: float) -> Tensor:
-    """Return v_u + g (v_c - v_u), g = cfg; 1 is off and costs one call instead of two."""
+    """Return v_u + g (v_c - v_u) (DD-3b), g = cfg; 1 is off and costs one call instead of two."""
     if cfg == 1:
         return model(x, t, condition)
     conditional = model(x, t, condition)

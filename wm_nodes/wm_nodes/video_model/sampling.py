@@ -1,4 +1,4 @@
-"""Algorithm 1, rollout half: sample videos and keep what training needs. Section 1.8.
+"""Sample videos and keep what training needs of them (DD-1, DD-14b).
 
 Shapes: N videos, S stochastic steps, L kept latents, C channels, F latent frames, H W grid, K given frames.
 """
@@ -226,6 +226,6 @@ def keep_transition(rollout: VideoRollout, k: int, x_s: Tensor, law: Step) -> No
 
 
 def normalised_noise(x_s: Tensor, law: Step, num_conditioning: int, out: Tensor | None = None) -> Tensor:
-    """Return zeta = (x_s - mean) / std on generated frames, (N, C, F - K, H, W), in `out` where given."""
+    """Return zeta of DD-14b, (x_s - mean) / std on generated frames, (N, C, F - K, H, W), in `out` where given."""
     K = num_conditioning
     return torch.sub(x_s[:, :, K:], law.mean[:, :, K:], out=out).div_(law.std[:, :, K:])

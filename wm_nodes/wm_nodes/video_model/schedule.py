@@ -1,4 +1,4 @@
-"""Times of a flow-matching sampler. t = 1 is pure noise, t = 0 is data; x_t = (1 - t) x_0 + t eps."""
+"""Times of a flow-matching sampler (DD-3a). t = 1 is pure noise, t = 0 is data; x_t = (1 - t) x_0 + t eps."""
 
 import torch
 from torch import Tensor

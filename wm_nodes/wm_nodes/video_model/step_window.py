@@ -1,4 +1,4 @@
-"""Which sampler steps are stochastic, and which of them train. Mix-GRPO's windows, Flow-GRPO-Fast, step fractions.
+"""Which sampler steps are stochastic (DD-25: windows of Mix-GRPO and Flow-GRPO-Fast), and which of them train (DD-26).
 
 Steps are numbered 0 to T - 1; the last one (s = 0) is never stochastic, so T - 1 steps can be.
 """

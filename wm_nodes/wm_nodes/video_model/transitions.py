@@ -1,4 +1,4 @@
-"""Algorithm 1, training half: what the current weights say about stored transitions. Section 1.5.
+"""What the current weights say about stored transitions (DD-1).
 
 Shapes: M transitions, C channels, F latent frames, H W grid, K given frames, U = C (F - K) H W generated elements.
 """

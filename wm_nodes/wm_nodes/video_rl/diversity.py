@@ -1,4 +1,4 @@
-"""How different the videos of one context are. Shapes: n videos, K frames, D features. Equation (19)."""
+"""How different the videos of one context are. Shapes: n videos, K frames, D features (DD-19)."""
 
 import torch
 from torch import Tensor
@@ -6,7 +6,7 @@ from torch.nn.functional import normalize
 
 
 def rollout_diversity(features_nKD: Tensor) -> float:
-    """Return (19), the mean pairwise cosine distance 1 - e_i . e_j of the videos of one context, in [0, 2].
+    """Return DD-19, the mean pairwise cosine distance 1 - e_i . e_j of the videos of one context, in [0, 2].
 
     e_i = normalise(concat_k normalise(features_{i,k})), so e_i . e_j is the mean over frames of the frames' cosines.
 

@@ -1,4 +1,4 @@
-"""Features of pictures for diversity (19): which ones measured is part of every number, so each has a name.
+"""Features of pictures for diversity (DD-19): which ones measured is part of every number, so each has a name.
 
 Shapes: N frames, H W 3 image, D features. A backbone comes from a local folder; nothing is downloaded.
 """

@@ -1,4 +1,4 @@
-"""Group-relative advantages of GRPO. Shapes: N videos, each of one group (one context). Equation (13).
+"""Group-relative advantages of GRPO. Shapes: N videos, each of one group (one context); DD-13 to DD-13c.
 
 Computed in float64: in float32 a group of equal rewards gets advantages of up to 0.9 from rounding alone.
 """
@@ -59,7 +59,7 @@ def group_advantages(
     floor: float = 1e-6,
     running: RunningStd | None = None,
 ) -> GroupAdvantages:
-    """Return A_i = clip((R_i - mean_g R) / std_g R, -clip, clip) (13) over the valid videos of each group.
+    """Return A_i = clip((R_i - mean_g R) / std_g R, -clip, clip) (DD-13) over the valid videos of each group.
 
     The mean is the group's; the standard deviation is the group's, that of all groups together, or the running one.
     A group of fewer than two valid videos, or with std < floor max(1, |mean|), has advantages 0 and is counted.
@@ -105,7 +105,7 @@ def group_advantages(
 
 
 def trainable(valid_N: BoolArray, group_ids_N: NDArray[np.int64]) -> BoolArray:
-    """Return which clips train, (N,): the valid ones of groups with n_valid >= max(2, G / 2)."""
+    """Return which clips train (RA-15), (N,): the valid ones of groups with n_valid >= max(2, G / 2)."""
     if valid_N.shape != group_ids_N.shape:
         raise ValueError(f"valid and group ids must have one shape, got {valid_N.shape} and {group_ids_N.shape}")
     kept = np.zeros(valid_N.shape, bool)
@@ -126,9 +126,9 @@ def mixed_advantages(
     ddof: int = 0,
     floor: float = 1e-6,
 ) -> GroupAdvantages:
-    """Return clip(sum_r w_r A_r / sum_r |w_r|) of rewards normalised one by one, whatever their units and spreads.
+    """Return clip(sum_r w_r A_r / sum_r |w_r|) of rewards normalised one by one (DD-13a).
 
-    A_r is (13) of reward r, unclipped. A group counts as one without spread where no reward has any.
+    A_r is DD-13 of reward r, unclipped. A group counts as one without spread where no reward has any.
 
     Raises:
         ValueError: no weight that is not 0, a weight of an unknown reward, or as group_advantages.
@@ -149,7 +149,7 @@ def mixed_advantages(
 
 
 def best_of_n(advantages_N: Tensor, group_ids_N: Tensor, kept_N: Tensor, n: int) -> Tensor:
-    """Return which videos stay, bool (N,): of each group the n // 2 best and the other n - n // 2 worst of those kept.
+    """Return which videos stay (DD-13b), bool (N,): of those kept the n // 2 best and n - n // 2 worst of each group.
 
     n = 0, or a group that is not larger than n: all stay. Equal advantages are ordered by their index.
     """
@@ -169,7 +169,7 @@ def _groups(group_ids_N: Tensor) -> list[int]:
 
 
 def win_rates(rewards_N: Tensor, group_ids_N: Tensor, valid_N: Tensor) -> Tensor:
-    """Return Pref-GRPO's reward: each valid video's share of wins against the others of its group; ties count half."""
+    """Return Pref-GRPO's reward (DD-13c): each valid video's share of wins within its group; ties count half."""
     rates = torch.full_like(rewards_N, float("nan"), dtype=torch.float64)
     for group in _groups(group_ids_N):
         members = (group_ids_N == group) & valid_N.bool()

@@ -1,9 +1,9 @@
-"""GRPO of a flow-matching video model on a rollout buffer, equations (13) to (18), (20).
+"""GRPO of a flow-matching video model on a rollout buffer (DD-13 to DD-18, DD-20; averaged weights: DD-30).
 
 Shapes: N videos, S stochastic steps, M transitions (video, step) of one network call, U generated elements.
 
 One buffer serves `updates_per_buffer` optimizer steps. Each one accumulates over every kept (video, step) pair, divided
-by their number, so that micro-batches and ranks do not change it. On the first one the ratio is 1 and the KL of (20) 0.
+by their number, so that micro-batches and ranks do not change it. On the first one the ratio is 1 and DD-20 is 0.
 """
 
 import copy

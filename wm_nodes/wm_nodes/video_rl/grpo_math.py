@@ -1,4 +1,5 @@
-"""Probability ratios, objective and KL of GRPO over Gaussian sampler steps. Equations (12), (14) to (18), (20).
+"""Probability ratios, objective and KL of GRPO over Gaussian sampler steps. DD-12, DD-14 to
+DD-17a, DD-27.
 
 Shapes: M transitions, each a (video, step) pair; U generated elements of one latent video. A transition is stored as
 its normalised noise zeta = (x_s - mean) / std, taken after x_s was rounded to its storage type; with std cached, every
@@ -20,28 +21,28 @@ KlMode = Literal["mean", "logk2", "logk3", "velocity", "none"]
 
 
 def gaussian_logprob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """Return (14): the mean over elements of (12), log N(x; mean, std^2), per row of (M, U), nats per element."""
+    """Return DD-14: the mean over elements of DD-12, log N(x; mean, std^2), per row of (M, U), nats per element."""
     return (-0.5 * ((x - mean) / std).square() - std.log() - 0.5 * math.log(2 * math.pi)).mean(1)
 
 
 def log_ratio(new_zeta_MU: Tensor, old_zeta_MU: Tensor, weight_MU: Tensor | float = 1.0) -> Tensor:
-    """Return the log of (15), (M,): mean over elements of weight (zeta_old - zeta_new)(zeta_old + zeta_new) / 2.
+    """Return the log of DD-15, (M,): mean over elements of weight (zeta_old - zeta_new)(zeta_old + zeta_new) / 2.
 
-    weight: 1 the full likelihood; 2 std^2 CPS's (no 1 / 2 std^2); (std / sigma_base)^2 the same 1 / 2 sigma_base^2 for
-    every cell, so that dynamic cells lead.
+    weight (DD-14c): 1 the full likelihood; 2 std^2 CPS's (no 1 / 2 std^2); (std / sigma_base)^2 the same
+    1 / 2 sigma_base^2 for every cell, so that dynamic cells lead.
     """
     return (0.5 * weight_MU * (old_zeta_MU - new_zeta_MU) * (old_zeta_MU + new_zeta_MU)).mean(1)
 
 
 def normalised_log_ratio(new_zeta_MU: Tensor, old_zeta_MU: Tensor, std_MU: Tensor) -> Tensor:
-    """Return the log of (15b), (M,): rms(std) (log ratio + mean (delta / std)^2 / 2), centred at 0 for small moves."""
+    """Return the log of DD-15b, (M,): rms(std) (log ratio + mean (delta / std)^2 / 2), centred at 0 for small moves."""
     drift = (old_zeta_MU - new_zeta_MU).square().mean(1) / 2
     rms = std_MU.expand_as(new_zeta_MU).square().mean(1).sqrt()
     return rms * (log_ratio(new_zeta_MU, old_zeta_MU) + drift)
 
 
 def clipped_objective(log_ratio_M: Tensor, advantages_M: Tensor, *, clip_low: float, clip_high: float) -> Tensor:
-    """Return (16) per transition, to be maximised: min(r A, clamp(r, 1 - clip_low, 1 + clip_high) A)."""
+    """Return DD-16 per transition, to be maximised: min(r A, clamp(r, 1 - clip_low, 1 + clip_high) A)."""
     ratio = log_ratio_M.exp()
     return torch.minimum(ratio * advantages_M, ratio.clamp(1 - clip_low, 1 + clip_high) * advantages_M)
 
@@ -53,22 +54,22 @@ def clip_tails(log_ratio_M: Tensor, *, clip_low: float, clip_high: float) -> tup
 
 
 def mean_kl(new_zeta_MU: Tensor, target_zeta_MU: Tensor) -> Tensor:
-    """Return (17), (M,): the KL of Gaussians of one std, mean over elements; (20) with the buffer's zeta as target."""
+    """Return DD-17, (M,): the KL of Gaussians of one std, mean over elements; with the buffer's zeta it is DD-20."""
     return 0.5 * (target_zeta_MU - new_zeta_MU).square().mean(1)
 
 
 def log_space_kl(log_ratio_M: Tensor, mode: Literal["logk2", "logk3"]) -> Tensor:
-    """Return the k2 estimate (log r)^2 / 2 or the k3 estimate r^-1 - 1 + log r, (M,); far weaker than (17)."""
+    """Return the k2 estimate (log r)^2 / 2 or the k3 estimate r^-1 - 1 + log r, (M,); DD-17a; far weaker than DD-17."""
     if mode == "logk2":
         return 0.5 * log_ratio_M.square()
     return torch.expm1(-log_ratio_M) + log_ratio_M
 
 
 def velocity_kl(new_zeta_MU: Tensor, target_zeta_MU: Tensor, std_MU: Tensor, slope_MU: Tensor) -> Tensor:
-    """Return mean over elements of (v_new - v_target)^2, (M,), from delta mean = slope delta v."""
+    """Return mean over elements of (v_new - v_target)^2 (DD-17a), (M,), from delta mean = slope delta v."""
     return (std_MU * (target_zeta_MU - new_zeta_MU) / slope_MU).square().mean(1)
 
 
 def step_equaliser(sensitivity_S: Tensor) -> Tensor:
-    """Return the weight median_j g_j / g_k of each step (SAGE), from g = rms_u |d mean / d v| / std, (S,)."""
+    """Return the weight median_j g_j / g_k of each step (SAGE, DD-27), from g = rms_u |d mean / d v| / std, (S,)."""
     return sensitivity_S.median() / sensitivity_S

@@ -13,7 +13,7 @@ Anchor = Literal["buffer", "frozen", "lora_off", "moving", "dual"]
 
 @dataclass(frozen=True)
 class AdvantageSettings:
-    """(13). clip: of the normalised advantage. mix: several rewards are added before they are normalised (reward), or
+    """DD-13. clip: of the normalised advantage. mix: several rewards are added before they are normalised (reward), or
     each is normalised and then weighed (advantage). best_of_n: videos of a group that train, best and worst; 0: all.
     floor: a group with std < floor max(1, |mean|) has no spread. source: what is normalised, the reward, or (win_rate)
     Pref-GRPO's share of wins against the others of the group.
@@ -30,9 +30,9 @@ class AdvantageSettings:
 
 @dataclass(frozen=True)
 class KlSettings:
-    """(17), (20). beta: weight. anchor: buffer (what sampled), frozen (the model as it was at the start), lora_off (the
-    same through switching the adapter off), moving (weights of every `moving_updates`-th update), dual (buffer always,
-    frozen on every `dual_every`-th update beside it).
+    """DD-17, DD-20. beta: weight. anchor: buffer (what sampled), frozen (the model as it was at the start), lora_off
+    (the same through switching the adapter off), moving (weights of every `moving_updates`-th update), dual (buffer
+    always, frozen on every `dual_every`-th update beside it).
     """
 
     mode: KlMode = "mean"
@@ -49,7 +49,7 @@ class GrpoSettings:
     trains: every parameter that asks for a gradient, or (condition) those of VideoNetwork.condition_parameters alone.
     updates_per_buffer: N_KL, optimizer steps on one buffer; passes: each on the whole buffer (full), or on its own
     part of the videos (parts). step_fraction, step_select, min_s: see step_window.select_steps. cfg: guidance of the
-    training pass. ratio_norm: (15b). equalise: weigh steps by SAGE's equaliser. max_staleness: optimizer steps between
+    training pass. ratio_norm: DD-15b. equalise: weigh steps by SAGE's equaliser. max_staleness: optimizer steps between
     sampling and training that are still accepted.
 
     Raises:
@@ -83,7 +83,7 @@ class GrpoSettings:
         if self.mask_source == "recompute" and any(others.values()):
             given = ", ".join(f"{name} {getattr(self, name)}" for name, other in others.items() if other)
             raise ValueError(
-                f"mask_source recompute has the full likelihood (12), got {given}; take logprob_weight full and "
+                f"mask_source recompute has the full likelihood (DD-12), got {given}; take logprob_weight full and "
                 "ratio_norm false, or mask_source cached"
             )
         if all(others.values()):

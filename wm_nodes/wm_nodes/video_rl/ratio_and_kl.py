@@ -1,4 +1,5 @@
-"""The two terms of GRPO's loss on stored transitions: the ratio of likelihoods (15) and the KL to an anchor (17), (20).
+"""The two terms of GRPO's loss on stored transitions: the ratio of likelihoods (DD-14b to DD-15b) and the KL to
+an anchor (DD-17, DD-20).
 
 Shapes: M transitions (video, step) of one network call, U generated elements, S stochastic steps.
 """
@@ -76,14 +77,14 @@ class GrpoTerms:
         self.anchor = {name: p.detach().clone() for name, p in named if p.requires_grad}
 
     def ratio(self, buffer: RolloutBuffer, rows: Rows) -> Pass:
-        """Run the current weights; the logarithm of (15), or of (15b) with ratio_norm."""
+        """Run the current weights; the logarithm of DD-15, or of DD-15b with ratio_norm."""
         cached = self.settings.mask_source == "cached"
         new = self._transition(self.model, buffer, rows, self._mask(buffer, rows) if cached else None)
         old_zeta = _stored_zeta(buffer, rows).to(new.zeta.device)
         return Pass(new, old_zeta, self._log_ratio(new, old_zeta, buffer, rows))
 
     def kl(self, found: Pass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
-        """(17) or (20) per transition, (M,). version: optimizer steps made, which tell when a dual anchor is due."""
+        """DD-17 or DD-20 per transition, (M,). version: optimizer steps made, which tell when a dual anchor is due."""
         settings, kl = self.settings.kl, torch.zeros_like(found.log_ratio)
         if settings.mode == "none" or settings.beta == 0:
             return kl
@@ -137,7 +138,7 @@ class GrpoTerms:
     def _recomputed_log_ratio(
         self, new: GaussianTransition, old_zeta: Tensor, buffer: RolloutBuffer, rows: Rows
     ) -> Tensor:
-        """Ablation: the current weights choose the mask too, so all three terms of (12) stay in the ratio."""
+        """Ablation: the current weights choose the mask too, so all three terms of DD-12 stay in the ratio."""
         old_std, zeros = self._old_std(new, buffer, rows), torch.zeros_like(new.zeta)
         return gaussian_logprob(new.zeta * new.std, zeros, new.std) - gaussian_logprob(
             old_zeta * old_std, zeros, old_std

@@ -1,9 +1,9 @@
-"""What sampled clips are worth, against the recorded episode they should have shown.
+"""What sampled clips are worth, against the recorded episode they should have shown (DD-28).
 
 Shapes: N clips, F frames, H W 3 image. Positions are read off the decoded pictures by the judge's probe
 (world_model/position_probe.py), which shares nothing with the video model; the truth is the simulator's. Nothing here
 is a learned preference: these are the verifiable rewards, and the held-out metrics beside which a judge's reward is
-watched (equation (2)).
+watched (DD-2).
 """
 
 from collections.abc import Mapping
@@ -98,7 +98,7 @@ def load_probe(folder: Path) -> PositionProbe:
 
 
 def mixed(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Return sum over names of weight x value, float64 (N,).
+    """Return sum over names of weight x value (DD-13a), float64 (N,).
 
     Raises:
         ValueError: a weight for something that was not scored, or no weight at all.

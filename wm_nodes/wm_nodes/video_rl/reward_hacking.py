@@ -1,4 +1,4 @@
-"""Reward hacking made visible, equation (2): the training reward goes up while what it stands for does not."""
+"""Reward hacking made visible (DD-2): the training reward goes up while what it stands for does not."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -48,7 +48,7 @@ class GroupSettings:
 @dataclass(frozen=True)
 class EvaluationSettings:
     """Held-out contexts, one ODE clip each, before, during and after. num_steps: sampler steps. every: buffers between
-    two evaluations of the learner; 0: none. window: newest evaluations over which equation (2) compares the training
+    two evaluations of the learner; 0: none. window: newest evaluations over which DD-2 compares the training
     reward with the held-out scores; at least 3.
     """
 

@@ -1,4 +1,4 @@
-"""A toy world for GRPO of video models: a disc on a texture, told where to go. Section 5.1 of the specification.
+"""A toy world for GRPO of video models: a disc on a texture, told where to go. Scored by DD-29.
 
 Shapes: B scenes, C = 2 channels, F = 6 frames, H = W = 16 cells, or the same scene in more of them. A "latent" video is
 the picture itself. In the training videos the disc obeys its action with probability OBEDIENCE and else takes a random

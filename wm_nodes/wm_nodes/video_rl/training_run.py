@@ -85,7 +85,7 @@ class VideoRun:
         self.packed: PackedWeights | None = None
         """The weights of `version`, once their files are written."""
         self.hacked: list[HackedMetric] = []
-        """What the newest held-out evaluation says of reward hacking, equation (2)."""
+        """What the newest held-out evaluation says of reward hacking, DD-2."""
 
     @property
     def version(self) -> int:

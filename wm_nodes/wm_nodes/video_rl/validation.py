@@ -1,4 +1,4 @@
-"""Held-out contexts beside the training reward: their scores, one ODE clip each, and the alarm of equation (2).
+"""Held-out contexts beside the training reward: their scores, one ODE clip each, and the alarm of DD-2.
 
 Shapes: E contexts.
 """
@@ -70,7 +70,7 @@ def validation_scores(
 
 
 def hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[HackedMetric]:
-    """Equation (2) on lines of metrics.jsonl: the scores that got worse over the newest `window` evaluations while the
+    """DD-2 on lines of metrics.jsonl: the scores that got worse over the newest `window` evaluations while the
     training reward rose, [] while there are fewer. The reward of an evaluation is that of the buffers since the one
     before; slopes are per evaluation, of scores turned so that more is better. Other scores are not watched.
     """

@@ -29,7 +29,7 @@ class ActionCondition(nn.Module):
     """Tokens of one transition: each action dimension, each value of the commanded tool position before and after,
     and a null token.
 
-    The tool positions add no information to eq. (1): state t + 1 = clip(state t + max_action a_t) is a function of the
+    The tool positions add no information to RS-1: state t + 1 = clip(state t + max_action a_t) is a function of the
     first state and of a_0 .. a_t.
     """
 

@@ -1,4 +1,7 @@
-"""Parallel decoding of one frame of discrete tokens (MaskGIT). Shapes: B batch, S tokens, V codes, D bits per token."""
+"""Parallel decoding of one frame of discrete tokens (MaskGIT, RS-1e).
+
+Shapes: B batch, S tokens, V codes, D bits per token.
+"""
 
 import math
 from collections.abc import Callable

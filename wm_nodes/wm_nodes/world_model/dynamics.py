@@ -1,4 +1,4 @@
-"""The next-frame model over continuous latents, eq. (1): (x_t+1, d_t+1) from frames 0..t and a condition.
+"""The next-frame model over continuous latents (RS-1): (x_t+1, d_t+1) from frames 0..t and a condition.
 
 Shapes: B batch, T frames, S tokens per frame, D values per token, N condition tokens, K done heads, J tasks,
 A action, P state, Q probed positions (PROBE_NAMES).
@@ -132,6 +132,6 @@ class ActionModel(FrameModel):
 
 
 def done_signal(done_logits_BKJ: Tensor) -> tuple[Tensor, Tensor]:
-    """Pessimistic done probability (B, J), the minimum over heads, and the heads' standard deviation (B, J)."""
+    """RS-1d: pessimistic done probability (B, J), the minimum over heads, and the heads' standard deviation (B, J)."""
     probabilities = done_logits_BKJ.sigmoid()
     return probabilities.amin(-2), probabilities.std(-2, correction=0)

@@ -1,4 +1,4 @@
-"""The world model behind the Environment interface: the policy's training ground, eq. (9).
+"""The world model behind the Environment interface: the policy's training ground (RS-9).
 
 Shapes: N environments, M starts, S tokens, D values per token, A action, P state.
 """
@@ -45,7 +45,7 @@ def load_starts(path: Path) -> tuple[UInt8Array, FloatArray]:
 
 class ImaginedEnvironment:
     """N imagined environments in lock-step. An episode terminates when the done signal exceeds
-    reward.success_threshold (E7), and is truncated at the step limit or above reward.uncertainty_limit.
+    reward.success_threshold (RS-7), and is truncated at the step limit or above reward.uncertainty_limit.
 
     Args:
         spec: of the simulator the model was learned from; env_id, source and truth are replaced.

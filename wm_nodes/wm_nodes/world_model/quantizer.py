@@ -1,4 +1,4 @@
-"""Lookup-free quantisation (MAGVIT-2). Shapes: B batch, S tokens per frame, D bits per token.
+"""Lookup-free quantisation (MAGVIT-2, RS-1b). Shapes: B batch, S tokens per frame, D bits per token.
 
 A token is the vector of signs of D real values: sign(0) is -1, and code index z = sum_j 1[u_j > 0] 2^j. The gradient of
 the sign is taken as the identity (straight-through).

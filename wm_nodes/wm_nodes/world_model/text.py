@@ -1,4 +1,4 @@
-"""WM_txt and the goals it imagines, eq. (6). Shapes: B batch, T frames, S tokens, D values per token, L words."""
+"""WM_txt and the goals it imagines (RS-6). Shapes: B batch, T frames, S tokens, D values per token, L words."""
 
 import hashlib
 from dataclasses import dataclass
@@ -90,7 +90,7 @@ def imagine_goals(
     threshold: float,
 ) -> ImaginedGoals:
     """Roll the text model out from first frames (B, H, W, 3); the goal is the first frame whose done signal is above
-    `threshold` (E6: t* = min{t : d_t > tau_goal}), else the frame of the highest signal, with found=False."""
+    `threshold` (RS-6: t* = min{t : d_t > tau_goal}), else the frame of the highest signal, with found=False."""
     current = tokenizer.encode(images).unsqueeze(1)
     caches = model.trunk.new_ring_caches(len(images), current.device)
     frames, signals = [np.asarray(images)], list[Tensor]()

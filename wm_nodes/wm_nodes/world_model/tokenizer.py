@@ -1,4 +1,4 @@
-"""The frame codec: an image becomes a grid of latent tokens and back.
+"""The frame codec: an image becomes a grid of latent tokens and back (RS-1a).
 
 Shapes: B batch, H W 3 image, S tokens per frame = (H / patch) (W / patch), row by row, D values per token, P probed
 ground-truth values.

@@ -1,4 +1,4 @@
-"""Spatio-temporal transformer over frames of tokens, with a temporal key/value cache.
+"""Spatio-temporal transformer over frames of tokens (RS-1c), with a temporal key/value cache.
 
 Shapes: B batch, T frames given, W frames remembered, S tokens per frame, D width, N condition tokens per frame,
 H heads, E values per head. Order in a block: spatial self-attention (within a frame, bidirectional), temporal

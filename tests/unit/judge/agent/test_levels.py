@@ -1,4 +1,4 @@
-"""Levels, votes and which frames are shown: specification, sections 2.3 and 2.4."""
+"""Levels, votes and which frames are shown (RA-3, RA-5 to RA-8)."""
 
 import math
 

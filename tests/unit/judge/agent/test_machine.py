@@ -1,4 +1,4 @@
-"""The state machine, precheck, votes, budgets, reflection and failures: specification, sections 2.2, 2.3 and 2.7."""
+"""The state machine, precheck, votes, budgets, reflection and failures (RA-1, RA-2, RA-6, RA-13)."""
 
 import asyncio
 import math

@@ -1,4 +1,4 @@
-"""Stage scores, gates, weights, reward, caps, rubric packs, trainer contract: specification, section 2.3."""
+"""Stage scores, gates, weights, reward, caps, rubric packs, trainer contract (RA-4, RA-9 to RA-12, RA-15)."""
 
 import math
 from dataclasses import replace

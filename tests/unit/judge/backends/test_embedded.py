@@ -1,4 +1,4 @@
-"""The embedded judge behind the agent: valid verdicts, gates, abstentions with reasons, equal hashes. Section 4.4."""
+"""The embedded judge behind the agent: valid verdicts, gates, abstentions with reasons, equal hashes."""
 
 import asyncio
 import functools

@@ -1,4 +1,4 @@
-"""What a benchmark set consists of: splits, prevalence, hashes. Specification, section 3.3."""
+"""What a benchmark set consists of: splits, prevalence, hashes. RA-21."""
 
 import functools
 import hashlib

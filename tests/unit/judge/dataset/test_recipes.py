@@ -1,4 +1,4 @@
-"""Clips that are wrong in a known way: specification, section 3.1. A toy drawn in NumPy stands for the renderer."""
+"""Clips that are wrong in a known way (RA-21). A toy drawn in NumPy stands for the renderer."""
 
 import functools
 from collections import Counter

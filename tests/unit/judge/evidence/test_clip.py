@@ -1,4 +1,4 @@
-"""Evidence reacts to what it is about, in the right direction, and not to something else. Section 4.1."""
+"""Evidence reacts to what it is about, in the right direction, and not to something else (RA-17)."""
 
 import functools
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What the shipped world model says of clips that it imagined itself, and of the same clips made wrong. Section 4.1."""
+"""What the shipped world model says of clips that it imagined itself, and of the same clips made wrong (RA-17)."""
 
 import numpy as np
 import pytest

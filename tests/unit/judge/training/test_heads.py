@@ -1,4 +1,4 @@
-"""Trees, calibration, familiarity and the folder of the embedded judge. Specification: section 4.3."""
+"""Trees, calibration, familiarity and the folder of the embedded judge (RA-18 to RA-20)."""
 
 import json
 from dataclasses import replace

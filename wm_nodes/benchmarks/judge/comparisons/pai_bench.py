@@ -146,7 +146,7 @@ def consistency(features_TD: FloatArray) -> float:
 
 
 def image_consistency(features_TD: FloatArray, image_D: FloatArray) -> float:
-    """The image-to-video terms [inferred]: `consistency` with the conditioning image as the frame before the first."""
+    """The image-to-video terms, our choice: `consistency` with the conditioning image as the frame before the first."""
     return consistency(np.concatenate([image_D[None], features_TD]))
 
 

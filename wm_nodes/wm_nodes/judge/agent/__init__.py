@@ -1,4 +1,4 @@
-"""The reward agent: plans, gates, votes and reflects over one Judge. Specification: section 2."""
+"""The reward agent: plans, gates, votes and reflects over one Judge (RA-1 to RA-16)."""
 
 from wm_nodes.judge.agent.contract import ADVANTAGE_CLIP, check_one_judge, pause_reason
 from wm_nodes.judge.agent.machine import RewardAgent

@@ -1,4 +1,4 @@
-"""What a trainer may do with verdicts. Specification: sections 2.3 (trainer contract) and 2.6. Shapes: N clips."""
+"""What a trainer may do with verdicts (RA-15). Shapes: N clips."""
 
 from collections.abc import Sequence
 

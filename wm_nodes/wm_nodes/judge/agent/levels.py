@@ -1,4 +1,4 @@
-"""From answers on five levels to one score: option order, pooling, majority. Specification: section 2.3.
+"""From answers on five levels to one score: option order, pooling, majority (RA-5 to RA-8).
 
 p is a distribution over levels 0..4, worst first. s = sum_l l p_l / 4; p_fail = p_0 + p_1 + p_2 / 2.
 """

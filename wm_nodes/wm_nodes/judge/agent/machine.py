@@ -1,4 +1,4 @@
-"""The state machine over a judge. Specification: section 2.2.
+"""The state machine over a judge (RA-1).
 
 PRECHECK -> PLAN -> VQ -> IF -> TC -> PC -> REFLECT -> HACK -> AGGREGATE. In reward mode a failed gate ends the reading;
 in benchmark mode every component is read. A second look that opens a closed gate goes on with the stages behind it,

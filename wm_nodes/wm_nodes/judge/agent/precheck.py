@@ -1,4 +1,4 @@
-"""What needs no model: is this a clip at all? Specification: section 2.2, PRECHECK. Shapes: T frames, H W 3 image.
+"""What needs no model (RA-2): is this a clip at all? Shapes: T frames, H W 3 image.
 
 Two kinds of refusal. `malformed`: whoever asked made a mistake (one frame, NaN pixels, wrong encoding, no
 instruction); the verdict is an ERROR without a number. `no video`: a proper clip that shows nothing; the verdict is

@@ -1,4 +1,4 @@
-"""When a verdict is looked at again, and what the second look may change. Specification: section 2.7. Pure functions.
+"""When a verdict is looked at again, and what the second look may change (RA-13, RA-14). Pure functions.
 
 The second look sees new pixels (profile D), must cite frames, and counts only if a fresh label read on those frames
 agrees.

@@ -1,4 +1,4 @@
-"""Rubric packs: components, level descriptions, weights and thresholds as versioned data. Specification: section 2.3.
+"""Rubric packs: components, level descriptions, weights and thresholds as versioned data (RA-4 to RA-14).
 
 A pack is a YAML file in rubrics/, or anywhere. `extends` lays it over another pack: mappings are merged name by name,
 so a new domain adds components, patterns or evidence without code. Its version names the resolved content.

@@ -1,4 +1,4 @@
-"""Stage scores, gates, planning weights and the reward: pure functions of scores. Specification: section 2.3.
+"""Stage scores, gates, planning weights and the reward: pure functions of scores (RA-4, RA-9 to RA-12).
 
 R = sum_d w_d S_d prod_{e before d} 1[S_e >= theta_e] over d = VQ, IF, TC, PC. A number that is missing makes R NaN.
 """

@@ -1,4 +1,4 @@
-"""What the reward agent and its judges say to each other. Specification: sections 2.1 and 4.4.
+"""What the reward agent and its judges say to each other.
 
 Shapes: T frames, H W 3 image, A action. A component (clarity, robot, ...) is a name that the rubric pack defines, so
 that another domain adds its own without code. Levels of a component: 0 unusable, 1 clearly wrong, 2 borderline,
@@ -52,7 +52,7 @@ class Status(StrEnum):
 
 
 class Profile(StrEnum):
-    """Which frames a read sees, section 2.4: static, instruction, end, dense."""
+    """Which frames a read sees (RA-3): static, instruction, end, dense."""
 
     S = "S"
     I = "I"  # noqa: E741
@@ -107,7 +107,7 @@ class TaskSpec:
 
 
 Evidence = Mapping[str, float]
-"""Endogenous signals by name (section 4). They trigger a second look and never add reward."""
+"""Endogenous signals by name (RA-17). They trigger a second look and never add reward."""
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ class Reflection:
 
 @dataclass(frozen=True)
 class HackFlag:
-    """One hacking pattern of section 3. confirmed: two reads agree; only then it caps."""
+    """One hacking pattern (RA-12). confirmed: two reads agree; only then it caps."""
 
     pattern: str
     p_present: float

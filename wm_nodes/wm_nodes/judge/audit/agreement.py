@@ -1,4 +1,4 @@
-"""How well a judge's verdicts agree with what people say, row by row of Table 2. Specification: section 2.8."""
+"""How well a judge's verdicts agree with what people say, row by row of Table 2 (RA-24)."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What the lines of an audit log hold, as JSON and back. Specification: sections 2.1 and 2.8.
+"""What the lines of an audit log hold, as JSON and back.
 
 rubric {version, rubric}; agent {capabilities, rubric_version, settings}; clip {sha256, fps, source, frames}: once each.
 evaluation {clip_id, sha256, agent, round, task, evidence}: its line number is its name in what follows:

@@ -1,4 +1,4 @@
-"""What people say of clips: the file that the viewer exports, for `agree` and `adopt`. Specification: section 2.8."""
+"""What people say of clips: the file that the viewer exports, for `agree` and `adopt`."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ FORMAT = "audit-labels-1"
 HACK = "hack: "
 """In front of a pattern's name, because a pattern may be called like a component. It passes where it is absent."""
 PASS_LEVEL = 3
-"""From here on a level passes; 2 has p_fail 0.5, which is no pass (section 2.3)."""
+"""From here on a level passes; 2 has p_fail 0.5, which is no pass (RA-5)."""
 
 Answer = bool | int | None
 """True: passes. False: fails. Of planning: the level. None: unsure."""

@@ -1,4 +1,4 @@
-"""An append-only file of JSON lines that cannot be changed unseen. Specification: section 2.8.
+"""An append-only file of JSON lines that cannot be changed unseen.
 
     {"body": ..., "hash": SHA-256 of the line without it, "kind": ..., "line": 1, 2, ..., "previous": hash of line - 1}
 

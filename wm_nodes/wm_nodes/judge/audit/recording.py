@@ -1,4 +1,4 @@
-"""A reward agent whose every question, answer and verdict is written down. Specification: section 2.8."""
+"""A reward agent whose every question, answer and verdict is written down."""
 
 import asyncio
 from collections.abc import Mapping

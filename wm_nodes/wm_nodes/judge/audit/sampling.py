@@ -1,4 +1,4 @@
-"""Which clips of a round a person should look at. Specification: section 2.8.
+"""Which clips of a round a person should look at (RA-23).
 
 n = round(200 + 400 (1 - mean reward)): 10 % conflicts, 15 % reflection flips, 20 % near a gate, 15 % of the highest
 rewards (hacking lives there), and 40 % plus whatever a stratum lacks at random from all that is left. A clip is in the

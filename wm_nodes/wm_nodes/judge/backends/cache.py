@@ -1,4 +1,4 @@
-"""Reads that were bought once: a content-addressed store on disk. Specification: section 2.6.
+"""Reads that were bought once: a content-addressed store on disk.
 
 The key covers everything that the answer depends on: media, prompt with its options, rubric, model, transport. It makes
 reruns bit-equal, which live servers do not promise.

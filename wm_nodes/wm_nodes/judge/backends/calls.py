@@ -1,5 +1,5 @@
 """One question to a chat server and the ladder below it: answer checked; asked once more with the reason; one label
-read per component; ERROR. Specification: sections 2.5 and 2.6.
+read per component; ERROR.
 """
 
 import asyncio

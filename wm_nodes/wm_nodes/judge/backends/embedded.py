@@ -1,4 +1,4 @@
-"""A judge in this process: no server, no download, no GPU. Specification: sections 4.3 and 4.4.
+"""A judge in this process: no server, no download, no GPU (RA-17 to RA-20).
 
 It reads the evidence of wm_nodes.judge.evidence with the heads of a trained folder. All votes of a component get the
 same answer, and a second look finds what the first one found: it never claims new pixels.

@@ -1,4 +1,4 @@
-"""A judge from the configuration's `judge` section. Specification: sections 2.6 and 4.4."""
+"""A judge from the configuration's `judge` section."""
 
 import re
 from collections.abc import Callable, Coroutine

@@ -1,4 +1,4 @@
-"""Label reads: one token, and how probable each option was. Specification: sections 2.4 and 2.5."""
+"""Label reads: one token, and how probable each option was (RA-6)."""
 
 import math
 from collections.abc import Mapping, Sequence

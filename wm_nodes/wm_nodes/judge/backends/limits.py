@@ -1,4 +1,4 @@
-"""How much an endpoint is asked for at once, and when it is left alone. Specification: section 2.6."""
+"""How much an endpoint is asked for at once, and when it is left alone."""
 
 import asyncio
 from collections import deque

@@ -1,4 +1,4 @@
-"""A judge behind a chat-completions server: vLLM, or any other that speaks the protocol. Specification: section 2.6."""
+"""A judge behind a chat-completions server: vLLM, or any other that speaks the protocol."""
 
 import asyncio
 import time

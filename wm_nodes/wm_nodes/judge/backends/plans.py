@@ -1,4 +1,4 @@
-"""One call per component, or one per stage: decided by what the server's prefix cache is seen to do. Section 2.4."""
+"""One call per component, or one per stage: decided by what the server's prefix cache is seen to do (RA-16)."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""One judge made of several: each stage is read by the one that was named for it. Specification: section 4.4."""
+"""One judge made of several: each stage is read by the one that was named for it."""
 
 import hashlib
 from collections.abc import Sequence

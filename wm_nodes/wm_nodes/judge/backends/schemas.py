@@ -1,4 +1,4 @@
-"""What a judge's JSON answer must look like, and whether it makes sense. Specification: section 2.5.
+"""What a judge's JSON answer must look like, and whether it makes sense.
 
 One schema per call type: nothing beside the named properties, every string and list bounded, evidence before level, so
 that the model looks before it scores.

@@ -1,7 +1,7 @@
 """Chat completions over an ordered list of endpoints: bounded, retried, never silently wrong.
 
 The `openai` package speaks the protocol; its own retries are off, because which endpoint a retry goes to, how long it
-waits and what counts against an endpoint are decided here. Specification: section 2.6.
+waits and what counts against an endpoint are decided here.
 """
 
 import asyncio

@@ -1,4 +1,4 @@
-"""Build a set of clips with known labels from the simulator: record, draw, edit, draw again, describe. Section 3.
+"""Build a set of clips with known labels from the simulator: record, draw, edit, draw again, describe (RA-21).
 
 A folder holds manifest.jsonl and one compressed .npz per clip (frames, masks, fps), named by its hash. The manifest is
 written last: a folder without one is unfinished. Equal arguments give equal bytes.

@@ -1,8 +1,7 @@
 """Episodes as states, and pictures of states without physics: the clips of the judges' benchmark.
 
 A clip is drawn from recorded or edited states by a scene of its own: nearer cameras than the policy's, a tiled table,
-clutter, coloured things of any size and number. Specification of the agent's reward, sections 3.1 and 3.2. Shapes:
-T frames, K things, J joints, H W image.
+clutter, coloured things of any size and number (RA-21). Shapes: T frames, K things, J joints, H W image.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,7 +29,7 @@ from wm_nodes.environments.maniskill.tasks import CUBE_HALF_SIZE_M, get_task
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Eye and target of a camera, m, world frame."""
 CLIP_FOV_RAD = 0.72
-"""With this a 4 cm cube is at least 9 px wide in 96 px (section 3.2)."""
+"""With this a 4 cm cube is at least 9 px wide in 96 px."""
 CAMERAS: Mapping[str, View] = {
     "near_side": ((0.22, 0.46, 0.34), (0.06, 0.0, 0.02)),
     "near_left": ((0.26, -0.42, 0.36), (0.06, 0.0, 0.02)),

@@ -1,4 +1,4 @@
-"""Clips of a benchmark set as a judge sees them: pixels, instruction, reference image. Specification: section 3.3."""
+"""Clips of a benchmark set as a judge sees them: pixels, instruction, reference image (RA-21)."""
 
 import zipfile
 import zlib
@@ -13,7 +13,7 @@ from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
 
 ROBOT = "panda"
 MIN_TEST_CLIPS = 400
-"""Below this the intervals are too wide to claim anything (section 1)."""
+"""Below this the intervals are too wide to claim anything."""
 
 
 def judged_clip(folder: Path, row: ManifestRow) -> tuple[ClipRef, TaskSpec]:

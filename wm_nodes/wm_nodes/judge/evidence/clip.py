@@ -1,4 +1,4 @@
-"""All evidence of a clip that the embedded judge reads. Specification: section 4.1. Shapes: T frames, H W 3 image."""
+"""All evidence of a clip that the embedded judge reads (RA-17). Shapes: T frames, H W 3 image."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What each number of clip_evidence says, and its range. Specification: section 4.1.
+"""What each number of clip_evidence says, and its range (RA-17).
 
 "Against the reference" is a ratio to, or a difference from, the reference frame: about 1 or 0 where nothing is wrong.
 Shares lie in [0, 1]; levels are grey levels of 0 to 255; sizes are object sizes, the square root of the object's area

@@ -1,4 +1,4 @@
-"""From evidence to calibrated answers, and to none where a clip is unlike all training. Specification: section 4.3.
+"""From evidence to calibrated answers, and to none where a clip is unlike all training (RA-18, RA-19).
 
 A question is "is the level above k?"; its trees give log-odds, and a line fitted on the validation part makes
 probabilities of them (Platt 1999). On disk: a folder with judge.safetensors, and judge.json, which says how it was

@@ -1,6 +1,6 @@
 """Evidence of motion without a cause and of outlines to parts of a pixel: jumps, attraction, tools that go through.
 
-Section 4.3. What objects.py says of masks is too coarse for an object of ten pixels beside a gripper: here a pixel at
+See RA-17. What objects.py says of masks is too coarse for an object of ten pixels beside a gripper: here a pixel at
 its edge counts by how much of the object's colour it has, and every step is held against the tool's own.
 Shapes: T frames with the reference frame before them, H W image. Lengths are in object sizes, as in objects.py.
 """

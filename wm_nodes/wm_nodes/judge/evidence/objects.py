@@ -1,4 +1,4 @@
-"""Evidence from masks: where the named object, the robot and the target are, and who moves whom. Section 4.3.
+"""Evidence from masks: where the named object, the robot and the target are, and who moves whom (RA-17).
 
 Shapes: T frames, H W image. Lengths are in object sizes (square root of its area in the reference frame), so that
 distance to the camera does not matter. Every number is finite; where there is no object, distances are FAR.

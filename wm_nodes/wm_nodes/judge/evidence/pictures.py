@@ -1,4 +1,4 @@
-"""A clip's pixels and what several kinds of evidence read off them. Specification: section 4.1.
+"""A clip's pixels and what several kinds of evidence read off them (RA-17).
 
 Shapes: T frames, H W 3 image, G grid cells along each side.
 """

@@ -1,4 +1,4 @@
-"""Evidence from masks: what scene, object, robot and clutter look like against the reference frame. Section 4.1.
+"""Evidence from masks: what scene, object, robot and clutter look like against the reference frame (RA-17).
 
 Shapes: T frames, H W 3 image, S tiles along each side. Every number is finite; a region that is nowhere counts as
 unchanged, objects.py says that it is missing.

@@ -1,4 +1,4 @@
-"""How the camera moved: shift, roll and zoom between neighbouring frames. Specification: section 4.1.
+"""How the camera moved: shift, roll and zoom between neighbouring frames (RA-17).
 
 Shapes: T frames, H W image. One Gauss-Newton step of Lucas-Kanade per pair of frames, on blurred pictures of the scene
 without robot and objects, with a similarity of four numbers: right, down, turn (rad), growth. What moves on its own all

@@ -1,4 +1,4 @@
-"""What each pixel shows: scene, robot, the named object, clutter. Specification: section 4.3 (U-Net masks).
+"""What each pixel shows: scene, robot, the named object, clutter (RA-17). A U-Net.
 
 Shapes: N images, H W 3 image, C classes, in the order of the masks of reward/adversarial. Trained on simulator masks by
 wm_nodes/judge/training/train.py.

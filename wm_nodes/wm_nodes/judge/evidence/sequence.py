@@ -1,6 +1,6 @@
 """What the object looks like from frame to frame, and where it and the tool are; and a small network that reads it.
 
-Section 4.3. The other evidence sums a clip up before anything learns from it. What happens beside a gripper within two
+See RA-17. The other evidence sums a clip up before anything learns from it. What happens beside a gripper within two
 frames is more than these numbers say, so this network sees the object's pictures one after the other, and its answers
 are numbers among them. Shapes: B clips, T frames with the reference frame before them, S side of a crop, M numbers of a
 frame, K questions.

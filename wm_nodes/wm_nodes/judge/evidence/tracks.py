@@ -1,4 +1,4 @@
-"""Blobs of masks and their way through a clip. Section 4.3. Shapes: T frames, H W image."""
+"""Blobs of masks and their way through a clip (RA-17). Shapes: T frames, H W image."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a world model says of a clip of its own cameras: surprise, reconstruction, actions, goal, done. Section 4.1.
+"""What a world model says of a clip of its own cameras: surprise, reconstruction, actions, goal, done (RA-17).
 
 Evidence, trigger and veto, never a score: likelihood alone rewards standing still, so surprise is given beside the
 error of a model of "nothing moves", and beside what other actions would have explained. Shapes: T frames, J actions

@@ -1,4 +1,4 @@
-"""Clips of adversarial sets, several sets at once, with their masks. Specification: section 3.
+"""Clips of adversarial sets, several sets at once, with their masks (RA-21).
 
 Shapes: T frames, H W 3 image.
 """

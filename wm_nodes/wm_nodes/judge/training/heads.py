@@ -1,4 +1,4 @@
-"""Fit the heads of the embedded judge to labels, and say how well they do. Specification: sections 4.2, 4.3.
+"""Fit the heads of the embedded judge to labels, and say how well they do (RA-18 to RA-20).
 
 Trees come from the training part; what turns log-odds into probabilities, and where a clip is too foreign to judge,
 from the validation part. Shapes: N clips, F evidence.

@@ -1,4 +1,4 @@
-"""Bands of endogenous evidence for the reward agent, from recordings in which nothing is wrong. Section 4.1.
+"""Bands of endogenous evidence for the reward agent, from recordings in which nothing is wrong (RA-13, RA-17).
 
 A signal outside of its band disagrees with a component that passes: the agent votes on it, and looks again. Bands hold
 for one world model, one camera and one number of actions between two frames, so they are data of their own: a rubric

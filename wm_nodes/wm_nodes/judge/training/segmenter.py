@@ -1,4 +1,4 @@
-"""Train the segmenter of the embedded judge on simulator masks. Specification: section 4.3.
+"""Train the segmenter of the embedded judge on simulator masks (RA-17).
 
 Only clips whose masks say what is seen: recorded ones, mild edits, edited states, and edits of the whole picture;
 none that a world model imagined.

@@ -1,4 +1,4 @@
-"""Train the networks that see the object over time, each on half of the recordings. Specification: section 4.3.
+"""Train the networks that see the object over time, each on half of the recordings (RA-17).
 
 Trees that read a network's answers must learn how good these are on clips it was not trained on. So each is trained on
 half of the recordings, and a training clip's numbers are the mean of those that were trained without its recording; on

@@ -1,4 +1,4 @@
-"""Make the embedded judge from adversarial sets: segmenter, evidence, heads, limits. Specification: section 4.3.
+"""Make the embedded judge from adversarial sets: segmenter, evidence, heads, limits (RA-17 to RA-20).
 
 Finished stages lie in the folder and are taken up again: segmenter.safetensors, evidence-*.npz and sequences-*.npz per
 set and part, and reader-*.safetensors, named by everything they depend on; of these, labels for the readers only.

@@ -1,7 +1,5 @@
 """The reward agent's face in the graph, the same in both reward evaluators: verdict topic, rubric service, diagnostics,
 and an action that judges clips in a folder.
-
-Specification: section 2.9.
 """
 
 import math

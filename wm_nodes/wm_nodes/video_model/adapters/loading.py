@@ -140,7 +140,7 @@ def _autocast(settings: LoadSettings) -> torch.dtype | None:
 
 
 def _shift(scheduler: dict[str, Any]) -> float:
-    """Wan's schedulers state it; Cosmos's sigmas are Karras's, for which the specification takes 5."""
+    """Wan's schedulers state it; Cosmos's sigmas are Karras's, for which we take 5."""
     if scheduler.get("use_karras_sigmas"):
         return 5.0
     shift: float = scheduler.get("flow_shift", scheduler.get("shift", 1.0))

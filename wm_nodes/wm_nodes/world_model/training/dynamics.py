@@ -100,7 +100,7 @@ def train_action_model(
 ) -> tuple[ActionModel, dict[str, float]]:
     """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
 
-    Loss (E4): latents + world_model.done_weight * done + world_model.state_weight * positions (those the model says,
+    Loss (RS-4): latents + world_model.done_weight * done + world_model.state_weight * positions (those the model says,
     and those the tokenizer's frozen probe reads off the predicted latents) + world_model.decoded_weight *
     decoded_losses. `model` continues from given weights (online rounds).
     """
@@ -208,7 +208,7 @@ def rollout_losses(
     config: RunConfig,
     done_loss: str = "bce",
 ) -> dict[str, Tensor]:
-    """The training losses (E2 for continuous latents, E3, E4) over the recorded steps."""
+    """The training losses (RS-2 for continuous latents, RS-3, RS-4) over the recorded steps."""
     target = data.latents[index].float()
     mask = data.step_mask[index].float()
     weight = token_weights(target, data.mean_change_S) * mask[..., None]
@@ -269,7 +269,7 @@ def token_weights(latents_BTSD: Tensor, mean_change_S: Tensor) -> Tensor:
 
 
 def done_losses(logits_BTKJ: Tensor, labels_BTJ: Tensor, mask_BTK: Tensor, kind: str = "bce") -> Tensor:
-    """kind "rmse": E3, the root of the mean squared error; "bce": binary cross-entropy on the same labels."""
+    """kind "rmse": RS-3, the root of the mean squared error; "bce": binary cross-entropy on the same labels."""
     labels = labels_BTJ.unsqueeze(2).expand_as(logits_BTKJ)
     weight = mask_BTK.unsqueeze(-1).expand_as(logits_BTKJ)
     if kind == "rmse":

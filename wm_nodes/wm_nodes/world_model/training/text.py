@@ -1,5 +1,5 @@
-"""Train WM_txt on demonstrations: from a first frame and an instruction, the golden trajectory. Shapes: B episodes,
-T steps, S tokens, D values per token, J tasks, P probed values."""
+"""Train WM_txt on demonstrations: from a first frame and an instruction, the golden trajectory (RS-4). Shapes:
+B episodes, T steps, S tokens, D values per token, J tasks, P probed values."""
 
 from pathlib import Path
 

@@ -32,7 +32,7 @@ def train_token_model(
     progress: bool = True,
     name: str = "action_model",
 ) -> tuple[TokenActionModel, dict[str, float]]:
-    """Train WM_act over tokens (E2: cross-entropy on masked tokens; E3; E4); returns it with its last metrics."""
+    """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics."""
     settings = config.world_model
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(numpy_stream(seed, "token_model_init").integers(2**31))

@@ -1,4 +1,4 @@
-"""Train the frame codec. Shapes: B frames, H W 3 image, S tokens, D values per token, P probed values."""
+"""Train the frame codec (RS-1a). Shapes: B frames, H W 3 image, S tokens, D values per token, P probed values."""
 
 from pathlib import Path
 

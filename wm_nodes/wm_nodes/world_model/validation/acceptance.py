@@ -1,4 +1,5 @@
-"""Does this world model deserve that a policy is trained in it? Judged on held-out real episodes, before any update.
+"""Does this world model deserve that a policy is trained in it? Judged on held-out real episodes before any update
+(RS-12).
 
 The numbers come from rollout_evaluation: recorded actions rolled out open-loop from recorded first frames. Positions
 are read off the imagined pictures by the judge's own probe; "copying" reads them off the first frame instead.

@@ -1,6 +1,6 @@
 """Clips that are wrong in a known way: recipes on pixels, time and states, their labels, the manifest of a set.
 
-Section 3 of the specification. Pure functions of arrays: what renders edited states is elsewhere.
+See RA-21. Pure functions of arrays: what renders edited states is elsewhere.
 """
 
 from wm_nodes.judge.dataset.edits.clips import (

@@ -1,4 +1,4 @@
-"""Clips whose truth is known, and what is known of them. Specification: section 3.1.
+"""Clips whose truth is known, and what is known of them (RA-21).
 
 Shapes: T frames, H W 3 image, J joints, K things, 7 pose (x y z in m, quaternion w x y z), world frame. Thing 0 is the
 one that the instruction names. The table top is z = 0.
@@ -29,12 +29,12 @@ COMPONENTS: tuple[Component, ...] = (
 PHYSICS: tuple[Component, ...] = ("interaction", "deformation", "geometry")
 TC = "task_completion"
 TC_PASS_LEVEL = 3
-"""TC passes from "nearly" on: level 2 is as likely to fail as to pass (section 2.3), so a certain 2 has p_fail 0.5."""
+"""TC passes from "nearly" on: level 2 is as likely to fail as to pass (RA-5), so a certain 2 has p_fail 0.5."""
 
 BACKGROUND, ROBOT, OBJECT, DISTRACTOR = 0, 1, 2, 3
 """Values of a mask. OBJECT is thing 0; DISTRACTOR is clutter that has no part in the task, and belongs to the scene."""
 MIN_SIDE_PX = 96
-"""Section 0: below this nobody can judge contact or shape."""
+"""Below this nobody can judge contact or shape."""
 
 
 class NotApplicableError(ValueError):

@@ -1,5 +1,5 @@
 """From one recorded clip to its edited children: every recipe, mild and failing, wherever it applies, and mild ones on
-top of each other. Section 3.1.
+top of each other (RA-21).
 """
 
 import itertools

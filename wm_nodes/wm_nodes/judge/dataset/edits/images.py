@@ -1,5 +1,5 @@
 """Image kernels of the recipes. NumPy only, elementwise and in one order: the same bytes on every machine, which a
-manifest of hashes needs and image libraries do not promise. Section 3.1.
+manifest of hashes needs and image libraries do not promise (RA-21).
 
 Shapes: T frames, H W C image, float32 grey levels 0 to 255.
 """

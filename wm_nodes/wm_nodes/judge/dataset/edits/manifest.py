@@ -1,6 +1,6 @@
 """What a benchmark set consists of: recipes, hashes, labels, splits, prevalence; the pixels are made again from it.
 
-Section 3.3. JSON lines: a header, then one clip per line in the order of their hashes. Kilobytes per thousand clips,
+See RA-21. JSON lines: a header, then one clip per line in the order of their hashes. Kilobytes per thousand clips,
 and a text that version control can show differences of.
 """
 

@@ -1,4 +1,4 @@
-"""Recipes on states (S): scenes that are drawn sharp and well lit and cannot happen. Section 3.1.
+"""Recipes on states (S): scenes that are drawn sharp and well lit and cannot happen (RA-21).
 
 Each takes (states, amount, rng) and returns edited states, which a simulator draws without stepping physics; nothing
 here knows a simulator. Lengths in m; T frames.

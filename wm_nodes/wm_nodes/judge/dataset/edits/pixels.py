@@ -1,4 +1,4 @@
-"""Recipes on pixels (P): what a generator does wrong to the picture, with the masks saying where. Section 3.1.
+"""Recipes on pixels (P): what a generator does wrong to the picture, with the masks saying where (RA-21).
 
 Each takes (clip, amount, rng) and returns the edited clip. The unit of `amount` and its mild and failing ranges are in
 recipes.py. Shapes: T frames, H W image.

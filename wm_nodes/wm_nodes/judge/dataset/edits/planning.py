@@ -1,7 +1,7 @@
-"""The planning level that a clip truly has, from its recipes and labels. Specification: sections 2.3 and 3.3.
+"""The planning level that a clip truly has, from its recipes and labels (RA-21).
 
 L0 invalid, L1 poor, L2 fair, L3 good, as the robot rubric describes them. The paper names no classes; which label
-gives which level is [inferred]: a picture that stands still is L0 by the rubric's own words; a fault of the picture
+gives which level is our choice: a picture that stands still is L0 by the rubric's own words; a fault of the picture
 that every part of the scene shares leaves it "in large parts unreadable"; everything else that fails is "a clear local
 fault". How far the task got is no matter of planning: a clean clip of a failed push is good.
 """

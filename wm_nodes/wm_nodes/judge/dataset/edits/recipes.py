@@ -1,4 +1,4 @@
-"""Every recipe with its ranges and the labels it forces, and how one is applied. Specification: section 3.1.
+"""Every recipe with its ranges and the labels it forces, and how one is applied (RA-21).
 
 Everything random of an edit comes from (SHA-256 of the parent, recipe, severity, seed). A mild edit is a fault that
 must still pass: it changes no label, so that no judge wins by seeing that a clip was edited at all.
@@ -92,7 +92,7 @@ _ALL = (
            on_defect=True),
     Recipe("occlude_shadow", "P", pixels.cast_shadow, (0.03, 0.08), (0.85, 1), "opacity", ("clarity",),
            ("brightness",), pattern="occlusion", on_defect=True),
-    # Motion degradation. A clip that stands still is a TC failure by section 3.1 and a temporal one by the rubric.
+    # Motion degradation. A clip that stands still is a TC failure (RA-21) and a temporal one by the rubric.
     Recipe("freeze", "T", timing.freeze, (0.05, 0.1), (1, 1), "of the clip", unknown=("temporal",), tc_cap=2,
            pattern="motion", hides_motion=True),
     Recipe("slow", "T", timing.slow, (0.04, 0.07), (0.6, 0.8), "of the motion", unknown=("temporal",), tc_cap=2,

@@ -1,4 +1,4 @@
-"""Recipes on time (T): the clip's own frames in another order; length, masks and states go along. Section 3.1.
+"""Recipes on time (T): the clip's own frames in another order; length, masks and states go along (RA-21).
 
 Each takes (clip, amount, rng) and returns the edited clip. Shapes: T frames; an order is int (T,), order[t] is the
 frame that is shown at t.

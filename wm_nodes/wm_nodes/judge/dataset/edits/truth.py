@@ -1,4 +1,4 @@
-"""What is true of recorded or edited states: how far the task got, and whether the physics can be. Section 3.1.
+"""What is true of recorded or edited states: how far the task got, and whether the physics can be (RA-21).
 
 A recording is what the simulator did, of a script or of a policy: its physics holds, and no threshold is asked. A
 recipe forces labels; failed_physics judges what else an edit of the states broke. It sees states at frame rate, not
