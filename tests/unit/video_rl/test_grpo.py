@@ -365,8 +365,8 @@ def test_switching_off_an_adapter_that_a_model_does_not_have_is_an_error() -> No
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"mask_source": "recompute", "logprob_weight": "cps"}, r"full likelihood \(12\), got logprob_weight cps;"),
-        ({"mask_source": "recompute", "ratio_norm": True}, r"full likelihood \(12\), got ratio_norm True;"),
+        ({"mask_source": "recompute", "logprob_weight": "cps"}, r"full likelihood \(DD-12\), got logprob_weight cps;"),
+        ({"mask_source": "recompute", "ratio_norm": True}, r"full likelihood \(DD-12\), got ratio_norm True;"),
         ({"ratio_norm": True, "logprob_weight": "base"}, "ratio_norm replaces .* got logprob_weight base; take full"),
     ],
 )
