@@ -1,6 +1,9 @@
-"""What every setting means and which values are allowed. The numbers live in presets/*.yaml, not here."""
+"""What every setting of loop 1 means and which values are allowed. The numbers live in presets/, not here.
 
-from typing import Annotated, Literal
+Loop 2's are in video.py.
+"""
+
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -20,6 +23,10 @@ class SettingsSection(BaseModel):
     """Frozen, and every unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def with_values(self, **values: Any) -> Self:
+        """A copy with other values, checked as those of a preset are."""
+        return self.model_validate({**dict(self), **values})
 
 
 class SimulationConfig(SettingsSection):
@@ -44,7 +51,7 @@ class DataConfig(SettingsSection):
     num_episodes: PositiveInt
     """Simulator episodes to collect for the world model."""
     num_heldout: PositiveInt
-    """Episodes kept apart for the gate; never trained on."""
+    """Episodes kept apart for the acceptance of the world model; never trained on."""
     behaviours: dict[str, NonNegativeFloat]
     """Relative share of each behaviour (expert, noisy, near_miss, biased, waypoint, random, reach, ...)."""
     num_workers: PositiveInt
@@ -243,7 +250,7 @@ class AcceptanceConfig(SettingsSection):
     """The SFT policy's imagined success must agree with its real success within the joint 95 % interval."""
 
 
-class RoundsConfig(SettingsSection):
+class ModelRefreshConfig(SettingsSection):
     """Online rounds: train in the model, collect with the policy in the simulator, refresh the model, go on."""
 
     num_rounds: Annotated[int, Field(ge=1, le=20)]
@@ -281,6 +288,6 @@ class RunConfig(SettingsSection):
     policy: PolicyConfig
     sft: SftConfig
     ppo: PpoConfig
-    gate: AcceptanceConfig
-    rounds: RoundsConfig
+    acceptance: AcceptanceConfig
+    model_refresh: ModelRefreshConfig
     evaluation: EvaluationConfig
