@@ -149,7 +149,7 @@ class JudgeConfig(SettingsSection):
     """openai: name of the environment variable that holds the key; empty: the server wants none."""
     folder: str
     """embedded: folder of the trained judge; empty: the shipped one that reads such pictures."""
-    conformal: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    conformal: Annotated[float, Field(ge=0, lt=1)]
     """embedded: abstain where the answer is not sure at this coverage (0.8, 0.9, 0.95 or 0.98); 0: always decide."""
     rubric: str
     """Rubric pack: a name, or a .yaml file."""
@@ -176,10 +176,10 @@ class JudgeConfig(SettingsSection):
     """Images that the server takes in one call."""
     video: bool
     """Send the dense frames of a clip as one video instead of images; for vLLM."""
-    choice_grammar: bool = False
+    choice_grammar: bool
     """openai: a read of one token may only be a listed letter (vLLM); without it, a read that is mostly other words
     abstains."""
-    label_token_ids: list[int] = []
+    label_token_ids: list[int]
     """openai: token ids of A to E, for servers that give the probabilities of given ids (vLLM: logprob_token_ids)."""
     repeat_share: Annotated[float, Field(ge=0, le=1)]
     """Share of the calls to a server that are made twice: `flip_rate` says how often the second answer is another."""
