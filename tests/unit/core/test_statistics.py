@@ -9,7 +9,6 @@ from wm_nodes.core.statistics import (
     mcnemar_exact,
     newcombe_difference,
     paired_difference,
-    proportions_agree,
     wilson_interval,
 )
 
@@ -34,9 +33,13 @@ def test_newcombe_difference_matches_the_published_example() -> None:
 
 
 def test_equal_rates_agree_and_far_ones_do_not() -> None:
-    assert proportions_agree(50, 100, 100, 200)
-    assert not proportions_agree(90, 100, 50, 100)
-    assert proportions_agree(0, 0, 7, 7)
+    def agree(*counts: int) -> bool:
+        low, high = newcombe_difference(*counts)
+        return low <= 0 <= high
+
+    assert agree(50, 100, 100, 200)
+    assert not agree(90, 100, 50, 100)
+    assert agree(0, 0, 7, 7)
 
 
 def test_mcnemar_is_the_two_sided_binomial_tail() -> None:

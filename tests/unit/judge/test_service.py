@@ -20,7 +20,7 @@ from scripted_judge import make_clip, make_task
 
 from wm_nodes.apps.train_policy import main as main_job
 from wm_nodes.apps.train_video_model import main
-from wm_nodes.config.load import default_judge, judge_overrides, load_config
+from wm_nodes.config.load import default_judge, dump_config, judge_overrides, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.judge.agent import Status, Verdict
 from wm_nodes.judge.audit import read_record
@@ -32,7 +32,6 @@ from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import GraphError
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import terminate_at_episode_end
-from wm_nodes.video_rl.settings import dump_video_config, load_video_config
 
 JUDGE = ("--judge", "http://127.0.0.1:9/v1", "--judge-model", "judge")
 SPEC = make_spec(num_envs=2, height=8, width=8)
@@ -269,7 +268,7 @@ def test_the_settings_of_loop_2_hold_the_judges_and_come_back_from_their_file(tm
     words = judge_overrides("http://a/v1, http://b/v1", "judge", "KEY")
     config = load_video_config("smoke", {"rewards": {"agent": 1.0}, **words})
     assert config.judge.endpoints == ["http://a/v1", "http://b/v1"]
-    (tmp_path / "config.yaml").write_text(dump_video_config(config))
+    (tmp_path / "config.yaml").write_text(dump_config(config))
     assert load_video_config(str(tmp_path / "config.yaml")) == config
     assert load_video_config("smoke").judge == load_config("smoke").judge
 

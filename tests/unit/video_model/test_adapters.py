@@ -22,6 +22,8 @@ diffusers = pytest.importorskip("diffusers")
 transformers = pytest.importorskip("transformers")
 pytest.importorskip("peft")
 
+from video_toys import grpo_config, kl_config  # noqa: E402
+
 from wm_nodes.apps.check_video_model import main as doctor  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
     Condition,
@@ -51,7 +53,6 @@ from wm_nodes.video_model.adapters import (  # noqa: E402
 )
 from wm_nodes.video_model.kernels import ode_step, with_conditioning  # noqa: E402
 from wm_nodes.video_rl.grpo import GrpoLearner  # noqa: E402
-from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings  # noqa: E402
 
 C, L, E = 4, 6, 8
 FRAMES, SIDE = 3, 4  # latent; 9 camera frames of 32x32
@@ -450,8 +451,8 @@ class TestTraining:
         anchor: Any = "lora_off" if lora else "frozen"
         learner = GrpoLearner(
             model,
-            GrpoSettings(
-                AdvantageSettings(), KlSettings(beta=0.1, anchor=anchor), learning_rate=1e-2, updates_per_buffer=2,
+            grpo_config(
+                kl=kl_config(beta=0.1, anchor=anchor), learning_rate=1e-2, updates_per_buffer=2,
                 step_fraction=1.0, micro_batch=4, cfg=2.0,
             ),
             settings,

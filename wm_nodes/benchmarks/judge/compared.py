@@ -17,7 +17,7 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.judge.comparisons import PAIRWISE, POINTWISE, ChatComparison
-from wm_nodes.core.reward_statistics import auroc, wilson_interval
+from wm_nodes.core.statistics import auroc, wilson_interval
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.rows import judged_clip
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.judge.labels import Known, truth_of
 from benchmarks.judge.run import Outcome
-from wm_nodes.core.reward_statistics import auroc, recall_at, wilson_interval
+from wm_nodes.core.statistics import auroc, recall_at, wilson_interval
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING
 from wm_nodes.judge.dataset.edits import SPLITS, TC

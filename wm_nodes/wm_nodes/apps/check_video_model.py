@@ -3,7 +3,6 @@
 import argparse
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,13 @@ from rich.console import Console
 from rich.table import Table
 from torch import nn
 
-from wm_nodes.config.load import parse_override
+from wm_nodes.config.load import VIDEO, load_video_config, parse_override, preset_names
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.video_model import Condition
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.checks import examine
-from wm_nodes.video_rl.settings import VideoRlConfig, load_video_config, video_preset_names
+from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
 
 VIDEOS = 4
@@ -34,7 +34,10 @@ def main(argv: Sequence[str]) -> int:
         config = load_video_config(arguments.preset, dict(parse_override(text) for text in arguments.set))
         model, condition, shape, config = _patient(arguments, config)
         videos = config.groups.contexts * config.groups.group_size
-        findings = examine(model, condition, shape, config.rollout, config.grpo, seed=config.seed, buffer_videos=videos)
+        findings = examine(
+            model, condition, shape, rollout_settings(config.rollout), config.grpo, seed=config.seed,
+            buffer_videos=videos,
+        )
     except (ValueError, OSError, ImportError, FloatingPointError) as error:
         console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
         return 2
@@ -86,8 +89,8 @@ def _public(
     model: Any = public.velocity
     if arguments.lora_rank:
         add_lora(model, arguments.lora_rank, 2 * arguments.lora_rank)
-    return model, condition.to(arguments.device), (C, F, H, W), replace(
-        config, rollout=replace(config.rollout, shift=public.shift)
+    return model, condition.to(arguments.device), (C, F, H, W), config.with_values(
+        rollout=config.rollout.with_values(shift=public.shift)
     )
 
 
@@ -126,6 +129,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--offload", action="store_true", help="VAE and text encoder rest on the CPU")
     parser.add_argument("--lora-rank", type=int, default=0, help="check with a LoRA adapter of this rank")
-    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(video_preset_names())}, or a .yaml")
+    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(preset_names(VIDEO))}, or a .yaml")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
     return parser

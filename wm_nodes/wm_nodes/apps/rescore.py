@@ -13,9 +13,10 @@ from tqdm import tqdm
 
 from wm_nodes.apps.policy_run import Stages, console, judge_options, open_run_dir
 from wm_nodes.apps.video_results import Finished, conclude
-from wm_nodes.config.load import judge_or_embedded, parse_override
+from wm_nodes.config.load import dump_config, judge_or_embedded, load_video_config, parse_override, reward_overrides
 from wm_nodes.config.schema import AGENT
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent import Verdict
 from wm_nodes.judge.backends.factory import for_clips
@@ -36,7 +37,6 @@ from wm_nodes.video_rl.recorded_buffers import (
     trained_clips,
 )
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.settings import VideoRlConfig, dump_video_config, load_video_config, reward_overrides
 from wm_nodes.video_rl.training_run import VideoRun, progress
 from wm_nodes.video_rl.validation import validation_scores
 
@@ -76,7 +76,7 @@ def retrain_run(arguments: argparse.Namespace, command: str) -> int:
     config = load_video_config(str(source / "config.yaml"), dict(parse_override(text) for text in arguments.set))
     if config.seed != live.seed:
         raise ValueError(f"the clips of {source} were drawn with seed {live.seed}, not {config.seed}; do not set it")
-    run_dir = open_run_dir(arguments.run_dir, "world_model_retrain", dump_video_config(config))
+    run_dir = open_run_dir(arguments.run_dir, "world_model_retrain", dump_config(config))
     if run_dir == source:
         raise ValueError(f"{run_dir} is the run to train again from; name a new folder with --run-dir")
     _, iterations = progress(source)

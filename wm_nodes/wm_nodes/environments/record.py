@@ -19,13 +19,13 @@ def collect_training_data(config: RunConfig, folder: Path, *, progress: bool = T
 
 
 def collect_heldout_data(config: RunConfig, folder: Path, *, progress: bool = True) -> list[Path]:
-    """The same behaviours on seeds that are never trained on, for the gate."""
+    """The same behaviours on seeds that are never trained on, for the acceptance of a model."""
     return collect_plan(scripted_plan(config, config.data.num_heldout, HELDOUT_SEEDS), config, folder, progress)
 
 
-def gate_plan(config: RunConfig) -> CollectionPlan:
-    """The held-out episodes that the gate judges a model on."""
-    return scripted_plan(config, min(config.gate.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
+def acceptance_plan(config: RunConfig) -> CollectionPlan:
+    """The held-out episodes that decide about accepting a model."""
+    return scripted_plan(config, min(config.acceptance.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
 
 
 def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wm_nodes.core.reward_statistics import balanced_accuracy, expected_calibration_error, kappa, wilson_of_share
+from wm_nodes.core.statistics import balanced_accuracy, expected_calibration_error, kappa, wilson_of_share
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING, Stage, Status, Verdict
 from wm_nodes.judge.dataset.edits import TC

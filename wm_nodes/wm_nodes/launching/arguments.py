@@ -6,13 +6,19 @@
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.config.load import dump_config, judge_or_embedded, judge_overrides, load_config
-from wm_nodes.config.schema import JudgeConfig, RunConfig
+from wm_nodes.config.load import (
+    dump_config,
+    judge_or_embedded,
+    judge_overrides,
+    load_config,
+    load_video_config,
+    reward_overrides,
+)
+from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.launching.graph import Graph, GraphError, compose
 from wm_nodes.launching.scenarios import build_graph, parse_arguments
@@ -96,22 +102,20 @@ def _check_judge(settings: JudgeConfig) -> None:
 
 
 def _resolve_video(values: dict[str, str], run_dir: Path, judge: dict[str, Any]) -> dict[str, str]:
-    """Loop 2 has settings of its own (video_rl/settings.py); the world model gives the judge's position probe."""
-    from wm_nodes.config.schema import AGENT
-    from wm_nodes.video_rl.settings import dump_video_config, load_video_config, reward_overrides
+    """Loop 2 has settings of its own (config/video.py); the world model gives the judge's position probe."""
 
     if values["reward"] not in ("", "agent"):
         raise GraphError(f"reward {values['reward']!r} is of policies; for the video model give agent or nothing")
     weights = reward_overrides(values["reward"] or None)
     config = load_video_config(values["config_file"] or values["video_preset"], {**weights, **judge})
     if config.rewards.get(AGENT):
-        config = replace(config, judge=judge_or_embedded(config.judge))
+        config = config.with_values(judge=judge_or_embedded(config.judge))
         _check_judge(config.judge)
     values["model_dir"] = _model_dir(values["model_dir"], config.task)
     values["bag_uri"] = _bag_uri(values["bag_uri"], "world_model_rl", run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
     values["config_file"] = str(run_dir / "video_config.yaml")
-    Path(values["config_file"]).write_text(dump_video_config(config))
+    Path(values["config_file"]).write_text(dump_config(config))
     return values
 
 

@@ -15,6 +15,7 @@ from rclpy.action import ActionClient
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
 from wm_msgs.msg import ClipScores, PolicyVersion
+from wm_nodes.config.load import load_video_config
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
 from wm_nodes.ros import convert, diagnostics
@@ -29,7 +30,6 @@ from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
-from wm_nodes.video_rl.settings import load_video_config
 from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, rewarded, version_uri
 from wm_nodes.video_rl.validation import alarm_text, validation_scores
 

@@ -15,7 +15,7 @@ from typing import Any
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.environments.maniskill.collection import CollectionPlan
 from wm_nodes.environments.maniskill.tasks import success
-from wm_nodes.environments.record import TRAINING_SEEDS, collect_plan, gate_plan, scripted_plan
+from wm_nodes.environments.record import TRAINING_SEEDS, acceptance_plan, collect_plan, scripted_plan
 from wm_nodes.policy_rl.factories import policy_actor
 from wm_nodes.policy_rl.pretraining import MODEL_TASKS
 from wm_nodes.recording import read_episodes
@@ -27,7 +27,7 @@ from wm_nodes.world_model.validation.acceptance import CONTACT_FREE, model_metri
 
 ROUND_SEEDS, ROUND_HELDOUT_SEEDS = 800_000, 900_000
 SEEDS_PER_ROUND = 5_000
-"""Reset seeds of round k start at (k - 1) * SEEDS_PER_ROUND from these; rounds.num_rounds is at most 20."""
+"""Reset seeds of round k start at (k - 1) * SEEDS_PER_ROUND from these; model_refresh.num_rounds is at most 20."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ def collect_round(
     """
     bags = []
     for name, first_seed, episodes in (
-        ("train", ROUND_SEEDS, config.rounds.episodes_per_round),
-        ("heldout", ROUND_HELDOUT_SEEDS, config.rounds.heldout_episodes),
+        ("train", ROUND_SEEDS, config.model_refresh.episodes_per_round),
+        ("heldout", ROUND_HELDOUT_SEEDS, config.model_refresh.heldout_episodes),
     ):
         plan = CollectionPlan(
             MODEL_TASKS[config.task][-1], config.simulation, episodes, first_seed + SEEDS_PER_ROUND * (number - 1), {},
@@ -103,11 +103,11 @@ def collect_round(
 
 
 def collect_replay(config: RunConfig, run_dir: Path, *, progress: bool = True) -> tuple[list[Path], list[Path]]:
-    """Scripted simulator episodes of a run, collected once: (replay for every refresh, held out as for the gate)."""
-    replay = scripted_plan(config, config.rounds.replay_episodes, TRAINING_SEEDS)
+    """Scripted simulator episodes of a run, collected once: (replay for every refresh, held out as for acceptance)."""
+    replay = scripted_plan(config, config.model_refresh.replay_episodes, TRAINING_SEEDS)
     return (
         collect_plan(replay, config, run_dir / "bags" / "replay", progress),
-        collect_plan(gate_plan(config), config, run_dir / "bags" / "heldout", progress),
+        collect_plan(acceptance_plan(config), config, run_dir / "bags" / "heldout", progress),
     )
 
 
@@ -129,7 +129,8 @@ def refresh_model(
     manifest = models.manifest
     settings = WorldModelConfig.model_validate(manifest["world_model"]).model_copy(
         update={
-            "num_iterations": config.rounds.refresh_iterations, "learning_rate": config.rounds.learning_rate,
+            "num_iterations": config.model_refresh.refresh_iterations,
+            "learning_rate": config.model_refresh.learning_rate,
             "rollout_steps": [config.simulation.max_episode_steps],
         }
     )
@@ -149,7 +150,7 @@ def refresh_model(
     )
     refreshed = {
         "source_sha256": models.sha256, "round": number, "episodes": len(episodes), "metrics": metrics,
-        "rounds": config.rounds.model_dump(),
+        "model_refresh": config.model_refresh.model_dump(),
     }
     earlier = list(manifest.get("refreshed", []))
     save_refreshed_folder(
@@ -163,7 +164,7 @@ def refresh_model(
 def compare_models(
     old: WorldModels, new: WorldModels, heldout: Mapping[str, EpisodeArrays], config: RunConfig
 ) -> RefreshDecision:
-    """Judge both models on the same held-out real episodes with the numbers of the gate.
+    """Judge both models on the same held-out real episodes with the numbers of its acceptance.
 
     Args:
         heldout: e.g. {"policy": ..., "scripted": ...}, episodes neither model was trained on.
@@ -174,10 +175,8 @@ def compare_models(
                    for models in (old, new)]
         for key, before in numbers[0].items():
             after = numbers[1][key]
-            grows = key.endswith("copying")
-            rows.append(
-                ModelComparison(name, key, before, after, is_worse(before, after, config.rounds.tolerance, grows))
-            )
+            worse = is_worse(before, after, config.model_refresh.tolerance, key.endswith("copying"))
+            rows.append(ModelComparison(name, key, before, after, worse))
     return RefreshDecision(tuple(rows))
 
 

@@ -60,7 +60,7 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
         f"{summary.minutes:.1f} minutes in all</p>",
         "<h2>Success</h2>", _results(summary),
         *_rounds(summary),
-        "<h2>Gate: did the world model deserve it?</h2>", _gate(summary.gate),
+        "<h2>Acceptance of the world model</h2>", _acceptance(summary.acceptance),
         *figures(pictures),
         "<h2>Look closer, do it again</h2>", _again(run_dir, summary),
         *made_on(summary.machine, config_text),
@@ -146,11 +146,11 @@ def _rounds(summary: Summary) -> Iterable[str]:
     )
 
 
-def _gate(gate: Mapping[str, Any]) -> str:
-    if not gate:
-        return "<p>The gate was not asked.</p>"
+def _acceptance(report: Mapping[str, Any]) -> str:
+    if not report:
+        return "<p>Not measured.</p>"
     rows = []
-    for criterion in gate["criteria"]:
+    for criterion in report["criteria"]:
         passed = criterion["passed"]
         mark = '<span class="good">passed</span>'
         if not passed:
@@ -159,12 +159,12 @@ def _gate(gate: Mapping[str, Any]) -> str:
             f"<tr><td>{escape(str(criterion['name']))}</td>{number_cell(_value(criterion['value']))}"
             f"<td>{escape(str(criterion['rule']))} {escape(_threshold(criterion))}</td><td>{mark}</td></tr>"
         )
-    notes = "".join(f'<p class="faint">{escape(str(note))}</p>' for note in gate.get("notes", ()))
-    words = "Passed" if gate["passed"] else "Failed: trained in it all the same"
+    notes = "".join(f'<p class="faint">{escape(str(note))}</p>' for note in report.get("notes", ()))
+    words = "Passed" if report["passed"] else "Failed: trained in it all the same"
     return (
-        f"<p>{words}. Judged on {gate['episodes']} held-out real episodes.</p>"
+        f"<p>{words}. Judged on {report['episodes']} held-out real episodes.</p>"
         '<div class="wide"><table><tr><th>criterion</th><th class="number">value</th><th>must be</th><th></th></tr>'
-        f"{''.join(rows)}</table></div>{notes}{_metrics(gate.get('metrics', {}))}"
+        f"{''.join(rows)}</table></div>{notes}{_metrics(report.get('metrics', {}))}"
     )
 
 

@@ -22,6 +22,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
+from wm_nodes.config.video import GrpoConfig
 from wm_nodes.core.files import write_atomic
 from wm_nodes.training.checkpoint import metadata_of, optimizer_tensors, restore_optimizer, section
 from wm_nodes.training.ranks import Ranks
@@ -39,7 +40,6 @@ from wm_nodes.video_rl.group_advantages import (
     win_rates,
 )
 from wm_nodes.video_rl.grpo_math import clip_tails, clipped_objective
-from wm_nodes.video_rl.grpo_settings import GrpoSettings
 from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
 
 
@@ -95,7 +95,7 @@ class GrpoLearner:
     def __init__(
         self,
         model: nn.Module,
-        settings: GrpoSettings,
+        settings: GrpoConfig,
         rollout: RolloutSettings,
         *,
         seed: int,

@@ -12,7 +12,7 @@ import pytest
 from audit_logs import Job, JudgeByClip, clips, judge_all
 from scripted_judge import CLEAN, FLAWED, WRONG, ScriptedJudge, clean_table
 
-from wm_nodes.core.reward_statistics import wilson_interval
+from wm_nodes.core.statistics import wilson_interval
 from wm_nodes.judge.agent import RewardAgent
 from wm_nodes.judge.agent.levels import next_vote
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from wm_nodes.core.reward_statistics import kappa
+from wm_nodes.core.statistics import kappa
 from wm_nodes.judge.agent.levels import settled
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import Status

@@ -1,4 +1,4 @@
-"""Does this world model deserve that a policy is trained in it? Judged on held-out real episodes before any update
+"""Whether a world model passes acceptance: measured on held-out real episodes, before a policy is trained in it
 (RS-12).
 
 The numbers come from rollout_evaluation: recorded actions rolled out open-loop from recorded first frames. Positions
@@ -74,7 +74,7 @@ class AcceptanceReport:
         """The criteria for the terminal; remedies where they failed."""
         words = "passed" if self.passed else "FAILED"
         table = Table(
-            title=f"gate {words}: {self.task}, {self.episodes} held-out real episodes",
+            title=f"acceptance {words}: {self.task}, {self.episodes} held-out real episodes",
             caption="\n".join(self.notes) or None,
         )
         table.add_column("criterion")
@@ -125,7 +125,7 @@ def criteria_of(
     real: tuple[int, int] | None,
 ) -> tuple[tuple[Criterion, ...], tuple[str, ...]]:
     """Criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model."""
-    gate, task = config.gate, config.task
+    limits, task = config.acceptance, config.task
     notes = [
         f"Errors are those of the full horizon over those of copying the first frame; the object's over the episodes "
         f"in which it moved more than {100 * MOVED_M:g} cm; the probe alone errs by "
@@ -137,16 +137,16 @@ def criteria_of(
         notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
     else:
         ratio = _at(metrics, "object_moved_ratio", num_steps)
-        criteria.append(_below(f"object error / copying, step {num_steps}", ratio, gate.object_error_ratio))
+        criteria.append(_below(f"object error / copying, step {num_steps}", ratio, limits.object_error_ratio))
     ratio = _at(metrics, "tool_ratio", num_steps)
-    criteria.append(_below(f"tool error / copying, step {num_steps}", ratio, gate.tool_error_ratio))
+    criteria.append(_below(f"tool error / copying, step {num_steps}", ratio, limits.tool_error_ratio))
     for kind, threshold, remedy in (
-        ("precision", gate.done_precision, MORE_NEAR_MISSES), ("recall", gate.done_recall, MORE_SUCCESSES),
+        ("precision", limits.done_precision, MORE_NEAR_MISSES), ("recall", limits.done_recall, MORE_SUCCESSES),
     ):
         value = float(metrics[f"done_{task}_{kind}"])
         criteria.append(Criterion(f"done {kind} on rollouts", value, threshold, ">=", value >= threshold, remedy))
-    if not gate.require_success_agreement:
-        notes.append("Agreement of imagined and real success was not asked for (gate.require_success_agreement).")
+    if not limits.require_success_agreement:
+        notes.append("Agreement of imagined and real success was not asked for (acceptance.require_success_agreement).")
     elif imagined is None or real is None:
         notes.append("Agreement of imagined and real success was not judged: no policy was measured in both.")
     else:

@@ -1,4 +1,4 @@
-"""Does the action model deserve to be trained in? Open-loop rollouts of held-out episodes against what really happened.
+"""Open-loop rollouts of held-out episodes by the action model, against what really happened.
 
 Shapes: E episodes, T steps, S tokens, D values per token, J tasks, P probed values (PROBE_NAMES).
 
