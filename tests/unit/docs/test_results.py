@@ -211,9 +211,8 @@ def table_rows() -> Rows:
 
 def pattern_rows() -> Rows:
     for one in runs("judge_table.jsonl")["shipped"]["patterns"]:
-        yield row(
-            one["pattern"], one["n"], share(one, "recall"), percent(one["false_positives"]), percent(one["best_recall"])
-        )
+        rates = (percent(one["false_positives"]), percent(one["best_recall"]))
+        yield row(one["pattern"], one["n"], share(one, "recall"), *rates)
 
 
 def conformal_rows() -> Rows:
@@ -270,15 +269,20 @@ def control_rows() -> Rows:
 def imagined_rows() -> Rows:
     for task, run in runs("judge_imagined_vs_real.jsonl").items():
         for one in run["agreement"]:
-            yield row(
-                task, one["kind"], f"{one['judged']} of {one['n']}", f"{one['auroc']:.3f}", share(one),
-                percent(one["balanced"]),
-            )
+            judged, quality = f"{one['judged']} of {one['n']}", f"{one['auroc']:.3f}"
+            yield row(task, one["kind"], judged, quality, share(one), percent(one["balanced"]))
         done = run["done_signal"]
-        yield row(
-            task, "done signal", "200 of 200", f"{done['auroc']:.3f}", percent(done["accuracy"]),
-            percent(done["balanced"]),
-        )
+        quality = f"{done['auroc']:.3f}"
+        yield row(task, "done signal", "200 of 200", quality, percent(done["accuracy"]), percent(done["balanced"]))
+
+
+def policy_camera_rows() -> Rows:
+    for name, run in runs("judge_policy_camera.jsonl").items():
+        planning, physics = run["planning"], run["hack/physics"]
+        n = physics["fails"]
+        found = (of_counts(round(physics[key] * n), n) for key in ("recall_at_5", "flagged"))
+        exact = of_counts(round(planning["level_accuracy"] * planning["n"]), planning["n"])
+        yield row(name, exact, *found, percent(physics["false_flags"]))
 
 
 # --- speed.md ---------------------------------------------------------------------------------------------------
@@ -299,15 +303,20 @@ def stage_rows() -> Rows:
 
 
 # --- shipped_models.md ------------------------------------------------------------------------------------------
+def heldout(folder: str) -> Run:
+    metrics: Run = json.loads((SHIPPED / folder / "manifest.json").read_text())["heldout"]
+    return metrics
+
+
 def world_model_rows() -> Rows:
-    found = json.loads((SHIPPED / "table_top_cube" / "manifest.json").read_text())["heldout"]
+    found = heldout("table_top_cube")
     for text, name in (("object that moved, cm", "object_moved"), ("tool, cm", "tool")):
         yield row(text, *(f"{found[f'{name}_{kind}_cm_h16']:.2f}" for kind in ("rollout", "floor", "copy")))
     yield row("PSNR, dB", *(f"{found[f'psnr_{kind}_db_h16']:.1f}" for kind in ("rollout", "recon", "copy")))
 
 
 def done_rows() -> Rows:
-    found = json.loads((SHIPPED / "table_top_cube" / "manifest.json").read_text())["heldout"]
+    found = heldout("table_top_cube")
     for task in ("push_cube", "reach"):
         rates = {name: found[f"done_{task}_{name}"] for name in ("auc", "recall", "real_rate", "imagined_rate")}
         n = found["episodes"]
@@ -322,7 +331,7 @@ def of_counts(hits: int, n: int) -> str:
 
 
 def video_model_rows() -> Rows:
-    found = json.loads((SHIPPED / "table_top_cube" / "video_model" / "manifest.json").read_text())["heldout"]
+    found = heldout("table_top_cube/video_model")
     for text, name, digits in (
         ("object, cm", "object_cm", 2), ("tool, cm", "tool_cm", 2), ("tracking score", "tracking", 3),
         ("PSNR, dB", "psnr_db", 1),
@@ -352,7 +361,7 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
     ],
     "judge": [
         table_rows, pattern_rows, conformal_rows, stacked_rows, efficiency_rows, judge_hacking_rows, control_rows,
-        imagined_rows,
+        imagined_rows, policy_camera_rows,
     ],
     "speed": [speed_summary_rows, stage_rows],
     "shipped_models": [world_model_rows, done_rows, video_model_rows, judge_rows],
