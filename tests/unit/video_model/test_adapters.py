@@ -616,7 +616,7 @@ class TestFolder:
         assert str(tmp_path) in capsys.readouterr().out.replace("\n", "")
 
     def test_the_documented_training_runs_as_written_and_its_adapter_loads(self, folder: Path, tmp_path: Path) -> None:
-        page = (Path(__file__).parents[3] / "wm_nodes" / "docs" / "dyndiff.md").read_text()
+        page = (Path(__file__).parents[3] / "wm_nodes" / "docs" / "public_video_models.md").read_text()
         (block,) = re.findall(r"## Training a public model.*?```python\n(.*?)```", page, re.DOTALL)
         small = {"rollout.num_steps": 4, "groups.group_size": 4, "grpo.advantage.best_of_n": 2}
         scope: dict[str, Any] = {

@@ -1,7 +1,7 @@
 """Claim B on clips of recorded contexts: what each sampler makes of the same number of model calls.
 
-The setting is the one of docs/dyndiff.md in which the shipped video model was seen to learn: contexts it has not been
-trained on, clips of few steps, only the weights that carry the condition, no KL.
+The setting: contexts that the shipped video model was not trained on, clips of few steps, only the weights that carry
+the condition, no KL. Results: docs/results/video_rl.md.
 """
 
 from collections.abc import Callable, Sequence

@@ -179,8 +179,8 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
         check_judge(config.judge)
     if config.grpo.kl.anchor == "lora_off":
         raise ValueError(
-            "grpo.kl.anchor lora_off is for public models with a LoRA adapter, trained in Python (docs/dyndiff.md); "
-            "the graph's video model has none: take frozen"
+            "grpo.kl.anchor lora_off is for public models with a LoRA adapter, trained in Python "
+            "(docs/public_video_models.md); the graph's video model has none: take frozen"
         )
     run_dir = open_run_dir(
         arguments.run_dir, "world_model_rl", dump_config(config),

@@ -390,7 +390,7 @@ def test_the_round_of_the_document_runs_as_it_is_written(tmp_path: Path, monkeyp
     Path("labels-Bob.json").write_text(bob)
     Path("next.yaml").write_text("extends: robot\nrevision: 2\nstages: {VQ: {threshold: 0.8}}\n")
     block = DOCUMENT.read_text().split("```bash\n")[1].split("```")[0]
-    commands = [line.removeprefix("python -m wm_nodes.judge.audit ").split() for line in block.splitlines()]
+    commands = [line.removeprefix("wm audit ").split() for line in block.splitlines()]
     assert [command[0] for command in commands] == [
         "verify", "sample", "view", "agree", "people", "replay", "replay", "replay", "adopt",
     ]
