@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
-from wm_nodes.environments.maniskill.tasks import TASKS
+from wm_nodes.config.tasks import task_names
 from wm_nodes.judge.agent import RewardAgent, load_rubric
 from wm_nodes.judge.agent.types import ClipRef, Stage, Status, TaskSpec, Verdict, clip_ref
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
@@ -34,7 +34,7 @@ def test_it_is_small_says_how_it_was_made_and_knows_its_evidence() -> None:
     head = load_head(shipped_head())
     assert size < 3_000_000
     assert set(head.names) == {*EVIDENCE, *reading_names()} and len(head.readers) == FOLDS
-    assert set(head.story["tasks"]) == set(TASKS)
+    assert set(head.story["tasks"]) == set(task_names())
     assert {"made", "data", "seed", "segmenter", "trees", "validation"} <= head.story.keys()
     assert head.story["made"]["command"].startswith("python -m wm_nodes.learning.train_judge"), "of its commit"
     card = EmbeddedJudge(head).card

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from wm_nodes.config.load import VIDEO, ConfigError, dump_config, load_video_config, preset_names
 from wm_nodes.core.seeding import torch_stream
-from wm_nodes.environments.maniskill.tasks import GROUND_TRUTH_NAMES
+from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import NetworkSettings, RolloutSettings, VideoNetwork
@@ -96,7 +96,7 @@ def recorded(positions_cm: Tensor) -> Clips:
     truth = np.zeros((N, F, len(GROUND_TRUTH_NAMES)), np.float32)
     for index, name in enumerate(PROBE_NAMES):
         truth[..., GROUND_TRUTH_NAMES.index(name)] = positions_cm[..., index].numpy() / 100
-    return Clips(frames, torch.zeros(N, F - 1, 6), truth, ("push",) * N)
+    return Clips(frames, torch.zeros(N, F - 1, 6), truth, ("push",) * N, "push_cube")
 
 
 def test_a_clip_equal_to_its_recording_has_full_scores_and_a_shifted_object_loses_by_the_formula() -> None:

@@ -10,7 +10,7 @@ from video_toys import ACTION_DIM, randn, times, tiny_network
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import FlowMatchingConfig
 from wm_nodes.core.seeding import torch_stream
-from wm_nodes.environments.maniskill.tasks import GROUND_TRUTH_NAMES
+from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork, guided_velocity
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.codec import PatchCodec
@@ -108,7 +108,7 @@ def test_a_trained_model_obeys_its_actions_and_without_them_knows_only_the_mean(
 def contexts(count: int, height: int, width: int) -> Clips:
     frames = torch.randint(0, 256, (count, 3, height, width, 3), generator=torch_stream(0, "pixels"), dtype=torch.uint8)
     truth = torch.zeros(count, 3, len(GROUND_TRUTH_NAMES)).numpy()
-    return Clips(frames, torch.zeros(count, 2, ACTION_DIM), truth, ("push",) * count)
+    return Clips(frames, torch.zeros(count, 2, ACTION_DIM), truth, ("push",) * count, "push_cube")
 
 
 @pytest.mark.parametrize(("height", "width"), [(8, 12), (16, 24), (20, 8)])

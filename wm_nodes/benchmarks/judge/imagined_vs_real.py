@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import default_task, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import BoolArray
-from wm_nodes.environments.maniskill.tasks import instruction
 from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.judge.agent import RewardAgent, TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.agent.types import GATED, Status
@@ -80,7 +80,8 @@ def jobs(
         for kind, after in (("recorded", episodes.images[e, 1:]), ("imagined", imagined.frames[e])):
             clip = clip_ref(f"{kind} {e}", np.concatenate([first, after[:end]]), config.simulation.control_hz)
             task = TaskSpec(
-                instruction(config.task), config.task, config.judge.robot, first[0], actions=episodes.actions[e, :end]
+                get_task(config.task).instruction, config.task, config.judge.robot, first[0],
+                actions=episodes.actions[e, :end],
             )  # both tasks are recorded in one scene, under the instruction of one
             yield kind, ClipJob(clip, task)
 
@@ -148,7 +149,7 @@ def main(argv: Sequence[str]) -> int:
     """Measure and print. Return the exit code: 0 done, 2 a clear error."""
     parser = argparse.ArgumentParser(prog="judge_dreams", description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="of the recorded episodes; finished ones are taken up again")
-    parser.add_argument("--task", choices=("reach", "push_cube"), default="push_cube")
+    parser.add_argument("--task", choices=task_names(), default=default_task())
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--judge", type=Path, help="folder of a trained judge; default: the shipped one")
     parser.add_argument("--model-dir", type=Path, help="world model; default: the shipped one")

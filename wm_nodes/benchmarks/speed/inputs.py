@@ -17,12 +17,11 @@ from safetensors.torch import save_file
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import get_task, model_tasks
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Environment, FloatArray, UInt64Array
-from wm_nodes.environments.maniskill.tasks import instruction
 from wm_nodes.policy_rl.factories import models_of
-from wm_nodes.policy_rl.pretraining import MODEL_TASKS
 from wm_nodes.world_model import load_starts, save_model_folder
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.text import TextModel, vocabulary_of
@@ -74,11 +73,12 @@ def prepare_model(config: RunConfig, folder: Path, given: Path | None) -> tuple[
 def random_model(config: RunConfig, folder: Path) -> Path:
     """A model folder of the configuration's size, untrained."""
     torch.manual_seed(stream_seed(config.seed, "benchmark_model") % 2**31)
-    size, tasks = config.simulation.image_size, MODEL_TASKS[config.task]
+    size, tasks = config.simulation.image_size, model_tasks(config.task)
     tokenizer = Tokenizer(config.tokenizer, size, size * len(config.simulation.cameras))
     sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_tasks": len(tasks)}
     action = ActionModel(config.world_model, action_dim=3, state_dim=3, **sizes)
-    text = TextModel(config.world_model, vocabulary=vocabulary_of(tuple(map(instruction, tasks))), **sizes)
+    words = vocabulary_of(tuple(get_task(task).instruction for task in tasks))
+    text = TextModel(config.world_model, vocabulary=words, **sizes)
     return save_model_folder(
         folder, tokenizer, action, text, tokenizer_config=config.tokenizer, world_model_config=config.world_model,
         simulation=config.simulation, tasks=tasks, story={"data": "none: random weights for benchmarks"},

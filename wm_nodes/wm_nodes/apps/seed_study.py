@@ -17,9 +17,10 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from wm_nodes.config.load import dump_config, load_config, parse_override, preset_names
+from wm_nodes.config.load import default_task, dump_config, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.statistics import paired_difference, wilson_interval
 from wm_nodes.core.types import Environment
@@ -112,7 +113,7 @@ def gain_over_simulator(rows: Sequence[dict[str, Any]]) -> float | None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="study.py", description=__doc__.split("\n")[0])
-    parser.add_argument("--tasks", nargs="+", default=["reach", "push_cube"])
+    parser.add_argument("--tasks", nargs="+", default=model_tasks(default_task()))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--preset", default="cpu", help=f"one of {', '.join(preset_names())}, or a .yaml of overrides")

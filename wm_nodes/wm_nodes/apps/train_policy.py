@@ -32,6 +32,7 @@ from wm_nodes.apps.policy_run import (
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, parse_override, preset_names
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import task_names
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
@@ -136,7 +137,7 @@ def _parser() -> argparse.ArgumentParser:
         "real simulator before and after.",
     )
     parser.add_argument("--preset", default="cpu", help=f"one of {', '.join(preset_names())}, or a .yaml of overrides")
-    parser.add_argument("--task", choices=("reach", "push_cube", "pull_cube"), help="default: the preset's")
+    parser.add_argument("--task", choices=task_names(), help="default: the preset's")
     parser.add_argument("--seed", type=int, help="root seed of every random number; default: the preset's")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
     parser.add_argument(

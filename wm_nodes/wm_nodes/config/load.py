@@ -1,9 +1,10 @@
-"""Presets: base.yaml holds every number of a loop; task, preset and command line override some of them, in this order.
+"""Presets: base.yaml holds every number of a loop; task, preset, command line override some of them, in this order.
 
 presets/policy is of loop 1, presets/video of loop 2; the judge of both is in presets/judge.yaml.
 """
 
 import re
+from copy import deepcopy
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -13,13 +14,12 @@ import yaml
 from pydantic import ValidationError
 
 from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig, SettingsSection
+from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.config.video import VideoRlConfig
 
 PRESETS = resources.files("wm_nodes.config") / "presets"
 POLICY, VIDEO = "policy", "video"
 """Folders of presets, one for each loop."""
-TASK_PREFIX = "task_"
-"""task_<name>.yaml holds what differs between tasks; it lies between base and the preset."""
 FREE = ("behaviours", "rewards")
 """Mappings without fixed keys, which are replaced as a whole."""
 FORMER_NAMES = {"gate": "acceptance", "rounds": "model_refresh"}
@@ -58,8 +58,9 @@ def _load(schema: type[Config], loop: str, preset: str, overrides: dict[str, Any
     values = read_preset("base", loop) | _read(PRESETS / "judge.yaml")
     chosen = read_preset(preset, loop)
     task = overrides.get("task", chosen.get("task", values["task"]))
-    task_file = PRESETS / loop / f"{TASK_PREFIX}{task}.yaml"
-    _merge(values, _read(task_file) if task_file.is_file() else {})
+    if loop == POLICY and task in task_names():
+        for dotted, value in get_task(task).settings.items():
+            _set_dotted(values, dotted, deepcopy(value))
     if preset != "base":
         _merge(values, chosen)
     for dotted, value in overrides.items():
@@ -68,6 +69,11 @@ def _load(schema: type[Config], loop: str, preset: str, overrides: dict[str, Any
         return schema.model_validate(values)
     except ValidationError as error:
         raise refusal(error, f"{schema.__module__.replace('.', '/')}.py") from None
+
+
+def default_task() -> str:
+    """The task of base.yaml."""
+    return str(read_preset("base")["task"])
 
 
 def default_judge() -> JudgeConfig:
@@ -127,9 +133,8 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def preset_names(loop: str = POLICY) -> list[str]:
-    """The presets of a loop; what only differs by task is none."""
-    names = (Path(entry.name).stem for entry in (PRESETS / loop).iterdir() if entry.name.endswith(".yaml"))
-    return sorted(name for name in names if not name.startswith(TASK_PREFIX))
+    """The presets of a loop."""
+    return sorted(Path(entry.name).stem for entry in (PRESETS / loop).iterdir() if entry.name.endswith(".yaml"))
 
 
 def read_preset(name: str, loop: str = POLICY) -> dict[str, Any]:

@@ -5,7 +5,9 @@ Loop 2's are in video.py.
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from wm_nodes.config.tasks import check_task
 
 PositiveInt = Annotated[int, Field(ge=1)]
 NonNegativeInt = Annotated[int, Field(ge=0)]
@@ -16,7 +18,8 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
 
-TaskName = Literal["reach", "push_cube", "pull_cube"]
+TaskName = Annotated[str, AfterValidator(check_task)]
+"""Name of a task's file, see config/tasks.py."""
 
 
 class SettingsSection(BaseModel):

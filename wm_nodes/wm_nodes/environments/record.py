@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import Episode
 from wm_nodes.environments.maniskill.collection import CollectionPlan, collect
-from wm_nodes.environments.maniskill.tasks import instruction
 from wm_nodes.recording import EpisodeBagWriter
 
 TRAINING_SEEDS, HELDOUT_SEEDS = 0, 500_000
@@ -29,9 +29,8 @@ def acceptance_plan(config: RunConfig) -> CollectionPlan:
 
 
 def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
-    scene_task = "push_cube" if config.task == "reach" else config.task  # one scene, one data set, two tasks
     return CollectionPlan(
-        task=scene_task,
+        task=model_tasks(config.task)[-1],  # one scene and one data set for all tasks of a model
         simulation=config.simulation,
         num_episodes=num_episodes,
         first_seed=first_seed,
@@ -63,7 +62,7 @@ def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path, progress
 
 def write_shard(path: Path, plan: CollectionPlan, episodes: list[Episode]) -> None:
     """Write one shard's episodes into a bag that is renamed to `path` when complete."""
-    spec = simulation_spec(plan.task, instruction(plan.task), plan.simulation, 1)
+    spec = simulation_spec(plan.task, plan.simulation, 1)
     custom = {"wm.seeds": f"{episodes[0].seed}..{episodes[-1].seed}"}
     with EpisodeBagWriter(
         path, spec, run_id=path.parent.name, custom=custom, start_ns=1, discard_partial=True

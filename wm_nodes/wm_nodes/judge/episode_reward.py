@@ -120,7 +120,7 @@ def episode_judge(config: RunConfig) -> JudgeConfig:
 
 
 def _scene(config: RunConfig) -> EnvironmentSpec:
-    return simulation_spec(config.task, "", config.simulation, 1)
+    return simulation_spec(config.task, config.simulation, 1)
 
 
 def _longest(spec: EnvironmentSpec) -> tuple[int, ...]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from wm_nodes.config.tasks import task_names
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
 
 TRUTHS = ("true", "false")
@@ -36,7 +37,7 @@ class LaunchArgument:
 
 ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("preset", "cpu", "Settings to start from, when config_file is empty: a name or a .yaml file"),
-    LaunchArgument("task", "push_cube", "Task, when config_file is empty", ("reach", "push_cube", "pull_cube")),
+    LaunchArgument("task", "push_cube", "Task, when config_file is empty", task_names()),
     LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
     LaunchArgument("run_dir", "", "Folder for weights, bags and logs; empty: runs/<time>-<scenario>"),
     LaunchArgument("namespace", "wm", "ROS namespace of the graph; several graphs on one host need several domains"),

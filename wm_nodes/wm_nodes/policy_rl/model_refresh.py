@@ -13,17 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
+from wm_nodes.config.tasks import get_task, model_tasks
 from wm_nodes.environments.maniskill.collection import CollectionPlan
-from wm_nodes.environments.maniskill.tasks import success
 from wm_nodes.environments.record import TRAINING_SEEDS, acceptance_plan, collect_plan, scripted_plan
 from wm_nodes.policy_rl.factories import policy_actor
-from wm_nodes.policy_rl.pretraining import MODEL_TASKS
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import ActionModel, WorldModels, load_model_folder, save_refreshed_folder
 from wm_nodes.world_model.folder import MANIFEST, read_manifest
 from wm_nodes.world_model.training.dynamics import train_action_model
-from wm_nodes.world_model.validation.acceptance import CONTACT_FREE, model_metrics
+from wm_nodes.world_model.validation.acceptance import model_metrics
 
 ROUND_SEEDS, ROUND_HELDOUT_SEEDS = 800_000, 900_000
 SEEDS_PER_ROUND = 5_000
@@ -95,7 +94,7 @@ def collect_round(
         ("heldout", ROUND_HELDOUT_SEEDS, config.model_refresh.heldout_episodes),
     ):
         plan = CollectionPlan(
-            MODEL_TASKS[config.task][-1], config.simulation, episodes, first_seed + SEEDS_PER_ROUND * (number - 1), {},
+            model_tasks(config.task)[-1], config.simulation, episodes, first_seed + SEEDS_PER_ROUND * (number - 1), {},
             make_policy=partial(policy_actor, config, model_dir, weights, None), policy_version=number,
         )
         bags.append(collect_plan(plan, config, folder / name, progress))
@@ -143,7 +142,7 @@ def refresh_model(
     action = copy.deepcopy(models.action)
     assert isinstance(action, ActionModel)
     recorded = (episode for bag in bags for episode in read_episodes(bag))
-    episodes = stack_episodes(recorded, models.tasks, success, num_steps=config.simulation.max_episode_steps)
+    episodes = stack_episodes(recorded, models.tasks, num_steps=config.simulation.max_episode_steps)
     action, metrics = train_action_model(
         models.tokenizer, episodes, training, config.seed + number, folder.with_name(f"{folder.name}_training"),
         model=action.requires_grad_(True), progress=progress,
@@ -193,7 +192,7 @@ def is_worse(old: float, new: float, tolerance: float, error: bool) -> bool:
 def _numbers(metrics: Mapping[str, float], config: RunConfig, num_steps: int) -> dict[str, float]:
     label = f"h{num_steps:02d}"
     errors = {"tool error / copying": f"tool_ratio_{label}"}
-    if config.task not in CONTACT_FREE:
+    if get_task(config.task).moves_object:
         errors["object error / copying"] = f"object_moved_ratio_{label}"
     rates = {f"done {kind}": f"done_{config.task}_{kind}" for kind in ("precision", "recall")}
     return {name: float(metrics.get(key, math.nan)) for name, key in (errors | rates).items()}

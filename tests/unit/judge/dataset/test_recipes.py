@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pushed_box import FRAMES, draw, push_clip, pushing_states, redrawn
 
+from wm_nodes.config.tasks import clip_rules
 from wm_nodes.judge.agent.levels import one_hot, p_fail_of
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.dataset.edits import (
@@ -20,7 +21,6 @@ from wm_nodes.judge.dataset.edits import (
     PHYSICS,
     RECIPES,
     ROBOT,
-    TASK_RULES,
     TC,
     ClipTruth,
     LabelledClip,
@@ -41,7 +41,7 @@ from wm_nodes.judge.dataset.edits.generator import edited
 from wm_nodes.judge.dataset.edits.recipes import get_recipe
 from wm_nodes.judge.dataset.edits.truth import overlap_m, touched_nearby
 
-PUSH = TASK_RULES["push_cube"]
+PUSH = clip_rules("push_cube").label
 TOUCHING = slice(7, 12)
 seeds = st.integers(0, 2**32)
 names = st.sampled_from(sorted(RECIPES))
@@ -322,7 +322,7 @@ def test_task_completion_levels_worked_by_hand() -> None:
     def tool_at(height_m: float) -> int:
         tool = states.thing + np.array([0, 0, 0.3], np.float32)
         tool[-1, 2] = 0.02 + height_m
-        return tc_level(replace(states, tool=tool, contact=np.zeros(FRAMES, bool)), TASK_RULES["reach"])
+        return tc_level(replace(states, tool=tool, contact=np.zeros(FRAMES, bool)), clip_rules("reach").label)
 
     assert tool_at(0.099) == 4 and tool_at(0.101) == 3 and tool_at(0.18) == 2 and tool_at(0.25) == 1
 

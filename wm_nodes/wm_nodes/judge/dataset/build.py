@@ -23,19 +23,19 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import default_task, load_config
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.tasks import clip_rules, get_task, task_names
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.tasks import TASKS, get_task
 from wm_nodes.judge.agent.types import media_sha
 from wm_nodes.judge.dataset.domain_randomization import RandomizedScene, drawn_variation
 from wm_nodes.judge.dataset.edits import (
@@ -76,9 +76,6 @@ OBJECT_COLOURS = {
     "blue": (0.05, 0.16, 0.63), "green": (0.05, 0.5, 0.12), "orange": (0.85, 0.4, 0.05), "purple": (0.45, 0.1, 0.6),
 }
 TABLES = {"sand": (0.78, 0.74, 0.66), "slate": (0.42, 0.46, 0.5), "moss": (0.5, 0.58, 0.42)}
-PUSHING = {"expert": 0.5, "short": 0.2, "near_miss": 0.15, "noisy": 0.1, "random": 0.05}
-BEHAVIOURS = {"push_cube": PUSHING, "pull_cube": PUSHING, "reach": {"hover": 0.6, "hover_noisy": 0.3, "near_miss": 0.1}}
-"""Shares by task."""
 HELD_OUT = Division(cameras=("near_high",), objects=("cube/purple",), scenes=("moss",))
 HELD_OUT_SHARE = 0.12
 """Of the episodes, for each held-out camera, object and scene; two thirds of a trained task's are none of them."""
@@ -93,12 +90,12 @@ STEADY = ("expert", "short", "near_miss")
 class SetPlan:
     """tasks: in turn. num_episodes: recorded ones, each seen by one camera. edits_per_clip: (recipe, severity) pairs
     that are tried on each, None for all. seed: episode i is reset with seed + i; look and recipes follow from it.
-    shapes: besides the cube; rare, and test clips only. Not in "reach", whose end state depends on the height.
+    shapes: besides the cube; rare, and test clips only. Not of tasks whose end state depends on the height.
     development: episodes that no test part has, num_episodes of them. diverse: scenes of diverse_looks.py. recipes: of
     the edits. policy: clips of policy_view.py. stacks_per_clip: besides the edits, see generator.stacks.
     """
 
-    tasks: tuple[str, ...] = ("push_cube",)
+    tasks: tuple[str, ...] = field(default_factory=lambda: (default_task(),))
     num_episodes: int = 8
     edits_per_clip: int | None = None
     seed: int = 0
@@ -236,11 +233,11 @@ def _drawn_part(task: str, seed: int) -> Part:
 def drawn_origin(task: str, seed: int, shapes: Collection[str] = ()) -> Origin:
     """Behaviour, camera and colours of an episode, drawn by `seed`. shapes: see SetPlan."""
     rng = numpy_stream(seed, f"adversarial_origin/{task}")
-    behaviours = BEHAVIOURS[task]
-    behaviour = str(rng.choice(list(behaviours), p=list(behaviours.values())))
+    rules = clip_rules(task)
+    behaviour = str(rng.choice(list(rules.behaviours), p=list(rules.behaviours.values())))
     things = [f"cube/{colour}" for colour in OBJECT_COLOURS]
     camera, thing = _pick(rng, list(CAMERAS), HELD_OUT.cameras), _pick(rng, things, HELD_OUT.objects)
-    others = [shape for shape in SHAPES if shape in shapes and shape != "cube" and task != "reach"]
+    others = [shape for shape in SHAPES if shape in shapes and shape != "cube" and rules.any_height]
     if others and behaviour in STEADY:  # drawn apart, so that everything else is as without them
         apart = numpy_stream(seed, f"adversarial_shape/{task}")
         thing = thing.replace("cube", _pick(apart, ["cube", *others], others))
@@ -359,7 +356,7 @@ def main(argv: Sequence[str]) -> int:
     """Build a set and print its prevalence. Return the exit code: 0 done, 2 a clear error."""
     parser = argparse.ArgumentParser(prog="adversarial_set", description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="new folder of the set")
-    parser.add_argument("--tasks", nargs="+", choices=sorted(TASKS), default=["push_cube"])
+    parser.add_argument("--tasks", nargs="+", choices=task_names(), default=[default_task()])
     parser.add_argument("--episodes", type=int, default=8, help="recorded episodes per task")
     parser.add_argument("--edits", type=int, help="edits tried on each; all by default")
     parser.add_argument(

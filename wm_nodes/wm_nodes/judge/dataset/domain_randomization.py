@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from wm_nodes.config.tasks import clip_rules
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.dataset.edits import Origin
 from wm_nodes.judge.dataset.edits.manifest import Part
@@ -102,7 +103,7 @@ def drawn_variation(task: str, seed: int, part: Part) -> RandomizedScene:
     lamp = (_rounded((np.cos(side), np.sin(side), -1.0)), strength)
     shades = (round(0.95 - contrast, 3), round(0.95 + contrast, 3))
     layout, turned = None, False
-    if task == "push_cube":
+    if clip_rules(task).any_heading:
         turned = wanted["heading"]
         layout = _layout(rng, (RESERVED_HEADING_DEGREES, PULL_DEGREES - HEADING_GAP_DEGREES) if turned
                          else (0.0, RESERVED_HEADING_DEGREES))

@@ -13,11 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
+from wm_nodes.config.load import default_task
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import clip_rules
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.dataset.edits import TASK_RULES, Origin, SceneStates, tc_level
+from wm_nodes.judge.dataset.edits import Origin, SceneStates, tc_level
 from wm_nodes.judge.dataset.rendering import ClipStage, Drawing, EpisodeStates, SceneAppearance
 from wm_nodes.judge.evidence.window import Window
 from wm_nodes.world_model import WorldModels
@@ -29,14 +31,6 @@ DRAWN, DECODED, IMAGINED = "plain", "plain, decoded", "plain, imagined"
 KINDS = {DRAWN: 0.25, DECODED: 0.25, IMAGINED: 0.5}
 NEAR_M = {"object": 0.04, "tool": 0.05}
 """An imagined thing may be read so far from where the recorded one is read; an object is 4 cm wide."""
-PUSHING = {
-    "expert": 0.3, "short": 0.12, "near_miss": 0.18, "noisy": 0.2, "over": 0.05, "detour": 0.05, "random": 0.1,
-}
-BEHAVIOURS = {
-    "push_cube": PUSHING, "pull_cube": PUSHING,
-    "reach": {"hover": 0.45, "hover_noisy": 0.3, "near_miss": 0.15, "random": 0.1},
-}
-"""Shares by task: more of those who miss, as a policy in training does."""
 SHORTEST = 4
 """Frames of a clip that ends with its success, at least."""
 LOOK = SceneAppearance(num_clutter=0, tiled=False)
@@ -56,7 +50,7 @@ def policy_window(config: SimulationConfig, side: int) -> Window:
 
 def policy_models(folder: Path) -> Path:
     """The world model's folder; the shipped one where none is named."""
-    return folder if folder.name else shipped_model("push_cube")
+    return folder if folder.name else shipped_model(default_task())
 
 
 @dataclass(frozen=True)
@@ -74,7 +68,7 @@ class PolicyCamera:
     def origin(self, task: str, seed: int) -> Origin:
         """Behaviour and kind of drawing of an episode, drawn by `seed`."""
         rng = numpy_stream(seed, f"policy_view/{task}")
-        shares = BEHAVIOURS[task]
+        shares = clip_rules(task).policy_behaviours
         behaviour = str(rng.choice(list(shares), p=list(shares.values())))
         kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
         return Origin(task, SEEN, "cube/blue", self._scene(kind), seed, behaviour)
@@ -90,7 +84,7 @@ class PolicyCamera:
         late, cut = int(rng.integers(2)), rng.random() < 0.5
         if not cut:
             return states
-        rule = TASK_RULES[origin.task]
+        rule = clip_rules(origin.task).label
         for end in range(SHORTEST, len(states) - late):
             if tc_level(states.at(np.arange(end)), rule) == 4:
                 return states.at(np.arange(end + late))

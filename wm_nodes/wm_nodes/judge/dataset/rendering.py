@@ -14,17 +14,17 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
-from mani_skill.utils.registration import register_env
 from numpy.typing import ArrayLike, NDArray
 
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.tasks import get_task
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, UInt8Array
-from wm_nodes.environments.maniskill.behaviours import script, turned
+from wm_nodes.environments.maniskill.behaviours import turned
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import record_episode
-from wm_nodes.environments.maniskill.scenes import WmPullCube, WmPushCube, make_scene, render
-from wm_nodes.environments.maniskill.tasks import CUBE_HALF_SIZE_M, get_task
+from wm_nodes.environments.maniskill.scenes import make_scene, render
+from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M
 
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Eye and target of a camera, m, world frame."""
@@ -138,7 +138,7 @@ def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int, layout: 
     env.reset(seeds=np.array([seed], np.uint64))
     rng, scale = numpy_stream(seed, "behaviour"), env.spec.action_scale[0]
     if layout is None:
-        scripted = script(behaviour, env.ground_truth[0], rng, scale)
+        scripted = get_task(env.spec.task).script(behaviour, env.ground_truth[0], rng, scale)
     else:
         env.lay_out(layout.cube_m, layout.heading_rad)
         scripted = turned(behaviour, env.ground_truth[0], rng, scale, layout.heading_rad)
@@ -170,18 +170,6 @@ class _ClipScene(BaseEnv):  # type: ignore[misc]
         ]
 
 
-class WmClipPushCube(_ClipScene, WmPushCube):
-    pass
-
-
-class WmClipPullCube(_ClipScene, WmPullCube):
-    pass
-
-
-register_env("WmClipPushCube-v1", max_episode_steps=10_000)(WmClipPushCube)
-register_env("WmClipPullCube-v1", max_episode_steps=10_000)(WmClipPullCube)
-
-
 class ClipStage:
     """Draws states of one task's scene; physics never runs.
 
@@ -193,8 +181,7 @@ class ClipStage:
     """
 
     def __init__(self, task: str, config: SimulationConfig, *, policy: bool = False) -> None:
-        scene = get_task(task).scene
-        self._env = make_scene(scene if policy else scene.replace("Wm", "WmClip", 1), config)
+        self._env = make_scene(get_task(task).scene, config, *(() if policy else (_ClipScene,)))
         self._size = self._env.image_size = config.image_size
         self._build()
 

@@ -14,13 +14,11 @@ import numpy as np
 from rich.table import Table
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import get_task
 from wm_nodes.core.statistics import newcombe_difference
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
-
-CONTACT_FREE = ("reach",)
-"""Tasks that are not about moving an object: only the tool is judged."""
 
 MORE_TRAINING = (
     "train longer (world_model.num_iterations) or on more episodes near contact (data.num_episodes, data.behaviours)"
@@ -133,7 +131,7 @@ def criteria_of(
         f"{_at(metrics, 'tool_floor_cm', num_steps):.2f} cm (tool) on real frames."
     ]
     criteria = []
-    if task in CONTACT_FREE:
+    if not get_task(task).moves_object:
         notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
     else:
         ratio = _at(metrics, "object_moved_ratio", num_steps)

@@ -33,7 +33,7 @@ from wm_nodes.judge.dataset.edits.manifest import (
 )
 from wm_nodes.judge.dataset.edits.planning import planning_level
 from wm_nodes.judge.dataset.edits.recipes import RECIPES, Recipe, StateEdit, apply, edit_states, recipes_sha, rendered
-from wm_nodes.judge.dataset.edits.truth import TASK_RULES, TaskRule, failed_physics, recorded, tc_level
+from wm_nodes.judge.dataset.edits.truth import failed_physics, recorded, tc_level
 
 __all__ = [
     "BACKGROUND",
@@ -44,7 +44,6 @@ __all__ = [
     "RECIPES",
     "ROBOT",
     "SPLITS",
-    "TASK_RULES",
     "TC",
     "ClipTruth",
     "Division",
@@ -59,7 +58,6 @@ __all__ = [
     "SceneStates",
     "SourceClip",
     "StateEdit",
-    "TaskRule",
     "apply",
     "children",
     "edit_states",

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from wm_nodes.config.tasks import clip_rules
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.dataset.edits import physics, pixels, timing
 from wm_nodes.judge.dataset.edits.clips import (
@@ -26,7 +27,7 @@ from wm_nodes.judge.dataset.edits.clips import (
     Severity,
     SourceClip,
 )
-from wm_nodes.judge.dataset.edits.truth import failed_physics, task_rule, tc_level
+from wm_nodes.judge.dataset.edits.truth import failed_physics, tc_level
 
 REVISION = 2
 """Counted up whenever code changes what a recipe draws or what truth.py says; recipes_sha sees ranges by itself."""
@@ -251,7 +252,7 @@ def seen_share(before: SourceClip, after: SourceClip) -> float:
 
 
 def _truth_level(clip: SourceClip) -> int:
-    return tc_level(clip.states, task_rule(clip.origin.task))
+    return tc_level(clip.states, clip_rules(clip.origin.task).label)
 
 
 def _physics_fails(labels: ClipTruth) -> bool:
