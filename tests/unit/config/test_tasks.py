@@ -91,7 +91,7 @@ def test_the_command_line_and_the_settings_name_the_known_tasks(
 @pytest.mark.parametrize(
     ("package", "files", "error"),
     [
-        ("absent_tasks", None, r"WM_TASKS names 'absent_tasks', which is no package"),
+        ("absent_tasks", None, r"WM_TASKS names 'absent_tasks', no package"),
         ("empty_tasks", {"blank": "TASK = 1"}, r"blank\.py has no TASK = Task\(\.\.\.\)"),
         ("double_tasks", {"reach": ""}, r"'reach' is in wm_nodes\.environments\.maniskill\.tasks and in double_tasks"),
     ],
@@ -105,6 +105,17 @@ def test_a_wrong_task_file_is_one_clear_error(
     monkeypatch.setenv(VARIABLE, package)
     with pytest.raises(ValueError, match=error):
         get_task(next(iter(files or ["blank"])) if package != "double_tasks" else "unheard")
+
+
+def test_a_task_without_rules_for_the_judge_says_what_its_file_lacks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    text = "from dataclasses import replace\n\nfrom wm_nodes.config.tasks import get_task\n\n"
+    write_package(tmp_path, "ruleless_tasks", wave=f"{text}TASK = replace(get_task('reach'), clips=None)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(VARIABLE, "ruleless_tasks")
+    with pytest.raises(ValueError, match=r"'wave' has no rule to label clips by; give its file clips=ClipRules"):
+        clip_rules("wave")
 
 
 def write_package(folder: Path, name: str, **files: str) -> None:

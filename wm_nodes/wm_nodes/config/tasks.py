@@ -13,7 +13,6 @@ import os
 import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -164,12 +163,10 @@ def _files() -> dict[str, str]:
     found: dict[str, str] = {}
     for package in (*PACKAGES, *filter(None, (part.strip() for part in os.environ.get(VARIABLE, "").split(",")))):
         try:
-            spec = find_spec(package)
-        except ModuleNotFoundError:
-            spec = None
-        if spec is None or spec.submodule_search_locations is None:
-            raise ValueError(f"{VARIABLE} names {package!r}, which is no package that Python finds; see PYTHONPATH")
-        for module in pkgutil.iter_modules(spec.submodule_search_locations):
+            folders = importlib.import_module(package).__path__
+        except (ModuleNotFoundError, AttributeError) as error:
+            raise ValueError(f"{VARIABLE} names {package!r}, no package that Python finds; see PYTHONPATH") from error
+        for module in pkgutil.iter_modules(folders):
             if module.name.startswith("_"):
                 continue
             if module.name in found:

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from wm_nodes.config.schema import RunConfig
@@ -65,7 +66,7 @@ def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, comma
         action, action_metrics = train_token_model(tokenizer, data, config, config.seed, run_dir, progress=progress)
     else:
         first, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir, progress=progress)
-        golden = episodes.select([i for i, behaviour in enumerate(episodes.behaviours) if behaviour in demonstrators()])
+        golden = episodes.select(np.flatnonzero(np.isin(episodes.behaviours, demonstrators())))
         texts = tuple(get_task(task).instruction for task in model_tasks(config.task))
         text, text_metrics = train_text_model(
             tokenizer, first, golden, tokenise_episodes(tokenizer, golden), texts, config, config.seed, run_dir,
