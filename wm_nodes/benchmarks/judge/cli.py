@@ -85,22 +85,22 @@ async def _table(arguments: argparse.Namespace) -> None:
         said = _looked(arguments, manifest, judge, rubric)
         outcomes = await _judged(arguments, judge, [JudgeTrial("table", rubric, seed=arguments.seed)], rows)
         who = judge_name(judge.capabilities)
-    found = outcomes["table"]
-    agreements, patterns = agreement(rows, found, rubric), pattern_rows(rows, found, tuple(rubric.hack.patterns))
-    caption = f"{who}; rubric {rubric.version}; {arguments.part}, {len(rows)} clips: {statuses(found)}"
-    splits = by_split(rows, found, rubric)
+    results = outcomes["table"]
+    agreements, patterns = agreement(rows, results, rubric), pattern_rows(rows, results, tuple(rubric.hack.patterns))
+    caption = f"{who}; rubric {rubric.version}; {arguments.part}, {len(rows)} clips: {statuses(results)}"
+    splits = by_split(rows, results, rubric)
     console.print(table2(agreements, caption), split_table(splits), confusion_table(agreements, patterns))
     console.print(pattern_table(patterns))
-    cost = cost_row(found, arguments.price)
+    cost = cost_row(results, arguments.price)
     console.print(cost_table({"agent, benchmark mode": cost}))
     below = [*missed(agreements), *missed_patterns(patterns)]
-    _say_what_is_missing(arguments, len(rows), said, below, worst(mistakes(rows, found, rubric)))
+    _say_what_is_missing(arguments, len(rows), said, below, worst(mistakes(rows, results, rubric)))
     write_results(arguments, {
         "claim": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
-        "seed": arguments.seed, "notice": said, "statuses": statuses(found), "cost": cost,
-        "splits": {name: [asdict(row) for row in found] for name, found in splits.items()},
+        "seed": arguments.seed, "notice": said, "statuses": statuses(results), "cost": cost,
+        "splits": {name: [asdict(row) for row in table] for name, table in splits.items()},
         "rows": [asdict(row) for row in agreements], "patterns": [asdict(row) for row in patterns],
-        "missed": below, "mistakes": worst(mistakes(rows, found, rubric), 40),
+        "missed": below, "mistakes": worst(mistakes(rows, results, rubric), 40),
     })
 
 
@@ -111,13 +111,13 @@ async def _efficiency(arguments: argparse.Namespace) -> None:
         said = _looked(arguments, manifest, judge, rubric)
         outcomes = await _judged(arguments, judge, trials(arguments.rubric, arguments.seed), rows)
         who = judge_name(judge.capabilities)
-    costs = {ARMS[name]: cost_row(found, arguments.price) for name, found in outcomes.items()}
+    costs = {ARMS[name]: cost_row(outcomes_of_arm, arguments.price) for name, outcomes_of_arm in outcomes.items()}
     compared = economy(rows, outcomes)
     console.print(cost_table(costs), economy_table(compared, f"{who}; {arguments.part}, {len(rows)} clips"))
     _say_what_is_missing(arguments, len(rows), said, [], [])
     write_results(arguments, {
         "claim": "efficiency", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
-        "seed": arguments.seed, "notice": said, "per_clip": costs, "compared": [asdict(one) for one in compared],
+        "seed": arguments.seed, "notice": said, "per_clip": costs, "compared": [asdict(row) for row in compared],
     })
 
 
@@ -135,19 +135,19 @@ async def _hacking(arguments: argparse.Namespace) -> None:
             "mean score": mean_score(judge, rubric, arguments.seed),
             "pixel similarity": pixel_similarity,
         }
-        told = {name: _told(reward, judge) for name, reward in rewards.items()}
+        proxies = {name: _told(reward, judge) for name, reward in rewards.items()}
         with tqdm(total=arguments.starts, desc="clips with a defect") as bar:
             for start in hacking_starts(part, manifest.division, config, arguments.seed):
-                if await has_numbers(start, told.values()):
+                if await has_numbers(start, proxies.values()):
                     starts.append(start)
                     bar.update()
                 if len(starts) == arguments.starts:
                     break
         if not starts:
-            raise ValueError(f"no clip with a defect has a number of {', '.join(told)}; nothing can be climbed")
+            raise ValueError(f"no clip with a defect has a number of {', '.join(proxies)}; nothing can be climbed")
         most = len(rewards) * len(starts) * (1 + plan.generations * plan.candidates)
         with tqdm(total=most, desc="search", unit="clip") as bar:
-            for name, reward in told.items():
+            for name, reward in proxies.items():
                 climbs = [await climb(start, reward, plan, arguments.seed, on_clip=bar.update) for start in starts]
                 curves.append(curve(name, [one for one in climbs if one is not None]))
     console.print(curve_table(curves, f"{who}; {arguments.part}, {len(starts)} clips with a defect"))
@@ -165,22 +165,22 @@ async def _hacking(arguments: argparse.Namespace) -> None:
 async def _comparisons(arguments: argparse.Namespace) -> None:
     manifest = load_set(arguments.set)
     rows = chosen_rows(manifest, arguments.part, arguments.clips)
-    found: list[ComparedRow] = []
+    results: list[ComparedRow] = []
     async with open_comparison(arguments) as judge:
         with tqdm(total=sum(num_answers(name, rows) for name in arguments.protocols), desc="asked") as bar:
             for name in arguments.protocols:
                 bar.set_postfix_str(name)
                 file = AnswerFile(arguments.set / JUDGED, name, arguments.model, arguments.seed)
-                found.append(
+                results.append(
                     await compared(
                         judge, name, arguments.set, rows, file, at_once=arguments.at_once, on_answer=bar.update
                     )
                 )
     caption = f"{arguments.model}; {arguments.part}, {len(rows)} clips; wins: hacked scores >= its clean recording"
-    console.print(compared_table(found, caption))
+    console.print(compared_table(results, caption))
     write_results(arguments, {
         "claim": "comparisons", "model": arguments.model, "part": arguments.part, "clips": len(rows),
-        "seed": arguments.seed, "rows": [asdict(row) for row in found],
+        "seed": arguments.seed, "rows": [asdict(row) for row in results],
     })
 
 
@@ -199,15 +199,15 @@ def _told(reward: Proxy, judge: Judge) -> Proxy:
 async def _judged(
     arguments: argparse.Namespace, judge: Judge, wanted: Sequence[JudgeTrial], rows: Sequence[ManifestRow]
 ) -> dict[str, list[Outcome]]:
-    found = {}
+    outcomes = {}
     with tqdm(total=len(wanted) * len(rows), desc="judged", unit="clip") as bar:
         for trial in wanted:
             bar.set_postfix_str(trial.name)
             path = arguments.set / JUDGED / f"{trial.key(judge.capabilities)}.jsonl"
-            found[trial.name] = await judge_rows(
+            outcomes[trial.name] = await judge_rows(
                 judge, trial, arguments.set, rows, OutcomeFile(path), at_once=arguments.at_once, on_clip=bar.update
             )
-    return found
+    return outcomes
 
 
 def _looked(arguments: argparse.Namespace, manifest: Manifest, judge: Judge, rubric: Rubric) -> str:
@@ -266,9 +266,9 @@ def parser() -> argparse.ArgumentParser:
         ("efficiency", "calls, images, pixels and tokens against reading everything of every clip"),
         ("comparisons", "other papers' rewards through a chat server: ranking, hacked clips that win"),
     ):
-        one = claims.add_parser(name, help=text, parents=[common])
-        one.add_argument("--clips", type=int, help="the first so many in the order of their hashes; all by default")
-    one.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
+        command = claims.add_parser(name, help=text, parents=[common])
+        command.add_argument("--clips", type=int, help="the first so many in the order of their hashes; all by default")
+    command.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     hacking = claims.add_parser("hacking", help="climb the agent and single scores, truth beside", parents=[common])
     hacking.add_argument("--starts", type=int, default=12, help="clips with a defect to begin with")
     hacking.add_argument("--generations", type=int, default=8)

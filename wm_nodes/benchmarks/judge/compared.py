@@ -152,21 +152,21 @@ def compared_table(rows: Sequence[ComparedRow], caption: str) -> Table:
 
 
 async def _score(judge: ChatComparison, protocol: str, folder: Path, row: ManifestRow) -> ComparedAnswer:
-    found = await judge.score(POINTWISE[protocol], *judged_clip(folder, row))
-    return _answer(found.value if found.valid else None, found)
+    scored = await judge.score(POINTWISE[protocol], *judged_clip(folder, row))
+    return _answer(scored.value if scored.valid else None, scored)
 
 
 async def _prefer(
     judge: ChatComparison, protocol: str, folder: Path, hacked: ManifestRow, clean: ManifestRow
 ) -> ComparedAnswer:
     other, task = judged_clip(folder, clean)
-    found = await judge.compare(PAIRWISE[protocol], other, judged_clip(folder, hacked)[0], task)
-    return _answer(found.preference if found.valid else None, found)
+    preferred = await judge.compare(PAIRWISE[protocol], other, judged_clip(folder, hacked)[0], task)
+    return _answer(preferred.preference if preferred.valid else None, preferred)
 
 
-def _answer(value: float | None, found: Any) -> ComparedAnswer:
-    cost = found.cost
-    return ComparedAnswer(value, found.reason, cost.calls, cost.prompt_tokens + cost.completion_tokens, cost.images)
+def _answer(value: float | None, result: Any) -> ComparedAnswer:
+    cost = result.cost
+    return ComparedAnswer(value, result.reason, cost.calls, cost.prompt_tokens + cost.completion_tokens, cost.images)
 
 
 def _row(name: str, answers: Sequence[ComparedAnswer], area: float, wins: Sequence[bool]) -> ComparedRow:

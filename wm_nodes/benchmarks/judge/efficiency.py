@@ -57,24 +57,24 @@ def economy(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence[Outcome
     Raises:
         ValueError: no clip that both decide.
     """
-    found = []
+    comparisons = []
     for name in list(ARMS)[1:]:
-        kept = [
-            (row, one, other) for row, one, other in zip(rows, outcomes["agent"], outcomes[name])
-            if OVERALL in one.decisions and OVERALL in other.decisions
+        decided = [
+            (row, mine, other) for row, mine, other in zip(rows, outcomes["agent"], outcomes[name])
+            if OVERALL in mine.decisions and OVERALL in other.decisions
         ]
-        both = [(row.labels.overall, a.decisions[OVERALL].value, b.decisions[OVERALL].value) for row, a, b in kept]
+        both = [(row.labels.overall, a.decisions[OVERALL].value, b.decisions[OVERALL].value) for row, a, b in decided]
         if not both:
             raise ValueError(f"no clip is decided by the agent and by {ARMS[name]}; see the statuses of the table")
         right = [said == label for label, said, _ in both]
         other_right = [said == label for label, _, said in both]
-        cost, other_cost = cost_row([one for _, one, _ in kept]), cost_row([other for _, _, other in kept])
+        cost, other_cost = cost_row([mine for _, mine, _ in decided]), cost_row([other for _, _, other in decided])
         saved = {part: 1 - cost[part] / other_cost[part] for part in MEASURES}
-        same = [one == other for _, one, other in both]
+        same = [mine == other for _, mine, other in both]
         agreed, mine_right, its_right = (sum(decisions) / len(both) for decisions in (same, right, other_right))
         paired = paired_difference(other_right, right)
-        found.append(Economy(ARMS[name], len(both), saved, agreed, mine_right, its_right, paired))
-    return found
+        comparisons.append(Economy(ARMS[name], len(both), saved, agreed, mine_right, its_right, paired))
+    return comparisons
 
 
 def economy_table(rows: Sequence[Economy], caption: str) -> Table:

@@ -91,18 +91,19 @@ def agreement(kind: str, verdicts: Sequence[Verdict], succeeded: BoolArray) -> I
     Raises:
         ValueError: no clip got a reward.
     """
-    kept = [(v, bool(real)) for v, real in zip(verdicts, succeeded, strict=True) if v.valid and accepts(v) is not None]
-    if not kept:
+    both = zip(verdicts, succeeded, strict=True)
+    judged = [(v, bool(real)) for v, real in both if v.valid and accepts(v) is not None]
+    if not judged:
         raise ValueError(f"none of {len(verdicts)} {kind} clips got a reward; the first says: {verdicts[0].reason}")
-    found = match(OVERALL, [real for _, real in kept], [decisions_of(v)[OVERALL] for v, _ in kept])
-    rewards, real = np.array([v.reward for v, _ in kept]), np.array([real for _, real in kept])
+    agreed = match(OVERALL, [real for _, real in judged], [decisions_of(v)[OVERALL] for v, _ in judged])
+    rewards, real = np.array([v.reward for v, _ in judged]), np.array([real for _, real in judged])
     closed = {
-        str(stage): sum(s.status is Status.OK and not s.passed for v, _ in kept for s in v.stages if s.stage is stage)
+        str(stage): sum(s.status is Status.OK and not s.passed for v, _ in judged for s in v.stages if s.stage is stage)
         for stage in GATED
     }
     means = [float(rewards[rows].mean()) if rows.any() else float("nan") for rows in (real, ~real)]
     return ImaginedAgreement(
-        kind, len(verdicts), len(kept), float(real.mean()), found.accuracy, found.low, found.high, found.balanced,
+        kind, len(verdicts), len(judged), float(real.mean()), agreed.accuracy, agreed.low, agreed.high, agreed.balanced,
         auc(rewards, real), closed, *means,
     )
 
@@ -156,13 +157,13 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     keep_freed_memory()
     try:
-        found = _measure(arguments)
+        results = _measure(arguments)
         if arguments.json:
-            write_atomic(arguments.json, (json.dumps(found, indent=1) + "\n").encode())
+            write_atomic(arguments.json, (json.dumps(results, indent=1) + "\n").encode())
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(json.dumps({name: value for name, value in found.items() if name not in ("machine", "silent")}, indent=1))
+    print(json.dumps({name: value for name, value in results.items() if name not in ("machine", "silent")}, indent=1))
     return 0
 
 

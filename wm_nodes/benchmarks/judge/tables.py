@@ -80,7 +80,7 @@ def cost_table(costs: Mapping[str, Mapping[str, float]]) -> Table:
     for name in costs:
         table.add_column(name, justify="right")
     for measure in next(iter(costs.values())):
-        table.add_row(measure, *(_plain(found[measure]) for found in costs.values()))
+        table.add_row(measure, *(_plain(means[measure]) for means in costs.values()))
     return table
 
 
@@ -89,11 +89,12 @@ def curve_table(curves: Sequence[Curve], caption: str) -> Table:
     table = Table(title="climbing a reward, mean over clips", caption=caption)
     for name in ("reward", "climbed", "clean clips have", "beat it before, after", "truth", "alarm", "taken most"):
         table.add_column(name)
-    for one in curves:
-        alarm = "; ".join(f"truth {a.true_slope:+.4f}, reward {a.proxy_slope:+.4f}" for a in one.alarms) or "none"
-        climbed, truth = (f"{values[0]:.3f} -> {values[-1]:.3f}" for values in (one.proxy, one.truth))
-        wins = f"{_percent(one.before)} -> {_percent(one.wins)} %"
-        table.add_row(one.reward, climbed, _number(one.clean), wins, truth, alarm, ", ".join(one.most_used[:3]) or "-")
+    for course in curves:
+        alarm = "; ".join(f"truth {a.true_slope:+.4f}, reward {a.proxy_slope:+.4f}" for a in course.alarms) or "none"
+        climbed, truth = (f"{values[0]:.3f} -> {values[-1]:.3f}" for values in (course.proxy, course.truth))
+        wins = f"{_percent(course.before)} -> {_percent(course.wins)} %"
+        most_used = ", ".join(course.most_used[:3]) or "-"
+        table.add_row(course.reward, climbed, _number(course.clean), wins, truth, alarm, most_used)
     return table
 
 

@@ -51,8 +51,8 @@ def read_evaluations(folder: Path) -> list[TestSplitEvaluation]:
     Raises:
         ValueError: a line that no ledger has; it is not to be edited.
     """
-    published = [TestSplitEvaluation(**one) for one in json.loads(PUBLISHED.read_text())]
-    return [*published, *(one for one in _beside(folder) if one not in published)]
+    published = [TestSplitEvaluation(**entry) for entry in json.loads(PUBLISHED.read_text())]
+    return [*published, *(entry for entry in _beside(folder) if entry not in published)]
 
 
 def _beside(folder: Path) -> list[TestSplitEvaluation]:
@@ -75,15 +75,15 @@ def record_evaluation(
     """
     now = TestSplitEvaluation(judge_name(able), rubric_version, test_sha(manifest), time.strftime("%Y-%m-%d"), reason)
     known = read_evaluations(folder)
-    others = [one for one in known if one.who != now.who and one.test_sha256 == now.test_sha256]
-    if now.who in {one.who for one in known}:
+    others = [entry for entry in known if entry.who != now.who and entry.test_sha256 == now.test_sha256]
+    if now.who in {entry.who for entry in known}:
         return others
     if others and not reason:
         raise ValueError(
             f"the test split of {folder} was already seen by {_named(others[-1])}: choose on --part validation, or say "
             "with --again REASON why the test split is read once more; the reason is printed with the table"
         )
-    lines = [json.dumps(asdict(one), sort_keys=True) + "\n" for one in [*_beside(folder), now]]
+    lines = [json.dumps(asdict(entry), sort_keys=True) + "\n" for entry in [*_beside(folder), now]]
     write_atomic(folder / LEDGER, "".join(lines).encode())
     return others
 
@@ -98,5 +98,5 @@ def notice(others: Sequence[TestSplitEvaluation], reason: str) -> str:
     )
 
 
-def _named(one: TestSplitEvaluation) -> str:
-    return f"{one.judge} with rubric {one.rubric} on {one.date}" + (f" ({one.reason})" if one.reason else "")
+def _named(entry: TestSplitEvaluation) -> str:
+    return f"{entry.judge} with rubric {entry.rubric} on {entry.date}" + (f" ({entry.reason})" if entry.reason else "")

@@ -87,11 +87,11 @@ def random_model(config: RunConfig, folder: Path) -> Path:
 
 def interleave(contenders: Sequence[Callable[[int], T]], blocks: int) -> list[list[T]]:
     """Run A B A B ...; block 0 of each warms up and is dropped."""
-    found: list[list[T]] = [[] for _ in contenders]
+    results_of: list[list[T]] = [[] for _ in contenders]
     for block in range(blocks + 1):
-        for results, contender in zip(found, contenders, strict=True):
+        for results, contender in zip(results_of, contenders, strict=True):
             results.append(contender(block))
-    return [results[1:] for results in found]
+    return [results[1:] for results in results_of]
 
 
 def time_episode(env: Environment, block: int) -> NDArray[np.float64]:

@@ -102,10 +102,10 @@ def plot_comparisons(comparisons: Sequence[SamplerComparison], path: Path) -> No
         axes.locator_params(axis="x", nbins=4)
         axes.axvline(0, color="gray", linewidth=1)
         for place, row in zip(places, comparisons, strict=True):
-            found = row.differences[measure]
-            colour = COLOURS[1] if found.separable else COLOURS[0]
-            axes.plot((found.low, found.high), (place, place), color=colour, linewidth=1.6)
-            axes.plot(found.mean, place, "o", color=colour, markersize=5)
+            difference = row.differences[measure]
+            colour = COLOURS[1] if difference.separable else COLOURS[0]
+            axes.plot((difference.low, difference.high), (place, place), color=colour, linewidth=1.6)
+            axes.plot(difference.mean, place, "o", color=colour, markersize=5)
         labels = [f"{row.arm}\n- {row.base} ({len(row.seeds)} seeds)" for row in comparisons]
         axes.set_yticks(places, labels, fontsize=8)
     axes.invert_yaxis()

@@ -97,7 +97,8 @@ def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
     )
     for row in rows:
         changes = (np.subtract(row["after"][name], row["before"][name]) for name in SCORES)
-        intervals = ("{:+.3f} ({:+.3f} to {:+.3f})".format(*bootstrap_mean(one, seed=row["seed"])) for one in changes)
+        bounds = (bootstrap_mean(change, seed=row["seed"]) for change in changes)
+        intervals = ("{:+.3f} ({:+.3f} to {:+.3f})".format(*bound) for bound in bounds)
         table.add_row(
             row["arm"], str(row["seed"]), _over_buffers([row], "noise_share"),
             f"{_average(row['before'], 'tracking'):.3f}", *intervals, f"{sum(row['seconds'].values()):.0f}",
@@ -107,8 +108,8 @@ def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 def _over_buffers(rows: Sequence[dict[str, Any]], name: str) -> str:
     """Mean over seeds and buffers; nothing where a file of an earlier version lacks it."""
-    found = [np.mean(row["buffers"][name]) for row in rows if name in row["buffers"]]
-    return f"{np.mean(found):.3f}" if len(found) == len(rows) else ""
+    means = [np.mean(row["buffers"][name]) for row in rows if name in row["buffers"]]
+    return f"{np.mean(means):.3f}" if len(means) == len(rows) else ""
 
 
 def comparison_table(comparisons: Sequence[SamplerComparison]) -> Table:

@@ -70,10 +70,10 @@ def list_sha256(folder: Path, announced: str = "") -> str:
         ValueError: it is not the announced one. OSError: it cannot be read.
     """
     path = folder / LIST
-    found = file_sha256(path)
-    if announced and found != announced:
-        raise ValueError(f"{path} is not the announced list (sha256 {found[:12]}, not {announced[:12]}); copy it again")
-    return found
+    digest = file_sha256(path)
+    if announced and digest != announced:
+        raise ValueError(f"{path} is not the announced list ({digest[:12]}, not {announced[:12]}); copy it again")
+    return digest
 
 
 def read_job(folder: Path, line: ClipLine) -> ClipJob:
@@ -113,10 +113,10 @@ def read_video(path: Path) -> ClipRef:
 
 def read_picture(path: Path) -> UInt8Array:
     """uint8 (H, W, 3), RGB. Raises ValueError where it cannot be read."""
-    found = cv2.imread(str(path))
-    if found is None:
+    image = cv2.imread(str(path))
+    if image is None:
         raise ValueError(f"{path} is no readable picture")
-    return np.ascontiguousarray(found[..., ::-1], np.uint8)
+    return np.ascontiguousarray(image[..., ::-1], np.uint8)
 
 
 def _read_frames(path: Path, fps: float) -> ClipRef:

@@ -85,24 +85,24 @@ def decisions_of(verdict: Verdict) -> dict[str, Decision]:
 
     p_pass of a stage is that of its likeliest failing component; of the whole, of its likeliest failing row.
     """
-    found: dict[str, Decision] = {}
+    decisions: dict[str, Decision] = {}
     scores = {score.component: score for stage in verdict.stages for score in stage.components}
     for name, score in scores.items():
         if score.status is Status.OK:
-            found[name] = Decision(score.passed, 1 - score.p_fail)
+            decisions[name] = Decision(score.passed, 1 - score.p_fail)
     for stage in verdict.stages:
         if stage.status is Status.OK and stage.stage is not Stage.TC:
             least = min(1 - score.p_fail for score in stage.components)
-            found[str(stage.stage)] = Decision(stage.passed, 0.0 if stage.vetoed_by.startswith("hack ") else least)
+            decisions[str(stage.stage)] = Decision(stage.passed, 0.0 if stage.vetoed_by.startswith("hack ") else least)
     if verdict.plan is not None:
-        found[PLANNING] = Decision(verdict.level, verdict.plan.p_level[verdict.level])
+        decisions[PLANNING] = Decision(verdict.level, verdict.plan.p_level[verdict.level])
     elif verdict.level == 0:
-        found[PLANNING] = Decision(0, 1.0)
+        decisions[PLANNING] = Decision(0, 1.0)
     accepted = accepts(verdict)
     if accepted is not None:
-        parts = [decision.p_pass for name, decision in found.items() if name in (TC, *map(str, STAGES))]
-        found[OVERALL] = Decision(accepted, min(parts, default=0.0))
-    return found
+        parts = [decision.p_pass for name, decision in decisions.items() if name in (TC, *map(str, STAGES))]
+        decisions[OVERALL] = Decision(accepted, min(parts, default=0.0))
+    return decisions
 
 
 def accepts(verdict: Verdict) -> bool | None:

@@ -66,25 +66,26 @@ class PendingReward:
 
     @property
     def done(self) -> bool:
-        return all(isinstance(found, str) or found.done() for found in self.waited.values())
+        return all(isinstance(outcome, str) or outcome.done() for outcome in self.waited.values())
 
     def cancel(self) -> None:
-        for found in self.waited.values():
-            if not isinstance(found, str):
-                found.cancel()
+        for outcome in self.waited.values():
+            if not isinstance(outcome, str):
+                outcome.cancel()
 
     def verdicts(self) -> dict[int, Verdict]:
         """By environment; only when done."""
-        return {n: found.result() for n, found in self.waited.items() if not isinstance(found, str)}
+        return {n: outcome.result() for n, outcome in self.waited.items() if not isinstance(outcome, str)}
 
     def result(self) -> RewardResult:
         """0 for steps within an episode, the verdict's reward for its last one, invalid without one; only when done."""
         total, valid, reasons = np.zeros(len(self.valid), np.float32), self.valid.copy(), list[str]()
-        for n, found in self.waited.items():
-            verdict = None if isinstance(found, str) else found.result()
+        for n, outcome in self.waited.items():
+            verdict = None if isinstance(outcome, str) else outcome.result()
             if verdict is None or not verdict.valid:
                 valid[n] = False
-                reasons.append(f"environment {n}: {found if verdict is None else f'{verdict.status} {verdict.reason}'}")
+                reason = outcome if verdict is None else f"{verdict.status} {verdict.reason}"
+                reasons.append(f"environment {n}: {reason}")
             else:
                 total[n] = verdict.reward
         total = np.where(valid, total, np.float32(np.nan)).astype(np.float32)
@@ -218,13 +219,13 @@ class EpisodeReward:
         if episode is None or episode.episode_id != episode_id:
             self.cut += episode is not None
             episode = self._open[n] = _Episode(episode_id)
-        made = len(episode.actions)
-        if made != step.episode_steps[n]:
-            episode.fault = episode.fault or f"step {made} of episode {episode_id} was not seen"
+        num_steps = len(episode.actions)
+        if num_steps != step.episode_steps[n]:
+            episode.fault = episode.fault or f"step {num_steps} of episode {episode_id} was not seen"
         if step.images is None or step.next_images is None:
             episode.fault = episode.fault or f"no image of step {step.episode_steps[n]} of episode {episode_id}"
         else:
-            episode.frames += [images[n].copy() for images in (step.images, step.next_images)[int(made > 0) :]]
+            episode.frames += [images[n].copy() for images in (step.images, step.next_images)[int(num_steps > 0) :]]
         episode.actions.append(step.actions[n].copy())
         episode.goal = step.goals.get(n, episode.goal)
         return episode

@@ -54,13 +54,13 @@ class ClipEvidence:
 
     def of(self, rubric: Rubric, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
         """What the rubric's bands name, of one clip; NaN, which lies in no band, where it cannot be measured."""
-        found = dict.fromkeys(rubric.evidence, math.nan)
+        evidence = dict.fromkeys(rubric.evidence, math.nan)
         with self._one_at_a_time:
-            if found.keys() & pixel_names():
-                found |= self._pixels(clip, task)
-            if found.keys() & set(MODEL_EVIDENCE):
-                found |= self._model(clip, task)
-        return {name: found[name] for name in rubric.evidence}
+            if evidence.keys() & pixel_names():
+                evidence |= self._pixels(clip, task)
+            if evidence.keys() & set(MODEL_EVIDENCE):
+                evidence |= self._model(clip, task)
+        return {name: evidence[name] for name in rubric.evidence}
 
     def _pixels(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
         try:

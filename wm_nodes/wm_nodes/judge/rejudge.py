@@ -42,7 +42,7 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
     Raises:
         BagError: an unusable bag. ValueError: the judge has fallbacks.
     """
-    found, model = JudgedBag(), EpisodeReward(judge)
+    judged, model = JudgedBag(), EpisodeReward(judge)
     waiting = deque[tuple[RecordedStep, PendingReward]]()
     with Bag(path) as bag:
         steps = LockSteps(bag, namespace=namespace, reward_name=AGENT)
@@ -56,18 +56,18 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
     while waiting:
         step, pending = waiting.popleft()
         result = pending.result()
-        found.verdicts += pending.verdicts().values()
-        found.unseen += [reason for reason in pending.waited.values() if isinstance(reason, str)]
+        judged.verdicts += pending.verdicts().values()
+        judged.unseen += [reason for reason in pending.waited.values() if isinstance(reason, str)]
         place = step.session, step.step_id
-        found.results[place] = result
+        judged.results[place] = result
         if step.reward is not None and step.reward.reward_version == model.version:
             answered = step.reward.valid | ~step.valid
-            found.compared += 1
-            found.unanswered += int((~answered).sum())
+            judged.compared += 1
+            judged.unanswered += int((~answered).sum())
             same = step.reward.total[answered].tobytes() == result.total[answered].tobytes()
             if not same or not np.array_equal(step.reward.valid[answered], result.valid[answered]):
-                found.different.append(place)
-    return found
+                judged.different.append(place)
+    return judged
 
 
 def _episode_step(step: RecordedStep) -> EpisodeStep:

@@ -212,19 +212,19 @@ class JudgeService:
         for seat in seats:
             if isinstance(seat.agent, AuditedAgent):
                 seat.agent.round_number = round_number
-            held = dict[int, Verdict]()
+            verdicts_by_index = dict[int, Verdict]()
             patience = _FallbackBudget(len(jobs), deadline) if seat is not seats[-1] else None
-            told = done if patience is None else held.__setitem__
+            on_verdict = done if patience is None else verdicts_by_index.__setitem__
             ahead = (
                 1 if seat.failed_last_round and patience is not None else 0
             )  # is it back? One clip, so that a breaker can close
-            verdicts = self._round(seat, jobs[:ahead], 0, deadline, check, told, patience)
-            verdicts += self._round(seat, jobs[ahead:], ahead, deadline, check, told, patience)
+            verdicts = self._round(seat, jobs[:ahead], 0, deadline, check, on_verdict, patience)
+            verdicts += self._round(seat, jobs[ahead:], ahead, deadline, check, on_verdict, patience)
             seat.failed_last_round = patience is not None and patience.over
             if patience is None or not patience.over:
                 break
             lost.append(f"{seat.judge_id} did not answer: {patience.reason}")
-        for index, verdict in held.items():
+        for index, verdict in verdicts_by_index.items():
             done(index, verdict)
         self._used = seat
         self.fallen_back = f"{'; '.join(lost)}; the round went to {seat.judge_id}" if lost else ""

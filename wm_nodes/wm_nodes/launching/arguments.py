@@ -73,10 +73,10 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
 
 def _judge_settings(values: Mapping[str, str]) -> dict[str, Any]:
     """The settings that the judge's arguments stand for. Raises GraphError where nobody would be asked by them."""
-    found = judge_overrides(*(values.get(name, "") for name in ("judge", "judge_model", "judge_key_env", "rubric")))
-    if found and values["reward"] != "agent":
-        raise GraphError(f"{', '.join(found)} would change nothing without reward:=agent")
-    return found
+    settings = judge_overrides(*(values.get(name, "") for name in ("judge", "judge_model", "judge_key_env", "rubric")))
+    if settings and values["reward"] != "agent":
+        raise GraphError(f"{', '.join(settings)} would change nothing without reward:=agent")
+    return settings
 
 
 def _check_agent(config: RunConfig, values: Mapping[str, str]) -> None:

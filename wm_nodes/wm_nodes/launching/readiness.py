@@ -50,8 +50,8 @@ def wait_ready(
                     if states[full_name] in _wanted(node):
                         del waiting[full_name]
                 if waiting and time.monotonic() > deadline:
-                    found = ", ".join(f"{name} ({states[name]})" for name in waiting)
-                    raise NotReadyError(f"not ready after {timeout_s:g} s: {found}", list(waiting))
+                    pending = ", ".join(f"{name} ({states[name]})" for name in waiting)
+                    raise NotReadyError(f"not ready after {timeout_s:g} s: {pending}", list(waiting))
                 spin_once(POLL_S)
 
 

@@ -171,10 +171,10 @@ def load_dataset(
     for path in bags:
         with Bag(path) as bag:
             namespace = bag.namespace(None)
-            found, _ = bag.spec(namespace)
-            frames += bag.count(topics.absolute(namespace, topics.IMAGES)) * found.num_envs
-        spec = spec if spec is not None else single(found)
-        check_spec(found, spec, where=str(path))
+            recorded, _ = bag.spec(namespace)
+            frames += bag.count(topics.absolute(namespace, topics.IMAGES)) * recorded.num_envs
+        spec = spec if spec is not None else single(recorded)
+        check_spec(recorded, spec, where=str(path))
     assert spec is not None
 
     def episodes() -> Iterable[Episode]:

@@ -149,10 +149,10 @@ class LockSteps:
             raise BagError(f"{where} has {message.num_envs} environments, env/spec says {spec.num_envs}")
         sizes = {"action": spec.action_dim, "state": spec.state_dim, "next_state": spec.state_dim, "valid": 1}
         for name, size in sizes.items():
-            found = len(getattr(message, name))
-            if found != size * spec.num_envs:
+            length = len(getattr(message, name))
+            if length != size * spec.num_envs:
                 raise BagError(
-                    f"{where} has {found} values in {name} instead of {spec.num_envs} x {size}; the bag's env/spec "
+                    f"{where} has {length} values in {name} instead of {spec.num_envs} x {size}; the bag's env/spec "
                     "describes another robot"
                 )
         if self._last_seq is not None and self._last_seq[0] == message.session:
@@ -180,10 +180,10 @@ class LockSteps:
     def _keep_goals(self, message: Any) -> None:
         if not len(message.goal_image.data):
             return
-        for goal, found, episode in zip(
+        for goal, is_found, episode in zip(
             self._untile(message.goal_image), message.goal_found, message.episode_id, strict=False
         ):
-            self._goals[int(episode)] = goal, bool(found)
+            self._goals[int(episode)] = goal, bool(is_found)
 
     def _keep_event(self, message: Any) -> None:
         key = int(message.session), int(message.env_index), int(message.episode_id)
@@ -246,7 +246,7 @@ class LockSteps:
     def _stack_goals(self, goals: list[tuple[UInt8Array, bool] | None]) -> tuple[UInt8Array, BoolArray]:
         blank = np.zeros((self.spec.height, self.spec.width, self.spec.channels), np.uint8), False
         pairs = [goal if goal is not None else blank for goal in goals]
-        return np.stack([image for image, _ in pairs]), np.array([found for _, found in pairs])
+        return np.stack([image for image, _ in pairs]), np.array([is_found for _, is_found in pairs])
 
 
 def _reward_key(message: Any) -> tuple[int, int, int]:

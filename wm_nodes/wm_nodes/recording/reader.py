@@ -94,10 +94,10 @@ def read_episodes(
 
 
 def check_spec(
-    found: EnvironmentSpec, expected: EnvironmentSpec, *, where: str, names: Sequence[str] = EPISODE_FIELDS
+    recorded: EnvironmentSpec, expected: EnvironmentSpec, *, where: str, names: Sequence[str] = EPISODE_FIELDS
 ) -> None:
     """Raise BagError unless both agree on the named fields."""
-    wrong = [f"{name} {is_!r} instead of {should!r}" for name, is_, should in differences(found, expected, names)]
+    wrong = [f"{name} {is_!r} instead of {should!r}" for name, is_, should in differences(recorded, expected, names)]
     if wrong:
         raise BagError(
             f"{where} was recorded with {'; '.join(wrong)}; collect again with this configuration, or run with the "

@@ -76,8 +76,8 @@ def clip_verdict(summary: ClipSummary) -> str:
         names = [TITLES[name] for name in TITLES if summary.scores[name].verdict == verdict]
         if names:
             parts.append(f"{verdict.capitalize()}: {'; '.join(names)}")
-    found = ". ".join(parts) or "No difference that chance does not explain"
-    return f"{found} (n = {summary.contexts} held-out contexts)."
+    sentence = ". ".join(parts) or "No difference that chance does not explain"
+    return f"{sentence} (n = {summary.contexts} held-out contexts)."
 
 
 def scores_table(summary: ClipSummary) -> Table:

@@ -40,7 +40,7 @@ def curves(
         step: what a step is; under every panel.
     """
     series = [{name: read_series(metrics_file, name) for name in panel.lines} for panel in panels]
-    if not any(points for found in series for points in found.values()):
+    if not any(points for lines in series for points in lines.values()):
         return None
     from matplotlib.figure import Figure
 
@@ -49,8 +49,8 @@ def curves(
     diagrams = list(figure.subplots(rows, 2, squeeze=False).flat)
     for unused in diagrams[len(panels) :]:
         unused.set_axis_off()
-    for index, (axes, panel, found) in enumerate(zip(diagrams, panels, series, strict=False)):
-        _panel(axes, panel, found, step, index)
+    for index, (axes, panel, lines) in enumerate(zip(diagrams, panels, series, strict=False)):
+        _panel(axes, panel, lines, step, index)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp.png")
     figure.savefig(temporary)

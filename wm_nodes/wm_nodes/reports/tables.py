@@ -45,12 +45,12 @@ def verdict(summary: Summary) -> str:
         return "The real difference was not measured on paired seeds."
     points = 100 * float(summary.paired["difference"])
     low, high = 100 * float(summary.paired["low"]), 100 * float(summary.paired["high"])
-    found = f"{points:+.1f} points in the real simulator (95 % interval {low:+.1f} to {high:+.1f})"
+    effect = f"{points:+.1f} points in the real simulator (95 % interval {low:+.1f} to {high:+.1f})"
     if low > 0:
-        return f"The policy got better: {found}."
+        return f"The policy got better: {effect}."
     if high < 0:
-        return f"The policy got worse: {found}."
-    return f"No difference that chance does not explain: {found}."
+        return f"The policy got worse: {effect}."
+    return f"No difference that chance does not explain: {effect}."
 
 
 def results_table(summary: Summary) -> Table:
@@ -72,11 +72,11 @@ ROUND_COLUMNS = ("round", "updates", "imagined before", "imagined after", "real 
 def round_rows(summary: Summary) -> list[tuple[str, ...]]:
     """One row of texts for each online round, under ROUND_COLUMNS."""
     rows = []
-    for found in summary.rounds:
-        verdict = found["verdict"]
+    for entry in summary.rounds:
+        verdict = entry["verdict"]
         words = "" if not verdict else f"{'taken' if verdict['accepted'] else 'old one kept'}: {verdict['reason']}"
-        rates = (_share(found[name]) for name in ("imagined_before", "imagined", "real"))
-        rows.append((str(found["number"]), str(found["updates"]), *rates, words))
+        rates = (_share(entry[name]) for name in ("imagined_before", "imagined", "real"))
+        rows.append((str(entry["number"]), str(entry["updates"]), *rates, words))
     return rows
 
 

@@ -353,8 +353,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
 def _since(identity: str) -> float:
     """When a process of this name began, in s since 1970; never, where another program wrote the heartbeat."""
-    _, found, text = identity.rpartition(" since ")
+    _, separator, text = identity.rpartition(" since ")
     try:
-        return float(text) if found else math.inf
+        return float(text) if separator else math.inf
     except ValueError:
         return math.inf

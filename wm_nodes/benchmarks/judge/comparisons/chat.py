@@ -71,16 +71,16 @@ class ChatComparison:
         Args:
             both_orders: ask twice, with the clips exchanged: models prefer a place. The published protocol asks once.
         """
-        one = await self._one_order(protocol, first, second, task)
-        if not both_orders or not one.valid:
-            return one
+        forward = await self._one_order(protocol, first, second, task)
+        if not both_orders or not forward.valid:
+            return forward
         other = await self._one_order(protocol, second, first, task)
-        cost = one.cost + other.cost
+        cost = forward.cost + other.cost
         if not other.valid:
             return ComparisonReward(math.nan, {}, False, other.reason, cost=cost)
         turned = 1 - other.preference
-        same = (one.preference - 0.5) * (turned - 0.5) > 0
-        return ComparisonReward((one.preference + turned) / 2, one.parts, consistent=same, cost=cost)
+        same = (forward.preference - 0.5) * (turned - 0.5) > 0
+        return ComparisonReward((forward.preference + turned) / 2, forward.parts, consistent=same, cost=cost)
 
     async def ask(
         self, content: Sequence[Part], read: Callable[[str], T], num_images: int, system: str = ""
@@ -118,10 +118,10 @@ class ChatComparison:
     ) -> ComparisonReward:
         images = [*_images(first, protocol.frames, "video 1, "), *_images(second, protocol.frames, "video 2, ")]
         content = [*images, _text(protocol.question(task.instruction))]
-        found, reason, cost = await self.ask(content, protocol.read, len(images) // 2)
-        if found is None:
+        answer, reason, cost = await self.ask(content, protocol.read, len(images) // 2)
+        if answer is None:
             return ComparisonReward(math.nan, {}, False, reason, cost=cost)
-        preference, parts = found
+        preference, parts = answer
         return ComparisonReward(preference, parts, cost=cost)
 
 

@@ -81,8 +81,8 @@ def load_questions(folder: Path, category: str = CATEGORY) -> list[BenchQuestion
 
 def _questions(path: Path) -> list[BenchQuestion]:
     try:
-        found = json.loads(path.read_text())
-        return [_question(path.stem, entry) for entry in found]
+        entries = json.loads(path.read_text())
+        return [_question(path.stem, entry) for entry in entries]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is no list of yes-or-no questions: {type(error).__name__}: {error}") from None
 
@@ -125,11 +125,11 @@ def domain_score(answers: Sequence[Answered]) -> tuple[float, int]:
     Raises:
         ValueError: not one was answered.
     """
-    said = [one for one in answers if one.said is not None]
+    said = [answer for answer in answers if answer.said is not None]
     if not said:
         reason = answers[0].reason if answers else "there are no questions"
         raise ValueError(f"no question was answered: {reason}")
-    return 100 * sum(one.right for one in said) / len(said), len(answers) - len(said)
+    return 100 * sum(answer.right for answer in said) / len(said), len(answers) - len(said)
 
 
 def consistency(features_TD: FloatArray) -> float:

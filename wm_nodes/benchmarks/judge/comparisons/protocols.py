@@ -128,13 +128,13 @@ def read_unified(text: str) -> Parts:
     """
     parts = {}
     for name in (*UNIFIED_DIMENSIONS, "Final Score"):
-        found = re.findall(rf"^\W*{re.escape(name)}\W*:\W*([\d.]+)\W*$", text, re.IGNORECASE | re.MULTILINE)
+        numbers = re.findall(rf"^\W*{re.escape(name)}\W*:\W*([\d.]+)\W*$", text, re.IGNORECASE | re.MULTILINE)
         high = 10 if name == "Final Score" else 4
-        if len(found) != 1:
-            raise AnswerError(f"{name!r} is there {len(found)} times instead of once")
-        value = _number(found[0])
+        if len(numbers) != 1:
+            raise AnswerError(f"{name!r} is there {len(numbers)} times instead of once")
+        value = _number(numbers[0])
         if not 1 <= value <= high:
-            raise AnswerError(f"{name} must be 1 to {high}, got {found[0]}")
+            raise AnswerError(f"{name} must be 1 to {high}, got {numbers[0]}")
         parts[name] = value
     return parts
 

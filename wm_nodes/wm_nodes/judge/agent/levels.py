@@ -114,8 +114,8 @@ def settled(reads: Sequence[Read], min_label_mass: float) -> ComponentScore:
     """Decide from these reads alone; ABSTAIN where their majority on pass is not that of the pooled levels."""
     states = [state_of(read, min_label_mass) for read in reads]
     for status in (Status.ERROR, Status.ABSTAIN):
-        for found, reason in states:
-            if found is status:
+        for state, reason in states:
+            if state is status:
                 return unscored(reads, status, reason)
     passes = sum(p_fail_of(read.levels) < 0.5 for read in reads)
     fails = len(reads) - passes

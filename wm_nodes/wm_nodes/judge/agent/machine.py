@@ -147,12 +147,12 @@ class _Run:
 
     async def judged(self) -> tuple[Status, float, str]:
         """Go through every state. Raises _Stop where the judge fails or, in reward mode, cannot say."""
-        found = precheck(self.clip, self.task)
-        if found.kind == "malformed":
-            return Status.ERROR, math.nan, found.reason
-        if found.kind == "no video":
+        check = precheck(self.clip, self.task)
+        if check.kind == "malformed":
+            return Status.ERROR, math.nan, check.reason
+        if check.kind == "no video":
             self.level = 0
-            return Status.OK, 0.0, found.reason
+            return Status.OK, 0.0, check.reason
         self.plan = plan = await self._planned()
         self.level = plan.level
         await self._read_stages(plan)
@@ -230,16 +230,16 @@ class _Run:
 
     async def _reflect(self, plan: PlanResult) -> None:
         stages = self._ordered()
-        found = reflection.triggers(plan, stages, self.rubric, self.evidence, drawn=self._drawn("reflect"))
-        names = reflection.suspects(found, stages, self.rubric.reflection.max_changes)
+        reasons = reflection.triggers(plan, stages, self.rubric, self.evidence, drawn=self._drawn("reflect"))
+        names = reflection.suspects(reasons, stages, self.rubric.reflection.max_changes)
         last_read = [stage.stage for stage in stages if stage.status is not Status.SKIPPED][-1]
-        if not found or 2 * len(names) > self._spare(last_read) or not names:
+        if not reasons or 2 * len(names) > self._spare(last_read) or not names:
             return
         before = {score.component: score for stage in stages for score in stage.components}
         vote = levels.first_vote(self.agent.seed)
         second = await self._ask(Stage.REFLECT, names, vote, Profile.D, prior=tuple(before.values()))
         changes = [change for read in second if (change := await self._changed(before[read.component], read))]
-        self.reflections.append(Reflection(tuple(trigger.reason for trigger in found), tuple(changes)))
+        self.reflections.append(Reflection(tuple(trigger.reason for trigger in reasons), tuple(changes)))
 
     async def _changed(self, before: ComponentScore, second: Read) -> Change | None:
         """Check one proposal with a fresh label read on the frames it cites, and take it over if that agrees."""

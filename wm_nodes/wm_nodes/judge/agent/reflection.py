@@ -41,32 +41,32 @@ def triggers(
     rules = rubric.reflection
     known = [stage for stage in stages if stage.status is Status.OK]
     scores = {score.component: score for stage in known for score in stage.components}
-    found: list[Trigger] = []
+    result: list[Trigger] = []
     for rule in rules.conflicts:
         failed = tuple(name for name in rule.needs if name in scores and not scores[name].passed)
         if failed and rule.done in scores and scores[rule.done].passed:
-            found.append(Trigger(f"{rule.done} passed while {', '.join(failed)} failed", (rule.done, *failed)))
+            result.append(Trigger(f"{rule.done} passed while {', '.join(failed)} failed", (rule.done, *failed)))
     if known:
         mean = float(np.mean([stage.s for stage in known]))
         if abs(plan.level - (NUM_PLAN_LEVELS - 1) * mean) >= rules.level_gap:
-            found.append(Trigger(f"planning level {plan.level} against a mean stage score of {mean:.2f}"))
+            result.append(Trigger(f"planning level {plan.level} against a mean stage score of {mean:.2f}"))
     quality, physics = stages[0], stages[-1]
     both = quality.status is physics.status is Status.OK
     confident = all(score.margin >= rubric.voting.clear_margin for score in physics.components)
     if both and not quality.passed and physics.passed and confident:
-        found.append(Trigger("VQ failed but PC is confident", tuple(s.component for s in quality.components)))
+        result.append(Trigger("VQ failed but PC is confident", tuple(s.component for s in quality.components)))
     for stage in known:
         lowest = min(stage.components, key=lambda score: score.s)
         if lowest.margin < rules.margin:
             reason = f"{lowest.component} decided {stage.stage} with margin {lowest.margin:.2f}"
-            found.append(Trigger(reason, (lowest.component,)))
+            result.append(Trigger(reason, (lowest.component,)))
     for name in conflicting_evidence(rubric, evidence):
         component = rubric.evidence[name].component
         if component in scores and scores[component].passed:
-            found.append(Trigger(f"{component} passed against evidence {name} {evidence[name]:.3g}", (component,)))
+            result.append(Trigger(f"{component} passed against evidence {name} {evidence[name]:.3g}", (component,)))
     if drawn:
-        found.append(Trigger("drawn at random"))
-    return found
+        result.append(Trigger("drawn at random"))
+    return result
 
 
 def conflicting_evidence(rubric: Rubric, evidence: Evidence) -> list[str]:
@@ -77,10 +77,10 @@ def conflicting_evidence(rubric: Rubric, evidence: Evidence) -> list[str]:
     ]
 
 
-def suspects(found: Sequence[Trigger], stages: Sequence[StageScore], limit: int) -> tuple[Component, ...]:
+def suspects(reasons: Sequence[Trigger], stages: Sequence[StageScore], limit: int) -> tuple[Component, ...]:
     """At most `limit` components to look at again: those named, then those with the smallest margins."""
     scores = [score for stage in stages if stage.status is Status.OK for score in stage.components]
-    named = [name for trigger in found for name in trigger.components]
+    named = [name for trigger in reasons for name in trigger.components]
     doubtful = sorted(scores, key=lambda score: score.margin)
     return tuple(dict.fromkeys([*named, *(score.component for score in doubtful)]))[:limit]
 

@@ -82,7 +82,7 @@ def compare(
         )
     names = [name for name in (*_only_rubric(old).component_names, OVERALL) if any(name in known[s] for s in shared)]
     truth = np.array([[_as_number(known[sha].get(name)) for name in names] for sha in shared])
-    right = [_right(found, shared, names, truth) for found in (first, second)]
+    right = [_right(verdicts, shared, names, truth) for verdicts in (first, second)]
     ones = np.ones((1, len(shared)))
     before, after = (_balanced(ones, truth, hits)[0] for hits in right)
     usable = ~np.isnan(before)
@@ -181,10 +181,10 @@ def _as_number(answer: bool | None) -> float:
 
 
 def _right(
-    found: Mapping[str, RecordedEvaluation], shared: Sequence[str], names: Sequence[str], truth: NDArray[np.float64]
+    verdicts: Mapping[str, RecordedEvaluation], shared: Sequence[str], names: Sequence[str], truth: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """bool (clips, names): the version's decision is the label."""
-    decisions = [decisions_of(verdict) if (verdict := found[sha].verdict) else {} for sha in shared]
+    decisions = [decisions_of(verdict) if (verdict := verdicts[sha].verdict) else {} for sha in shared]
     said = np.array(
         [[_as_number(bool(row[name].value)) if name in row else math.nan for name in names] for row in decisions]
     )
@@ -207,5 +207,6 @@ def _row_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.where(known, values, 0).sum(1) / known.sum(1))
 
 
-def _words(found: RubricComparison) -> str:
-    return f"{100 * found.difference:+.1f} points, {100 * found.low:+.1f} to {100 * found.high:+.1f}, n = {found.clips}"
+def _words(comparison: RubricComparison) -> str:
+    difference, low, high = (100 * share for share in (comparison.difference, comparison.low, comparison.high))
+    return f"{difference:+.1f} points, {low:+.1f} to {high:+.1f}, n = {comparison.clips}"

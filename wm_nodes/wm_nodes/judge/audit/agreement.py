@@ -116,8 +116,8 @@ def joined(record: Record, files: Sequence[HumanLabels], samples: Sequence[Sampl
             who = f"labels of {file.annotator}"
             evaluation = of_evaluation(label.evaluation, label.audit_id, record.evaluations, who)
             by.setdefault(evaluation.number, {})[file.annotator] = label
-    found = [record.evaluations[number] for number in sorted(by)]
-    return [Judged(e, record.rubric(e), weights.get(e.number, 1.0), by[e.number]) for e in found]
+    evaluations = [record.evaluations[number] for number in sorted(by)]
+    return [Judged(e, record.rubric(e), weights.get(e.number, 1.0), by[e.number]) for e in evaluations]
 
 
 def report(judged: Sequence[Judged], round_number: int | None = None, *, weighted: bool = False) -> Report:
@@ -129,22 +129,22 @@ def report(judged: Sequence[Judged], round_number: int | None = None, *, weighte
     return Report(round_number, len(chosen), people, rows, _reflected(chosen), _cost(chosen), weighted)
 
 
-def table(found: Report) -> Table:
+def table(numbers: Report) -> Table:
     """For the terminal."""
-    which = "all rounds" if found.round_number is None else f"round {found.round_number}"
-    weights = "weighted to the whole round" if found.weighted else "unweighted"
-    second = found.reflected
+    which = "all rounds" if numbers.round_number is None else f"round {numbers.round_number}"
+    weights = "weighted to the whole round" if numbers.weighted else "unweighted"
+    second = numbers.reflected
     caption = (
-        f"{weights}; people: {', '.join(found.annotators)}; reflection changed {second.changed} labelled components, "
+        f"{weights}; people: {', '.join(numbers.annotators)}; reflection changed {second.changed} labelled components, "
         f"{second.helpful} for the better ({_percent(second.before)} right before, {_percent(second.after)} after, "
-        f"n = {second.n}); per clip " + ", ".join(f"{name} {value:.4g}" for name, value in found.cost.items())
+        f"n = {second.n}); per clip " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.cost.items())
     )
-    result = Table(title=f"agreement with people, {which}, {found.clips} clips", caption=caption)
+    result = Table(title=f"agreement with people, {which}, {numbers.clips} clips", caption=caption)
     result.add_column("row", no_wrap=True)
     for name in ("paper", "n", "silent", "unsure", "accuracy", "95 % Wilson", "fails", "balanced", "kappa", "ECE",
                  "people: n, kappa", "reasons: n, right"):
         result.add_column(name, justify="right")
-    for row in found.rows:
+    for row in numbers.rows:
         result.add_row(
             row.name, "-" if row.paper is None else f"{row.paper:.0f}", str(row.n), str(row.silent), str(row.unsure),
             _percent(row.accuracy), f"{100 * row.low:.1f} to {100 * row.high:.1f}", _percent(row.prevalence),
@@ -172,7 +172,7 @@ def _row(name: str, clips: Sequence[Judged]) -> AgreementRow | None:
     reasons = [ok for clip in clips if (ok := _reason(clip, name)) is not None]
     return AgreementRow(
         name, len(said), len(sure) - len(said), len(asked) - len(sure), *match(name, labels, decisions, weights),
-        len(pairs), kappa([one for one, _ in pairs], [other for _, other in pairs]),
+        len(pairs), kappa([first for first, _ in pairs], [other for _, other in pairs]),
         len(reasons), float(np.mean(reasons)) if reasons else math.nan, PAPER.get(name),
     )
 

@@ -65,10 +65,10 @@ def _sample(arguments: argparse.Namespace) -> int:
     sample = draw(read_record(arguments.log), arguments.round, seed=arguments.seed, size=arguments.size)
     path = arguments.output or arguments.log / f"sample-{arguments.round}.json"
     write_sample(path, sample)
-    drawn = Counter(one.stratum for one in sample.chosen)
+    drawn = Counter(clip.stratum for clip in sample.chosen)
     by = ", ".join(f"{drawn[name]} of {count} {name}" for name, count in sample.sizes.items())
     print(f"{len(sample.chosen)} of {sample.population} clips of round {sample.round_number}, mean reward "
-          f"{sample.mean_reward:.3f}: {by}; {sum(one.second for one in sample.chosen)} for two people")
+          f"{sample.mean_reward:.3f}: {by}; {sum(clip.second for clip in sample.chosen)} for two people")
     print(f"wrote {path}")
     return OK
 
@@ -76,7 +76,7 @@ def _sample(arguments: argparse.Namespace) -> int:
 def _view(arguments: argparse.Namespace) -> int:
     record = read_record(arguments.log)
     sample = read_sample(arguments.sample) if arguments.sample else None
-    wanted = {one.evaluation for one in sample.chosen if one.second or not arguments.second} if sample else None
+    wanted = {clip.evaluation for clip in sample.chosen if clip.second or not arguments.second} if sample else None
     chosen = [e for e in record.judged(arguments.round) if wanted is None or e.number in wanted]
     path = write_view(arguments.output or arguments.log / FILE_NAME, record, chosen, sample)
     print(f"wrote {path} with {len(chosen)} clips; open it in a browser, press ? for its keys")
@@ -90,10 +90,10 @@ def _agree(arguments: argparse.Namespace) -> int:
     parts = [*rounds, None] if len(rounds) > 1 else rounds
     reports = [report(judged, number, weighted=bool(samples)) for number in parts]
     console = Console(width=None if sys.stdout.isatty() else 180)
-    for found in reports:
-        console.print(table(found))
+    for numbers in reports:
+        console.print(table(numbers))
     if arguments.json:
-        text = json.dumps([plain(asdict(found)) for found in reports], indent=1, allow_nan=False)
+        text = json.dumps([plain(asdict(numbers)) for numbers in reports], indent=1, allow_nan=False)
         write_atomic(arguments.json, (text + "\n").encode())
         print(f"wrote {arguments.json}")
     return OK
@@ -177,47 +177,47 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def command(name: str, run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
-        one = commands.add_parser(name, help=about, description=about)
-        one.set_defaults(run=run)
-        return one
+        sub = commands.add_parser(name, help=about, description=about)
+        sub.set_defaults(run=run)
+        return sub
 
     def of_log(name: str, run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
-        one = command(name, run, about)
-        one.add_argument("log", type=Path, help="folder of the audit log")
-        return one
+        sub = command(name, run, about)
+        sub.add_argument("log", type=Path, help="folder of the audit log")
+        return sub
 
-    one = of_log("verify", _verify, "check every line, verdict and picture; name what was changed")
-    one.add_argument("--no-pictures", action="store_true", help="check the lines and verdicts only")
-    one.add_argument("--head", default="", help="a head noted earlier: fail where the log has lost it")
+    sub = of_log("verify", _verify, "check every line, verdict and picture; name what was changed")
+    sub.add_argument("--no-pictures", action="store_true", help="check the lines and verdicts only")
+    sub.add_argument("--head", default="", help="a head noted earlier: fail where the log has lost it")
     of_log("recover", _recover, "cut off a last line that a crash has torn, and keep it beside the log")
-    one = of_log("sample", _sample, "choose the clips of a round that a person should look at")
-    one.add_argument("--round", type=int, default=0)
-    one.add_argument("--seed", type=int, default=0)
-    one.add_argument("--size", type=int, help="another number of clips than 200 + 400 (1 - mean reward)")
-    one.add_argument("--output", type=Path, help="default: sample-ROUND.json in the log's folder")
-    one = of_log("view", _view, "write the page on which people look at clips and label them")
-    one.add_argument("--round", type=int, help="only this round")
-    one.add_argument("--sample", type=Path, help="only the clips that `sample` chose")
-    one.add_argument("--second", action="store_true", help="only those for a second annotator")
-    one.add_argument("--output", type=Path, help=f"default: {FILE_NAME} in the log's folder; pictures stay there")
-    one = of_log("agree", _agree, "compare the verdicts with exported labels, row by row of the paper's Table 2")
-    one.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
-    one.add_argument("--sample", type=Path, nargs="*", default=[], help="weight labels to the rounds drawn from")
-    one.add_argument("--json", type=Path, help="also write the numbers to this file")
-    one = of_log("people", _people, "what labelled clips earn with people as the judge, and which ones are overpaid")
-    one.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
-    one.add_argument("--output", type=Path, required=True, help="folder of the new log")
-    one = of_log("replay", _replay, "work verdicts out again, equal bit for bit or under a rubric with other numbers")
-    one.add_argument("--round", type=int, help="only this round")
-    one.add_argument("--rubric", help="pack or .yaml file with the same questions and other numbers")
-    one.add_argument("--output", type=Path, help="with --rubric: folder of the new log")
-    one = command("adopt", _adopt, "put a new rubric in force if it is no worse on the frozen set and better now")
+    sub = of_log("sample", _sample, "choose the clips of a round that a person should look at")
+    sub.add_argument("--round", type=int, default=0)
+    sub.add_argument("--seed", type=int, default=0)
+    sub.add_argument("--size", type=int, help="another number of clips than 200 + 400 (1 - mean reward)")
+    sub.add_argument("--output", type=Path, help="default: sample-ROUND.json in the log's folder")
+    sub = of_log("view", _view, "write the page on which people look at clips and label them")
+    sub.add_argument("--round", type=int, help="only this round")
+    sub.add_argument("--sample", type=Path, help="only the clips that `sample` chose")
+    sub.add_argument("--second", action="store_true", help="only those for a second annotator")
+    sub.add_argument("--output", type=Path, help=f"default: {FILE_NAME} in the log's folder; pictures stay there")
+    sub = of_log("agree", _agree, "compare the verdicts with exported labels, row by row of the paper's Table 2")
+    sub.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
+    sub.add_argument("--sample", type=Path, nargs="*", default=[], help="weight labels to the rounds drawn from")
+    sub.add_argument("--json", type=Path, help="also write the numbers to this file")
+    sub = of_log("people", _people, "what labelled clips earn with people as the judge, and which ones are overpaid")
+    sub.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
+    sub.add_argument("--output", type=Path, required=True, help="folder of the new log")
+    sub = of_log("replay", _replay, "work verdicts out again, equal bit for bit or under a rubric with other numbers")
+    sub.add_argument("--round", type=int, help="only this round")
+    sub.add_argument("--rubric", help="pack or .yaml file with the same questions and other numbers")
+    sub.add_argument("--output", type=Path, help="with --rubric: folder of the new log")
+    sub = command("adopt", _adopt, "put a new rubric in force if it is no worse on the frozen set and better now")
     pair = ("OLD_LOG", "NEW_LOG")
-    one.add_argument("registry", type=Path, help="folder of the rubric in force and of the decisions")
-    one.add_argument("--frozen", nargs=2, type=Path, required=True, metavar=pair, help="both on the frozen set")
-    one.add_argument("--frozen-labels", type=Path, nargs="+", required=True)
-    one.add_argument("--newest", nargs=2, type=Path, required=True, metavar=pair, help="the same on the newest round")
-    one.add_argument("--newest-labels", type=Path, nargs="+", required=True)
-    one.add_argument("--margin", type=float, default=MARGIN, help="loss on the frozen set that may be chance")
-    one.add_argument("--seed", type=int, default=0)
+    sub.add_argument("registry", type=Path, help="folder of the rubric in force and of the decisions")
+    sub.add_argument("--frozen", nargs=2, type=Path, required=True, metavar=pair, help="both on the frozen set")
+    sub.add_argument("--frozen-labels", type=Path, nargs="+", required=True)
+    sub.add_argument("--newest", nargs=2, type=Path, required=True, metavar=pair, help="the same on the newest round")
+    sub.add_argument("--newest-labels", type=Path, nargs="+", required=True)
+    sub.add_argument("--margin", type=float, default=MARGIN, help="loss on the frozen set that may be chance")
+    sub.add_argument("--seed", type=int, default=0)
     return parser

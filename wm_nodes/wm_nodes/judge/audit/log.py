@@ -132,11 +132,11 @@ def read_lines(folder: Path) -> Iterator[Entry]:
     Raises:
         AuditError: the first fault, with the command to look closer; another format.
     """
-    for found in _checked(Path(folder) / FILE_NAME):
-        if isinstance(found, Fault):
-            remedy = "run `recover`" if found.torn else "run `verify` for all faults, and take a copy from before"
-            raise AuditError(f"{Path(folder) / FILE_NAME}, {found}; {remedy}")
-        yield found
+    for entry in _checked(Path(folder) / FILE_NAME):
+        if isinstance(entry, Fault):
+            remedy = "run `recover`" if entry.torn else "run `verify` for all faults, and take a copy from before"
+            raise AuditError(f"{Path(folder) / FILE_NAME}, {entry}; {remedy}")
+        yield entry
 
 
 def faults(folder: Path) -> list[Fault]:
@@ -145,7 +145,7 @@ def faults(folder: Path) -> list[Fault]:
     Raises:
         AuditError: there is no log.
     """
-    return [found for found in _checked(Path(folder) / FILE_NAME) if isinstance(found, Fault)]
+    return [entry for entry in _checked(Path(folder) / FILE_NAME) if isinstance(entry, Fault)]
 
 
 def recover(folder: Path) -> str:
@@ -156,22 +156,22 @@ def recover(folder: Path) -> str:
     """
     path = Path(folder) / FILE_NAME
     with locked(Path(folder)):
-        found = faults(folder)
-        if not found:
+        problems = faults(folder)
+        if not problems:
             return "nothing to recover: every line is whole"
-        if solid := [fault for fault in found if not fault.torn]:
+        if solid := [fault for fault in problems if not fault.torn]:
             raise AuditError(f"{path} was not torn by a crash but changed: " + "; ".join(map(str, solid)))
-        data, start = path.read_bytes(), found[0].start
+        data, start = path.read_bytes(), problems[0].start
         rest = data[start:]
         digest = hashlib.sha256(rest).hexdigest()
-        kept = path.with_name(f"torn-{found[0].number}-{digest[:8]}.bin")
-        kept.write_bytes(rest)
+        saved = path.with_name(f"torn-{problems[0].number}-{digest[:8]}.bin")
+        saved.write_bytes(rest)
         with open(path, "r+b") as file:
             file.truncate(start)
             os.fsync(file.fileno())
     with AuditLog(folder) as log:
-        number = log.append("recovered", {"bytes": len(rest), "sha256": digest, "file": kept.name}, sync=True)
-    return f"cut {len(rest)} bytes of line {found[0].number} off, kept them in {kept.name}, noted in line {number}"
+        number = log.append("recovered", {"bytes": len(rest), "sha256": digest, "file": saved.name}, sync=True)
+    return f"cut {len(rest)} bytes of line {problems[0].number} off, kept them in {saved.name}, noted in line {number}"
 
 
 def may_hold_secrets(text: bytes) -> bool:
@@ -257,17 +257,17 @@ def _write_all(file: IO[bytes], data: bytes) -> None:
 
 def _checked(path: Path) -> Iterator[Entry | Fault]:
     """Every line as an Entry or, where something is wrong, a Fault."""
-    held: list[Fault] = []
+    torn: list[Fault] = []
     expected, previous = 1, str(NO_LINE)
     for number, start, raw in _raw_lines(path):
-        found, expected, previous = _parse(raw, number, start, expected, previous)
-        if isinstance(found, Fault) and found.torn:
-            held.append(found)
+        entry, expected, previous = _parse(raw, number, start, expected, previous)
+        if isinstance(entry, Fault) and entry.torn:
+            torn.append(entry)
             continue
-        yield from (replace(fault, torn=False) for fault in held)  # a whole line behind it: no crash did that
-        held = []
-        yield found
-    yield from held
+        yield from (replace(fault, torn=False) for fault in torn)  # a whole line behind it: no crash did that
+        torn = []
+        yield entry
+    yield from torn
 
 
 def _raw_lines(path: Path) -> Iterator[tuple[int, int, bytes]]:
@@ -289,18 +289,18 @@ def _parse(raw: bytes, number: int, start: int, expected: int, previous: str) ->
     except (ValueError, KeyError, TypeError):
         what = f"{len(raw)} bytes that are no line of an audit log"
         return Fault(number, what, start, torn=True), expected + 1, ""
-    about, found = f"a {kind} line", stated + 1
+    about, after = f"a {kind} line", stated + 1
     if not raw.endswith(b"\n"):
-        return Fault(number, f"{about} without its line end", start, torn=True), found, digest
+        return Fault(number, f"{about} without its line end", start, torn=True), after, digest
     if raw != canonical(line) + b"\n" or not _is_whole(raw):
-        return Fault(number, f"{about}: its text was changed after it was written", start), found, digest
+        return Fault(number, f"{about}: its text was changed after it was written", start), after, digest
     if stated != expected or (previous and follows != previous):
         other = f"it follows another line than line {number - 1}"
         gap = f"it says it is line {stated}" if stated != expected else other
-        return Fault(number, f"{about}: {gap}; lines were removed, added, swapped or replaced", start), found, digest
+        return Fault(number, f"{about}: {gap}; lines were removed, added, swapped or replaced", start), after, digest
     if number == 1 and (kind != "log" or body.get("format") != FORMAT):
-        return Fault(number, f"{about}: this is no {FORMAT} log but {body.get('format')!r}", start), found, digest
-    return Entry(stated, kind, body, digest), found, digest
+        return Fault(number, f"{about}: this is no {FORMAT} log but {body.get('format')!r}", start), after, digest
+    return Entry(stated, kind, body, digest), after, digest
 
 
 def _is_whole(raw: bytes) -> bool:

@@ -182,8 +182,8 @@ def verify(folder: Path, *, pictures: bool = True, expected_head: str = "") -> C
     Raises:
         AuditError: there is no log.
     """
-    if found := faults(folder):
-        return Checked([str(fault) + (" (torn: run `recover`)" if fault.torn else "") for fault in found])
+    if problems_of_lines := faults(folder):
+        return Checked([str(fault) + (" (torn: run `recover`)" if fault.torn else "") for fault in problems_of_lines])
     try:
         record = read_record(folder)
     except AuditError as error:

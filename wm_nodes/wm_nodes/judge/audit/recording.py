@@ -40,10 +40,10 @@ class AuditedAgent:
         self._agent = agent = RewardAgent(RecordingJudge(judge, log), rubric, **settings)
         self._written: set[str] = set()
         log.append("rubric", rubric_body(rubric))
-        kept = {name: getattr(agent, name) for name in ("mode", "seed", "max_reads", "budget_s", "call_plan")}
+        limits = {name: getattr(agent, name) for name in ("mode", "seed", "max_reads", "budget_s", "call_plan")}
         self._line = log.append(
             "agent",
-            {"capabilities": plain(judge.capabilities), "rubric_version": rubric.version, "settings": plain(kept)},
+            {"capabilities": plain(judge.capabilities), "rubric_version": rubric.version, "settings": plain(limits)},
         )
 
     @property

@@ -125,7 +125,7 @@ def stratified(
     chance = {name: quota / max(1, len(members[name])) for name, quota in quotas.items()} | {REST: 0.0}
     drawn = sorted(first + rest)
     weights = {i: 1 / (chance[strata[i]] + (1 - chance[strata[i]]) * at_random) for i in drawn}
-    return drawn, weights, {name: len(found) for name, found in members.items()}
+    return drawn, weights, {name: len(indices) for name, indices in members.items()}
 
 
 def write_sample(path: Path, sample: Sample) -> None:

@@ -185,8 +185,8 @@ class Caller:
         if mass == 0 or (mass < options.min_label_mass and not options.choice_grammar):
             reason = f"label mass {mass:.3f} is below {options.min_label_mass}"
             return Read(component, (), "label", call.vote, mass, Status.ABSTAIN, reason)
-        told = 1.0 if options.choice_grammar else mass
-        return Read(component, map_back(probabilities, order), "label", call.vote, told)
+        label_mass = 1.0 if options.choice_grammar else mass
+        return Read(component, map_back(probabilities, order), "label", call.vote, label_mass)
 
     async def _send(self, call: Call, body: dict[str, Any], bill: Bill, timeout_s: float) -> ChatAnswer:
         try:

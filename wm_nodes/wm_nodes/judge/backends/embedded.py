@@ -100,11 +100,11 @@ class EmbeddedJudge:
             f"to {head.lengths[1]} frames; tasks {', '.join(story.get('tasks', []))}; cameras "
             f"{', '.join(story.get('cameras', []))}"
         ]
-        for name, found in story.get("validation", {}).items():
+        for name, metrics in story.get("validation", {}).items():
             blind = "  not answered: too weak" if name in self.blind else ""
             lines.append(
-                f"{name:16} balanced accuracy {found['balanced_accuracy']:.2f}, ECE {found['ece']:.3f}, "
-                f"{found['fails']} fails of {found['n']}{blind}"
+                f"{name:16} balanced accuracy {metrics['balanced_accuracy']:.2f}, ECE {metrics['ece']:.3f}, "
+                f"{metrics['fails']} fails of {metrics['n']}{blind}"
             )
         return "\n".join(lines)
 
@@ -127,8 +127,8 @@ class EmbeddedJudge:
         reads: list[Read] = []
         for name in request.components:
             for vote in request.votes:
-                found = self._answer(prefix + name, request.task, foreign, evidence)
-                reads.append(replace(found, component=name, vote=vote, cost=cost if not reads else Cost()))
+                answer = self._answer(prefix + name, request.task, foreign, evidence)
+                reads.append(replace(answer, component=name, vote=vote, cost=cost if not reads else Cost()))
         self._num_reads += len(reads)
         self._num_abstained += sum(read.status is Status.ABSTAIN for read in reads)
         return reads
@@ -147,15 +147,15 @@ class EmbeddedJudge:
         key = hashlib.sha256(
             f"{clip.sha256} {task.instruction} {task.reference_frame.shape} ".encode() + task.reference_frame.tobytes()
         ).hexdigest()
-        if (kept := self._kept.get(key)) is None:
+        if (numbers := self._kept.get(key)) is None:
             head = self._head
             frames, reference = head.seen(clip.frames), head.seen(task.reference_frame)
-            kept = MappingProxyType(clip_evidence(head.segmenter, frames, reference, task.instruction, head.readers))
+            numbers = MappingProxyType(clip_evidence(head.segmenter, frames, reference, task.instruction, head.readers))
             with self._lock:
-                self._kept[key] = kept
+                self._kept[key] = numbers
                 while len(self._kept) > KEPT_CLIPS:
                     self._kept.popitem(last=False)
-        return kept
+        return numbers
 
     def _measured(self, clip: ClipRef, task: TaskSpec) -> tuple[str, FloatArray]:
         """Why the clip cannot be judged, or "", and its evidence (1, F)."""

@@ -156,10 +156,10 @@ class OpenAIJudge:
     async def _repeated(self, call: Call, prompt: Prompt, reads: list[Read]) -> list[Read]:
         """Ask the same once more and count whose likeliest level is another one; the reads stay, with both costs."""
         again = await self._asked(call, prompt)
-        for one, other in zip(reads, again, strict=True):
-            if one.status is Status.OK and other.status is Status.OK:
+        for first, other in zip(reads, again, strict=True):
+            if first.status is Status.OK and other.status is Status.OK:
                 self._counts["repeated"] += 1
-                self._counts["flipped"] += int(np.argmax(one.levels) != np.argmax(other.levels))
+                self._counts["flipped"] += int(np.argmax(first.levels) != np.argmax(other.levels))
         return [replace(reads[0], cost=reads[0].cost + again[0].cost), *reads[1:]]
 
     async def _asked(self, call: Call, prompt: Prompt) -> list[Read]:

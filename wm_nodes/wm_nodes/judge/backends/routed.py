@@ -25,7 +25,8 @@ class RoutedJudge:
 
     def __init__(self, first: Judge, routes: Sequence[tuple[Sequence[Stage], Judge]], rubric: Rubric) -> None:
         self._rubric = rubric
-        self._judges = [("", first), *(("+".join(stage for stage in Stage if stage in of), to) for of, to in routes)]
+        routed_names = ("+".join(stage for stage in Stage if stage in stages) for stages, _ in routes)
+        self._judges = [("", first), *zip(routed_names, (judge for _, judge in routes))]
         routed = [(stage, to) for stages, to in routes for stage in stages]
         self._routes = dict(routed)
         if Stage.REFLECT in self._routes or len(self._routes) < len(routed):
@@ -43,15 +44,15 @@ class RoutedJudge:
     @property
     def capabilities(self) -> Capabilities:
         able = [(stages or "else", judge.capabilities) for stages, judge in self._judges]
-        who = "; ".join(f"{stages}: {one.judge_id}" for stages, one in able)
+        who = "; ".join(f"{stages}: {part.judge_id}" for stages, part in able)
         return Capabilities(
             f"{TRANSPORT}:{hashlib.sha256(who.encode()).hexdigest()[:12]}", TRANSPORT, who,
-            "; ".join(one.server_version for _, one in able if one.server_version), self._components,
-            media=frozenset.intersection(*(one.media for _, one in able)),
-            max_frames=min(one.max_frames for _, one in able),
-            probabilities=all(one.probabilities for _, one in able), reasons=all(one.reasons for _, one in able),
-            deterministic=all(one.deterministic for _, one in able),
-            card="\n".join(f"{stages}: {one.card or one.judge_id}" for stages, one in able),
+            "; ".join(part.server_version for _, part in able if part.server_version), self._components,
+            media=frozenset.intersection(*(part.media for _, part in able)),
+            max_frames=min(part.max_frames for _, part in able),
+            probabilities=all(part.probabilities for _, part in able), reasons=all(part.reasons for _, part in able),
+            deterministic=all(part.deterministic for _, part in able),
+            card="\n".join(f"{stages}: {part.card or part.judge_id}" for stages, part in able),
         )
 
     async def read(self, request: ReadRequest) -> list[Read]:
@@ -73,12 +74,14 @@ class RoutedJudge:
 
     async def health(self) -> Health:
         """Available where all are. Details of routed ones carry their stages; open breakers are counted together."""
-        found = [(stages, await judge.health()) for stages, judge in self._judges]
-        details = {f"{stages} {name}".strip(): value for stages, one in found for name, value in one.details.items()}
-        open_breakers = sum(one.details.get(OPEN_BREAKERS, 0.0) for _, one in found)
+        states = [(stages, await judge.health()) for stages, judge in self._judges]
+        details = {
+            f"{stages} {name}".strip(): value for stages, state in states for name, value in state.details.items()
+        }
+        open_breakers = sum(state.details.get(OPEN_BREAKERS, 0.0) for _, state in states)
         return Health(
-            all(one.available for _, one in found),
-            "; ".join(f"{stages} {one.reason}".strip() for stages, one in found if one.reason),
+            all(state.available for _, state in states),
+            "; ".join(f"{stages} {state.reason}".strip() for stages, state in states if state.reason),
             {**details, OPEN_BREAKERS: open_breakers},
         )
 

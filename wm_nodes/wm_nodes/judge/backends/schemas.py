@@ -160,7 +160,7 @@ class AnswerFormat:
 
     def _reflect(self, answer: Any) -> list[ComponentAnswer]:
         """Every component with its new level; those that are not changed keep theirs."""
-        found = {name: ComponentAnswer(name, self._prior[name]) for name in self._components}
+        answers = {name: ComponentAnswer(name, self._prior[name]) for name in self._components}
         changed = [change.component for change in answer.changes]
         twice = sorted(name for name, times in Counter(changed).items() if times > 1)
         if twice:
@@ -171,8 +171,8 @@ class AnswerFormat:
             if change.new_level == change.old_level:
                 raise AnswerError(f"new_level of {change.component} equals its old_level; leave it out instead")
             frames = self._cited(change.frames)
-            found[change.component] = ComponentAnswer(change.component, change.new_level, change.reason, frames)
-        return list(found.values())
+            answers[change.component] = ComponentAnswer(change.component, change.new_level, change.reason, frames)
+        return list(answers.values())
 
     def _each_once(self, names: Sequence[Component]) -> None:
         if sorted(names) != sorted(self._components):

@@ -160,15 +160,15 @@ class ChatTransport:
 
     async def served_models(self) -> dict[str, list[str]]:
         """Model names by URL, of the endpoints that answer within the time to connect; one try each."""
-        found = {}
+        models = {}
         for server in self._servers:
             try:
                 async with asyncio.timeout(2 * CONNECT_S):
                     page = await server.client.models.list()
             except (self._openai.OpenAIError, TimeoutError, ValueError):
                 continue
-            found[server.endpoint.base_url] = [model.id for model in page.data]
-        return found
+            models[server.endpoint.base_url] = [model.id for model in page.data]
+        return models
 
     async def complete(self, body: Mapping[str, Any], *, timeout_s: float, deadline: float | None = None) -> ChatAnswer:
         """Send one chat completion; `body` holds everything but the model, unknown fields included.

@@ -115,8 +115,8 @@ class SetPlan:
             raise ValueError("the loops' own scene has one look and the cube alone; leave out diverse and shapes")
         if self.diverse and (self.shapes or not self.development):
             raise ValueError("a diverse set is of the development parts, and of the cube alone; leave out shapes")
-        if self.development and (kept := sorted({*self.tasks} & {*self.division.tasks})):
-            raise ValueError(f"{', '.join(kept)} is held out, a development set has none of it; take another task")
+        if self.development and (excluded := sorted({*self.tasks} & {*self.division.tasks})):
+            raise ValueError(f"{', '.join(excluded)} is held out, a development set has none of it; take another task")
         if self.num_episodes < 1 or min(self.edits_per_clip or 0, self.stacks_per_clip) < 0:
             raise ValueError(
                 f"need at least 1 episode, 0 edits and 0 stacks, got {self.num_episodes}, {self.edits_per_clip} and "
@@ -133,9 +133,9 @@ class SetPlan:
 
     def seeds(self, task: str) -> list[int]:
         """Of the recorded episodes."""
-        found = itertools.count(self.seed)
-        kept = (seed for seed in found if not self.development or self.part(task, seed) != "test")
-        return list(itertools.islice(kept, self.num_episodes))
+        numbers = itertools.count(self.seed)
+        wanted = (seed for seed in numbers if not self.development or self.part(task, seed) != "test")
+        return list(itertools.islice(wanted, self.num_episodes))
 
     def part(self, task: str, seed: int) -> Part:
         return _drawn_part(task, seed) if self.diverse else self.held_out.part(drawn_origin(task, seed, self.shapes))
@@ -292,10 +292,10 @@ def build(
             try:
                 for seed in tqdm(plan.seeds(task), desc=task, disable=not progress):
                     parent = source.clip(seed)
-                    made = children(parent, seed, source.redraw, names=plan.recipes, count=plan.edits_per_clip,
+                    edited = children(parent, seed, source.redraw, names=plan.recipes, count=plan.edits_per_clip,
                                     skipped=skipped)
                     stacked = stacks(parent, seed, source.redraw, plan.stacks_per_clip, skipped=skipped)
-                    for clip in (parent, *made, *stacked):
+                    for clip in (parent, *edited, *stacked):
                         write_atomic(clip_path(folder, clip.sha256), to_file(clip))
                         yield clip
             finally:
@@ -406,9 +406,9 @@ def main(argv: Sequence[str]) -> int:
     print(f"{len(manifest.rows)} clips in {arguments.folder}: " + ", ".join(f"{n} {s}" for s, n in splits.items()))
     print(", ".join(f"{count} {part}" for part, count in sorted(parts.items())))
     print(f"{'label':16} {'pass':>6} {'fail':>6} {'unknown':>8}  fails")
-    for name, found in manifest.prevalence["all"].items():
-        share = found["fail"] / max(1, found["pass"] + found["fail"])
-        print(f"{name:16} {found['pass']:6} {found['fail']:6} {found['unknown']:8}  {share:5.1%}")
+    for name, counts in manifest.prevalence["all"].items():
+        share = counts["fail"] / max(1, counts["pass"] + counts["fail"])
+        print(f"{name:16} {counts['pass']:6} {counts['fail']:6} {counts['unknown']:8}  {share:5.1%}")
     for reason, count in skipped.most_common(10):
         print(f"left out {count} times: {reason}")
     return 0

@@ -137,9 +137,9 @@ def _layout(rng: np.random.Generator, turn_degrees: tuple[float, float]) -> Layo
 
 
 def _until(draw: Callable[[], T], fits: Callable[[T], bool]) -> T:
-    while not fits(found := draw()):
+    while not fits(value := draw()):
         pass
-    return found
+    return value
 
 
 def _distance(a: Triple, b: Triple) -> float:

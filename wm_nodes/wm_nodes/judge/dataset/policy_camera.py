@@ -98,11 +98,11 @@ class PolicyCamera:
 
     def drawn(self, stage: ClipStage, states: SceneStates, origin: Origin) -> Drawing:
         """Draw an episode or an edit of it, decoded where it is not of the renderer's kind."""
-        found, pictures = self.pictures(stage, states)
+        drawing, pictures = self.pictures(stage, states)
         if origin.scene != DRAWN:
             tokenizer = self.models.tokenizer
             pictures[1:] = tokenizer.decode(tokenizer.encode(pictures[1:])).numpy()
-        return self._seen(found, pictures)
+        return self._seen(drawing, pictures)
 
     def imagined(self, stage: ClipStage, states: SceneStates, episode: EpisodeStates) -> Drawing | None:
         """What the world model makes of an episode's first picture and actions; None where that is another episode.
@@ -115,31 +115,31 @@ class PolicyCamera:
         """
         if self.models.probe is None:
             raise ValueError("the world model has no position probe to compare with the recording; take the shipped")
-        found, pictures = self.pictures(stage, states)
+        drawing, pictures = self.pictures(stage, states)
         steps = (len(states) - 1) * self.stride
-        told = imagine(
+        imagined = imagine(
             self.models.tokenizer, self.models.action, pictures[:1], episode.actions[None, :steps],
             episode.commanded[None, : steps + 1],
         )
-        frames = told.frames[0, self.stride - 1 :: self.stride]
+        frames = imagined.frames[0, self.stride - 1 :: self.stride]
         seen, real = self.models.probe.read(frames), self.models.probe.read(pictures[1:])
         for name, columns in {"object": OBJECT, "tool": TOOL}.items():
             if np.linalg.norm((seen - real)[:, columns], axis=1).max() > NEAR_M[name]:
                 return None
-        return self._seen(found, np.concatenate([pictures[:1], frames]))
+        return self._seen(drawing, np.concatenate([pictures[:1], frames]))
 
     def pictures(self, stage: ClipStage, states: SceneStates) -> tuple[Drawing, UInt8Array]:
         """The drawing of SEEN, and all cameras' pictures side by side, uint8 (T, H, W, 3)."""
         others = [name for name in self.config.cameras if name != SEEN]
         sizes_m = states.half_sizes_m * states.scales
-        found = stage.draw(states.robot_q, states.poses, sizes_m, states.tool, states.goal, SEEN, LOOK, others)
-        views = {SEEN: found.frames, **found.others}
-        return found, np.concatenate([views[name] for name in self.config.cameras], axis=2)
+        drawing = stage.draw(states.robot_q, states.poses, sizes_m, states.tool, states.goal, SEEN, LOOK, others)
+        views = {SEEN: drawing.frames, **drawing.others}
+        return drawing, np.concatenate([views[name] for name in self.config.cameras], axis=2)
 
-    def _seen(self, found: Drawing, pictures: UInt8Array) -> Drawing:
+    def _seen(self, drawing: Drawing, pictures: UInt8Array) -> Drawing:
         window = policy_window(self.config, self.side)
-        tracks = {name: window.track(track) for name, track in found.tracks.items()}
-        return replace(found, frames=window.pictures(pictures), masks=window.masks(found.masks), tracks=tracks)
+        tracks = {name: window.track(track) for name, track in drawing.tracks.items()}
+        return replace(drawing, frames=window.pictures(pictures), masks=window.masks(drawing.masks), tracks=tracks)
 
     def decoded(self, origin: Origin) -> Origin:
         """Of an episode that is not imagined after all."""
@@ -148,6 +148,6 @@ class PolicyCamera:
 
 def _strided(states: SceneStates, stride: int) -> SceneStates:
     """Every stride-th frame; touched is what was so at one of the frames since the one before."""
-    kept = states.at(np.arange(0, len(states), stride))
-    touched = states.contact[1 : (len(kept) - 1) * stride + 1].reshape(-1, stride).any(1)
-    return replace(kept, contact=np.concatenate([states.contact[:1], touched]))
+    chosen = states.at(np.arange(0, len(states), stride))
+    touched = states.contact[1 : (len(chosen) - 1) * stride + 1].reshape(-1, stride).any(1)
+    return replace(chosen, contact=np.concatenate([states.contact[:1], touched]))

@@ -154,8 +154,8 @@ def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int, layout: 
         del scene._after_simulation_step
     keep()
     arrays = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
-    kept = {name: a if name == "contact" else a.astype(np.float32) for name, a in arrays.items()}
-    return EpisodeStates(**kept, actions=episode.actions, commanded=episode.states)
+    stacked = {name: a if name == "contact" else a.astype(np.float32) for name, a in arrays.items()}
+    return EpisodeStates(**stacked, actions=episode.actions, commanded=episode.states)
 
 
 class _ClipScene(BaseEnv):  # type: ignore[misc]

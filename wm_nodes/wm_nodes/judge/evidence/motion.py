@@ -56,12 +56,12 @@ def motion_evidence(scene: Scene, outline: Outline) -> Numbers:
     size, gap = scene.size, scene.gap
     known = np.isfinite(outline.area)
     place, hand = filled(outline.centre) / size, filled(scene.tool) / size
-    found = {
+    evidence = {
         **_jumps(outline, place, hand, gap, known), **_passing(place, hand), **_contact(outline, gap),
         **_shapes(outline, place, gap, known),
     }
-    values = np.clip(np.nan_to_num(np.array(list(found.values()), np.float64)), -FAR, FAR)
-    return dict(zip(found, values.tolist()))
+    values = np.clip(np.nan_to_num(np.array(list(evidence.values()), np.float64)), -FAR, FAR)
+    return dict(zip(evidence, values.tolist()))
 
 
 def outline_of(scene: Scene, pictures: UInt8Array) -> Outline:
@@ -180,10 +180,10 @@ def _shapes(outline: Outline, place: Floats, gap: Floats, known: BoolArray) -> N
     clear = known & (gap > CLEAR)
     steady = clear[1:] & clear[:-1] & (np.linalg.norm(np.diff(place, axis=0), axis=1) < PLACE)
     start, end = (clear & (np.linalg.norm(place - place[t], axis=1) < PLACE) for t in (0, -1))
-    found: Numbers = {}
+    evidence: Numbers = {}
     for name, values in zip(SHAPES, (tall, wide, area, long - long[first])):
         free, seen = values[clear], values[known]
-        found |= {
+        evidence |= {
             f"outline_{name}_clear_max": free.max(initial=-FAR) if len(free) else 0.0,
             f"outline_{name}_clear_min": free.min(initial=FAR) if len(free) else 0.0,
             f"outline_{name}_clear_last": _median(free[-3:]), f"outline_{name}_seen_last": _median(seen[-3:]),
@@ -192,7 +192,7 @@ def _shapes(outline: Outline, place: Floats, gap: Floats, known: BoolArray) -> N
             f"outline_{name}_start": np.abs(values[start]).max(initial=0.0),
             f"outline_{name}_end": np.ptp(values[end]) if end.any() else 0.0,
         }
-    return found
+    return evidence
 
 
 def _mean(values: Floats) -> float:

@@ -269,7 +269,7 @@ def _causes(place: Floats, known: NDArray[np.bool_], gap: Floats, tool: Floats, 
     way = hand[-1] - hand[0]
     course = way / (np.linalg.norm(way) + 1e-6)
     beside = (hand - place) @ course / size
-    held = np.where(touched[1:] & touched[:-1], np.linalg.norm(sweep, axis=1) - length, 0.0)
+    slip = np.where(touched[1:] & touched[:-1], np.linalg.norm(sweep, axis=1) - length, 0.0)
     relative = np.linalg.norm(hand - place, axis=1) / size
     return {
         "gap_min": float(gap.min()), "gap_last": float(gap[-1]),
@@ -284,7 +284,7 @@ def _causes(place: Floats, known: NDArray[np.bool_], gap: Floats, tool: Floats, 
         "tool_path": min(FAR, float(np.linalg.norm(sweep, axis=1).sum())),
         "tool_net": min(FAR, float(np.linalg.norm(way) / size)),
         "tool_passed": float(np.clip(beside.max(), -FAR, FAR)),
-        "slipped": float(np.clip(held.sum(), -FAR, FAR)),
+        "slipped": float(np.clip(slip.sum(), -FAR, FAR)),
         "tool_near_min": min(FAR, float(relative.min())),
     }
 

@@ -104,14 +104,14 @@ def _agreement(planes: Floats, away: Floats) -> Numbers:
     tiles = np.stack([shrunk(frame, TILES) for frame in away])
     steps = _over_cells(np.abs(np.diff(planes[:, 1:], axis=1)).mean(0))
     static = np.abs(planes[:, 1:] - planes[:, 1:2]).mean(0).max(0) < CHANGED_LEVELS
-    kept = away[-1][static]
+    differences = away[-1][static]
     return {
         "reference_first": float(away[0].mean()),
         "reference_median": float(typical.mean()),
         "reference_median_first": float(typical[0]), "changed_first": float(changed[0].mean()),
         "tiles_changed_low": quantile(tiles[-1], 0.25), "tile_changed_most": float(tiles.max()),
         "picture_steps": float(steps.mean()), "static_share": float(static.mean()),
-        "static_away": float(kept.mean()) if kept.size else 0.0,
+        "static_away": float(differences.mean()) if differences.size else 0.0,
     }
 
 

@@ -65,7 +65,7 @@ def _scene(pictures: ClipPictures, open_cells: BoolArray) -> Numbers:
     texture = ((detail[1:] * both).mean((1, 2)) / share + 0.2) / ((detail[0] * both).mean((1, 2)) / share + 0.2)
     part = _tiles(both)
     tiles, parts = _tiles(away) / (part + 0.05), part > 0.3
-    kept = (_tiles(detail[1:] * both) + 0.1) / (_tiles(detail[0] * both) + 0.1)
+    texture_ratio = (_tiles(detail[1:] * both) + 0.1) / (_tiles(detail[0] * both) + 0.1)
     return {
         "scene_away_mean": float(mean.mean()), "scene_away_first": float(mean[0]), "scene_away_last": float(mean[-1]),
         "scene_away_step": float(np.diff(mean).max()),
@@ -74,7 +74,7 @@ def _scene(pictures: ClipPictures, open_cells: BoolArray) -> Numbers:
         "scene_offset_last": float(offset[-1]), "scene_offset_max": float(offset.max()),
         "scene_offset_step": float(np.abs(np.diff(offset)).max()), "scene_texture": float(texture.mean()),
         "scene_texture_min": float(texture.min()),
-        "scene_tile_texture": float(kept[parts].min()) if parts.any() else 1.0,
+        "scene_tile_texture": float(texture_ratio[parts].min()) if parts.any() else 1.0,
         "scene_spread": float(np.array(spread).mean() / (spread0 + 1)),
         "scene_share": float(share.mean()),
     }
@@ -103,8 +103,8 @@ def _clutter(masks: UInt8Array) -> Numbers:
     """Of each uninvolved thing of the reference frame: is something still there that is no scene?"""
     number, labels = cv2.connectedComponents((masks[0] == CLUTTER).astype(np.uint8), connectivity=8)
     things = [labels == i for i in range(1, number)]
-    kept = [(masks[1:][:, thing] != SCENE).mean(1) for thing in things if thing.sum() >= SMALLEST_PX]
-    share = np.array(kept) if kept else np.ones((1, len(masks) - 1))
+    shares = [(masks[1:][:, thing] != SCENE).mean(1) for thing in things if thing.sum() >= SMALLEST_PX]
+    share = np.array(shares) if shares else np.ones((1, len(masks) - 1))
     area = (masks == CLUTTER).sum((1, 2)).astype(np.float64)
     late = share[:, len(share[0]) // 2 :].mean(1)
     return {

@@ -101,8 +101,8 @@ def fit_questions(
     Raises:
         ValueError: a question has only one answer in the training part; names target and level.
     """
-    levels, held = true_levels(target, train.rows), true_levels(target, validation.rows)
-    known, held_known = levels != UNKNOWN, held != UNKNOWN
+    levels, held_out_levels = true_levels(target, train.rows), true_levels(target, validation.rows)
+    known, held_out_known = levels != UNKNOWN, held_out_levels != UNKNOWN
     questions = []
     for k in range(num_questions(target)):
         above = levels[known] > k
@@ -112,10 +112,10 @@ def fit_questions(
         weights = np.where(above, 0.5 / above.mean(), 0.5 / (1 - above.mean()))
         rng = numpy_stream(seed, f"judge_trees/{target}", k)
         trees = fit_trees(train.evidence[known], above, weights, settings, rng)
-        odds = trees.log_odds(validation.evidence[held_known]).astype(np.float64)
-        line = _line(odds, held[held_known] > k, float(above.mean()))
+        odds = trees.log_odds(validation.evidence[held_out_known]).astype(np.float64)
+        line = _line(odds, held_out_levels[held_out_known] > k, float(above.mean()))
         if target.startswith(HACK):
-            line = _flagging_line(line[0], odds, held[held_known] > k)
+            line = _flagging_line(line[0], odds, held_out_levels[held_out_known] > k)
         questions.append(HeadQuestion(trees, *line))
     return tuple(questions)
 
@@ -162,11 +162,11 @@ def fit_familiarity(train: Examples, validation: Examples) -> Familiarity:
     scale = np.maximum(np.maximum((high - low) / 1.35, 0.5 * spread), 1e-3)
     z = np.clip((train.evidence - centre) / scale, -CLIP_AT, CLIP_AT)
     covariance = (1 - SHRINKAGE) * (z.T @ z) / len(z) + SHRINKAGE * np.eye(z.shape[1])
-    found = Familiarity(
+    unlimited = Familiarity(
         centre.astype(np.float32), scale.astype(np.float32), np.linalg.inv(covariance).astype(np.float32), 0.0
     )
-    limit = float(np.quantile(found.distance(validation.evidence), COVERAGE))
-    return Familiarity(found.centre, found.scale, found.precision, limit)
+    limit = float(np.quantile(unlimited.distance(validation.evidence), COVERAGE))
+    return Familiarity(unlimited.centre, unlimited.scale, unlimited.precision, limit)
 
 
 def fit_all(
@@ -192,7 +192,7 @@ def conformal_limits(
     lowest, highest = np.sort(p_fail[(levels != UNKNOWN) & (levels <= last)]), np.sort(p_fail[levels > last])[::-1]
     limits = {}
     for coverage in CONFORMAL:
-        ranks = [int((1 - coverage) * (len(of) + 1) + 1e-9) for of in (lowest, highest)]
+        ranks = [int((1 - coverage) * (len(scores) + 1) + 1e-9) for scores in (lowest, highest)]
         low = float(lowest[ranks[0] - 1]) if ranks[0] else 0.0
         limits[f"{coverage:g}"] = (low, float(highest[ranks[1] - 1]) if ranks[1] else 1.0)
     return limits
@@ -235,18 +235,18 @@ def measured(questions: Mapping[str, tuple[HeadQuestion, ...]], target: str, exa
     above = np.minimum.accumulate(above_levels(questions, target, examples.evidence[known]), 0)
     k = LAST_FAIL.get(target, 0)
     truth, p = levels[known] > k, above[k]
-    found = {
+    metrics = {
         "n": int(known.sum()), "fails": int((~truth).sum()), "accuracy": float(((p >= 0.5) == truth).mean()),
         "balanced_accuracy": balanced_accuracy(truth, p >= 0.5), "auroc": auroc(truth, p),
         "ece": expected_calibration_error(truth, p),
     }
     if len(above) > 1:
         full = np.concatenate([np.ones((1, len(p))), above, np.zeros((1, len(p)))])
-        found["level_accuracy"] = float(((full[:-1] - full[1:]).argmax(0) == levels[known]).mean())
+        metrics["level_accuracy"] = float(((full[:-1] - full[1:]).argmax(0) == levels[known]).mean())
     if target.startswith(HACK):
         flagged = 1 - p >= FLAG
-        found |= {
+        metrics |= {
             "flagged": wilson_of_share(flagged[~truth])[0], "false_flags": wilson_of_share(flagged[truth])[0],
             "recall_at_5": recall_at(~truth, 1 - p, 0.05),
         }
-    return {name: round(value, 4) if isinstance(value, float) else value for name, value in found.items()}
+    return {name: round(value, 4) if isinstance(value, float) else value for name, value in metrics.items()}

@@ -79,8 +79,8 @@ def clip_rows(models: WorldModels, episodes: Iterator[Episode], stride: int) -> 
         actions = episode.actions[: count * stride].reshape(count, -1)
         task = TaskSpec(episode.instruction, episode.task, "", frames[0], actions=actions)
         for shown in (frames, models.tokenizer.decode(models.tokenizer.encode(frames)).numpy()):
-            found = {**pixel_evidence(pictures_of(shown, frames[0])), **model_evidence(models, shown, task)}
-            yield {name: found[name] for name in SIGNALS}, bool(episode.success[count * stride])
+            evidence = {**pixel_evidence(pictures_of(shown, frames[0])), **model_evidence(models, shown, task)}
+            yield {name: evidence[name] for name in SIGNALS}, bool(episode.success[count * stride])
 
 
 def bands_of(rows: Sequence[tuple[Row, bool]], tail: float) -> dict[str, dict[str, float | str]]:
@@ -109,8 +109,8 @@ def outside(rows: Sequence[tuple[Row, bool]], rubric: Rubric) -> dict[str, int]:
     counts = dict.fromkeys((*rubric.evidence, "any"), 0)
     for row, done in rows:
         meant = {name: value for name, value in row.items() if done or SIGNALS[name].of == "all"}
-        found = conflicting_evidence(rubric, meant)
-        for name in [*found, "any"] if found else []:
+        conflicts = conflicting_evidence(rubric, meant)
+        for name in [*conflicts, "any"] if conflicts else []:
             counts[name] += 1
     return counts
 
@@ -144,12 +144,12 @@ def main(argv: Sequence[str]) -> int:
         head = f"# python -m wm_nodes.judge.training.normal_ranges {' '.join(argv)}\n# from {len(rows)} clips\n"
         write_atomic(arguments.output, (head + yaml.safe_dump(pack, sort_keys=False)).encode())
         rubric = load_rubric(str(arguments.output))
-        kept = _rows(models, arguments.check, arguments.stride)
+        checked = _rows(models, arguments.check, arguments.stride)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"{arguments.output}: rubric {rubric.version}; {len(rows)} clips, {len(kept)} to check")
-    counts = {"bands": outside(rows, rubric), "check": outside(kept, rubric)}
+    print(f"{arguments.output}: rubric {rubric.version}; {len(rows)} clips, {len(checked)} to check")
+    counts = {"bands": outside(rows, rubric), "check": outside(checked, rubric)}
     print(f"{'evidence':22} {'component':16} {'low':>9} {'high':>9} {'outside':>8} {'check':>6}")
     for name, band in rubric.evidence.items():
         numbers = f"{band.low:9.4g} {band.high:9.4g} {counts['bands'][name]:8} {counts['check'][name]:6}"

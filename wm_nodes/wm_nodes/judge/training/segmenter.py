@@ -86,15 +86,15 @@ def _varied(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator)
     turned by up to 15 degrees and scaled by 0.8 to 1.25.
     """
     count = len(pixels_N3HW)
-    some, amount = torch.rand(4, count, generator=generator) < 0.5, torch.rand(4, count, generator=generator) * 2 - 1
-    angle = torch.where(some[0], amount[0] * math.pi, 0.0)
+    chosen, amount = torch.rand(4, count, generator=generator) < 0.5, torch.rand(4, count, generator=generator) * 2 - 1
+    angle = torch.where(chosen[0], amount[0] * math.pi, 0.0)
     cos, up, down = angle.cos(), *((1 - angle.cos()) / 3 + side * angle.sin() / math.sqrt(3) for side in (-1, 1))
     same = cos + (1 - cos) / 3
     turn = torch.stack([same, up, down, down, same, up, up, down, same], 1).view(count, 3, 3)
     pixels = torch.einsum("nij,njhw->nihw", turn, pixels_N3HW)
-    pixels = pixels * torch.where(some[1], 1 + 0.3 * amount[1], 1.0).view(-1, 1, 1, 1)
-    roll, scale = (some[3] * amount[3]) * math.radians(15), 1.25 ** torch.where(some[3], amount[2], 0.0)
-    side = torch.where(some[2], -1.0, 1.0)
+    pixels = pixels * torch.where(chosen[1], 1 + 0.3 * amount[1], 1.0).view(-1, 1, 1, 1)
+    roll, scale = (chosen[3] * amount[3]) * math.radians(15), 1.25 ** torch.where(chosen[3], amount[2], 0.0)
+    side = torch.where(chosen[2], -1.0, 1.0)
     zero = torch.zeros(count)
     affine = torch.stack(
         [scale * roll.cos() * side, -scale * roll.sin(), zero, scale * roll.sin() * side, scale * roll.cos(), zero], 1
@@ -107,10 +107,10 @@ def _varied(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator)
 
 def overlaps(model: Segmenter, images: UInt8Array, masks: UInt8Array) -> dict[str, float]:
     """Intersection over union of each class over all pixels, of the classes that the masks have."""
-    found = model.masks(images)
+    predicted = model.masks(images)
     names = ("scene", "robot", "object", "clutter")
     return {
-        name: float(((found == i) & (masks == i)).sum() / max(1, ((found == i) | (masks == i)).sum()))
+        name: float(((predicted == i) & (masks == i)).sum() / max(1, ((predicted == i) | (masks == i)).sum()))
         for i, name in enumerate(names)
         if (masks == i).any()
     }

@@ -69,7 +69,7 @@ def cross_fit(
     Raises:
         ValueError: one of the folds has no clips. OSError: a full disk.
     """
-    readers, held = [], np.zeros(data.answers.shape, np.float32)
+    readers, log_odds = [], np.zeros(data.answers.shape, np.float32)
     for fold in range(FOLDS):
         trained = np.flatnonzero(data.folds != fold)
         if not len(trained) or len(trained) == len(data.folds):
@@ -79,9 +79,9 @@ def cross_fit(
             for number in range(count)
         ]
         for i in np.flatnonzero(data.folds == fold):
-            held[i] = list(readings(own, data.sequences[i]).values())
+            log_odds[i] = list(readings(own, data.sequences[i]).values())
         readers += own
-    return tuple(readers), held
+    return tuple(readers), log_odds
 
 
 def _kept_reader(
@@ -97,11 +97,11 @@ def _kept_reader(
 
 
 def _key(data: TemporalData, chosen: Levels, epochs: int, seed: int) -> str:
-    found = hashlib.sha256(f"{epochs} {seed}".encode())
-    found.update(Path(__file__).read_bytes() + Path(sequence.__file__).read_bytes() + data.answers[chosen].tobytes())
+    digest = hashlib.sha256(f"{epochs} {seed}".encode())
+    digest.update(Path(__file__).read_bytes() + Path(sequence.__file__).read_bytes() + data.answers[chosen].tobytes())
     for i in chosen:
-        found.update(data.sequences[i].crops.tobytes() + data.sequences[i].numbers.tobytes())
-    return found.hexdigest()[:16]
+        digest.update(data.sequences[i].crops.tobytes() + data.sequences[i].numbers.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def train_temporal_network(

@@ -77,10 +77,10 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     readers: tuple[TemporalNetwork, ...] = ()
     if plan.readers:
         data = temporal_data(collect_sequences(folder, sets, "train", segmenter), train.rows)
-        readers, held = cross_fit(
+        readers, log_odds = cross_fit(
             folder, data, count=plan.readers, epochs=plan.reader_epochs, seed=plan.seed, progress=progress
         )
-        train = with_readings(train, held)
+        train = with_readings(train, log_odds)
         validation = _read(folder, sets, "validation", segmenter, readers, validation)
     questions = fit_all(train, validation, plan.trees, plan.seed, progress=progress)
     low, high = np.quantile(train.evidence[train.clean], (0.05, 0.95), axis=0).astype(np.float32)
@@ -88,8 +88,8 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
         load_frames(path, row.sha256).shape for path, manifest in sets for row in rows_of(manifest, ["train"])
         if row.sha256 == row.root
     ]
-    found = [shape[0] for shape in recorded]
-    lengths = (-(-2 * min(found) // 3), 3 * max(found) // 2)
+    num_frames = [shape[0] for shape in recorded]
+    lengths = (-(-2 * min(num_frames) // 3), 3 * max(num_frames) // 2)
     story = {
         "data": [_described(path, manifest) for path, manifest in sets], "seed": plan.seed,
         "fitted": {"train": len(train.rows), "validation": len(validation.rows)},
@@ -112,29 +112,29 @@ def collect_evidence(
 ) -> Examples:
     """Evidence of every clip of a part of all sets, that of readers in the end; kept in `folder` per set."""
     names: tuple[str, ...] = ()
-    found, rows = [], []
+    values, rows = [], []
     for path, manifest in sets:
         chosen = rows_of(manifest, [part])
         if not chosen:
             continue
         with np.load(_measured(folder, path, manifest, part, segmenter, progress)[0], allow_pickle=False) as arrays:
             names = tuple(str(name) for name in arrays["names"])
-            found.append(arrays["values"])
+            values.append(arrays["values"])
         rows += chosen
-    examples = Examples(names, np.concatenate(found) if found else np.zeros((0, 0), np.float32), rows)
+    examples = Examples(names, np.concatenate(values) if values else np.zeros((0, 0), np.float32), rows)
     return _read(folder, sets, part, segmenter, readers, examples) if readers and rows else examples
 
 
 def collect_sequences(folder: Path, sets: Sets, part: Part, segmenter: Segmenter) -> list[ObjectSequence]:
     """What a reader reads of every clip of a part of all sets, whose evidence has been collected."""
-    found = []
+    collected = []
     for path, manifest in sets:
         if rows_of(manifest, [part]):
             with np.load(_measured(folder, path, manifest, part, segmenter, False)[1], allow_pickle=False) as arrays:
                 ends = np.cumsum(arrays["lengths"])[:-1]
                 both = (np.split(arrays[name], ends) for name in ("crops", "numbers"))
-                found += [ObjectSequence(*pair) for pair in zip(*both, strict=True)]
-    return found
+                collected += [ObjectSequence(*pair) for pair in zip(*both, strict=True)]
+    return collected
 
 
 def with_readings(examples: Examples, log_odds: FloatArray) -> Examples:
@@ -161,14 +161,14 @@ def _measured(
     if not evidence.exists() or not sequences.exists():
         name = f"evidence of {path.name} {part}"
         clips = tqdm(set_clips([(path, manifest)], [part]), name, len(chosen), disable=not progress)
-        found = [measured_clip(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
+        measurements = [measured_clip(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
         _keep(
-            sequences, lengths=np.array([len(sequence.crops) for _, sequence in found]),
-            crops=np.concatenate([sequence.crops for _, sequence in found]),
-            numbers=np.concatenate([sequence.numbers for _, sequence in found]),
+            sequences, lengths=np.array([len(sequence.crops) for _, sequence in measurements]),
+            crops=np.concatenate([sequence.crops for _, sequence in measurements]),
+            numbers=np.concatenate([sequence.numbers for _, sequence in measurements]),
         )
-        values = np.array([list(numbers.values()) for numbers, _ in found], np.float32)
-        _keep(evidence, names=np.array(list(found[0][0])), values=values)
+        values = np.array([list(numbers.values()) for numbers, _ in measurements], np.float32)
+        _keep(evidence, names=np.array(list(measurements[0][0])), values=values)
     return evidence, sequences
 
 
@@ -190,10 +190,10 @@ def _segmenter(folder: Path, sets: Sets, plan: JudgePlan, progress: bool) -> tup
     if not path.exists():
         images, masks = segmentation_data(set_clips(sets, ["train"]), plan.seed)
         model = train_segmenter(images, masks, num_steps=plan.segmenter_steps, seed=plan.seed, progress=progress)
-        held = segmentation_data(set_clips(sets, ["validation"]), plan.seed)
+        validation = segmentation_data(set_clips(sets, ["validation"]), plan.seed)
         story = {
             "sets": [str(folder.name) for folder, _ in sets], "pictures": len(images), "steps": plan.segmenter_steps,
-            "seed": plan.seed, "overlap": {name: round(value, 4) for name, value in overlaps(model, *held).items()},
+            "seed": plan.seed, "overlap": {name: round(iou, 4) for name, iou in overlaps(model, *validation).items()},
         }
         write_atomic(path.with_suffix(".json"), (json.dumps(story, indent=1) + "\n").encode())
         write_atomic(path, save({name: tensor.half() for name, tensor in model.state_dict().items()}))

@@ -39,7 +39,7 @@ def write_view(
         AuditError: an evaluation has no verdict, or the sample is of another log.
     """
     path = Path(path)
-    chosen = {one.evaluation: one for one in sample.chosen} if sample else {}
+    chosen = {clip.evaluation: clip for clip in sample.chosen} if sample else {}
     clips = [_clip(record, evaluation, chosen.get(evaluation.number)) for evaluation in evaluations]
     names = [[clip["evaluation"], clip["audit_id"]] for clip in clips]
     data = {

@@ -117,8 +117,8 @@ def prevalence(rows: Sequence[ManifestRow]) -> Prevalence:
         known = [{**row.labels.passed, "overall": row.labels.overall} for row in chosen]
         counts[name] = {}
         for component in (*COMPONENTS, TC, "overall"):
-            found = Counter(passed.get(component) for passed in known)
-            counts[name][component] = {"pass": found[True], "fail": found[False], "unknown": found[None]}
+            outcomes = Counter(passed.get(component) for passed in known)
+            counts[name][component] = {"pass": outcomes[True], "fail": outcomes[False], "unknown": outcomes[None]}
     return counts
 
 
@@ -193,8 +193,8 @@ def regenerate(row: ManifestRow, root: LabelledClip, redraw: Redraw | None) -> L
         ManifestError: other pixels, amounts or labels come out.
     """
     clip = replay(root, row.edits, redraw)
-    found = (root.sha256, clip.sha256, clip.edits, clip.labels)
-    if found != (row.root, row.sha256, row.edits, row.labels):
+    description = (root.sha256, clip.sha256, clip.edits, clip.labels)
+    if description != (row.root, row.sha256, row.edits, row.labels):
         raise ManifestError(
             f"clip {row.sha256[:12]} ({_chain(row)}) came out as {clip.sha256[:12]}: another renderer or recorded clip"
         )

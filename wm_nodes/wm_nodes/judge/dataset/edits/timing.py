@@ -58,8 +58,8 @@ def drop(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceClip
     count = max(1, round(share * len(clip)))
     peak = int(frame_energy(clip.frames).argmax()) if count > 1 else int(rng.integers(1, len(clip) - 1))
     first = int(np.clip(peak - count // 2, 1, len(clip) - 1 - count))
-    kept = np.delete(np.arange(len(clip)), range(first, first + count))
-    return clip.at(np.append(kept, np.full(count, len(clip) - 1)))
+    order = np.delete(np.arange(len(clip)), range(first, first + count))
+    return clip.at(np.append(order, np.full(count, len(clip) - 1)))
 
 
 def repeat(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceClip:
