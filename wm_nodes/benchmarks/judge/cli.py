@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from tqdm import tqdm
 
-from benchmarks.judge.compared import PROTOCOLS, AnswerFile, ComparedRow, compared, compared_table, num_answers
-from benchmarks.judge.efficiency import ARMS, economy, economy_table, trials
+from benchmarks.judge.compared import PROTOCOLS, AnswerFile, ComparedRow, compared, comparison_table, num_answers
+from benchmarks.judge.efficiency import ARMS, measure_savings, savings_table, trials
 from benchmarks.judge.hacking import (
     Proxy,
     SearchPlan,
@@ -32,12 +32,12 @@ from benchmarks.judge.metrics import (
     agreement,
     by_split,
     cost_row,
-    missed,
     missed_patterns,
+    missed_targets,
     mistakes,
+    most_frequent,
     pattern_rows,
     statuses,
-    worst,
 )
 from benchmarks.judge.run import JudgeTrial, Outcome, OutcomeFile, judge_rows
 from benchmarks.judge.search_starts import hacking_starts
@@ -51,7 +51,7 @@ from wm_nodes.judge.dataset.build import load_set
 from wm_nodes.judge.dataset.edits import LabelledClip, Manifest
 from wm_nodes.judge.dataset.edits.generator import SEVERITIES
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
-from wm_nodes.judge.dataset.rows import MIN_TEST_CLIPS, chosen_rows
+from wm_nodes.judge.dataset.rows import MIN_TEST_CLIPS, select_rows
 
 LOG_COLUMNS = 180
 JUDGED = "judged"
@@ -80,10 +80,10 @@ def main(argv: Sequence[str]) -> int:
 
 async def _table(arguments: argparse.Namespace) -> None:
     rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
-    rows = chosen_rows(manifest, arguments.part, arguments.clips)
+    rows = select_rows(manifest, arguments.part, arguments.clips)
     async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
-        said = _looked(arguments, manifest, judge, rubric)
-        outcomes = await _judged(arguments, judge, [JudgeTrial("table", rubric, seed=arguments.seed)], rows)
+        said = _record_test_evaluation(arguments, manifest, judge, rubric)
+        outcomes = await _judge_trials(arguments, judge, [JudgeTrial("table", rubric, seed=arguments.seed)], rows)
         who = judge_name(judge.capabilities)
     results = outcomes["table"]
     agreements, patterns = agreement(rows, results, rubric), pattern_rows(rows, results, tuple(rubric.hack.patterns))
@@ -93,28 +93,28 @@ async def _table(arguments: argparse.Namespace) -> None:
     console.print(pattern_table(patterns))
     cost = cost_row(results, arguments.price)
     console.print(cost_table({"agent, benchmark mode": cost}))
-    below = [*missed(agreements), *missed_patterns(patterns)]
-    _say_what_is_missing(arguments, len(rows), said, below, worst(mistakes(rows, results, rubric)))
+    below = [*missed_targets(agreements), *missed_patterns(patterns)]
+    _print_notes(arguments, len(rows), said, below, most_frequent(mistakes(rows, results, rubric)))
     write_results(arguments, {
         "claim": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "notice": said, "statuses": statuses(results), "cost": cost,
         "splits": {name: [asdict(row) for row in table] for name, table in splits.items()},
         "rows": [asdict(row) for row in agreements], "patterns": [asdict(row) for row in patterns],
-        "missed": below, "mistakes": worst(mistakes(rows, results, rubric), 40),
+        "missed": below, "mistakes": most_frequent(mistakes(rows, results, rubric), 40),
     })
 
 
 async def _efficiency(arguments: argparse.Namespace) -> None:
     rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
-    rows = chosen_rows(manifest, arguments.part, arguments.clips)
+    rows = select_rows(manifest, arguments.part, arguments.clips)
     async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
-        said = _looked(arguments, manifest, judge, rubric)
-        outcomes = await _judged(arguments, judge, trials(arguments.rubric, arguments.seed), rows)
+        said = _record_test_evaluation(arguments, manifest, judge, rubric)
+        outcomes = await _judge_trials(arguments, judge, trials(arguments.rubric, arguments.seed), rows)
         who = judge_name(judge.capabilities)
     costs = {ARMS[name]: cost_row(outcomes_of_arm, arguments.price) for name, outcomes_of_arm in outcomes.items()}
-    compared = economy(rows, outcomes)
-    console.print(cost_table(costs), economy_table(compared, f"{who}; {arguments.part}, {len(rows)} clips"))
-    _say_what_is_missing(arguments, len(rows), said, [], [])
+    compared = measure_savings(rows, outcomes)
+    console.print(cost_table(costs), savings_table(compared, f"{who}; {arguments.part}, {len(rows)} clips"))
+    _print_notes(arguments, len(rows), said, [], [])
     write_results(arguments, {
         "claim": "efficiency", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "notice": said, "per_clip": costs, "compared": [asdict(row) for row in compared],
@@ -124,18 +124,18 @@ async def _efficiency(arguments: argparse.Namespace) -> None:
 async def _hacking(arguments: argparse.Namespace) -> None:
     rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
     plan = SearchPlan(arguments.generations, arguments.candidates, severities=tuple(arguments.severities))
-    part = chosen_rows(manifest, arguments.part)
+    part = select_rows(manifest, arguments.part)
     config = load_config("cpu").simulation
     starts, curves = [], []
     async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
         who = judge_name(judge.capabilities)
-        said = _looked(arguments, manifest, judge, rubric)
+        said = _record_test_evaluation(arguments, manifest, judge, rubric)
         rewards: dict[str, Proxy] = {
             "agent": agent_reward(judge, rubric, arguments.seed),
             "mean score": mean_score(judge, rubric, arguments.seed),
             "pixel similarity": pixel_similarity,
         }
-        proxies = {name: _told(reward, judge) for name, reward in rewards.items()}
+        proxies = {name: _with_labels(reward, judge) for name, reward in rewards.items()}
         with tqdm(total=arguments.starts, desc="clips with a defect") as bar:
             for start in hacking_starts(part, manifest.division, config, arguments.seed):
                 if await has_numbers(start, proxies.values()):
@@ -164,7 +164,7 @@ async def _hacking(arguments: argparse.Namespace) -> None:
 
 async def _comparisons(arguments: argparse.Namespace) -> None:
     manifest = load_set(arguments.set)
-    rows = chosen_rows(manifest, arguments.part, arguments.clips)
+    rows = select_rows(manifest, arguments.part, arguments.clips)
     results: list[ComparedRow] = []
     async with open_comparison(arguments) as judge:
         with tqdm(total=sum(num_answers(name, rows) for name in arguments.protocols), desc="asked") as bar:
@@ -177,14 +177,14 @@ async def _comparisons(arguments: argparse.Namespace) -> None:
                     )
                 )
     caption = f"{arguments.model}; {arguments.part}, {len(rows)} clips; wins: hacked scores >= its clean recording"
-    console.print(compared_table(results, caption))
+    console.print(comparison_table(results, caption))
     write_results(arguments, {
         "claim": "comparisons", "model": arguments.model, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "rows": [asdict(row) for row in results],
     })
 
 
-def _told(reward: Proxy, judge: Judge) -> Proxy:
+def _with_labels(reward: Proxy, judge: Judge) -> Proxy:
     """The control judge must be told the labels of every new clip; others look."""
     if not isinstance(judge, LabelJudge):
         return reward
@@ -196,7 +196,7 @@ def _told(reward: Proxy, judge: Judge) -> Proxy:
     return proxy
 
 
-async def _judged(
+async def _judge_trials(
     arguments: argparse.Namespace, judge: Judge, wanted: Sequence[JudgeTrial], rows: Sequence[ManifestRow]
 ) -> dict[str, list[Outcome]]:
     outcomes = {}
@@ -210,7 +210,7 @@ async def _judged(
     return outcomes
 
 
-def _looked(arguments: argparse.Namespace, manifest: Manifest, judge: Judge, rubric: Rubric) -> str:
+def _record_test_evaluation(arguments: argparse.Namespace, manifest: Manifest, judge: Judge, rubric: Rubric) -> str:
     """Record an evaluation on the test split; return what the output must say of it. Controls are not recorded."""
     if arguments.part != "test" or arguments.judge == "simulator":
         return ""
@@ -218,7 +218,7 @@ def _looked(arguments: argparse.Namespace, manifest: Manifest, judge: Judge, rub
     return notice(others, arguments.again)
 
 
-def _say_what_is_missing(
+def _print_notes(
     arguments: argparse.Namespace, count: int, said: str, below: Sequence[str], wrong: Sequence[tuple[str, int]]
 ) -> None:
     lines = [said] if said else []

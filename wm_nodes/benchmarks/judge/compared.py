@@ -19,7 +19,7 @@ from rich.table import Table
 from benchmarks.judge.comparisons import PAIRWISE, POINTWISE, ChatComparison
 from wm_nodes.core.statistics import auroc, wilson_interval
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
-from wm_nodes.judge.dataset.rows import judged_clip
+from wm_nodes.judge.dataset.rows import read_clip
 
 PROTOCOLS = (*POINTWISE, *PAIRWISE)
 
@@ -77,12 +77,12 @@ class AnswerFile:
         if known is None or known.value is None:
             known = self.kept[key] = await ask()
             with self._path.open("a") as file:
-                file.write("\n" * bool(self._torn()) + json.dumps({"of": key, **asdict(known)}) + "\n")
+                file.write("\n" * bool(self._is_torn()) + json.dumps({"of": key, **asdict(known)}) + "\n")
                 file.flush()
                 os.fsync(file.fileno())
         return known
 
-    def _torn(self) -> bool:
+    def _is_torn(self) -> bool:
         data = self._path.read_bytes()
         return bool(data) and not data.endswith(b"\n")
 
@@ -106,13 +106,13 @@ async def compared(
     gate = asyncio.Semaphore(at_once)
     pairs = hacked_pairs(rows)
 
-    async def one(row: ManifestRow) -> ComparedAnswer:
+    async def score_clip(row: ManifestRow) -> ComparedAnswer:
         async with gate:
             answer = await file.get(row.sha256, lambda: _score(judge, protocol, folder, row))
             on_answer()
             return answer
 
-    async def two(hacked: ManifestRow, clean: ManifestRow) -> ComparedAnswer:
+    async def compare_pair(hacked: ManifestRow, clean: ManifestRow) -> ComparedAnswer:
         async with gate:
             key = f"{hacked.sha256}/{clean.sha256}"
             answer = await file.get(key, lambda: _prefer(judge, protocol, folder, hacked, clean))
@@ -120,10 +120,10 @@ async def compared(
             return answer
 
     if protocol in PAIRWISE:
-        answers = list(await asyncio.gather(*(two(*pair) for pair in pairs)))
+        answers = list(await asyncio.gather(*(compare_pair(*pair) for pair in pairs)))
         wins = [answer.value <= 0.5 for answer in answers if answer.value is not None]
         return _row(protocol, answers, float("nan"), wins)
-    answers = list(await asyncio.gather(*(one(row) for row in rows)))
+    answers = list(await asyncio.gather(*(score_clip(row) for row in rows)))
     values = {row.sha256: answer.value for row, answer in zip(rows, answers)}
     known = [(row.labels.overall, value) for row in rows if (value := values[row.sha256]) is not None]
     both = [(values[hacked.sha256], values[clean.sha256]) for hacked, clean in pairs]
@@ -135,7 +135,7 @@ def num_answers(protocol: str, rows: Sequence[ManifestRow]) -> int:
     return len(hacked_pairs(rows)) if protocol in PAIRWISE else len(rows)
 
 
-def compared_table(rows: Sequence[ComparedRow], caption: str) -> Table:
+def comparison_table(rows: Sequence[ComparedRow], caption: str) -> Table:
     table = Table(title="comparison rewards", caption=caption)
     table.add_column("reward")
     for name in ("n", "invalid", "AUROC", "hacked pairs", "hacked wins", "95 % Wilson", "calls", "tokens", "images"):
@@ -152,15 +152,15 @@ def compared_table(rows: Sequence[ComparedRow], caption: str) -> Table:
 
 
 async def _score(judge: ChatComparison, protocol: str, folder: Path, row: ManifestRow) -> ComparedAnswer:
-    scored = await judge.score(POINTWISE[protocol], *judged_clip(folder, row))
+    scored = await judge.score(POINTWISE[protocol], *read_clip(folder, row))
     return _answer(scored.value if scored.valid else None, scored)
 
 
 async def _prefer(
     judge: ChatComparison, protocol: str, folder: Path, hacked: ManifestRow, clean: ManifestRow
 ) -> ComparedAnswer:
-    other, task = judged_clip(folder, clean)
-    preferred = await judge.compare(PAIRWISE[protocol], other, judged_clip(folder, hacked)[0], task)
+    other, task = read_clip(folder, clean)
+    preferred = await judge.compare(PAIRWISE[protocol], other, read_clip(folder, hacked)[0], task)
     return _answer(preferred.preference if preferred.valid else None, preferred)
 
 

@@ -27,7 +27,7 @@ MEASURES = ("reads", "calls", "images", "pixels", "tokens")
 
 
 @dataclass(frozen=True)
-class Economy:
+class Savings:
     """The agent against another way, on the n clips that both decide. saved: share of the other's measures, by name.
     same: share of them with the same decision. accuracy, other_accuracy: of accepting, against the labels.
     difference: agent - other on the same clips, with Tango's interval.
@@ -51,7 +51,7 @@ def trials(rubric: str, seed: int) -> list[JudgeTrial]:
     ]
 
 
-def economy(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence[Outcome]]) -> list[Economy]:
+def measure_savings(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence[Outcome]]) -> list[Savings]:
     """The agent against each of the others.
 
     Raises:
@@ -73,11 +73,11 @@ def economy(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence[Outcome
         same = [mine == other for _, mine, other in both]
         agreed, mine_right, its_right = (sum(decisions) / len(both) for decisions in (same, right, other_right))
         paired = paired_difference(other_right, right)
-        comparisons.append(Economy(ARMS[name], len(both), saved, agreed, mine_right, its_right, paired))
+        comparisons.append(Savings(ARMS[name], len(both), saved, agreed, mine_right, its_right, paired))
     return comparisons
 
 
-def economy_table(rows: Sequence[Economy], caption: str) -> Table:
+def savings_table(rows: Sequence[Savings], caption: str) -> Table:
     table = Table(title="saved by the agent, and what it costs in agreement", caption=caption)
     table.add_column("against")
     for name in ("n", *MEASURES, "same decision", "accuracy", "other's", "difference (95 %)"):

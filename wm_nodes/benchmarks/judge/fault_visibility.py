@@ -40,12 +40,12 @@ def changed_px(folder: Path, row: ManifestRow) -> int:
 def visibility(sets: Sets, part: Part) -> dict[Kind, list[int]]:
     """changed_px of every clip, by severity and recipe; several edits, and other recipes, are left out."""
     counts: dict[Kind, list[int]] = defaultdict(list)
-    for folder, row in tqdm(list(_chosen(sets, part)), desc="compared", unit="clip"):
+    for folder, row in tqdm(list(_select_clips(sets, part)), desc="compared", unit="clip"):
         counts[row.edits[0].severity, row.edits[0].recipe].append(changed_px(folder, row))
     return dict(sorted(counts.items()))
 
 
-def _chosen(sets: Sets, part: Part) -> Iterator[tuple[Path, ManifestRow]]:
+def _select_clips(sets: Sets, part: Part) -> Iterator[tuple[Path, ManifestRow]]:
     for folder, manifest in sets:
         for row in rows_of(manifest, [part]):
             if len(row.edits) == 1 and RECIPES[row.edits[0].recipe].kind == "S":

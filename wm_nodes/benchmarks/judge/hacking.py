@@ -142,7 +142,7 @@ async def climb(
     search = Climb([best], [true_value(chain)], math.nan if clean is None else clean)
     for generation in range(plan.generations):
         rng = numpy_stream(seed, f"hack_search/{start.clip.sha256}/{generation}")
-        for child in _children(chain, plan, rng) if len(search.edits) < plan.max_edits else []:
+        for child in _make_children(chain, plan, rng) if len(search.edits) < plan.max_edits else []:
             value = await proxy(child, start.task)
             on_clip()
             if value is not None and value > best:
@@ -154,7 +154,7 @@ async def climb(
     return search
 
 
-def _children(chain: Sequence[LabelledClip], plan: SearchPlan, rng: np.random.Generator) -> list[LabelledClip]:
+def _make_children(chain: Sequence[LabelledClip], plan: SearchPlan, rng: np.random.Generator) -> list[LabelledClip]:
     children: list[LabelledClip] = []
     for _ in range(4 * plan.candidates):
         if len(children) == plan.candidates:

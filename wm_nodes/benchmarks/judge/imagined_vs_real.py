@@ -64,7 +64,7 @@ class ImaginedAgreement:
     reward_failure: float
 
 
-def ends(episodes: EpisodeArrays, task: str) -> tuple[NDArray[np.int64], BoolArray]:
+def episode_ends(episodes: EpisodeArrays, task: str) -> tuple[NDArray[np.int64], BoolArray]:
     """(last frame, succeeded) of each episode, int64 and bool (E,): the first frame of success, else the last one."""
     won = episodes.success[:, 1:, episodes.tasks.index(task)] & episodes.step_mask
     succeeded = won.any(1)
@@ -108,7 +108,7 @@ def agreement(kind: str, verdicts: Sequence[Verdict], succeeded: BoolArray) -> I
     )
 
 
-async def _judged(agent: RewardAgent, asked: Sequence[ClipJob]) -> list[Verdict]:
+async def _judge_clips(agent: RewardAgent, asked: Sequence[ClipJob]) -> list[Verdict]:
     return [await agent.evaluate(job.clip, job.task) for job in tqdm(asked, desc="judged", unit="clip")]
 
 
@@ -119,12 +119,12 @@ def _measure(arguments: argparse.Namespace) -> dict[str, object]:
     bags = collect_plan(scripted_plan(config, arguments.episodes, FIRST_SEED), config, arguments.folder)
     episodes = load_arrays(bags, config)
     imagined = imagine_episodes(models.tokenizer, models.action, episodes)
-    last, succeeded = ends(episodes, config.task)
+    last, succeeded = episode_ends(episodes, config.task)
     rubric = load_rubric(config.judge.rubric)
     opened = make_judge(episode_judge(config), rubric)
     agent = RewardAgent(opened.judge, rubric, seed=config.seed)
     asked = list(jobs(episodes, imagined, config, last))
-    verdicts = asyncio.run(_judged(agent, [job for _, job in asked]))
+    verdicts = asyncio.run(_judge_clips(agent, [job for _, job in asked]))
     signal = imagined.signals[..., models.task_index(config.task)]
     strongest = np.array([signal[e, :end].max() for e, end in enumerate(last)])
     fired = strongest > config.reward.success_threshold

@@ -170,7 +170,7 @@ def statuses(outcomes: Sequence[Outcome]) -> dict[str, int]:
     return dict(Counter(outcome.status for outcome in outcomes))
 
 
-def missed(agreements: Sequence[LabelAgreement], targets: Mapping[str, float] = PAPER) -> list[str]:
+def missed_targets(agreements: Sequence[LabelAgreement], targets: Mapping[str, float] = PAPER) -> list[str]:
     """The rows below their figure in the paper, in words; and "overall", where its balanced accuracy is too low."""
     below = [
         f"{row.name} {100 * row.accuracy:.1f} < {targets[row.name]:.0f}"
@@ -193,7 +193,7 @@ def missed_patterns(rows: Sequence[PatternRow]) -> list[str]:
     ]
 
 
-def worst(confusions: Sequence[tuple[str, str]], count: int = 6) -> list[tuple[str, int]]:
+def most_frequent(confusions: Sequence[tuple[str, str]], count: int = 6) -> list[tuple[str, int]]:
     """Which recipe makes a row wrong most often: (row, recipe) pairs counted."""
     return [(f"{name}: {recipe}", times) for (name, recipe), times in Counter(confusions).most_common(count)]
 

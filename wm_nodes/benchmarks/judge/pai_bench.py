@@ -71,7 +71,7 @@ async def domain(arguments: argparse.Namespace, videos: Sequence[Path]) -> tuple
     if not asked:
         raise ValueError(f"no question of {arguments.questions} is about a video of {arguments.videos}")
     transport = ChatTransport([Endpoint(url, arguments.model, arguments.api_key_env) for url in arguments.url])
-    answers: list[pai.Answered] = []
+    answers: list[pai.AnsweredQuestion] = []
     try:
         judge, clip = ChatComparison(transport, seed=arguments.seed), None
         for question in tqdm(asked, "domain"):
@@ -109,7 +109,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE")
     arguments = parser.parse_args(argv)
     try:
-        results = _measured(arguments)
+        results = _measure(arguments)
     except (ValueError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -124,7 +124,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
+def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     videos = sorted(arguments.videos.glob("*.mp4"))
     if not videos:
         raise ValueError(f"{arguments.videos} holds no .mp4")

@@ -16,7 +16,7 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.types import Capabilities
 from wm_nodes.judge.dataset.edits import Manifest
 
-LEDGER = "test_ledger.jsonl"
+LOG_NAME = "test_ledger.jsonl"
 PUBLISHED = Path(__file__).with_name("published_evaluations.json")
 
 
@@ -52,11 +52,11 @@ def read_evaluations(folder: Path) -> list[TestSplitEvaluation]:
         ValueError: a line that no ledger has; it is not to be edited.
     """
     published = [TestSplitEvaluation(**entry) for entry in json.loads(PUBLISHED.read_text())]
-    return [*published, *(entry for entry in _beside(folder) if entry not in published)]
+    return [*published, *(entry for entry in _read_log(folder) if entry not in published)]
 
 
-def _beside(folder: Path) -> list[TestSplitEvaluation]:
-    path = folder / LEDGER
+def _read_log(folder: Path) -> list[TestSplitEvaluation]:
+    path = folder / LOG_NAME
     if not path.is_file():
         return []
     try:
@@ -80,11 +80,11 @@ def record_evaluation(
         return others
     if others and not reason:
         raise ValueError(
-            f"the test split of {folder} was already seen by {_named(others[-1])}: choose on --part validation, or say "
-            "with --again REASON why the test split is read once more; the reason is printed with the table"
+            f"the test split of {folder} was already seen by {_describe(others[-1])}: choose on --part validation, or "
+            "say with --again REASON why the test split is read once more; the reason is printed with the table"
         )
-    lines = [json.dumps(asdict(entry), sort_keys=True) + "\n" for entry in [*_beside(folder), now]]
-    write_atomic(folder / LEDGER, "".join(lines).encode())
+    lines = [json.dumps(asdict(entry), sort_keys=True) + "\n" for entry in [*_read_log(folder), now]]
+    write_atomic(folder / LOG_NAME, "".join(lines).encode())
     return others
 
 
@@ -93,10 +93,10 @@ def notice(others: Sequence[TestSplitEvaluation], reason: str) -> str:
     if not others:
         return ""
     return (
-        f"NOT A FIRST LOOK: the test split was seen before by {'; '.join(map(_named, others))}. "
+        f"NOT A FIRST LOOK: the test split was seen before by {'; '.join(map(_describe, others))}. "
         f"Reason given now: {reason or 'none, this judge and rubric had looked before'}"
     )
 
 
-def _named(entry: TestSplitEvaluation) -> str:
+def _describe(entry: TestSplitEvaluation) -> str:
     return f"{entry.judge} with rubric {entry.rubric} on {entry.date}" + (f" ({entry.reason})" if entry.reason else "")

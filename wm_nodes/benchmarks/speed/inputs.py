@@ -97,15 +97,15 @@ def interleave(contenders: Sequence[Callable[[int], T]], blocks: int) -> list[li
 def time_episode(env: Environment, block: int) -> NDArray[np.float64]:
     """Seconds of each step of one episode; the reset is not counted."""
     env.reset(None, seeds_of(env.spec, block))
-    return _timed(env, actions_of(env.spec, block, env.spec.max_episode_steps))
+    return _time_actions(env, actions_of(env.spec, block, env.spec.max_episode_steps))
 
 
 def time_steps(env: Environment, steps: int) -> NDArray[np.float64]:
     env.reset(None, seeds_of(env.spec, 0))
-    return _timed(env, actions_of(env.spec, 0, steps))
+    return _time_actions(env, actions_of(env.spec, 0, steps))
 
 
-def _timed(env: Environment, actions: Iterator[FloatArray]) -> NDArray[np.float64]:
+def _time_actions(env: Environment, actions: Iterator[FloatArray]) -> NDArray[np.float64]:
     seconds = []
     for action in actions:
         start = time.perf_counter()

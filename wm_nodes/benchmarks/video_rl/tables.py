@@ -119,11 +119,12 @@ def comparison_table(comparisons: Sequence[SamplerComparison]) -> Table:
         ("arm", "base"), ("seeds", *measures),
     )
     for row in comparisons:
-        table.add_row(row.arm, row.base, str(len(row.seeds)), *(_shown(row.differences[name]) for name in measures))
+        texts = (_difference_text(row.differences[name]) for name in measures)
+        table.add_row(row.arm, row.base, str(len(row.seeds)), *texts)
     return table
 
 
-def _shown(difference: Difference) -> str:
+def _difference_text(difference: Difference) -> str:
     star = "*" if difference.separable else ""
     return f"{difference.mean:+.4f} ({difference.low:+.4f}, {difference.high:+.4f}){star}"
 

@@ -112,19 +112,19 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
     spec = _scene(config)
     if trains:
         check_horizon(config.ppo.num_steps, spec.max_episode_steps)
-    check_clips(config.judge, _longest(spec))
+    check_clips(config.judge, _longest_clip(spec))
 
 
 def episode_judge(config: RunConfig) -> JudgeConfig:
     """The judge's settings for episodes of the configured scene, see judge_or_embedded and for_clips."""
-    return for_clips(judge_or_embedded(config.judge), _longest(_scene(config)))
+    return for_clips(judge_or_embedded(config.judge), _longest_clip(_scene(config)))
 
 
 def _scene(config: RunConfig) -> EnvironmentSpec:
     return simulation_spec(config.task, "", config.simulation, 1)
 
 
-def _longest(spec: EnvironmentSpec) -> tuple[int, ...]:
+def _longest_clip(spec: EnvironmentSpec) -> tuple[int, ...]:
     """Shape of the longest episode as a clip."""
     return (spec.max_episode_steps + 1, spec.height, spec.width, spec.channels)
 
@@ -156,7 +156,7 @@ def check_horizon(num_steps: int, max_episode_steps: int) -> None:
         )
 
 
-def unjudged(rollout: Rollout) -> str:
+def unjudged_reason(rollout: Rollout) -> str:
     """Why training must pause before a rollout that the agent judged: none of its episodes ended, or more than
     MAX_INVALID_SHARE of them without a reward, so that nobody knows what their steps were worth; "" where it may go on.
     """
@@ -207,13 +207,13 @@ class EpisodeReward:
         """Take the next lock-step of a session of the environment."""
         waited: dict[int, Future[Verdict] | str] = {}
         for n in map(int, np.flatnonzero(step.valid)):
-            episode = self._extended(n, step)
+            episode = self._extend(n, step)
             if step.ended[n]:
                 del self._open[n]
                 waited[n] = episode.fault or self._judge.submit(self._job(episode, spec, session))
         return PendingReward(step.valid, waited)
 
-    def _extended(self, n: int, step: EpisodeStep) -> _Episode:
+    def _extend(self, n: int, step: EpisodeStep) -> _Episode:
         """The episode of environment n with this step."""
         episode, episode_id = self._open.get(n), int(step.episode_ids[n])
         if episode is None or episode.episode_id != episode_id:

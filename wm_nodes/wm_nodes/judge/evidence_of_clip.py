@@ -50,31 +50,31 @@ class ClipEvidence:
                 "folder in model_dir, or take another rubric"
             )
         if asked:
-            self._loaded()
+            self._load()
 
-    def of(self, rubric: Rubric, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
-        """What the rubric's bands name, of one clip; NaN, which lies in no band, where it cannot be measured."""
+    def measure(self, rubric: Rubric, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
+        """Measure the evidence of one clip that the rubric's bands name; NaN, outside every band, where impossible."""
         evidence = dict.fromkeys(rubric.evidence, math.nan)
         with self._one_at_a_time:
             if evidence.keys() & pixel_names():
-                evidence |= self._pixels(clip, task)
+                evidence |= self._measure_pixels(clip, task)
             if evidence.keys() & set(MODEL_EVIDENCE):
-                evidence |= self._model(clip, task)
+                evidence |= self._measure_model(clip, task)
         return {name: evidence[name] for name in rubric.evidence}
 
-    def _pixels(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
+    def _measure_pixels(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
         try:
             return pixel_evidence(pictures_of(clip.frames, task.reference_frame))
         except ValueError:  # of another shape than its reference frame, or no pictures: the agent says so
             return {}
 
-    def _model(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
+    def _measure_model(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
         try:
-            return model_evidence(self._loaded(), clip.frames, task)
+            return model_evidence(self._load(), clip.frames, task)
         except (ValueError, ModelFolderError):  # of other cameras, another task, or without its actions
             return {}
 
-    def _loaded(self) -> WorldModels:
+    def _load(self) -> WorldModels:
         assert self._model_dir is not None  # check refuses such bands
         if self._models is None:
             self._models = load_model_folder(self._model_dir)

@@ -22,7 +22,7 @@ from torch import Tensor
 from wm_nodes.config.schema import AGENT, JudgeConfig
 from wm_nodes.judge.agent import ClipRef, RewardAgent, Rubric, Status, TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
-from wm_nodes.judge.agent.scoring import skipped
+from wm_nodes.judge.agent.scoring import skipped_stage
 from wm_nodes.judge.agent.types import GATED, Cost, Health, Provenance, content_hash
 from wm_nodes.judge.audit import AuditedAgent, AuditLog, write_exchange
 from wm_nodes.judge.backends.factory import OpenedJudge, check_judge, judges_of, make_judge
@@ -133,18 +133,18 @@ class JudgeService:
         self._evidence = evidence or ClipEvidence()
         self._log = None if audit is None else AuditLog(audit)
         self.pack, self.tally, self.health = settings.rubric, VerdictCounts(), Health(True, "not asked yet")
-        self._seats = self._made(load_rubric(settings.rubric))
-        self.fallen_back, self._used = "", self._seats[0]
-        self._places = asyncio.Semaphore(settings.concurrency)
-        self._asked_s = -math.inf
-        self._asking: Future[None] | None = None
+        self._slots = self._make_slots(load_rubric(settings.rubric))
+        self.fallen_back, self._used = "", self._slots[0]
+        self._semaphore = asyncio.Semaphore(settings.concurrency)
+        self._health_asked_s = -math.inf
+        self._health_request: Future[None] | None = None
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="reward agent", daemon=True)
         self._thread.start()
 
     @property
     def rubric(self) -> Rubric:
-        return self._seats[0].agent.rubric
+        return self._slots[0].agent.rubric
 
     @property
     def judge_id(self) -> str:
@@ -154,12 +154,12 @@ class JudgeService:
     @property
     def judge_ids(self) -> list[str]:
         """Of all judges, in the order in which they are tried."""
-        return [seat.judge_id for seat in self._seats]
+        return [slot.judge_id for slot in self._slots]
 
     @property
     def cards(self) -> list[str]:
         """What the judges were measured to see, in words; those of whom nobody knows say nothing."""
-        return [card for seat in self._seats if (card := seat.agent.judge.capabilities.card)]
+        return [card for slot in self._slots if (card := slot.agent.judge.capabilities.card)]
 
     def set_rubric(self, pack: str, base: Path) -> None:
         """Judge by another rubric from now on; call it while nothing is being judged.
@@ -174,14 +174,14 @@ class JudgeService:
         """
         path = base / pack
         rubric = load_rubric(str(path) if path.is_file() else pack)
-        old, self._seats = self._seats, self._made(rubric)
-        self.pack, self.fallen_back, self._used = pack, "", self._seats[0]
-        for seat in old:
-            self._run(seat.opened.close())
+        old, self._slots = self._slots, self._make_slots(rubric)
+        self.pack, self.fallen_back, self._used = pack, "", self._slots[0]
+        for slot in old:
+            self._run(slot.opened.close())
 
     def submit(self, job: ClipJob, deadline: float | None = None) -> "Future[Verdict]":
         """Have the first judge judge a clip as soon as there is a place. deadline: on the time.monotonic clock, s."""
-        return self._run(self._judged(self._seats[0].agent, job, deadline))
+        return self._run(self._judge_clip(self._slots[0].agent, job, deadline))
 
     def judge(
         self, jobs: Sequence[ClipJob], *, check: Callable[[], None] = lambda: None,
@@ -204,38 +204,38 @@ class JudgeService:
         Raises:
             ValueError: there is no judge of this id.
         """
-        seats = [seat for seat in self._seats if by in ("", seat.judge_id)]
-        if not seats:
+        slots = [slot for slot in self._slots if by in ("", slot.judge_id)]
+        if not slots:
             raise ValueError(f"there is no judge {by!r} to ask, only {', '.join(self.judge_ids)}")
         deadline = None if within_s is None else time.monotonic() + within_s
         lost = list[str]()
-        for seat in seats:
-            if isinstance(seat.agent, AuditedAgent):
-                seat.agent.round_number = round_number
+        for slot in slots:
+            if isinstance(slot.agent, AuditedAgent):
+                slot.agent.round_number = round_number
             verdicts_by_index = dict[int, Verdict]()
-            patience = _FallbackBudget(len(jobs), deadline) if seat is not seats[-1] else None
-            on_verdict = done if patience is None else verdicts_by_index.__setitem__
+            budget = _FallbackBudget(len(jobs), deadline) if slot is not slots[-1] else None
+            on_verdict = done if budget is None else verdicts_by_index.__setitem__
             ahead = (
-                1 if seat.failed_last_round and patience is not None else 0
+                1 if slot.failed_last_round and budget is not None else 0
             )  # is it back? One clip, so that a breaker can close
-            verdicts = self._round(seat, jobs[:ahead], 0, deadline, check, on_verdict, patience)
-            verdicts += self._round(seat, jobs[ahead:], ahead, deadline, check, on_verdict, patience)
-            seat.failed_last_round = patience is not None and patience.over
-            if patience is None or not patience.over:
+            verdicts = self._round(slot, jobs[:ahead], 0, deadline, check, on_verdict, budget)
+            verdicts += self._round(slot, jobs[ahead:], ahead, deadline, check, on_verdict, budget)
+            slot.failed_last_round = budget is not None and budget.over
+            if budget is None or not budget.over:
                 break
-            lost.append(f"{seat.judge_id} did not answer: {patience.reason}")
+            lost.append(f"{slot.judge_id} did not answer: {budget.reason}")
         for index, verdict in verdicts_by_index.items():
             done(index, verdict)
-        self._used = seat
-        self.fallen_back = f"{'; '.join(lost)}; the round went to {seat.judge_id}" if lost else ""
+        self._used = slot
+        self.fallen_back = f"{'; '.join(lost)}; the round went to {slot.judge_id}" if lost else ""
         return verdicts
 
     def refresh_health(self) -> None:
         """Ask the judge how it is, at most every HEALTH_S and without waiting: `health` is the newest answer."""
-        idle = self._asking is None or self._asking.done()
-        if idle and not self._loop.is_closed() and time.monotonic() - self._asked_s >= HEALTH_S:
-            self._asked_s = time.monotonic()
-            self._asking = self._run(self._ask_health(self._seats[0]))
+        idle = self._health_request is None or self._health_request.done()
+        if idle and not self._loop.is_closed() and time.monotonic() - self._health_asked_s >= HEALTH_S:
+            self._health_asked_s = time.monotonic()
+            self._health_request = self._run(self._ask_health(self._slots[0]))
 
     def close(self) -> None:
         """Drop what is under way and end the thread."""
@@ -249,12 +249,12 @@ class JudgeService:
 
     # internals
 
-    def _made(self, rubric: Rubric) -> list[_JudgeSlot]:
+    def _make_slots(self, rubric: Rubric) -> list[_JudgeSlot]:
         check_judge(self.settings)
         self._evidence.check(rubric)
-        return [self._seat(settings, rubric) for settings in judges_of(self.settings)]
+        return [self._make_slot(settings, rubric) for settings in judges_of(self.settings)]
 
-    def _seat(self, settings: JudgeConfig, rubric: Rubric) -> _JudgeSlot:
+    def _make_slot(self, settings: JudgeConfig, rubric: Rubric) -> _JudgeSlot:
         log = self._log
         limits: dict[str, Any] = {
             "mode": settings.mode, "seed": self._seed, "max_reads": settings.max_reads,
@@ -267,22 +267,23 @@ class JudgeService:
         return _JudgeSlot(opened, AuditedAgent(opened.judge, rubric, log, **limits))
 
     def _round(
-        self, seat: _JudgeSlot, jobs: Sequence[ClipJob], first: int, deadline: float | None, check: Callable[[], None],
-        done: Callable[[int, Verdict], None], patience: "_FallbackBudget | None",
+        self, slot: _JudgeSlot, jobs: Sequence[ClipJob], first: int, deadline: float | None, check: Callable[[], None],
+        done: Callable[[int, Verdict], None], budget: "_FallbackBudget | None",
     ) -> list[Verdict]:
         """The verdicts of one judge; fewer where patience with it is over. first: index of the first job."""
-        if patience is not None and patience.over:
+        if budget is not None and budget.over:
             return []
-        futures = {self._run(self._judged(seat.agent, job, deadline)): first + index for index, job in enumerate(jobs)}
+        work = (self._judge_clip(slot.agent, job, deadline) for job in jobs)
+        futures = {self._run(each): index for index, each in enumerate(work, first)}
         open_ = set(futures)
         try:
-            while open_ and not (patience is not None and patience.over):
+            while open_ and not (budget is not None and budget.over):
                 check()
                 finished, open_ = wait(open_, POLL_S, FIRST_COMPLETED)
                 for future in finished:
                     done(futures[future], future.result())
-                    if patience is not None:
-                        patience.record(future.result(), alone=len(jobs) == 1)
+                    if budget is not None:
+                        budget.record(future.result(), alone=len(jobs) == 1)
         finally:
             for future in open_:
                 future.cancel()
@@ -291,36 +292,37 @@ class JudgeService:
     def _run(self, work: Coroutine[Any, Any, T]) -> "Future[T]":
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
-    async def _judged(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
+    async def _judge_clip(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
         left_s = None if deadline is None else deadline - time.monotonic()
         try:
-            async with asyncio.timeout(left_s), self._places:
+            async with asyncio.timeout(left_s), self._semaphore:
                 bands = agent.rubric.evidence
-                evidence = await asyncio.to_thread(self._evidence.of, agent.rubric, job.clip, job.task) if bands else {}
+                measure = partial(self._evidence.measure, agent.rubric, job.clip, job.task)
+                evidence = await asyncio.to_thread(measure) if bands else {}
                 verdict = await agent.evaluate(job.clip, job.task, evidence)
         except TimeoutError:
-            verdict = _late(agent, job, self._seed)
+            verdict = _late_verdict(agent, job, self._seed)
         self.tally.add(verdict)
         return verdict
 
-    async def _ask_health(self, seat: _JudgeSlot) -> None:
-        self.health = await seat.opened.judge.health()
+    async def _ask_health(self, slot: _JudgeSlot) -> None:
+        self.health = await slot.opened.judge.health()
 
     async def _end(self) -> None:
         others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
         for task in others:
             task.cancel()
         await asyncio.gather(*others, return_exceptions=True)
-        for seat in self._seats:
-            await seat.opened.close()
+        for slot in self._slots:
+            await slot.opened.close()
 
 
-def _late(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict:
+def _late_verdict(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict:
     """The verdict on a clip that the round did not wait for."""
     able, now = agent.judge.capabilities, time.time()
     verdict = Verdict(
         clip_id=job.clip.clip_id, status=Status.ERROR, reward=math.nan, level=-1,
-        stages=tuple(map(skipped, GATED)), plan=None, reflections=(), hack_flags=(), cost=Cost(),
+        stages=tuple(map(skipped_stage, GATED)), plan=None, reflections=(), hack_flags=(), cost=Cost(),
         provenance=Provenance(
             able.judge_id, able.transport, able.model, able.server_version, agent.rubric.version, "", job.clip.sha256,
             seed, now, now,

@@ -62,7 +62,7 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     if values.get("starts_file") == "":
         values["starts_file"] = str(Path(values["model_dir"]) / "starts.safetensors")
     if values["params_file"]:
-        values["params_file"] = _existing(values["params_file"], "params_file")
+        values["params_file"] = _check_file(values["params_file"], "params_file")
     if "bag_uri" in values:
         values["bag_uri"] = _bag_uri(values["bag_uri"], scenario, run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
@@ -146,7 +146,7 @@ def _model_dir(given: str, task: str) -> str:
         raise GraphError(str(error)) from None
 
 
-def _existing(given: str, name: str) -> str:
+def _check_file(given: str, name: str) -> str:
     path = Path(given).expanduser().absolute()
     if not path.is_file():
         raise GraphError(f"{name} {given!r} does not exist")

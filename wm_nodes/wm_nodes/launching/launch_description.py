@@ -16,7 +16,7 @@ from wm_nodes.launching.environment import graph_environment, interpreter
 from wm_nodes.launching.graph import Graph, NodeSpec
 from wm_nodes.launching.scenarios import argument_table
 
-HELD: list[DomainLock] = []
+LOCKS: list[DomainLock] = []
 """Of the graphs that this process launched, until it ends: ros2 launch runs nothing of ours at its own end."""
 
 
@@ -55,15 +55,15 @@ def _start(scenario: str, context: Any) -> list[Any]:
         argument.name: LaunchConfiguration(argument.name).perform(context) for argument in argument_table(scenario)
     }
     python = interpreter(given)
-    graph = prepared(scenario, given, python)
+    graph = prepare_graph(scenario, given, python)
     domain = int(graph_environment(graph.environment, python=python)["ROS_DOMAIN_ID"])
     lock = DomainLock(domain, f"graph {graph.name!r}")
     lock.acquire()
-    HELD.append(lock)
+    LOCKS.append(lock)
     return node_actions(graph, python)
 
 
-def prepared(scenario: str, given: Mapping[str, str], python: str) -> Graph:
+def prepare_graph(scenario: str, given: Mapping[str, str], python: str) -> Graph:
     """ros.arguments.prepare in the nodes' interpreter.
 
     Raises:

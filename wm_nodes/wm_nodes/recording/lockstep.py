@@ -120,7 +120,7 @@ class LockSteps:
             if topic is topics.TRANSITION:
                 if self._last_seq is not None and self._last_seq[0] != message.session:
                     while pending:
-                        yield self._joined(pending.popleft())
+                        yield self._join_step(pending.popleft())
                     self._forget_images(time_ns)
                 self._check_transition(message)
                 self._last_transition_ns = time_ns
@@ -135,9 +135,9 @@ class LockSteps:
             else:
                 self._keep_event(message)
             while pending and (len(pending) > MAX_LAG or self._is_complete(pending[0])):
-                yield self._joined(pending.popleft())
+                yield self._join_step(pending.popleft())
         while pending:
-            yield self._joined(pending.popleft())
+            yield self._join_step(pending.popleft())
 
     def _untile(self, message: Any) -> UInt8Array:
         mosaic = mosaic_of(message, self.spec, self.tiles, where=str(self.bag.path))
@@ -197,7 +197,7 @@ class LockSteps:
         expects_reward = self._counts[topics.REWARD] > 0 and message.valid.any()
         return not expects_reward or _reward_key(message) in self._rewards
 
-    def _joined(self, message: Any) -> RecordedStep:
+    def _join_step(self, message: Any) -> RecordedStep:
         spec = self.spec
         num_envs = spec.num_envs
         now_ns, next_ns = stamp_ns(message.header.stamp), stamp_ns(message.next_stamp)

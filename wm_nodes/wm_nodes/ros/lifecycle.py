@@ -163,7 +163,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             if self._active or while_inactive:
                 callback(message)
             if grantor is not None:
-                grantor.consumed(tracker)
+                grantor.record_consumed(tracker)
 
         subscription = self.create_subscription(row.type, row.name, observe, row.reader_qos)
         self._entities.append(lambda: self.destroy_subscription(subscription))
@@ -201,7 +201,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.failed = True
         return not self.failed
 
-    def settled(self, stop_s: float) -> bool:
+    def is_settled(self, stop_s: float) -> bool:
         """Whether all that was sent to this node before the stop, at time.monotonic() `stop_s`, has been taken."""
         return True
 
@@ -304,7 +304,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         """
         if message.state not in (RunState.IDLE, RunState.RUNNING) or message.detail == self._identity or self.failed:
             return
-        if _since(message.detail) < _since(self._identity):
+        if _start_time(message.detail) < _start_time(self._identity):
             self.failed = True
             self.get_logger().error(
                 f"another {message.node} is there already ({message.detail}): stop it, or give this one another "
@@ -351,7 +351,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             return
 
 
-def _since(identity: str) -> float:
+def _start_time(identity: str) -> float:
     """When a process of this name began, in s since 1970; never, where another program wrote the heartbeat."""
     _, separator, text = identity.rpartition(" since ")
     try:

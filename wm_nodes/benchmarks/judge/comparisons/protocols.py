@@ -145,7 +145,7 @@ def read_flex(text: str) -> tuple[float, Parts]:
     Raises:
         AnswerError: not that JSON, points that do not sum to 10, or a winner whom the points contradict.
     """
-    answer = _parsed(_Flex, text)
+    answer = _parse(_Flex, text)
     shares: dict[str, float] = {}
     points: list[float] = []
     for category in answer.categories:
@@ -162,10 +162,10 @@ def read_flex(text: str) -> tuple[float, Parts]:
 
 
 def _reader(model: type[BaseModel]) -> Callable[[str], Parts]:
-    return lambda text: _parsed(model, text).model_dump()
+    return lambda text: _parse(model, text).model_dump()
 
 
-def _parsed(model: type[Any], text: str) -> Any:
+def _parse(model: type[Any], text: str) -> Any:
     try:
         return model.model_validate(json.loads(strip_reasoning(text)))
     except ValidationError as error:

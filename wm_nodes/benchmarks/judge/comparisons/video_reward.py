@@ -137,7 +137,7 @@ def to_patches(frames: Tensor, pictures: VideoPatches) -> tuple[Tensor, Tensor]:
     The last frame is repeated until the number of frames is a multiple of `temporal`.
     """
     patch, merge, pair = pictures.patch_px, pictures.merge, pictures.temporal
-    height, width = fitted(frames.shape[1], frames.shape[2], pictures)
+    height, width = fit_size(frames.shape[1], frames.shape[2], pictures)
     pixels = frames.permute(0, 3, 1, 2).float()
     pixels = F.interpolate(pixels, (height, width), mode="bicubic", antialias=True).round().clamp(0, 255) / 255
     mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (pictures.mean, pictures.std))
@@ -149,7 +149,7 @@ def to_patches(frames: Tensor, pictures: VideoPatches) -> tuple[Tensor, Tensor]:
     return parts.reshape(times * rows * columns, 3 * pair * patch * patch), torch.tensor([times, rows, columns])
 
 
-def fitted(height: int, width: int, pictures: VideoPatches) -> tuple[int, int]:
+def fit_size(height: int, width: int, pictures: VideoPatches) -> tuple[int, int]:
     """The size in px: multiples of patch x merge, nearest to the frame's, within the limits at its proportions."""
     unit = pictures.patch_px * pictures.merge
     rows, columns = (max(unit, round(side / unit) * unit) for side in (height, width))

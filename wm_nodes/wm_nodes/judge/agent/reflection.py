@@ -85,13 +85,13 @@ def suspects(reasons: Sequence[Trigger], stages: Sequence[StageScore], limit: in
     return tuple(dict.fromkeys([*named, *(score.component for score in doubtful)]))[:limit]
 
 
-def proposes(before: ComponentScore, second: Read, num_frames: int) -> bool:
+def proposes_change(before: ComponentScore, second: Read, num_frames: int) -> bool:
     """The second look changes something by half a level or more, and cites frames that exist."""
     cites = bool(second.frames_cited) and all(0 <= index < num_frames for index in second.frames_cited)
     return cites and abs(score([second], "").s - before.s) >= MIN_CHANGE
 
 
-def agreed(before: ComponentScore, second: Read, fresh: Read) -> bool:
+def is_confirmed(before: ComponentScore, second: Read, fresh: Read) -> bool:
     """The fresh read is on the second look's side of pass, and nearer to it than to what was before."""
     proposed, checked = score([second], ""), score([fresh], "")
     return checked.passed == proposed.passed and abs(checked.s - proposed.s) < abs(checked.s - before.s)

@@ -17,13 +17,13 @@ from tqdm import tqdm
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.audit.adoption import MARGIN, Registry, compare, decide
-from wm_nodes.judge.audit.agreement import joined, report, table
+from wm_nodes.judge.audit.agreement import join_labels, report, table
 from wm_nodes.judge.audit.entries import plain
 from wm_nodes.judge.audit.labels import load_all
 from wm_nodes.judge.audit.log import AuditError, AuditLog, recover
 from wm_nodes.judge.audit.people import HumanJudge
 from wm_nodes.judge.audit.reading import read_record, verify
-from wm_nodes.judge.audit.replay import judged_again, reaggregated, replayed
+from wm_nodes.judge.audit.replay import judge_again, reaggregate, replay_evaluation
 from wm_nodes.judge.audit.sampling import draw, read_sample, write_sample
 from wm_nodes.judge.audit.viewer import FILE_NAME, write_view
 
@@ -85,7 +85,7 @@ def _view(arguments: argparse.Namespace) -> int:
 
 def _agree(arguments: argparse.Namespace) -> int:
     samples = [read_sample(path) for path in arguments.sample]
-    judged = joined(read_record(arguments.log), load_all(arguments.labels), samples)
+    judged = join_labels(read_record(arguments.log), load_all(arguments.labels), samples)
     rounds = sorted({clip.evaluation.round_number for clip in judged})
     parts = [*rounds, None] if len(rounds) > 1 else rounds
     reports = [report(judged, number, weighted=bool(samples)) for number in parts]
@@ -101,10 +101,10 @@ def _agree(arguments: argparse.Namespace) -> int:
 
 def _people(arguments: argparse.Namespace) -> int:
     record, labels = read_record(arguments.log), load_all(arguments.labels)
-    chosen = [clip.evaluation for clip in joined(record, labels)]
+    chosen = [clip.evaluation for clip in join_labels(record, labels)]
     judge, progress = HumanJudge(labels), tqdm(chosen, desc="people", disable=None)
     with AuditLog(arguments.output) as log:
-        by_people = asyncio.run(judged_again(record, progress, lambda e: (judge, record.rubric(e)), log))
+        by_people = asyncio.run(judge_again(record, progress, lambda e: (judge, record.rubric(e)), log))
     pairs = [(e.verdict, new) for e, new in zip(chosen, by_people) if e.verdict is not None]
     both = [(old.clip_id, (old.reward, new.reward)) for old, new in pairs if old.valid and new.valid]
     rewards = [pair for _, pair in both]
@@ -129,11 +129,11 @@ def _replay(arguments: argparse.Namespace) -> int:
             raise AuditError("a replay under another rubric needs --output, the folder of its own log")
         rubric = load_rubric(arguments.rubric)
         with AuditLog(arguments.output) as log:
-            verdicts = asyncio.run(reaggregated(record, progress, rubric, log))
+            verdicts = asyncio.run(reaggregate(record, progress, rubric, log))
         open_ones = sum(not verdict.valid for verdict in verdicts)
         print(f"{len(verdicts)} verdicts under {rubric.version} in {arguments.output}, {open_ones} without a number")
         return OK
-    results = [asyncio.run(replayed(record, evaluation)) for evaluation in progress]
+    results = [asyncio.run(replay_evaluation(record, evaluation)) for evaluation in progress]
     for result in results:
         if result.after is not None and not result.equal:
             print(f"evaluation {result.evaluation.number} of {result.evaluation.clip_id}: another verdict now")

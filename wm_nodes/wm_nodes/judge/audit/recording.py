@@ -60,7 +60,7 @@ class AuditedAgent:
         Raises:
             OSError: it cannot be written down; then there is no verdict.
         """
-        evaluation = self._begun(clip, task, evidence or {})
+        evaluation = self._begin(clip, task, evidence or {})
         token = _EVALUATION.set(evaluation)
         try:
             verdict = await self._agent.evaluate(clip, task, evidence)
@@ -69,7 +69,7 @@ class AuditedAgent:
         self._log.append("verdict", {"evaluation": evaluation, "verdict": plain(verdict)}, sync=True)
         return verdict
 
-    def _begun(self, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> int:
+    def _begin(self, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> int:
         if clip.sha256 not in self._written:
             self._log.append("clip", clip_body(clip, self._store))
             self._written.add(clip.sha256)

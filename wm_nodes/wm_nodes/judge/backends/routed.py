@@ -36,7 +36,7 @@ class RoutedJudge:
         needed |= {stage: set(rubric.stages[stage].components) for stage in GATED}
         needed[Stage.HACK] = set(rubric.hack.patterns if rubric.hack.enabled else ())
         for stage, names in needed.items():
-            able = self._of(stage).capabilities
+            able = self._judge_of(stage).capabilities
             if able.components is not None and (blind := sorted(names - able.components)):
                 raise ValueError(f"{able.judge_id} does not read {', '.join(blind)}; route {stage} to another judge")
         self._components = frozenset[Component]().union(*needed.values())
@@ -62,10 +62,10 @@ class RoutedJudge:
             JudgeError: one of them could not answer at all.
         """
         if request.stage is not Stage.REFLECT:
-            return await self._of(request.stage).read(request)
+            return await self._judge_of(request.stage).read(request)
         parts: dict[int, tuple[Judge, list[Component]]] = {}
         for name in request.components:
-            judge = self._of(self._rubric.stage_of(name))
+            judge = self._judge_of(self._rubric.stage_of(name))
             parts.setdefault(id(judge), (judge, []))[1].append(name)
         reads: list[Read] = []
         for judge, names in parts.values():
@@ -85,5 +85,5 @@ class RoutedJudge:
             {**details, OPEN_BREAKERS: open_breakers},
         )
 
-    def _of(self, stage: Stage) -> Judge:
+    def _judge_of(self, stage: Stage) -> Judge:
         return self._routes.get(stage, self._judges[0][1])

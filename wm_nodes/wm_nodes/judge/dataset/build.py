@@ -37,7 +37,7 @@ from wm_nodes.core.types import UInt8Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.tasks import TASKS, get_task
 from wm_nodes.judge.agent.types import media_sha
-from wm_nodes.judge.dataset.domain_randomization import RandomizedScene, drawn_variation
+from wm_nodes.judge.dataset.domain_randomization import RandomizedScene, draw_scene
 from wm_nodes.judge.dataset.edits import (
     RECIPES,
     Division,
@@ -50,9 +50,9 @@ from wm_nodes.judge.dataset.edits import (
     StateEdit,
     children,
     from_bytes,
+    label_rendered,
     manifest_of,
     recorded,
-    rendered,
     stacks,
     to_bytes,
 )
@@ -138,7 +138,7 @@ class SetPlan:
         return list(itertools.islice(wanted, self.num_episodes))
 
     def part(self, task: str, seed: int) -> Part:
-        return _drawn_part(task, seed) if self.diverse else self.held_out.part(drawn_origin(task, seed, self.shapes))
+        return _part_of_seed(task, seed) if self.diverse else self.held_out.part(draw_origin(task, seed, self.shapes))
 
 
 BENCHMARK = SetPlan(
@@ -174,47 +174,47 @@ class ClipSource:
     def origin(self, seed: int) -> Origin:
         if self._policy is not None:
             return self._policy.origin(self._task, seed)
-        drawn = drawn_origin(self._task, seed, self._shapes)
-        return self._variation(seed).origin(self._task, seed, drawn.behaviour) if self._diverse else drawn
+        drawn = draw_origin(self._task, seed, self._shapes)
+        return self._draw_scene(seed).origin(self._task, seed, drawn.behaviour) if self._diverse else drawn
 
     def clip(self, seed: int) -> LabelledClip:
         """Record one episode and draw it."""
         origin = self.origin(seed)
         height = SHAPES[origin.object_id.split("/")[0]]
-        layout = self._variation(seed).look.layout if self._diverse else None
+        layout = self._draw_scene(seed).look.layout if self._diverse else None
         episode = record_states(self._env, origin.behaviour.split()[0], seed, layout)
         states = scene_states(episode, height)
         if self._policy is not None:
-            states = self._policy.ended(states, origin)
+            states = self._policy.end_states(states, origin)
             if origin.scene.startswith(IMAGINED):
-                drawing = self._policy.imagined(self.stage, states, episode)
+                drawing = self._policy.imagine(self.stage, states, episode)
                 if drawing is not None:
-                    return recorded(self._clip_of(drawing, states, origin))
-                origin = self._policy.decoded(origin)
-        return recorded(self._drawn(states, origin))
+                    return recorded(self._make_clip(drawing, states, origin))
+                origin = self._policy.mark_decoded(origin)
+        return recorded(self._draw(states, origin))
 
     def redraw(self, parent: LabelledClip, edit: StateEdit) -> LabelledClip:
-        return rendered(parent, edit, self._drawn(edit.states, parent.clip.origin))
+        return label_rendered(parent, edit, self._draw(edit.states, parent.clip.origin))
 
     def close(self) -> None:
         self._env.close()
         self.stage.close()
 
-    def _variation(self, seed: int) -> RandomizedScene:
-        return drawn_variation(self._task, seed, _drawn_part(self._task, seed))
+    def _draw_scene(self, seed: int) -> RandomizedScene:
+        return draw_scene(self._task, seed, _part_of_seed(self._task, seed))
 
-    def _drawn(self, states: SceneStates, origin: Origin) -> SourceClip:
+    def _draw(self, states: SceneStates, origin: Origin) -> SourceClip:
         if self._policy is not None:
-            drawing = self._policy.drawn(self.stage, states, origin)
+            drawing = self._policy.draw(self.stage, states, origin)
         else:
             camera, look = self._scenery(origin)
             sizes_m = states.half_sizes_m * states.scales
             drawing = self.stage.draw(
                 states.robot_q, states.poses, sizes_m, states.tool, states.goal, camera, look
             )
-        return self._clip_of(drawing, states, origin)
+        return self._make_clip(drawing, states, origin)
 
-    def _clip_of(self, drawing: Drawing, states: SceneStates, origin: Origin) -> SourceClip:
+    def _make_clip(self, drawing: Drawing, states: SceneStates, origin: Origin) -> SourceClip:
         return SourceClip(
             drawing.frames, drawing.masks, drawing.tracks, states, origin,
             instruction_of(origin), self._config.control_hz / (1 if self._policy is None else self._policy.stride),
@@ -222,18 +222,18 @@ class ClipSource:
 
     def _scenery(self, origin: Origin) -> tuple[str | View, SceneAppearance]:
         if self._diverse:
-            variation = self._variation(origin.seed)
+            variation = self._draw_scene(origin.seed)
             return variation.view, variation.look
         colour = origin.object_id.split("/")[1]
         return origin.camera, SceneAppearance(OBJECT_COLOURS[colour], TABLES[origin.scene], seed=origin.seed)
 
 
-def _drawn_part(task: str, seed: int) -> Part:
+def _part_of_seed(task: str, seed: int) -> Part:
     """Of an episode that has nothing of what is held out."""
     return HELD_OUT.part(Origin(task, "drawn", "cube/drawn", "drawn", seed))
 
 
-def drawn_origin(task: str, seed: int, shapes: Collection[str] = ()) -> Origin:
+def draw_origin(task: str, seed: int, shapes: Collection[str] = ()) -> Origin:
     """Behaviour, camera and colours of an episode, drawn by `seed`. shapes: see SetPlan."""
     rng = numpy_stream(seed, f"adversarial_origin/{task}")
     behaviours = BEHAVIOURS[task]
@@ -286,7 +286,7 @@ def build(
         raise FileExistsError(f"{folder / MANIFEST} is there already; take a new folder, or remove the old set")
     skipped: Counter[str] = Counter()
 
-    def kept() -> Iterator[LabelledClip]:
+    def make_clips() -> Iterator[LabelledClip]:
         for task in plan.tasks:
             source = ClipSource(task, config, plan.shapes, diverse=plan.diverse, policy=policy)
             try:
@@ -301,7 +301,7 @@ def build(
             finally:
                 source.close()
 
-    manifest = manifest_of(kept(), plan.held_out)
+    manifest = manifest_of(make_clips(), plan.held_out)
     write_atomic(folder / MANIFEST, to_bytes(manifest))
     return manifest, skipped
 

@@ -82,10 +82,10 @@ class PolicyCamera:
     def _scene(self, kind: str) -> str:
         return kind if kind == DRAWN else f"{kind} by {self.models.sha256[:12]}"
 
-    def ended(self, states: SceneStates, origin: Origin) -> SceneStates:
+    def end_states(self, states: SceneStates, origin: Origin) -> SceneStates:
         """The states of the frames of a clip, up to the end of its episode."""
         if self.stride > 1:
-            return _strided(states, self.stride)
+            return _take_every(states, self.stride)
         rng = numpy_stream(origin.seed, f"policy_view_end/{origin.task}")
         late, cut = int(rng.integers(2)), rng.random() < 0.5
         if not cut:
@@ -96,26 +96,26 @@ class PolicyCamera:
                 return states.at(np.arange(end + late))
         return states
 
-    def drawn(self, stage: ClipStage, states: SceneStates, origin: Origin) -> Drawing:
+    def draw(self, stage: ClipStage, states: SceneStates, origin: Origin) -> Drawing:
         """Draw an episode or an edit of it, decoded where it is not of the renderer's kind."""
-        drawing, pictures = self.pictures(stage, states)
+        drawing, pictures = self.render(stage, states)
         if origin.scene != DRAWN:
             tokenizer = self.models.tokenizer
             pictures[1:] = tokenizer.decode(tokenizer.encode(pictures[1:])).numpy()
-        return self._seen(drawing, pictures)
+        return self._crop(drawing, pictures)
 
-    def imagined(self, stage: ClipStage, states: SceneStates, episode: EpisodeStates) -> Drawing | None:
+    def imagine(self, stage: ClipStage, states: SceneStates, episode: EpisodeStates) -> Drawing | None:
         """What the world model makes of an episode's first picture and actions; None where that is another episode.
 
         Args:
-            states: of the clip's frames, as `ended` gives them.
+            states: of the clip's frames, as `end_states` gives them.
 
         Raises:
             ValueError: the model has no position probe.
         """
         if self.models.probe is None:
             raise ValueError("the world model has no position probe to compare with the recording; take the shipped")
-        drawing, pictures = self.pictures(stage, states)
+        drawing, pictures = self.render(stage, states)
         steps = (len(states) - 1) * self.stride
         imagined = imagine(
             self.models.tokenizer, self.models.action, pictures[:1], episode.actions[None, :steps],
@@ -126,9 +126,9 @@ class PolicyCamera:
         for name, columns in {"object": OBJECT, "tool": TOOL}.items():
             if np.linalg.norm((seen - real)[:, columns], axis=1).max() > NEAR_M[name]:
                 return None
-        return self._seen(drawing, np.concatenate([pictures[:1], frames]))
+        return self._crop(drawing, np.concatenate([pictures[:1], frames]))
 
-    def pictures(self, stage: ClipStage, states: SceneStates) -> tuple[Drawing, UInt8Array]:
+    def render(self, stage: ClipStage, states: SceneStates) -> tuple[Drawing, UInt8Array]:
         """The drawing of SEEN, and all cameras' pictures side by side, uint8 (T, H, W, 3)."""
         others = [name for name in self.config.cameras if name != SEEN]
         sizes_m = states.half_sizes_m * states.scales
@@ -136,18 +136,18 @@ class PolicyCamera:
         views = {SEEN: drawing.frames, **drawing.others}
         return drawing, np.concatenate([views[name] for name in self.config.cameras], axis=2)
 
-    def _seen(self, drawing: Drawing, pictures: UInt8Array) -> Drawing:
+    def _crop(self, drawing: Drawing, pictures: UInt8Array) -> Drawing:
         window = policy_window(self.config, self.side)
         tracks = {name: window.track(track) for name, track in drawing.tracks.items()}
         return replace(drawing, frames=window.pictures(pictures), masks=window.masks(drawing.masks), tracks=tracks)
 
-    def decoded(self, origin: Origin) -> Origin:
-        """Of an episode that is not imagined after all."""
+    def mark_decoded(self, origin: Origin) -> Origin:
+        """The origin of an episode whose imagined clip was refused: its pictures are decoded instead."""
         return replace(origin, scene=self._scene(DECODED))
 
 
-def _strided(states: SceneStates, stride: int) -> SceneStates:
-    """Every stride-th frame; touched is what was so at one of the frames since the one before."""
+def _take_every(states: SceneStates, stride: int) -> SceneStates:
+    """Every stride-th frame; contact is true where any frame since the one before had contact."""
     chosen = states.at(np.arange(0, len(states), stride))
     touched = states.contact[1 : (len(chosen) - 1) * stride + 1].reshape(-1, stride).any(1)
     return replace(chosen, contact=np.concatenate([states.contact[:1], touched]))

@@ -16,7 +16,7 @@ MIN_TEST_CLIPS = 400
 """Below this the intervals are too wide to claim anything."""
 
 
-def judged_clip(folder: Path, row: ManifestRow) -> tuple[ClipRef, TaskSpec]:
+def read_clip(folder: Path, row: ManifestRow) -> tuple[ClipRef, TaskSpec]:
     """A clip and what it should show. The reference image is the first frame of the recorded clip, as a video model
     would have been given it; actions are not told: most edits are none of the robot's.
 
@@ -31,7 +31,7 @@ def judged_clip(folder: Path, row: ManifestRow) -> tuple[ClipRef, TaskSpec]:
     )
 
 
-def chosen_rows(manifest: Manifest, part: Part, count: int | None = None) -> list[ManifestRow]:
+def select_rows(manifest: Manifest, part: Part, count: int | None = None) -> list[ManifestRow]:
     """The clips of a part in the order of their hashes, which is as good as drawn by lot; the first `count` of them.
 
     The test split of a set is chosen_rows(manifest, "test"): frozen by the manifest, the same on every machine.

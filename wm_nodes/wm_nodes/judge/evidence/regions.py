@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from wm_nodes.core.types import BoolArray, UInt8Array
 from wm_nodes.judge.evidence.objects import HUES_DEGREES
-from wm_nodes.judge.evidence.pictures import GRID, TURN, ClipPictures, shrunk
+from wm_nodes.judge.evidence.pictures import GRID, TURN, ClipPictures, shrink
 from wm_nodes.judge.evidence.quantiles import median, quantile
 from wm_nodes.judge.evidence.registration import registration_evidence
 from wm_nodes.judge.evidence.segmentation import CLUTTER, OBJECT, ROBOT, SCENE
@@ -31,7 +31,7 @@ def region_evidence(pictures: ClipPictures, masks: UInt8Array, instruction: str)
     """
     robot, thing = _means(pictures.colours, masks, (ROBOT, OBJECT))
     colours = [word for word in instruction.lower().split() if word in HUES_DEGREES]
-    scene = np.stack([shrunk(mask == SCENE, GRID) > 0.99 for mask in masks])
+    scene = np.stack([shrink(mask == SCENE, GRID) > 0.99 for mask in masks])
     return {
         **_scene(pictures, scene),
         **registration_evidence(pictures.greys, scene),
@@ -39,13 +39,13 @@ def region_evidence(pictures: ClipPictures, masks: UInt8Array, instruction: str)
         **_hue(thing),
         **_paint(thing, "object"),
         **_paint(robot, "robot"),
-        **_named(thing, colours),
+        **_named_hue(thing, colours),
         **_robot(masks == ROBOT),
-        "share_unsure": float((masks[1:] != _smoothed(masks[1:])).mean()),
+        "share_unsure": float((masks[1:] != _smooth(masks[1:])).mean()),
     }
 
 
-def _smoothed(masks: UInt8Array) -> UInt8Array:
+def _smooth(masks: UInt8Array) -> UInt8Array:
     """Each mask after a 3 x 3 median: speckles are where the segmentation is not sure."""
     return np.stack([cv2.medianBlur(mask, 3) for mask in masks])
 
@@ -53,7 +53,7 @@ def _smoothed(masks: UInt8Array) -> UInt8Array:
 def _scene(pictures: ClipPictures, open_cells: BoolArray) -> Numbers:
     """The scene where it is in view, in the clip and in the reference frame: colour, texture, things that are gone."""
     both = open_cells[1:] & open_cells[0]
-    detail = np.stack([shrunk(np.abs(cv2.Laplacian(grey, cv2.CV_16S)), GRID) for grey in pictures.greys])
+    detail = np.stack([shrink(np.abs(cv2.Laplacian(grey, cv2.CV_16S)), GRID) for grey in pictures.greys])
     away = pictures.away * both
     share = both.mean((1, 2)) + 1e-6
     mean = away.mean((1, 2)) / share
@@ -145,7 +145,7 @@ def _hue(means: Floats) -> Numbers:
     }
 
 
-def _named(means: Floats, colours: list[str]) -> Numbers:
+def _named_hue(means: Floats, colours: list[str]) -> Numbers:
     """Hue of the object against the one that the instruction names, degrees; 0 where it names none."""
     shown = means[1:][np.isfinite(means[1:, 0])]
     if not colours or not len(shown):

@@ -16,7 +16,7 @@ from wm_nodes.judge.agent.types import TaskSpec
 from wm_nodes.judge.dataset.build import clip_path, load_set
 from wm_nodes.judge.dataset.edits import Manifest, ManifestError
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
-from wm_nodes.judge.dataset.rows import judged_clip
+from wm_nodes.judge.dataset.rows import read_clip
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def set_clips(sets: Sequence[tuple[Path, Manifest]], parts: Sequence[Part]) -> I
     """
     for folder, manifest in sets:
         for row in rows_of(manifest, parts):
-            clip, task = judged_clip(folder, row)
+            clip, task = read_clip(folder, row)
             yield SetClip(row, clip.frames, _load_masks(folder, row.sha256), task)
 
 

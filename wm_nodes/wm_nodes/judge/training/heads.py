@@ -225,10 +225,15 @@ def _p_fail(questions: Mapping[str, tuple[HeadQuestion, ...]], target: str, exam
     return np.array([p_fail_of(levels_of(target, column)) for column in above.T])
 
 
-def measured(questions: Mapping[str, tuple[HeadQuestion, ...]], target: str, examples: Examples) -> dict[str, Any]:
-    """n, prevalence of fails, accuracy, balanced accuracy, AUROC and ECE of a target; of task completion's pass is
-    meant from "nearly" on; planning also says how often the likeliest level is the true one, and a hacking pattern
-    which share of it and of the other clips is flagged, and which could be at 5 % false flags.
+def measure_target(
+    questions: Mapping[str, tuple[HeadQuestion, ...]], target: str, examples: Examples
+) -> dict[str, Any]:
+    """Measure how well a target's questions agree with the labels.
+
+    Keys: n, fails (clips that fail), accuracy, balanced_accuracy, auroc, ece. Task completion passes from level 3
+    ("nearly") on. Targets of several levels also have level_accuracy: share of clips whose likeliest level is the true
+    one. Hacking patterns also have flagged and false_flags (shares of the clips with and without the pattern) and
+    recall_at_5, the recall at 5 % false flags.
     """
     levels = true_levels(target, examples.rows)
     known = levels != UNKNOWN

@@ -104,7 +104,7 @@ def bands_of(rows: Sequence[tuple[Row, bool]], tail: float) -> dict[str, dict[st
     return bands
 
 
-def outside(rows: Sequence[tuple[Row, bool]], rubric: Rubric) -> dict[str, int]:
+def count_outside(rows: Sequence[tuple[Row, bool]], rubric: Rubric) -> dict[str, int]:
     """Clips outside of each band, of those it is meant for, and under "any" outside of at least one."""
     counts = dict.fromkeys((*rubric.evidence, "any"), 0)
     for row, done in rows:
@@ -149,7 +149,7 @@ def main(argv: Sequence[str]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(f"{arguments.output}: rubric {rubric.version}; {len(rows)} clips, {len(checked)} to check")
-    counts = {"bands": outside(rows, rubric), "check": outside(checked, rubric)}
+    counts = {"bands": count_outside(rows, rubric), "check": count_outside(checked, rubric)}
     print(f"{'evidence':22} {'component':16} {'low':>9} {'high':>9} {'outside':>8} {'check':>6}")
     for name, band in rubric.evidence.items():
         numbers = f"{band.low:9.4g} {band.high:9.4g} {counts['bands'][name]:8} {counts['check'][name]:6}"

@@ -33,7 +33,7 @@ WHOLE_PICTURE = frozenset({
 """Recipes on pixels or time after which a mask still shows what can be seen."""
 
 
-def masks_hold(row: ManifestRow) -> bool:
+def has_true_masks(row: ManifestRow) -> bool:
     """Whether the masks of a clip say what is seen in it; in imagined ones things are near those places only."""
     return not row.origin.scene.startswith(IMAGINED) and all(
         edit.severity == "mild" or edit.recipe in WHOLE_PICTURE or RECIPES[edit.recipe].kind == "S"
@@ -45,7 +45,7 @@ def segmentation_data(clips: Iterable[SetClip], seed: int) -> tuple[UInt8Array, 
     """Return images (N, H, W, 3) and masks (N, H, W): FRAMES_PER_CLIP of each clip whose masks hold."""
     images, masks = [], []
     for clip in clips:
-        if masks_hold(clip.row):
+        if has_true_masks(clip.row):
             rng = numpy_stream(seed, f"segmenter_frames/{clip.row.sha256}")
             chosen = rng.choice(len(clip.frames), min(FRAMES_PER_CLIP, len(clip.frames)), replace=False)
             images.append(clip.frames[chosen])
@@ -69,7 +69,7 @@ def train_segmenter(
     steps = trange(num_steps, desc="segmenter", disable=not progress)
     for _ in steps:
         chosen = torch.randint(len(pictures), (BATCH,), generator=generator)
-        pixels, wanted = _varied(pictures[chosen].permute(0, 3, 1, 2).float() / 255, labels[chosen].long(), generator)
+        pixels, wanted = _augment(pictures[chosen].permute(0, 3, 1, 2).float() / 255, labels[chosen].long(), generator)
         loss = F.cross_entropy(model(pixels), wanted, weights)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -79,7 +79,7 @@ def train_segmenter(
     return model.eval().requires_grad_(False)
 
 
-def _varied(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _augment(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Other colours, light, sides and distances, so that shapes count: half of the pictures each, drawn evenly.
 
     Colours are turned about the grey axis by any angle; the light is 0.7 to 1.3; the picture is mirrored; and it is

@@ -74,17 +74,15 @@ def cross_fit(
         trained = np.flatnonzero(data.folds != fold)
         if not len(trained) or len(trained) == len(data.folds):
             raise ValueError(f"recordings of one parity of seeds only: {len(data.folds)} clips; build larger sets")
-        own = [
-            _kept_reader(folder, data, trained, epochs, stream_seed(seed, "reader", fold + FOLDS * number), progress)
-            for number in range(count)
-        ]
+        seeds = [stream_seed(seed, "reader", fold + FOLDS * number) for number in range(count)]
+        own = [_load_or_train_reader(folder, data, trained, epochs, each, progress) for each in seeds]
         for i in np.flatnonzero(data.folds == fold):
             log_odds[i] = list(readings(own, data.sequences[i]).values())
         readers += own
     return tuple(readers), log_odds
 
 
-def _kept_reader(
+def _load_or_train_reader(
     folder: Path, data: TemporalData, trained: Levels, epochs: int, seed: int, progress: bool
 ) -> TemporalNetwork:
     path = folder / f"reader-{_key(data, trained, epochs, seed)}.safetensors"
@@ -122,7 +120,7 @@ def train_temporal_network(
             optimiser, LEARNING_RATE, total_steps=max(MIN_STEPS, len(batches)), pct_start=0.1
         )
         for batch in (steps := tqdm(batches, "reader", disable=not progress)):
-            crops, known = _varied(*_stacked(data, batch), rng)
+            crops, known = _augment(*_stack(data, batch), rng)
             wanted = torch.from_numpy(data.answers[batch])
             weight = torch.where(wanted > 0, weights[1], weights[0]) * (wanted != UNKNOWN)
             aim = wanted.clamp(0).float() * (1 - 2 * SMOOTHING) + SMOOTHING
@@ -157,12 +155,12 @@ def _batches(data: TemporalData, chosen: Levels, rng: np.random.Generator) -> It
     yield from (batches[i] for i in rng.permutation(len(batches)))
 
 
-def _stacked(data: TemporalData, batch: Levels) -> tuple[Tensor, Tensor]:
+def _stack(data: TemporalData, batch: Levels) -> tuple[Tensor, Tensor]:
     crops = np.stack([data.sequences[i].crops for i in batch])
     return torch.from_numpy(crops), torch.from_numpy(np.stack([data.sequences[i].numbers for i in batch]))
 
 
-def _varied(crops: Tensor, numbers: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+def _augment(crops: Tensor, numbers: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Mirrored, colours exchanged, half of the clips each; other gains and offsets of colours; noise on the numbers."""
     count = len(crops)
     mirrored = torch.from_numpy(rng.random(count) < 0.5)

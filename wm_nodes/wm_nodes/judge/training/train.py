@@ -24,14 +24,14 @@ from wm_nodes.judge.dataset.build import load_frames
 from wm_nodes.judge.dataset.edits import COMPONENTS, TC, Manifest
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part, to_bytes
 from wm_nodes.judge.dataset.policy_camera import SEEN
-from wm_nodes.judge.evidence.clip import measured_clip
+from wm_nodes.judge.evidence.clip import measure_clip
 from wm_nodes.judge.evidence.head import JudgeHead
 from wm_nodes.judge.evidence.segmentation import Segmenter
 from wm_nodes.judge.evidence.sequence import ObjectSequence, TemporalNetwork, reading_names, readings
 from wm_nodes.judge.evidence.trees import TreeSettings
 from wm_nodes.judge.evidence.window import Window
 from wm_nodes.judge.training.data import load_sets, rows_of, set_clips
-from wm_nodes.judge.training.heads import TARGETS, Examples, conformal_limits, fit_all, fit_familiarity, measured
+from wm_nodes.judge.training.heads import TARGETS, Examples, conformal_limits, fit_all, fit_familiarity, measure_target
 from wm_nodes.judge.training.segmenter import overlaps, segmentation_data, train_segmenter
 from wm_nodes.judge.training.temporal_networks import cross_fit, temporal_data
 
@@ -68,7 +68,7 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
             "a judge reads either the clips of --policy-view or others: give --policy-view to sets that were made so, "
             "and to no other"
         )
-    segmenter, segmenter_story = _segmenter(folder, sets, plan, progress)
+    segmenter, segmenter_story = _load_or_train_segmenter(folder, sets, plan, progress)
     train, validation = (
         collect_evidence(folder, sets, part, segmenter, progress=progress) for part in ("train", "validation")
     )
@@ -81,7 +81,7 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
             folder, data, count=plan.readers, epochs=plan.reader_epochs, seed=plan.seed, progress=progress
         )
         train = with_readings(train, log_odds)
-        validation = _read(folder, sets, "validation", segmenter, readers, validation)
+        validation = _add_readings(folder, sets, "validation", segmenter, readers, validation)
     questions = fit_all(train, validation, plan.trees, plan.seed, progress=progress)
     low, high = np.quantile(train.evidence[train.clean], (0.05, 0.95), axis=0).astype(np.float32)
     recorded = [
@@ -91,12 +91,12 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     num_frames = [shape[0] for shape in recorded]
     lengths = (-(-2 * min(num_frames) // 3), 3 * max(num_frames) // 2)
     story = {
-        "data": [_described(path, manifest) for path, manifest in sets], "seed": plan.seed,
+        "data": [_describe_set(path, manifest) for path, manifest in sets], "seed": plan.seed,
         "fitted": {"train": len(train.rows), "validation": len(validation.rows)},
         "segmenter": segmenter_story, "trees": vars(plan.trees), "reader_epochs": plan.reader_epochs,
         "tasks": sorted({row.origin.task for row in train.rows}),
         "cameras": sorted({row.origin.camera.split()[0] for row in train.rows}),
-        "validation": {target: measured(questions, target, validation) for target in TARGETS},
+        "validation": {target: measure_target(questions, target, validation) for target in TARGETS},
         "conformal": {target: conformal_limits(questions, target, validation) for target in (*COMPONENTS, TC)},
     }
     known = fit_familiarity(train, validation)
@@ -117,12 +117,12 @@ def collect_evidence(
         chosen = rows_of(manifest, [part])
         if not chosen:
             continue
-        with np.load(_measured(folder, path, manifest, part, segmenter, progress)[0], allow_pickle=False) as arrays:
+        with np.load(_measure_part(folder, path, manifest, part, segmenter, progress)[0], allow_pickle=False) as arrays:
             names = tuple(str(name) for name in arrays["names"])
             values.append(arrays["values"])
         rows += chosen
     examples = Examples(names, np.concatenate(values) if values else np.zeros((0, 0), np.float32), rows)
-    return _read(folder, sets, part, segmenter, readers, examples) if readers and rows else examples
+    return _add_readings(folder, sets, part, segmenter, readers, examples) if readers and rows else examples
 
 
 def collect_sequences(folder: Path, sets: Sets, part: Part, segmenter: Segmenter) -> list[ObjectSequence]:
@@ -130,7 +130,8 @@ def collect_sequences(folder: Path, sets: Sets, part: Part, segmenter: Segmenter
     collected = []
     for path, manifest in sets:
         if rows_of(manifest, [part]):
-            with np.load(_measured(folder, path, manifest, part, segmenter, False)[1], allow_pickle=False) as arrays:
+            _, file = _measure_part(folder, path, manifest, part, segmenter, False)
+            with np.load(file, allow_pickle=False) as arrays:
                 ends = np.cumsum(arrays["lengths"])[:-1]
                 both = (np.split(arrays[name], ends) for name in ("crops", "numbers"))
                 collected += [ObjectSequence(*pair) for pair in zip(*both, strict=True)]
@@ -143,7 +144,7 @@ def with_readings(examples: Examples, log_odds: FloatArray) -> Examples:
     return Examples(examples.names + reading_names(), evidence, examples.rows)
 
 
-def _read(
+def _add_readings(
     folder: Path, sets: Sets, part: Part, segmenter: Segmenter, readers: Sequence[TemporalNetwork], examples: Examples
 ) -> Examples:
     sequences = collect_sequences(folder, sets, part, segmenter)
@@ -151,7 +152,7 @@ def _read(
     return with_readings(examples, np.array(answers, np.float32))
 
 
-def _measured(
+def _measure_part(
     folder: Path, path: Path, manifest: Manifest, part: Part, segmenter: Segmenter, progress: bool
 ) -> tuple[Path, Path]:
     """Evidence and sequences of the clips of a part of a set, in files that are made where they are missing."""
@@ -161,7 +162,7 @@ def _measured(
     if not evidence.exists() or not sequences.exists():
         name = f"evidence of {path.name} {part}"
         clips = tqdm(set_clips([(path, manifest)], [part]), name, len(chosen), disable=not progress)
-        measurements = [measured_clip(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
+        measurements = [measure_clip(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
         _keep(
             sequences, lengths=np.array([len(sequence.crops) for _, sequence in measurements]),
             crops=np.concatenate([sequence.crops for _, sequence in measurements]),
@@ -181,11 +182,13 @@ def _keep(path: Path, **arrays: NDArray[Any]) -> None:
 def _key(rows: Sequence[ManifestRow], segmenter: Segmenter) -> str:
     """Of clips, their reference frames, what instructions are made of, weights and code."""
     shown = "".join(f"{row.sha256} {row.root} {row.origin.task} {row.origin.object_id}\n" for row in rows)
-    return hashlib.sha256(shown.encode() + _state(segmenter) + _sources()).hexdigest()[:16]
+    return hashlib.sha256(shown.encode() + _weights_digest(segmenter) + _code_digest()).hexdigest()[:16]
 
 
-def _segmenter(folder: Path, sets: Sets, plan: JudgePlan, progress: bool) -> tuple[Segmenter, dict[str, Any]]:
-    """Train the segmenter, or take up the one that lies there; and say how it was made. Weights are float16's."""
+def _load_or_train_segmenter(
+    folder: Path, sets: Sets, plan: JudgePlan, progress: bool
+) -> tuple[Segmenter, dict[str, Any]]:
+    """Load the segmenter of the folder, or train it; return it and how it was trained. Weights are of float16."""
     path = folder / SEGMENTER
     if not path.exists():
         images, masks = segmentation_data(set_clips(sets, ["train"]), plan.seed)
@@ -203,16 +206,16 @@ def _segmenter(folder: Path, sets: Sets, plan: JudgePlan, progress: bool) -> tup
     return segmenter.eval().requires_grad_(False), story
 
 
-def _described(path: Path, manifest: Manifest) -> dict[str, Any]:
+def _describe_set(path: Path, manifest: Manifest) -> dict[str, Any]:
     parts = {part: sum(row.part == part for row in manifest.rows) for part in ("train", "validation", "test")}
     return {"set": path.name, "manifest_sha256": hashlib.sha256(to_bytes(manifest)).hexdigest(), "clips": parts}
 
 
-def _state(segmenter: Segmenter) -> bytes:
+def _weights_digest(segmenter: Segmenter) -> bytes:
     return hashlib.sha256(save(dict(segmenter.state_dict()))).digest()
 
 
-def _sources() -> bytes:
+def _code_digest() -> bytes:
     """Of the code that computes evidence: a changed number is another number."""
     folder = Path(str(wm_nodes.judge.evidence.__path__[0]))
     others = ("__init__", "definitions", "head", "trees", "window")
