@@ -20,6 +20,7 @@ from benchmarks.judge.comparisons import PAIRWISE, POINTWISE, ChatComparison
 from wm_nodes.core.statistics import auroc, wilson_interval
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.rows import read_clip
+from wm_nodes.reports.console_table import decimal, make_table, percent, percent_interval
 
 PROTOCOLS = (*POINTWISE, *PAIRWISE)
 
@@ -136,19 +137,16 @@ def num_answers(protocol: str, rows: Sequence[ManifestRow]) -> int:
 
 
 def comparison_table(rows: Sequence[ComparedRow], caption: str) -> Table:
-    table = Table(title="comparison rewards", caption=caption)
-    table.add_column("reward")
-    for name in ("n", "invalid", "AUROC", "hacked pairs", "hacked wins", "95 % Wilson", "calls", "tokens", "images"):
-        table.add_column(name, justify="right")
-    for row in rows:
-        area = "-" if row.area != row.area else f"{row.area:.3f}"
-        wins = "-" if row.win_rate != row.win_rate else f"{100 * row.win_rate:.1f}"
-        table.add_row(
-            row.name, str(row.n), str(row.invalid), area, str(row.pairs), wins,
-            f"{100 * row.low:.1f} to {100 * row.high:.1f}", f"{row.calls:.2f}", f"{row.tokens:.0f}",
-            f"{row.images:.1f}",
+    columns = ("reward", "n", "invalid", "AUROC", "hacked pairs", "hacked wins", "95 % Wilson", "calls", "tokens",
+               "images")
+    cells = (
+        (
+            row.name, row.n, row.invalid, decimal(row.area), row.pairs, percent(row.win_rate),
+            percent_interval(row.low, row.high), f"{row.calls:.2f}", f"{row.tokens:.0f}", f"{row.images:.1f}",
         )
-    return table
+        for row in rows
+    )
+    return make_table("comparison rewards", columns, cells, caption=caption)
 
 
 async def _score(judge: ChatComparison, protocol: str, folder: Path, row: ManifestRow) -> ComparedAnswer:

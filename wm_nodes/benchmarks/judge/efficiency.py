@@ -16,6 +16,7 @@ from wm_nodes.judge.agent import load_rubric
 from wm_nodes.judge.agent.types import GATED, NUM_PLAN_LEVELS
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.decisions import OVERALL
+from wm_nodes.reports.console_table import estimate, make_table, percent
 
 ARMS = {
     "agent": "agent", "everything": "everything, no early exit", "voted": "every component voted",
@@ -78,15 +79,13 @@ def measure_savings(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence
 
 
 def savings_table(rows: Sequence[Savings], caption: str) -> Table:
-    table = Table(title="saved by the agent, and what it costs in agreement", caption=caption)
-    table.add_column("against")
-    for name in ("n", *MEASURES, "same decision", "accuracy", "other's", "difference (95 %)"):
-        table.add_column(name, justify="right")
+    columns = ("against", "n", *MEASURES, "same decision", "accuracy", "other's", "difference (95 %)")
+    cells = []
     for row in rows:
         d = row.difference
-        table.add_row(
-            row.against, str(row.n), *(f"-{100 * row.saved[part]:.1f} %" for part in MEASURES), f"{100 * row.same:.1f}",
-            f"{100 * row.accuracy:.1f}", f"{100 * row.other_accuracy:.1f}",
-            f"{100 * d.difference:+.1f} ({100 * d.low:+.1f} to {100 * d.high:+.1f})",
-        )
-    return table
+        cells.append((
+            row.against, row.n, *(f"-{percent(row.saved[part])} %" for part in MEASURES), percent(row.same),
+            percent(row.accuracy), percent(row.other_accuracy),
+            estimate((100 * d.difference, 100 * d.low, 100 * d.high), "+.1f"),
+        ))
+    return make_table("saved by the agent, and what it costs in agreement", columns, cells, caption=caption)

@@ -8,11 +8,9 @@ import math
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.video_rl.plots import figure_of, save_figure, style_axes
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.agent import Judge, ReadRequest, RewardAgent, Rubric, TaskSpec
 from wm_nodes.judge.agent.levels import first_vote, score_of
@@ -23,7 +21,7 @@ from wm_nodes.judge.dataset.edits import COMPONENTS, LabelledClip, NotApplicable
 from wm_nodes.judge.dataset.edits.clips import Severity
 from wm_nodes.judge.dataset.edits.generator import FRAME_RECIPES, SEVERITIES
 from wm_nodes.judge.dataset.rows import ROBOT
-from wm_nodes.reports.curves import COLOURS
+from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figure, style_axes
 from wm_nodes.video_rl.reward_hacking import HackedMetric, hacked_metrics
 
 Proxy = Callable[[LabelledClip, TaskSpec], Awaitable[float | None]]
@@ -201,7 +199,7 @@ def curve(name: str, climbs: Sequence[Climb]) -> Curve:
 
 def plot_curves(curves: Sequence[Curve], path: Path) -> None:
     """The reward that is climbed beside the truth, a panel per reward."""
-    figure: Any = figure_of(4.2 * len(curves), 3.8)
+    figure = make_figure(4.2 * len(curves), 3.8)
     panels = np.atleast_1d(figure.subplots(1, len(curves), sharey=True))
     for axes, course in zip(panels, curves, strict=True):
         alarm = "alarm" if course.alarms else "no alarm"
@@ -211,5 +209,5 @@ def plot_curves(curves: Sequence[Curve], path: Path) -> None:
         if not math.isnan(course.clean):
             axes.axhline(course.clean, color="gray", linewidth=1, linestyle=":", label="reward of the clean recording")
         axes.set_ylim(0, 1.02)
-        axes.legend(fontsize=8, frameon=False, loc="lower left")
+        add_legend(axes, "lower left")
     save_figure(figure, path)

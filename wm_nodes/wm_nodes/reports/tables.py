@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import SuccessRate, Summary
 
 
@@ -56,9 +57,7 @@ def verdict(summary: Summary) -> str:
 def results_table(summary: Summary) -> Table:
     """The table for the terminal."""
     title = f"{summary.task}, preset {summary.preset}, seed {summary.seed}, reward {summary.reward}"
-    table = Table(title=title, caption=verdict(summary))
-    for name in ("success", "real simulator", "imagined"):
-        table.add_column(name, justify="left" if name == "success" else "right")
+    table = make_table(title, ("success", "real simulator", "imagined"), caption=verdict(summary))
     for row in result_rows(summary):
         style = "bold" if row.label == "difference" else ""
         table.add_row(row.label, *(f"{c.percent}   {c.count}\n[dim]{c.interval}" for c in (row.real, row.imagined)),
@@ -82,12 +81,8 @@ def round_rows(summary: Summary) -> list[tuple[str, ...]]:
 
 def rounds_table(summary: Summary) -> Table:
     """The online rounds for the terminal."""
-    table = Table(title="online rounds: success in the model of the round, and in the simulator")
-    for name in ROUND_COLUMNS:
-        table.add_column(name, justify="left" if name == ROUND_COLUMNS[-1] else "right")
-    for row in round_rows(summary):
-        table.add_row(*row)
-    return table
+    title = "online rounds: success in the model of the round, and in the simulator"
+    return make_table(title, ROUND_COLUMNS, round_rows(summary), left=ROUND_COLUMNS[-1:])
 
 
 def _share(rate: Mapping[str, Any]) -> str:

@@ -16,6 +16,7 @@ from wm_nodes.judge.audit.labels import HACK, ClipLabel, HumanLabels, annotators
 from wm_nodes.judge.audit.reading import Record, RecordedEvaluation
 from wm_nodes.judge.audit.sampling import Sample
 from wm_nodes.judge.decisions import PAPER, Decision, decisions_of, match, row_names
+from wm_nodes.reports.console_table import decimal, make_table, percent, percent_interval
 
 
 @dataclass(frozen=True)
@@ -138,22 +139,22 @@ def table(numbers: Report) -> Table:
     second = numbers.reflected
     caption = (
         f"{weights}; people: {', '.join(numbers.annotators)}; reflection changed {second.changed} labelled components, "
-        f"{second.helpful} for the better ({_percent(second.before)} right before, {_percent(second.after)} after, "
+        f"{second.helpful} for the better ({percent(second.before)} right before, {percent(second.after)} after, "
         f"n = {second.n}); per clip " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.cost.items())
     )
-    result = Table(title=f"agreement with people, {which}, {numbers.clips} clips", caption=caption)
-    result.add_column("row", no_wrap=True)
-    for name in ("paper", "n", "silent", "unsure", "accuracy", "95 % Wilson", "fails", "balanced", "kappa", "ECE",
-                 "people: n, kappa", "reasons: n, right"):
-        result.add_column(name, justify="right")
-    for row in numbers.rows:
-        result.add_row(
-            row.name, "-" if row.paper is None else f"{row.paper:.0f}", str(row.n), str(row.silent), str(row.unsure),
-            _percent(row.accuracy), f"{100 * row.low:.1f} to {100 * row.high:.1f}", _percent(row.prevalence),
-            _percent(row.balanced), _number(row.kappa), _number(row.calibration),
-            f"{row.people}, {_number(row.kappa_people)}", f"{row.reasons}, {_percent(row.reasons_right)}",
+    columns = ("row", "paper", "n", "silent", "unsure", "accuracy", "95 % Wilson", "fails", "balanced", "kappa", "ECE",
+               "people: n, kappa", "reasons: n, right")
+    cells = (
+        (
+            row.name, "-" if row.paper is None else f"{row.paper:.0f}", row.n, row.silent, row.unsure,
+            percent(row.accuracy), percent_interval(row.low, row.high), percent(row.prevalence),
+            percent(row.balanced), decimal(row.kappa), decimal(row.calibration),
+            f"{row.people}, {decimal(row.kappa_people)}", f"{row.reasons}, {percent(row.reasons_right)}",
         )
-    return result
+        for row in numbers.rows
+    )
+    title = f"agreement with people, {which}, {numbers.clips} clips"
+    return make_table(title, columns, cells, caption=caption, no_wrap=("row",))
 
 
 def _row_names(rubric: Rubric) -> list[str]:
@@ -209,11 +210,3 @@ def _cost(clips: Sequence[LabelledEvaluation]) -> dict[str, float]:
     names: tuple[str, ...] = ("calls", "prompt_tokens", "cached_tokens", "completion_tokens", "images", "wall_s", "usd")
     known: dict[str, list[Any]] = {name: [getattr(cost, name) for cost in costs] for name in names}
     return {n: float(np.mean(v)) for n, v in known.items() if v and None not in v}
-
-
-def _percent(share: float) -> str:
-    return "-" if math.isnan(share) else f"{100 * share:.1f}"
-
-
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.3f}"
