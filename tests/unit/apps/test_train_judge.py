@@ -8,8 +8,8 @@ import pytest
 from pushed_box import push_clip, redrawn
 
 from wm_nodes.apps.train_judge import main
-from wm_nodes.judge.dataset.build import MANIFEST, clip_path, to_file
 from wm_nodes.judge.dataset.edits import Division, LabelledClip, children, manifest_of, to_bytes
+from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 from wm_nodes.judge.evidence.definitions import EVIDENCE
 from wm_nodes.judge.evidence.segmentation import Segmenter
 from wm_nodes.judge.training.data import load_sets, rows_of, set_clips

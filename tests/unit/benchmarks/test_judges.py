@@ -26,10 +26,11 @@ from wm_nodes.judge.agent.levels import first_vote, next_vote
 from wm_nodes.judge.agent.profiles import profile_media
 from wm_nodes.judge.agent.types import Capabilities, Profile, ReadRequest, Stage
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
-from wm_nodes.judge.dataset.build import BENCHMARK, draw_origin, instruction_of, load_set
+from wm_nodes.judge.dataset.build import BENCHMARK, draw_origin, instruction_of
 from wm_nodes.judge.dataset.edits import ClipTruth, Edit, Manifest, ManifestError, Origin, planning_level
 from wm_nodes.judge.dataset.edits.clips import COMPONENTS
 from wm_nodes.judge.dataset.rows import read_clip, select_rows
+from wm_nodes.judge.dataset.set_files import load_set
 from wm_nodes.judge.decisions import PAPER, accepts, decisions_of, row_names
 from wm_nodes.judge.evidence.head import load_head
 

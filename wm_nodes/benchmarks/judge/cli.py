@@ -47,11 +47,11 @@ from benchmarks.speed.results import write_results
 from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent import Judge, Rubric, TaskSpec, load_rubric
 from wm_nodes.judge.agent.types import Stage
-from wm_nodes.judge.dataset.build import load_set
 from wm_nodes.judge.dataset.edits import LabelledClip, Manifest
 from wm_nodes.judge.dataset.edits.generator import SEVERITIES
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.rows import MIN_TEST_CLIPS, select_rows
+from wm_nodes.judge.dataset.set_files import load_set
 
 LOG_COLUMNS = 180
 JUDGED = "judged"

@@ -1,4 +1,4 @@
-"""Other papers' rewards on the same clips: how well they rank, and whether they fall for a hacked clip.
+"""Other papers' rewards on the same clips: how well they rank them, and how often a hacked clip wins.
 
 A score is measured without a threshold, since each has a scale of its own: AUROC of good clips against others, and the
 share of hacked clips that score at least as high as their clean recording. Answers are kept, one JSON line each.

@@ -1,4 +1,4 @@
-"""Does a judge of the loops' clips know what the same actions do in the simulator? RA-17 to RA-20.
+"""Compare verdicts on imagined and on recorded clips with the success that the simulator measured (RA-17 to RA-20).
 
 Held-out episodes are recorded in the simulator, and imagined by a world model from their first frames with the same
 actions; the judge sees both kinds as an episode's clip, up to the step on which the real one succeeds. The label is the

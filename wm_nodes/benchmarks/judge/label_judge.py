@@ -1,7 +1,7 @@
-"""A judge that knows the labels and errs at a known rate: the control of the benchmark, never a reward.
+"""A judge that knows the labels and errs at a known rate: a control of the benchmark, never a reward.
 
-It shows what the agent's machinery does with a judge of a given quality: what Table 2 can reach at all, what the early
-exits cost and save, how votes mend independent errors.
+It shows how the agent works with a judge of a given accuracy: the upper bound of Table 2, what early exits cost and
+save, and how far votes correct independent errors.
 """
 
 import hashlib

@@ -1,8 +1,8 @@
-"""Which judges were evaluated on the test split, so that a table says when a judge was tuned on it.
+"""A log of the evaluations on the test split, so that a table says when a judge may have been tuned on it.
 
-A file beside the set has one line per first evaluation of a judge with a rubric. The evaluations behind the published
-tables come with this package, so that building the set again forgets none. The same judge with the same rubric may be
-evaluated again: nothing was changed in between.
+A file beside the set has one line for the first evaluation of each judge with a rubric. The evaluations behind the
+published tables are part of this package, so that a set that is built again has them, too. The same judge with the same
+rubric may be evaluated again, because nothing was tuned in between.
 """
 
 import hashlib
@@ -46,10 +46,10 @@ def test_sha(manifest: Manifest) -> str:
 
 
 def read_evaluations(folder: Path) -> list[TestSplitEvaluation]:
-    """The published evaluations, then those that only the ledger of a set has, oldest first.
+    """The published evaluations, then those that only the log of the set has, oldest first.
 
     Raises:
-        ValueError: a line that no ledger has; it is not to be edited.
+        ValueError: a line that cannot be read; the file must not be edited.
     """
     published = [TestSplitEvaluation(**entry) for entry in json.loads(PUBLISHED.read_text())]
     return [*published, *(entry for entry in _read_log(folder) if entry not in published)]

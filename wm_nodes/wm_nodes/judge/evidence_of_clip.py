@@ -1,7 +1,7 @@
-"""Endogenous evidence of a clip, as far as a rubric's bands ask for it (RA-13, RA-17).
+"""Endogenous evidence of a clip, for the bands of a rubric (RA-13, RA-17).
 
-Pixels need nothing; what a world model says needs one that was trained in the clip's cameras, and the clip's actions.
-Evidence causes votes and second looks of the agent, and never adds reward.
+Pixel evidence needs the frames only; evidence of a world model needs one that was trained in the clip's cameras, and
+the clip's actions. Evidence makes the agent vote and reflect, and never adds reward.
 """
 
 import functools
@@ -20,10 +20,10 @@ from wm_nodes.world_model.folder import ModelFolderError
 
 
 class ClipEvidence:
-    """Measures clips.
+    """Measures the evidence of clips.
 
     Args:
-        model_dir: folder of the world model, loaded when a band first asks for it; None: there is none.
+        model_dir: folder of the world model, loaded when a band first needs it; None: there is none.
     """
 
     def __init__(self, model_dir: Path | None = None) -> None:
@@ -32,7 +32,7 @@ class ClipEvidence:
         self._one_at_a_time = threading.Lock()
 
     def check(self, rubric: Rubric) -> None:
-        """Refuse bands of evidence that is never measured: they would be silent.
+        """Refuse bands of evidence that is not measured here.
 
         Raises:
             ValueError: names the evidence and the remedy.
@@ -40,7 +40,7 @@ class ClipEvidence:
         """
         if unknown := sorted(set(rubric.evidence) - pixel_names() - set(MODEL_EVIDENCE)):
             raise ValueError(
-                f"rubric {rubric.version} has bands of {', '.join(unknown)}, which nobody measures here; known: "
+                f"rubric {rubric.version} has bands of {', '.join(unknown)}, which is not measured here; known: "
                 f"{', '.join(sorted({*pixel_names(), *MODEL_EVIDENCE}))}"
             )
         asked = sorted(set(rubric.evidence) & set(MODEL_EVIDENCE))

@@ -1,4 +1,4 @@
-"""The reward agent at work on many clips, for callers that do not await (RA-1, RA-15).
+"""A service that judges many clips with the reward agent, for callers that do not use asyncio (RA-1, RA-15).
 
 Shapes: N clips, F frames, H W 3 image, A action.
 """
@@ -31,18 +31,18 @@ from wm_nodes.recording.reader import read_spec
 from wm_nodes.video_model.clips import Clips
 
 READS = "judge_reads"
-"""Folder of a run that keeps the judge's answers."""
+"""Folder of a run with the cached answers of the judge."""
 POLL_S = 0.05
-"""How often a waiting caller looks whether it must stop."""
+"""How often a waiting caller checks whether it must stop, s."""
 HEALTH_S = 10.0
-"""Time between two questions to the servers whether they are there."""
+"""Time between two health requests to the servers, s."""
 CLOSE_S = 5.0
 
 T = TypeVar("T")
 
 
 class TrainingPaused(Exception):
-    """Too much of a round has no reward to train on: says why, and what to do."""
+    """Too many clips of a round have no reward; the text says why and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class ClipJob:
 
 @dataclass
 class VerdictCounts:
-    """What verdicts were given since the start, and what they took."""
+    """Number and cost of the verdicts since the start."""
 
     verdicts: int = 0
     by_status: dict[Status, int] = field(default_factory=dict)
@@ -78,7 +78,7 @@ class VerdictCounts:
 
 @dataclass
 class _JudgeSlot:
-    """One of the judges. failed_last_round: the last round that it was given was taken from it."""
+    """One judge with its agent. failed_last_round: it answered too few clips of its last round, see _FallbackBudget."""
 
     opened: OpenedJudge
     agent: RewardAgent | AuditedAgent
@@ -90,9 +90,10 @@ class _JudgeSlot:
 
 
 class _FallbackBudget:
-    """With a judge that others could stand in for: over when more than MAX_INVALID_SHARE of a round's clips have no
-    answer, or the clip that was sent ahead has none. It lasts when the round's time is up: nobody else could judge it.
+    """Counts the unanswered clips of a round and decides when the next judge takes the round over.
 
+    over: more than MAX_INVALID_SHARE of the clips have no answer, or the single clip that was sent as a test has none.
+    Clips that end after the round's deadline do not count, because no other judge could answer them in time.
     reason: of the newest clip without an answer.
     """
 
@@ -110,10 +111,10 @@ class _FallbackBudget:
 
 
 class JudgeService:
-    """A reward agent with its judge on an event loop in a thread of its own; at most `concurrency` clips at a time.
+    """Runs a reward agent on an event loop in a thread of its own; at most `concurrency` clips at a time.
 
-    settings.fallbacks are further judges for whole rounds, see judge. fallen_back: why the last round did not stay with
-    the first judge, and to whom it went; "" where it stayed.
+    settings.fallbacks are further judges for whole rounds, see judge. fallen_back: why another judge than the first
+    judged the last round, and which; "" where the first did.
 
     Args:
         reads: folder that keeps the judge's answers; None: none are kept.
@@ -148,17 +149,17 @@ class JudgeService:
 
     @property
     def judge_id(self) -> str:
-        """Of the judge of the last round; before one, of the first judge, of whom `health` is too."""
+        """Identity of the judge of the last round; before the first round, of the first judge."""
         return self._used.judge_id
 
     @property
     def judge_ids(self) -> list[str]:
-        """Of all judges, in the order in which they are tried."""
+        """Identities of all judges, in the order in which they are tried."""
         return [slot.judge_id for slot in self._slots]
 
     @property
     def cards(self) -> list[str]:
-        """What the judges were measured to see, in words; those of whom nobody knows say nothing."""
+        """The measured abilities of each judge, as text; judges without a measurement are left out."""
         return [card for slot in self._slots if (card := slot.agent.judge.capabilities.card)]
 
     def set_rubric(self, pack: str, base: Path) -> None:
@@ -180,7 +181,7 @@ class JudgeService:
             self._run(slot.opened.close())
 
     def submit(self, job: ClipJob, deadline: float | None = None) -> "Future[Verdict]":
-        """Have the first judge judge a clip as soon as there is a place. deadline: on the time.monotonic clock, s."""
+        """Have the first judge judge one clip, concurrency permitting. deadline: on the time.monotonic clock, s."""
         return self._run(self._judge_clip(self._slots[0].agent, job, deadline))
 
     def judge(
@@ -190,15 +191,15 @@ class JudgeService:
     ) -> list[Verdict]:
         """Judge a round of clips by one judge and one rubric; the verdicts are in the order of the jobs.
 
-        A judge that leaves more than MAX_INVALID_SHARE of the clips without an answer (status ERROR) loses the round to
-        the next one, as long as there is one and time: all its verdicts are dropped, the answers it gave included.
+        If a judge leaves more than MAX_INVALID_SHARE of the clips without an answer (status ERROR), all its verdicts
+        are dropped and the next judge judges the whole round, while time is left.
 
         Args:
-            check: called at least every POLL_S; what it raises ends the judging, and calls under way are dropped.
-            done: called in this thread with the index and verdict of every clip: as it is judged by the last judge
-                there is, or when a round that could still be taken from its judge is over.
-            within_s: clips without a verdict by then get one that says so, without a reward; None: no limit.
-            round_number: what the audit log calls these clips' round.
+            check: called at least every POLL_S; an exception from it ends the judging and cancels open calls.
+            done: called in this thread with the index and verdict of every clip; immediately for the last judge, at
+                the end of the round for judges that have a fallback.
+            within_s: clips without a verdict after this time get one with status ERROR; None: no limit.
+            round_number: of these clips in the audit log.
             by: the id of the only judge to ask; empty: all, in their order.
 
         Raises:
@@ -217,7 +218,7 @@ class JudgeService:
             on_verdict = done if budget is None else verdicts_by_index.__setitem__
             ahead = (
                 1 if slot.failed_last_round and budget is not None else 0
-            )  # is it back? One clip, so that a breaker can close
+            )  # one clip tests whether the judge answers again and lets its circuit breaker close
             verdicts = self._round(slot, jobs[:ahead], 0, deadline, check, on_verdict, budget)
             verdicts += self._round(slot, jobs[ahead:], ahead, deadline, check, on_verdict, budget)
             slot.failed_last_round = budget is not None and budget.over
@@ -231,14 +232,14 @@ class JudgeService:
         return verdicts
 
     def refresh_health(self) -> None:
-        """Ask the judge how it is, at most every HEALTH_S and without waiting: `health` is the newest answer."""
+        """Request the judge's health, at most every HEALTH_S and without waiting; `health` is the newest answer."""
         idle = self._health_request is None or self._health_request.done()
         if idle and not self._loop.is_closed() and time.monotonic() - self._health_asked_s >= HEALTH_S:
             self._health_asked_s = time.monotonic()
             self._health_request = self._run(self._ask_health(self._slots[0]))
 
     def close(self) -> None:
-        """Drop what is under way and end the thread."""
+        """Cancel open calls and end the thread."""
         with suppress(TimeoutError):
             self._run(self._end()).result(CLOSE_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
@@ -270,7 +271,7 @@ class JudgeService:
         self, slot: _JudgeSlot, jobs: Sequence[ClipJob], first: int, deadline: float | None, check: Callable[[], None],
         done: Callable[[int, Verdict], None], budget: "_FallbackBudget | None",
     ) -> list[Verdict]:
-        """The verdicts of one judge; fewer where patience with it is over. first: index of the first job."""
+        """The verdicts of one judge, incomplete when its budget is over. first: index of the first job."""
         if budget is not None and budget.over:
             return []
         work = (self._judge_clip(slot.agent, job, deadline) for job in jobs)
@@ -318,7 +319,7 @@ class JudgeService:
 
 
 def _late_verdict(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict:
-    """The verdict on a clip that the round did not wait for."""
+    """The verdict on a clip that was not judged by the round's deadline."""
     able, now = agent.judge.capabilities, time.time()
     verdict = Verdict(
         clip_id=job.clip.clip_id, status=Status.ERROR, reward=math.nan, level=-1,
@@ -335,8 +336,9 @@ def _late_verdict(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) ->
 def buffer_jobs(
     frames: Tensor, references: Clips, sha256: str, *, given: int, fps: float, task: str, robot: str
 ) -> list[ClipJob]:
-    """One job per clip of a buffer. Frames that the model was given are shown as they were recorded: what its codec
-    makes of them is no work of the model's.
+    """One job per clip of a buffer.
+
+    The conditioning frames are shown as they were recorded, not as the video model's codec decodes them.
 
     Args:
         frames: decoded clips, uint8 (N, F, H, W, 3). references: the recordings of their contexts, a row per clip.

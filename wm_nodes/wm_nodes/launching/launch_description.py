@@ -1,7 +1,7 @@
-"""The face of a scenario for `ros2 launch`: needs the ROS 2 packages launch and launch_ros (apt), nothing of rclpy.
+"""The launch description of a scenario for `ros2 launch`; needs the ROS 2 packages launch and launch_ros (apt).
 
-ros2 runs under the system's Python, which has neither our pydantic nor torch: the graph is made by the nodes'
-interpreter (ros.arguments, in a process of its own), and this module imports only the standard library.
+ros2 runs under the system's Python, which has neither pydantic nor torch: the graph is made by the nodes' interpreter
+(launching.arguments, in a process of its own), and this module imports only the standard library.
 
 PyPI's `launch` 0.1.3 is an unrelated project of the same name.
 """
@@ -64,7 +64,7 @@ def _start(scenario: str, context: Any) -> list[Any]:
 
 
 def prepare_graph(scenario: str, given: Mapping[str, str], python: str) -> Graph:
-    """ros.arguments.prepare in the nodes' interpreter.
+    """Run launching.arguments.prepare in the nodes' interpreter and return its graph.
 
     Raises:
         RuntimeError: its last line of error, and what to set where a module is missing.

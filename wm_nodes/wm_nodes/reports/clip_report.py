@@ -1,4 +1,4 @@
-"""What a run of loop 2 leaves for people: summary.json, the table of held-out scores, report.html."""
+"""The report of a run of loop 2: summary.json, the table of held-out scores, report.html."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,7 +38,7 @@ class ScoreChange:
 
 @dataclass(frozen=True)
 class ClipSummary:
-    """What a run of loop 2 found out.
+    """The results of a run of loop 2.
 
     scores: by name. contexts: held-out ones behind each. iterations: buffers trained on. version: optimizer steps.
     weights: which ones were measured after, "averaged" or "last". evaluations: held-out ones made while training.

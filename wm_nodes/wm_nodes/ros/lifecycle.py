@@ -149,8 +149,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     ) -> ConsumerCredits | None:
         """Subscribe to a row of the QoS table until cleanup. Messages with (session, seq) are checked for gaps.
 
-        credit: grant the producer messages as they are consumed (see ros.credit); for keep-all streams. The grantor is
-            returned.
+        credit: grant the producer messages as they are consumed (see flow_control.py), for keep-all streams; the
+            ConsumerCredits are returned.
         while_inactive: latched topics, whose message must not be missed before activation.
         """
         row = topic(name)

@@ -83,7 +83,7 @@ def test_what_cannot_be_measured_lies_in_no_band(server: PickyServer, tmp_path: 
 
 def test_bands_of_evidence_that_nobody_measures_are_refused_by_name(server: PickyServer, tmp_path: Path) -> None:
     unknown = pack(tmp_path, sharpnes={"component": "clarity", "low": 0.5})
-    with pytest.raises(ValueError, match=r"bands of sharpnes, which nobody measures here; known: .*sharpness_min"):
+    with pytest.raises(ValueError, match=r"bands of sharpnes, which is not measured here; known: .*sharpness_min"):
         JudgeService(settings(server, unknown), seed=0)
     needs_model = pack(tmp_path, **BANDS)
     with pytest.raises(ValueError, match=r"bands of still_energy, which a world model measures; name its folder"):

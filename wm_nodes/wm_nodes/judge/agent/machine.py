@@ -1,8 +1,8 @@
-"""The state machine over a judge (RA-1).
+"""The state machine of the reward agent (RA-1).
 
 PRECHECK -> PLAN -> VQ -> IF -> TC -> PC -> REFLECT -> HACK -> AGGREGATE. In reward mode a failed gate ends the reading;
-in benchmark mode every component is read. A second look that opens a closed gate goes on with the stages behind it,
-once. Whatever the judge does, the result is a Verdict: a judge that fails or cannot say leaves reward NaN.
+in benchmark mode every component is read. If reflection opens a closed gate, the stages after it are read, too, once.
+The result is always a Verdict; its reward is NaN where the judge fails or abstains.
 """
 
 import asyncio
@@ -124,7 +124,7 @@ class RewardAgent:
 
 
 class _Stop(Exception):
-    """Nothing more is asked: the verdict has no number."""
+    """Ends the evaluation of a clip with a verdict without a reward."""
 
     def __init__(self, status: Status, reason: str) -> None:
         super().__init__(reason)
@@ -132,7 +132,7 @@ class _Stop(Exception):
 
 
 class _Run:
-    """One clip on its way through the states."""
+    """The evaluation of one clip."""
 
     def __init__(self, agent: RewardAgent, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> None:
         self.agent, self.rubric, self.clip, self.task, self.evidence = agent, agent.rubric, clip, task, evidence
@@ -304,7 +304,7 @@ class _Run:
         except JudgeError as error:
             self.cost += error.cost
             raise _Stop(Status.ERROR, f"{stage}: {error}") from error
-        except Exception as error:  # a judge is somebody else's code: whatever it raises, this clip has no number
+        except Exception as error:  # a judge is external code: whatever it raises, this clip has no reward
             raise _Stop(Status.ERROR, f"{stage}: judge raised {type(error).__name__}: {error}") from error
         self.cost = sum((read.cost for read in reads), self.cost)
         self.prompts += [read.prompt_sha for read in reads]

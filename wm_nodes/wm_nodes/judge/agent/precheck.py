@@ -1,8 +1,8 @@
-"""What needs no model (RA-2): is this a clip at all? Shapes: T frames, H W 3 image.
+"""Checks of a clip that need no model (RA-2). Shapes: T frames, H W 3 image.
 
-Two kinds of refusal. `malformed`: whoever asked made a mistake (one frame, NaN pixels, wrong encoding, no
-instruction); the verdict is an ERROR without a number. `no video`: a proper clip that shows nothing; the verdict is
-level 0 with reward 0.
+Two kinds of refusal. `malformed`: a mistake of the caller (one frame, NaN pixels, wrong encoding, no instruction); the
+verdict is an ERROR without a reward. `no video`: a well-formed clip that is black or still; the verdict is level 0 with
+reward 0.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Precheck:
 
 
 def precheck(clip: ClipRef, task: TaskSpec) -> Precheck:
-    """Refuse what no judge should be asked about."""
+    """Check a clip and its task."""
     if fault := _format_problem(clip, task):
         return Precheck("malformed", fault)
     if clip.frames.max() <= BLACK_MAX:

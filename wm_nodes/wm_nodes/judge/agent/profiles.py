@@ -1,4 +1,4 @@
-"""Which frames a read sees, chosen here and not by the server (RA-3). Shapes: T frames.
+"""Choose the frames that a read sees (RA-3). Shapes: T frames.
 
 Two media trunks: S, then I, then E only append images to one another, so that a server's prefix cache still holds what
 came before; D is a trunk of its own. No image is in a trunk twice.

@@ -1,7 +1,7 @@
-"""When a verdict is looked at again, and what the second look may change (RA-13, RA-14). Pure functions.
+"""When the agent reflects on a verdict, and which of the proposed changes count (RA-13, RA-14). Pure functions.
 
-The second look sees new pixels (profile D), must cite frames, and counts only if a fresh label read on those frames
-agrees.
+The second read sees new frames (profile D) and must cite frames; its change counts only if a fresh label read on those
+frames agrees.
 """
 
 from collections.abc import Sequence
@@ -86,12 +86,12 @@ def suspects(reasons: Sequence[Trigger], stages: Sequence[StageScore], limit: in
 
 
 def proposes_change(before: ComponentScore, second: Read, num_frames: int) -> bool:
-    """The second look changes something by half a level or more, and cites frames that exist."""
+    """Whether the second read changes the score by half a level or more, and cites frames that exist."""
     cites = bool(second.frames_cited) and all(0 <= index < num_frames for index in second.frames_cited)
     return cites and abs(score([second], "").s - before.s) >= MIN_CHANGE
 
 
 def is_confirmed(before: ComponentScore, second: Read, fresh: Read) -> bool:
-    """The fresh read is on the second look's side of pass, and nearer to it than to what was before."""
+    """Whether the fresh read passes or fails as the second one does, and is nearer to it than to the score before."""
     proposed, checked = score([second], ""), score([fresh], "")
     return checked.passed == proposed.passed and abs(checked.s - proposed.s) < abs(checked.s - before.s)

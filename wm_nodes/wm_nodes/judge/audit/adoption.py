@@ -1,4 +1,4 @@
-"""Whether a new version of a rubric takes over (RA-25).
+"""Decide whether a new version of a rubric is adopted (RA-25).
 
 Both versions judged the clips of two labelled sets. The frozen set guards what was reached, the newest round shows what
 was gained. Measured by the balanced accuracy, averaged over the components and "overall", because a judge that

@@ -1,4 +1,4 @@
-"""A reward agent whose every question, answer and verdict is written down."""
+"""A reward agent that writes every question, answer and verdict into an audit log."""
 
 import asyncio
 from collections.abc import Mapping

@@ -1,8 +1,8 @@
-"""A log as a judge: verdicts worked out again offline, equal bit for bit; and anew under a rubric with other numbers.
+"""A judge that answers from an audit log: it recomputes verdicts bit for bit, or under a rubric with other numbers.
 
-The answers are those that were given. A rubric with other weights, thresholds, votes or caps may lead to a question
-that nobody was asked then, e.g. of a stage behind a gate that is now open: such a clip gets an ERROR that names the
-question, never a guess. Logs of benchmark mode hold a read of everything.
+The answers are the recorded ones. A rubric with other weights, thresholds, votes or caps may need a read that was not
+recorded, e.g. of a stage behind a gate that is now open: such a clip gets an ERROR that names the question. Logs of
+benchmark mode hold a read of every component.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

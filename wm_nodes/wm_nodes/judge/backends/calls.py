@@ -1,5 +1,7 @@
-"""One question to a chat server and the ladder below it: answer checked; asked once more with the reason; one label
-read per component; ERROR.
+"""One question to a chat server with its fallbacks.
+
+An answer is checked; a refused one is asked for once more with the reason; then each component is read by a label; then
+the read is an ERROR.
 """
 
 import asyncio
@@ -33,7 +35,7 @@ JSON_TRIES = 2
 MEASURED_CALLS = 200
 SEED_LIMIT = 2**31
 Exchange = Mapping[str, Any]
-"""What was asked in words and what came back, as JSON values: the raw material of an audit log."""
+"""The texts of a request and the raw reply, as JSON values, for an audit log."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class Prompt:
 
 
 class CallCost:
-    """What one call costs, retries and ladder included. Requests without an answer count as retries only."""
+    """Cost of one call with its retries and fallbacks. Requests without an answer count as retries only."""
 
     def __init__(self, num_images: int) -> None:
         self._num_images = num_images
@@ -226,7 +228,7 @@ class Caller:
 
 
 def describe_request(call: Call, body: Mapping[str, Any]) -> dict[str, Any]:
-    """The words of a request and its settings; its images are named by their hash."""
+    """The texts and settings of a request; its images are named by their hash."""
     system, user = body["messages"]
     words = [part["text"] for part in user["content"][len(call.media) :]]
     return {

@@ -1,7 +1,7 @@
 """A judge in this process: no server, no download, no GPU (RA-17 to RA-20).
 
-It reads the evidence of wm_nodes.judge.evidence with the heads of a trained folder. All votes of a component get the
-same answer, and a second look finds what the first one found: it never claims new pixels.
+It reads the evidence of wm_nodes.judge.evidence with the heads of a trained folder. It is deterministic: all votes of a
+component and the second read of a reflection get the same answer.
 
     agent = RewardAgent(EmbeddedJudge(load_head(folder)), load_rubric())
 """
@@ -41,11 +41,11 @@ from wm_nodes.judge.evidence.head import HACK, TASK_COMPLETION, JudgeHead, compo
 
 TRANSPORT = "embedded"
 REVISION = "1"
-"""Counted up whenever the same head gives other answers, so that two versions are two judges."""
+"""Raised whenever the same head gives other answers, so that two versions have two identities."""
 CACHED_CLIPS = 64
-"""Clips whose evidence is kept: the stages of one verdict ask one after the other."""
+"""Clips whose evidence is cached, for the stages of one verdict."""
 BLIND_AUROC = 0.75
-"""A component that the validation part could not be told apart better than this is not answered."""
+"""A component with a smaller AUROC on the validation part is not answered."""
 TEXT_LIMIT = 240
 MAX_FRAMES = 64
 
@@ -134,12 +134,12 @@ class EmbeddedJudge:
         return reads
 
     async def health(self) -> Health:
-        """Always there; says how many reads there were, and of how many it could not tell."""
+        """Always available; details count the reads and the abstentions."""
         counts = {"reads": float(self._num_reads), "abstained": float(self._num_abstained)}
         return Health(True, "", counts)
 
     def evidence(self, clip: ClipRef, task: TaskSpec) -> Evidence:
-        """The numbers that the answers come from, by name.
+        """The evidence of a clip by name; cached.
 
         Raises:
             ValueError: frames or reference frame of a wrong shape or type.

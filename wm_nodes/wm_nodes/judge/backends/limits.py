@@ -1,4 +1,4 @@
-"""How much an endpoint is asked for at once, and when it is left alone."""
+"""Limit of concurrent calls, and circuit breaker of an endpoint."""
 
 import asyncio
 from collections import deque

@@ -1,4 +1,4 @@
-"""One call per component, or one per stage: decided by what the server's prefix cache is seen to do (RA-16)."""
+"""Choose one call per component or one per stage by the measured hit rate of the server's prefix cache (RA-16)."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""What a chat judge is asked, laid out so that a server's prefix cache pays.
+"""The prompts of a chat judge, ordered so that a server's prefix cache is used.
 
 Order: system (constant), media with labels, task, rubric of the stage, question, output rule, what was found before.
 Nothing variable stands before the media, and nothing that differs between two questions of a stage before the question.

@@ -1,4 +1,4 @@
-"""One judge made of several: each stage is read by the one that was named for it."""
+"""A judge that routes each stage to one of several judges."""
 
 import hashlib
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ class RoutedJudge:
     """Has some stages read by other judges, everything else by `first`. Second looks (REFLECT) go to whoever reads the
     component's own stage.
 
-    Its identity is that of all of them with their stages: verdicts of other routes are verdicts of another judge. It
-    sees as many frames per call as the least of them.
+    Its identity covers all of them with their stages: with other routes it is another judge. Its max_frames is the
+    smallest of theirs.
 
     Raises:
         ValueError: a stage routed twice, a route of REFLECT, or a judge that does not read a component of its stages.

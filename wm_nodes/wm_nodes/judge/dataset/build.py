@@ -9,18 +9,15 @@ written last: a folder without one is unfinished. Equal arguments give equal byt
     python3 launch_scripts/make_adversarial_set.py FOLDER --policy-view --development --episodes 40 --edits 26
 
 --benchmark is the set that judges are compared on: three tasks, shapes that no judge was trained on, and seeds of its
-own; its test split is fixed by the manifest (benchmark_clips.chosen_rows) and has 400 clips or more.
+own; its test split is fixed by the manifest (rows.select_rows) and has 400 clips or more.
 --development leaves out the episodes of the test part, which training does not read; --diverse does so too, and draws
-cameras, colours, light and push directions from ranges that keep away from what is held out (diverse_looks.py).
---policy-view draws the loops' own scene and camera, most through a world model (policy_view.py).
+cameras, colours, light and push directions from ranges that exclude what is held out (domain_randomization.py).
+--policy-view draws the policy's scene and camera, most through a world model (policy_camera.py).
 """
 
 import argparse
-import io
 import itertools
 import sys
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -33,23 +30,19 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.types import UInt8Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.tasks import TASKS, get_task
-from wm_nodes.judge.agent.types import media_sha
 from wm_nodes.judge.dataset.domain_randomization import RandomizedScene, draw_scene
 from wm_nodes.judge.dataset.edits import (
     RECIPES,
     Division,
     LabelledClip,
     Manifest,
-    ManifestError,
     Origin,
     SceneStates,
     SourceClip,
     StateEdit,
     children,
-    from_bytes,
     label_rendered,
     manifest_of,
     recorded,
@@ -68,9 +61,9 @@ from wm_nodes.judge.dataset.rendering import (
     cube_half_sizes,
     record_states,
 )
+from wm_nodes.judge.dataset.set_files import MANIFEST, check_set, clip_path, to_file
 from wm_nodes.world_model import load_model_folder
 
-MANIFEST = "manifest.jsonl"
 SIDE_PX = 96
 OBJECT_COLOURS = {
     "blue": (0.05, 0.16, 0.63), "green": (0.05, 0.5, 0.12), "orange": (0.85, 0.4, 0.05), "purple": (0.45, 0.1, 0.6),
@@ -91,11 +84,13 @@ STEADY = ("expert", "short", "near_miss")
 
 @dataclass(frozen=True)
 class SetPlan:
-    """tasks: in turn. num_episodes: recorded ones, each seen by one camera. edits_per_clip: (recipe, severity) pairs
-    that are tried on each, None for all. seed: episode i is reset with seed + i; look and recipes follow from it.
-    shapes: besides the cube; rare, and test clips only. Not in "reach", whose end state depends on the height.
-    development: episodes that no test part has, num_episodes of them. diverse: scenes of diverse_looks.py. recipes: of
-    the edits. policy: clips of policy_view.py. stacks_per_clip: besides the edits, see generator.stacks.
+    """Settings of a set.
+
+    tasks: built one after the other. num_episodes: recorded per task, each by one camera. edits_per_clip: (recipe,
+    severity) pairs tried on each, None for all. seed: episode i is reset with seed + i and draws everything from it.
+    shapes: besides the cube; rare, and in test clips only; not in "reach", whose end state depends on the height.
+    development: only episodes that are in no test part. diverse: scenes of domain_randomization.py. recipes: of the
+    edits. policy: clips of policy_camera.py. stacks_per_clip: besides the edits, see generator.stacks.
     """
 
     tasks: tuple[str, ...] = ("push_cube",)
@@ -149,8 +144,7 @@ were trained without that task."""
 
 
 class ClipSource:
-    """Recorded clips and redrawn edits of one task; shapes, diverse: see SetPlan. Building it starts the simulator:
-    seconds.
+    """Records clips of one task and renders edits of them. shapes, diverse: see SetPlan. It starts the simulator.
 
     Raises:
         NoRendererError: Vulkan finds no device.
@@ -229,7 +223,7 @@ class ClipSource:
 
 
 def _part_of_seed(task: str, seed: int) -> Part:
-    """Of an episode that has nothing of what is held out."""
+    """The part of an episode whose camera, object and scene are not held out."""
     return HELD_OUT.part(Origin(task, "drawn", "cube/drawn", "drawn", seed))
 
 
@@ -254,15 +248,13 @@ def _pick(rng: np.random.Generator, values: Sequence[str], rare: Sequence[str]) 
 
 
 def instruction_of(origin: Origin) -> str:
-    """The task's instruction with the object's colour in place of blue, and its shape in place of the cube. What
-    follows the colour's name, as numbers do that were drawn, is not said.
-    """
+    """The task's instruction with the object's colour and shape in place of "blue" and "cube"."""
     shape, _, colour = origin.object_id.partition("/")
     return get_task(origin.task).instruction.replace("blue", colour.split()[0]).replace("cube", shape)
 
 
 def scene_states(states: EpisodeStates, height: float = 1.0) -> SceneStates:
-    """An episode of the cube in the benchmark's words. height: of the box in its place, over the cube's."""
+    """Convert an episode's states; the cube becomes a box of `height` times its height."""
     num_frames = len(states.poses)
     half_sizes_m, poses = cube_half_sizes(1)[0], states.poses.copy()
     poses[..., 2] += (np.float32(height) - 1) * half_sizes_m[0, 2]  # it stands on the same table
@@ -304,55 +296,6 @@ def build(
     manifest = manifest_of(make_clips(), plan.held_out)
     write_atomic(folder / MANIFEST, to_bytes(manifest))
     return manifest, skipped
-
-
-def clip_path(folder: Path, sha256: str) -> Path:
-    return folder / "clips" / f"{sha256}.npz"
-
-
-def to_file(clip: LabelledClip) -> bytes:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, frames=clip.clip.frames, masks=clip.clip.masks, fps=np.float64(clip.clip.fps))
-    return buffer.getvalue()
-
-
-def load_set(folder: Path) -> Manifest:
-    """Read and verify a set's manifest.
-
-    Raises:
-        ManifestError: see manifest.from_bytes. OSError: not there.
-    """
-    return from_bytes((folder / MANIFEST).read_bytes())
-
-
-def load_frames(folder: Path, sha256: str) -> UInt8Array:
-    """The frames of a clip, uint8 (T, H, W, 3).
-
-    Raises:
-        ManifestError: the file is missing or damaged, or holds another clip.
-    """
-    path = clip_path(folder, sha256)
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            frames, fps = arrays["frames"], float(arrays["fps"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ManifestError(f"{path} cannot be read: {error}; build the set again") from error
-    if media_sha(frames, fps) != sha256:
-        raise ManifestError(f"{path} holds another clip than its name says; build the set again")
-    checked: UInt8Array = frames
-    return checked
-
-
-def check_set(folder: Path) -> Manifest:
-    """Read the manifest and every clip of a set.
-
-    Raises:
-        ManifestError: what is wrong. OSError: no manifest.
-    """
-    manifest = load_set(folder)
-    for row in manifest.rows:
-        load_frames(folder, row.sha256)
-    return manifest
 
 
 def main(argv: Sequence[str]) -> int:

@@ -1,11 +1,11 @@
-"""Clips as the loops see them: the policy's own camera and plain scene, drawn, decoded or imagined by a world model.
+"""Clips of the policy's camera and plain scene: rendered, decoded or imagined by a world model.
 
-Of the loops' pictures the window of SEEN is read, scaled to the size of all clips. A quarter of the episodes is drawn
-by the renderer. Of another quarter every picture but the first has gone through a world model's tokenizer. The other
-half is imagined by that model from the first picture, with the recorded actions: such a clip is kept where a probe sees
-object and tool on every frame where they were in the simulator (NEAR_M), so that what is known of the recording is true
-of it; else, and where states are edited, it is decoded. Half of the successes end with the frame of their success or
-one later, as episodes do; with a stride, as the video model has one, all clips have their whole length.
+A clip shows the window of the camera SEEN, scaled to the size of all clips. A quarter of the episodes is rendered. In
+another quarter every frame but the first is encoded and decoded by a world model's tokenizer. The other half is
+imagined by that model from the first frame with the recorded actions; such a clip is used only if a position probe
+finds object and tool within NEAR_M of their recorded places on every frame, so that the recording's labels hold for it.
+Otherwise, and where states are edited, it is decoded. Half of the successful clips end at the success or one frame
+later, as episodes do; with a stride above 1, as the video model has, all clips keep their whole length.
 """
 
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ LOOK = SceneAppearance(num_clutter=0, tiled=False)
 
 
 def policy_window(config: SimulationConfig, side: int) -> Window:
-    """What is read of the loops' pictures.
+    """The part of the policy's pictures that a judge reads.
 
     Raises:
         ValueError: the configured scene has no such camera.
@@ -61,7 +61,7 @@ def policy_models(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class PolicyCamera:
-    """models: who decodes and imagines. side: of the pictures of a clip, px. stride: steps between two frames."""
+    """Makes clips of the policy's camera. models: decode and imagine. side: of a frame, px. stride: steps per frame."""
 
     models: WorldModels
     side: int
@@ -105,7 +105,7 @@ class PolicyCamera:
         return self._crop(drawing, pictures)
 
     def imagine(self, stage: ClipStage, states: SceneStates, episode: EpisodeStates) -> Drawing | None:
-        """What the world model makes of an episode's first picture and actions; None where that is another episode.
+        """Imagine a clip from an episode's first frame and actions; None where object or tool go elsewhere.
 
         Args:
             states: of the clip's frames, as `end_states` gives them.

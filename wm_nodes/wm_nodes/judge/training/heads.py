@@ -1,7 +1,7 @@
-"""Fit the heads of the embedded judge to labels, and say how well they do (RA-18 to RA-20).
+"""Fit the heads of the embedded judge to labels, and measure them (RA-18 to RA-20).
 
-Trees come from the training part; what turns log-odds into probabilities, and where a clip is too foreign to judge,
-from the validation part. Shapes: N clips, F evidence.
+Trees are fitted on the training part; the calibration of their log-odds and the limit beyond which a clip is out of
+distribution, on the validation part. Shapes: N clips, F evidence.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,12 +43,12 @@ UNKNOWN = -1
 SHRINKAGE = 0.3
 """Share of the identity in the covariance of standardised evidence."""
 COVERAGE = 0.99
-"""Share of the validation part that is near enough to training to be judged."""
+"""Share of the validation part that counts as in distribution."""
 MIN_SLOPE, MAX_SLOPE = 0.1, 3.0
 FLAG, MAX_FALSE_FLAGS = 0.8, 0.02
 """The agent confirms a pattern from this probability on (rubrics: hack.confirm)."""
 CONFORMAL = (0.8, 0.9, 0.95, 0.98)
-"""Coverages whose limits are kept with a judge."""
+"""Coverages whose limits are saved with a judge."""
 LAST_FAIL = {PLANNING: 1, TC: 2}
 """The highest level that counts as failing, where it is not 0."""
 MIN_CASES = 5
@@ -60,7 +60,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """evidence: (N, F) in the order of `names`. rows: what is known of each clip."""
+    """Evidence (N, F) in the order of `names`, and the manifest row of each clip with its labels."""
 
     names: tuple[str, ...]
     evidence: FloatArray
@@ -72,12 +72,12 @@ class Examples:
 
     @property
     def clean(self) -> BoolArray:
-        """(N,), nothing fails."""
+        """bool (N,), True where no label fails."""
         return np.array([row.labels.overall for row in self.rows], bool)
 
 
 def true_levels(target: str, rows: Sequence[ManifestRow]) -> Levels:
-    """(N,) of levels; 0 or 1 for components (passes) and patterns (absent); UNKNOWN where nobody knows."""
+    """Labels (N,): levels, or 1 for a component that passes and for an absent pattern, else 0; UNKNOWN without one."""
     return np.array([_true_level(target, row) for row in rows], np.int64)
 
 
@@ -121,10 +121,10 @@ def fit_questions(
 
 
 def _flagging_line(slope: float, odds: Floats, absent: BoolArray) -> tuple[float, float]:
-    """A line that puts the threshold with the best recall less false flags at a pattern's probability of FLAG.
+    """(slope, offset) that give the threshold with the largest recall - false flags a pattern probability of FLAG.
 
-    The agent confirms a pattern by this probability, so that it is a decision first and a probability second. At most
-    MAX_FALSE_FLAGS of the clips without the pattern are flagged; the threshold lies midway between two clips.
+    The agent confirms a pattern from this probability on. At most MAX_FALSE_FLAGS of the clips without the pattern are
+    flagged; the threshold is midway between two clips.
     """
     ordered = np.unique(odds)
     thresholds = np.concatenate([[ordered[0] - 1], (ordered[1:] + ordered[:-1]) / 2])
@@ -137,9 +137,10 @@ def _flagging_line(slope: float, odds: Floats, absent: BoolArray) -> tuple[float
 
 
 def _line(odds: Floats, above: BoolArray, share: float) -> tuple[float, float]:
-    """(slope, offset) of the likeliest sigmoid, by Newton steps; Platt's smoothed targets keep it finite.
+    """(slope, offset) of the sigmoid of maximum likelihood, by Newton steps on Platt's smoothed targets.
 
-    share: of the training labels; what balanced training took out of the odds where too few cases can say.
+    share: of passing training labels; with fewer than MIN_CASES validation cases only the balance of training is
+    corrected by it.
     """
     passes, fails = int(above.sum()), int((~above).sum())
     if min(passes, fails) < MIN_CASES:
@@ -156,7 +157,7 @@ def _line(odds: Floats, above: BoolArray, share: float) -> tuple[float, float]:
 
 
 def fit_familiarity(train: Examples, validation: Examples) -> Familiarity:
-    """Learn what evidence looks like, faults included, and the distance within which COVERAGE of validation lies."""
+    """Fit the distribution of the evidence, faults included, and the distance that covers COVERAGE of validation."""
     low, centre, high = np.quantile(train.evidence.astype(np.float64), (0.25, 0.5, 0.75), axis=0)
     spread = train.evidence.std(0, dtype=np.float64)
     scale = np.maximum(np.maximum((high - low) / 1.35, 0.5 * spread), 1e-3)
@@ -172,7 +173,7 @@ def fit_familiarity(train: Examples, validation: Examples) -> Familiarity:
 def fit_all(
     train: Examples, validation: Examples, settings: TreeSettings, seed: int, *, progress: bool = True
 ) -> dict[str, tuple[HeadQuestion, ...]]:
-    """Questions of every target."""
+    """Fit the questions of every target."""
     targets = tqdm(TARGETS, desc="heads", disable=not progress)
     return {target: fit_questions(target, train, validation, settings, seed) for target in targets}
 
@@ -201,9 +202,11 @@ def conformal_limits(
 def conformal_errors(
     questions: Mapping[str, tuple[HeadQuestion, ...]], limits: Mapping[str, tuple[float, float]], examples: Examples
 ) -> dict[str, Any]:
-    """What abstaining between conformal limits costs and saves. answered: share of the clips in which every target is.
-    targets: of each one the share without answer, and how many of the clips that fail are said to pass (fail_as_pass)
-    and of those that pass to fail (pass_as_fail), first if it always decided.
+    """Measure what abstaining between conformal limits costs and saves.
+
+    answered: share of the clips on which every target is answered. targets: by target, silent (share without answer),
+    fail_as_pass (share of failing clips that are called passing) and pass_as_fail (the reverse); the last two as
+    (without abstaining, with abstaining).
     """
     answered, targets = np.ones(len(examples.rows), bool), {}
     for target, (low, high) in limits.items():

@@ -34,7 +34,7 @@ WHOLE_PICTURE = frozenset({
 
 
 def has_true_masks(row: ManifestRow) -> bool:
-    """Whether the masks of a clip say what is seen in it; in imagined ones things are near those places only."""
+    """Whether the masks of a clip match its pixels; in imagined clips they are only near."""
     return not row.origin.scene.startswith(IMAGINED) and all(
         edit.severity == "mild" or edit.recipe in WHOLE_PICTURE or RECIPES[edit.recipe].kind == "S"
         for edit in row.edits
@@ -80,7 +80,7 @@ def train_segmenter(
 
 
 def _augment(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Other colours, light, sides and distances, so that shapes count: half of the pictures each, drawn evenly.
+    """Augment images, each change with probability 1/2 and a uniform amount, so that the network learns shapes.
 
     Colours are turned about the grey axis by any angle; the light is 0.7 to 1.3; the picture is mirrored; and it is
     turned by up to 15 degrees and scaled by 0.8 to 1.25.

@@ -1,8 +1,9 @@
-"""Train the networks that see the object over time, each on half of the recordings (RA-17).
+"""Train the temporal networks ("readers") of the embedded judge by cross-fitting (RA-17).
 
-Trees that read a network's answers must learn how good these are on clips it was not trained on. So each is trained on
-half of the recordings, and a training clip's numbers are the mean of those that were trained without its recording; on
-every other clip it is the mean of all that counts. Shapes: N clips, T frames, K questions, in the order of READS.
+The trees use the networks' answers as evidence, so these must be as reliable in training as on new clips. Therefore
+each network is trained on half of the recordings, and a training clip gets the mean answer of the networks that were
+not trained on its recording; every other clip gets the mean of all. Shapes: N clips, T frames, K questions, in the
+order of READS.
 """
 
 import hashlib
@@ -48,7 +49,7 @@ class TemporalData:
 
 
 def temporal_data(sequences: Sequence[ObjectSequence], rows: Sequence[ManifestRow]) -> TemporalData:
-    """What the readers learn from, of clips and what is known of them."""
+    """Training data of the readers: sequences, answers by label, and folds by recording."""
     answers = [_answers(question, rows) for question in READS]
     return TemporalData(sequences, np.stack(answers, 1), np.array([row.origin.seed % FOLDS for row in rows], np.int64))
 
@@ -64,7 +65,7 @@ def cross_fit(
     """`count` readers per fold, and log-odds (N, K) of every clip, the mean of those that have not seen its recording.
 
     Args:
-        folder: of finished readers, which are taken up again: files named by everything they depend on.
+        folder: of finished readers, which are loaded; the file names hash everything they depend on.
 
     Raises:
         ValueError: one of the folds has no clips. OSError: a full disk.
@@ -139,7 +140,7 @@ def train_temporal_network(
 
 
 def _weights(answers: Levels) -> Tensor:
-    """(2, K), of no and of yes: between those of the data and alike for both, so that rare faults count more."""
+    """Loss weights (2, K) of no and yes: square roots of the balancing weights, so that rare faults count more."""
     known = (answers != UNKNOWN).sum(0)
     counts = np.stack([(answers == answer).sum(0) for answer in (0, 1)])
     return torch.from_numpy(np.sqrt(0.5 * known / np.maximum(counts, 1)).astype(np.float32))
@@ -161,7 +162,7 @@ def _stack(data: TemporalData, batch: Levels) -> tuple[Tensor, Tensor]:
 
 
 def _augment(crops: Tensor, numbers: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Mirrored, colours exchanged, half of the clips each; other gains and offsets of colours; noise on the numbers."""
+    """Augment clips: half mirrored, half with exchanged colours; random colour gains and offsets, noise on numbers."""
     count = len(crops)
     mirrored = torch.from_numpy(rng.random(count) < 0.5)
     crops = torch.where(mirrored[:, None, None, None, None], crops.flip(3), crops)

@@ -1,7 +1,7 @@
-"""Make the embedded judge from adversarial sets: segmenter, evidence, heads, limits (RA-17 to RA-20).
+"""Train the embedded judge on adversarial sets: segmenter, evidence, heads, limits (RA-17 to RA-20).
 
-Finished stages lie in the folder and are taken up again: segmenter.safetensors, evidence-*.npz and sequences-*.npz per
-set and part, and reader-*.safetensors, named by everything they depend on; of these, labels for the readers only.
+Finished stages are files of the folder and are loaded by the next call: segmenter.safetensors, evidence-*.npz and
+sequences-*.npz per set and part, and reader-*.safetensors. Their names hash everything they depend on.
 """
 
 import hashlib
@@ -20,10 +20,10 @@ from tqdm import tqdm
 import wm_nodes.judge.evidence
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import FloatArray
-from wm_nodes.judge.dataset.build import load_frames
 from wm_nodes.judge.dataset.edits import COMPONENTS, TC, Manifest
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part, to_bytes
 from wm_nodes.judge.dataset.policy_camera import SEEN
+from wm_nodes.judge.dataset.set_files import load_frames
 from wm_nodes.judge.evidence.clip import measure_clip
 from wm_nodes.judge.evidence.head import JudgeHead
 from wm_nodes.judge.evidence.segmentation import Segmenter
@@ -41,22 +41,23 @@ Sets = Sequence[tuple[Path, Manifest]]
 
 @dataclass(frozen=True)
 class JudgePlan:
-    """sets: folders of adversarial sets. segmenter_steps: batches. readers: networks over time per half of the
-    recordings. reader_epochs: times that each sees its clips. seed: of everything drawn. window: what the clips show of
-    the pictures that will be judged, of sets that were drawn so (policy_view.py).
-    """
+    """Settings of a judge's training."""
 
     sets: tuple[Path, ...]
+    """Folders of adversarial sets."""
     segmenter_steps: int = 2800
+    """Batches that the segmenter is trained on."""
     readers: int = 1
+    """Temporal networks per half of the recordings."""
     reader_epochs: int = 16
     trees: TreeSettings = field(default_factory=TreeSettings)
     seed: int = 0
     window: Window | None = None
+    """The part of the judged pictures that the clips show, for sets of the policy's camera (policy_camera.py)."""
 
 
 def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> JudgeHead:
-    """Train every part; the head's story holds data, seeds and what the validation part measures, not yet who and when.
+    """Train every part of a judge; the head's story holds the data, the seeds and the metrics on the validation part.
 
     Raises:
         ManifestError: a damaged set. ValueError: sets too small to learn from. OSError: a full disk.
@@ -110,7 +111,7 @@ def collect_evidence(
     folder: Path, sets: Sets, part: Part, segmenter: Segmenter, readers: Sequence[TemporalNetwork] = (), *,
     progress: bool = True,
 ) -> Examples:
-    """Evidence of every clip of a part of all sets, that of readers in the end; kept in `folder` per set."""
+    """Evidence of every clip of a part of all sets, with the readers' answers last; cached in `folder` per set."""
     names: tuple[str, ...] = ()
     values, rows = [], []
     for path, manifest in sets:
@@ -126,7 +127,7 @@ def collect_evidence(
 
 
 def collect_sequences(folder: Path, sets: Sets, part: Part, segmenter: Segmenter) -> list[ObjectSequence]:
-    """What a reader reads of every clip of a part of all sets, whose evidence has been collected."""
+    """The object sequence of every clip of a part of all sets; collect_evidence must have run before."""
     collected = []
     for path, manifest in sets:
         if rows_of(manifest, [part]):
@@ -139,7 +140,7 @@ def collect_sequences(folder: Path, sets: Sets, part: Part, segmenter: Segmenter
 
 
 def with_readings(examples: Examples, log_odds: FloatArray) -> Examples:
-    """The examples with what the readers answer, (N, K), as their last numbers."""
+    """The examples with the readers' log-odds (N, K) as their last evidence."""
     evidence = np.concatenate([examples.evidence, log_odds], 1)
     return Examples(examples.names + reading_names(), evidence, examples.rows)
 
@@ -155,7 +156,7 @@ def _add_readings(
 def _measure_part(
     folder: Path, path: Path, manifest: Manifest, part: Part, segmenter: Segmenter, progress: bool
 ) -> tuple[Path, Path]:
-    """Evidence and sequences of the clips of a part of a set, in files that are made where they are missing."""
+    """Paths of the evidence and the sequences of a set's part, which are measured where the files are missing."""
     chosen = rows_of(manifest, [part])
     key = _key(chosen, segmenter)
     evidence, sequences = (folder / f"{name}-{key}.npz" for name in ("evidence", "sequences"))
@@ -180,7 +181,7 @@ def _keep(path: Path, **arrays: NDArray[Any]) -> None:
 
 
 def _key(rows: Sequence[ManifestRow], segmenter: Segmenter) -> str:
-    """Of clips, their reference frames, what instructions are made of, weights and code."""
+    """Hash of the clips, their reference frames and instructions, the segmenter's weights and the code."""
     shown = "".join(f"{row.sha256} {row.root} {row.origin.task} {row.origin.object_id}\n" for row in rows)
     return hashlib.sha256(shown.encode() + _weights_digest(segmenter) + _code_digest()).hexdigest()[:16]
 
@@ -216,7 +217,7 @@ def _weights_digest(segmenter: Segmenter) -> bytes:
 
 
 def _code_digest() -> bytes:
-    """Of the code that computes evidence: a changed number is another number."""
+    """Hash of the code that computes evidence."""
     folder = Path(str(wm_nodes.judge.evidence.__path__[0]))
     others = ("__init__", "definitions", "head", "trees", "window")
     files = (path for path in sorted(folder.glob("*.py")) if path.stem not in others)
