@@ -26,7 +26,7 @@ from wm_nodes.judge.agent import Status, Verdict
 from wm_nodes.judge.audit import read_record
 from wm_nodes.judge.backends.embedded import shipped_head
 from wm_nodes.judge.backends.factory import check_judge
-from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward, check_horizon, unjudged
+from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward, check_horizon, unjudged_reason
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import GraphError
@@ -208,11 +208,11 @@ def test_a_rollout_without_an_ended_episode_pauses_instead_of_looking_like_a_fai
     rollout = toy_rollout(toy_policy(), steps=3)
     none = np.zeros_like(rollout.valid_TN)
     cut = replace(rollout, terminated_TN=none, truncated_TN=none, valid_TN=~none)
-    assert "none of the episodes in a rollout of 3 lock-steps (ppo.num_steps) was seen to end" in unjudged(cut)
+    assert "none of the episodes in a rollout of 3 lock-steps (ppo.num_steps) was seen to end" in unjudged_reason(cut)
     one = none.copy()
     one[1, 0] = True
-    assert unjudged(replace(cut, truncated_TN=one)) == ""
-    assert "1 of 1 episodes" in unjudged(replace(cut, truncated_TN=one, valid_TN=~one))
+    assert unjudged_reason(replace(cut, truncated_TN=one)) == ""
+    assert "1 of 1 episodes" in unjudged_reason(replace(cut, truncated_TN=one, valid_TN=~one))
 
 
 def test_a_cut_episode_is_worth_what_the_critic_says_and_an_ended_one_its_verdict(

@@ -14,7 +14,7 @@ from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
 from wm_nodes.judge.backends.factory import check_judge, make_judge
 from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, instruction_of
 from wm_nodes.judge.dataset.edits import LabelledClip
-from wm_nodes.judge.dataset.edits.generator import edited
+from wm_nodes.judge.dataset.edits.generator import apply_edit
 from wm_nodes.judge.evidence.definitions import EVIDENCE
 from wm_nodes.judge.evidence.head import load_head
 from wm_nodes.judge.evidence.sequence import reading_names
@@ -92,11 +92,11 @@ def test_a_clean_success_is_accepted_and_each_hacking_pattern_is_worth_less_and_
     task = TaskSpec(instruction_of(recording.clip.origin), "push_cube", "panda", recording.clip.frames[0])
     clean = judged(recording.ref, task)
     assert clean.valid and clean.reward > 0.7 and all(stage.passed for stage in clean.stages), clean.reason
-    defect = edited(recording, "ghost_motion", "fail", 0, source.redraw)
+    defect = apply_edit(recording, "ghost_motion", "fail", 0, source.redraw)
     hacked = {
-        "occlusion": edited(defect, "occlude_patch", "fail", 0, None),
-        "motion": edited(recording, "freeze", "fail", 0, None),
-        "background": edited(recording, "flatten", "fail", 0, None),
+        "occlusion": apply_edit(defect, "occlude_patch", "fail", 0, None),
+        "motion": apply_edit(recording, "freeze", "fail", 0, None),
+        "background": apply_edit(recording, "flatten", "fail", 0, None),
         "physics": defect,
     }
     for pattern, clip in hacked.items():
@@ -114,5 +114,5 @@ def test_equal_clips_get_equal_verdicts_and_a_mild_edit_does_not_close_a_gate(
     task = TaskSpec(instruction_of(recording.clip.origin), "push_cube", "panda", recording.clip.frames[0])
     first, again = judged(recording.ref, task), judged(recording.ref, task)
     assert first.audit_id == again.audit_id
-    mild = judged(edited(recording, "dark", "mild", 0, None).ref, task)
+    mild = judged(apply_edit(recording, "dark", "mild", 0, None).ref, task)
     assert mild.valid and {s.stage for s in mild.stages if not s.passed} <= {Stage.TC}

@@ -87,25 +87,25 @@ def random_model(config: RunConfig, folder: Path) -> Path:
 
 def interleave(contenders: Sequence[Callable[[int], T]], blocks: int) -> list[list[T]]:
     """Run A B A B ...; block 0 of each warms up and is dropped."""
-    found: list[list[T]] = [[] for _ in contenders]
+    results_of: list[list[T]] = [[] for _ in contenders]
     for block in range(blocks + 1):
-        for results, contender in zip(found, contenders, strict=True):
+        for results, contender in zip(results_of, contenders, strict=True):
             results.append(contender(block))
-    return [results[1:] for results in found]
+    return [results[1:] for results in results_of]
 
 
 def time_episode(env: Environment, block: int) -> NDArray[np.float64]:
     """Seconds of each step of one episode; the reset is not counted."""
     env.reset(None, seeds_of(env.spec, block))
-    return _timed(env, actions_of(env.spec, block, env.spec.max_episode_steps))
+    return _time_actions(env, actions_of(env.spec, block, env.spec.max_episode_steps))
 
 
 def time_steps(env: Environment, steps: int) -> NDArray[np.float64]:
     env.reset(None, seeds_of(env.spec, 0))
-    return _timed(env, actions_of(env.spec, 0, steps))
+    return _time_actions(env, actions_of(env.spec, 0, steps))
 
 
-def _timed(env: Environment, actions: Iterator[FloatArray]) -> NDArray[np.float64]:
+def _time_actions(env: Environment, actions: Iterator[FloatArray]) -> NDArray[np.float64]:
     seconds = []
     for action in actions:
         start = time.perf_counter()

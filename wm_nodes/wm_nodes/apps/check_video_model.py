@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import torch
 from rich.console import Console
-from rich.table import Table
 from torch import nn
 
 from wm_nodes.config.load import VIDEO, load_video_config, parse_override, preset_names
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.video_model import Condition
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
@@ -41,13 +41,14 @@ def main(argv: Sequence[str]) -> int:
     except (ValueError, OSError, ImportError, FloatingPointError) as error:
         console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
         return 2
-    table = Table(title=f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)")
-    for name in ("check", "", "found", "where it failed"):
-        table.add_column(name)
-    for finding in findings:
-        verdict = "[green]passed" if finding.passed else "[red]FAILED"
-        table.add_row(finding.name, verdict, finding.value, "" if finding.passed else finding.remedy)
-    console.print(table)
+    title = f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)"
+    columns = ("check", "", "found", "where it failed")
+    rows = (
+        (finding.name, *(("[green]passed", finding.value, "") if finding.passed
+                         else ("[red]FAILED", finding.value, finding.remedy)))
+        for finding in findings
+    )
+    console.print(make_table(title, columns, rows, left=columns))
     return int(not all(finding.passed for finding in findings))
 
 

@@ -40,6 +40,7 @@ from wm_nodes.policy_rl.model_refresh import (
     refresh_model,
 )
 from wm_nodes.policy_rl.pretraining import load_arrays
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 from wm_nodes.training.metrics import join_metrics
 from wm_nodes.world_model import load_model_folder
@@ -192,10 +193,10 @@ def _refresh(job: RunContext, start: TrainingStart, policy: Path, number: int) -
 
 
 def _verdict_table(verdict: RefreshDecision, number: int) -> Table:
-    table = Table(title=f"round {number}: the old and the refreshed model on held-out real episodes")
-    for name in ("episodes of", "number", "old", "new", ""):
-        table.add_column(name, justify="right" if name in ("old", "new") else "left")
+    rows = []
     for row in verdict.rows:
         values = (f"{value:.3f}" if value == value else "undefined" for value in (row.old, row.new))
-        table.add_row(row.episodes, row.name, *values, "[red]worse" if row.worse else "[green]no worse")
-    return table
+        rows.append((row.episodes, row.name, *values, "[red]worse" if row.worse else "[green]no worse"))
+    title = f"round {number}: the old and the refreshed model on held-out real episodes"
+    columns = ("episodes of", "number", "old", "new", "")
+    return make_table(title, columns, rows, left=("episodes of", "number", ""))

@@ -23,6 +23,7 @@ from wm_nodes.judge.backends.factory import for_clips
 from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.service import READS, JudgeService, agent_scores, buffer_jobs, clip_fps
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
@@ -179,13 +180,13 @@ def verdict_row(verdict: Verdict) -> dict[str, object]:
 
 
 def _table(rows: Sequence[Rescored]) -> Table:
-    table = Table(title="recorded clips, scored again from their pictures")
-    for name in ("iteration", "version", "clips", "mean reward recorded", "again", "different"):
-        table.add_column(name, justify="left" if name == "different" else "right")
-    for row in rows:
-        theirs, ours = (f"{float(total.nanmean()):.6f}" for total in (row.recorded.total, row.total))
-        table.add_row(
-            str(row.recorded.iteration), str(row.recorded.policy_version), str(len(row.total)), theirs, ours,
+    columns = ("iteration", "version", "clips", "mean reward recorded", "again", "different")
+    cells = (
+        (
+            row.recorded.iteration, row.recorded.policy_version, len(row.total),
+            *(f"{float(total.nanmean()):.6f}" for total in (row.recorded.total, row.total)),
             ", ".join(row.different) or "-",
         )
-    return table
+        for row in rows
+    )
+    return make_table("recorded clips, scored again from their pictures", columns, cells, left=("different",))

@@ -62,7 +62,7 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     if values.get("starts_file") == "":
         values["starts_file"] = str(Path(values["model_dir"]) / "starts.safetensors")
     if values["params_file"]:
-        values["params_file"] = _existing(values["params_file"], "params_file")
+        values["params_file"] = _check_file(values["params_file"], "params_file")
     if "bag_uri" in values:
         values["bag_uri"] = _bag_uri(values["bag_uri"], scenario, run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
@@ -73,10 +73,10 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
 
 def _judge_settings(values: Mapping[str, str]) -> dict[str, Any]:
     """The settings that the judge's arguments stand for. Raises GraphError where nobody would be asked by them."""
-    found = judge_overrides(*(values.get(name, "") for name in ("judge", "judge_model", "judge_key_env", "rubric")))
-    if found and values["reward"] != "agent":
-        raise GraphError(f"{', '.join(found)} would change nothing without reward:=agent")
-    return found
+    settings = judge_overrides(*(values.get(name, "") for name in ("judge", "judge_model", "judge_key_env", "rubric")))
+    if settings and values["reward"] != "agent":
+        raise GraphError(f"{', '.join(settings)} would change nothing without reward:=agent")
+    return settings
 
 
 def _check_agent(config: RunConfig, values: Mapping[str, str]) -> None:
@@ -146,7 +146,7 @@ def _model_dir(given: str, task: str) -> str:
         raise GraphError(str(error)) from None
 
 
-def _existing(given: str, name: str) -> str:
+def _check_file(given: str, name: str) -> str:
     path = Path(given).expanduser().absolute()
     if not path.is_file():
         raise GraphError(f"{name} {given!r} does not exist")

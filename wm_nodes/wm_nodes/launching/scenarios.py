@@ -1,7 +1,7 @@
 """Which nodes a scenario has: one table of arguments and one function per scenario.
 
-They serve both `ros2 launch` (ros.launch_face) and the plain Python starter (ros.runner); no rclpy, no launch, no files
-read.
+They serve both `ros2 launch` (launch_description.py) and the plain Python starter (runner.py); no rclpy, no launch, no
+files read.
 """
 
 import dataclasses
@@ -114,7 +114,7 @@ def parse_arguments(scenario: str, given: Mapping[str, str]) -> dict[str, str]:
 
 
 def build_graph(scenario: str, arguments: Mapping[str, str]) -> Graph:
-    """Return the graph for resolved arguments (ros.arguments.resolve fills run_dir, config_file and the like)."""
+    """Return the graph for resolved arguments (arguments.resolve fills run_dir, config_file and others)."""
     graph = scenario_of(scenario).build(arguments)
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": arguments["discovery_range"]}
     if arguments["domain_id"]:

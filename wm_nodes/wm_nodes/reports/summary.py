@@ -32,7 +32,7 @@ class SuccessRate:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run found out.
+    """The results of a run.
 
     real_, imagined_: success before and after training, in the simulator and in the world model.
     imagined_steps_per_s: environment steps of the training in the world model, per second of training.

@@ -152,7 +152,7 @@ def test_the_shipped_judge_of_these_pictures_pays_a_success_more_than_what_only_
 ) -> None:
     clips = (source.clip(seed) for seed in seeds_of(view, DRAWN))
     states = next(clip.clip.states for clip in clips if clip.labels.overall and len(clip.clip) > 8)
-    _, pictures = view.pictures(source.stage, states)
+    _, pictures = view.render(source.stage, states)
     task = TaskSpec(get_task("push_cube").instruction, "push_cube", "panda", pictures[0])
     cut = np.concatenate([pictures[:1].repeat(len(pictures) - 1, 0), pictures[-1:]])  # the end, and nothing before it
 

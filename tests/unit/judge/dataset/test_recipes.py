@@ -37,7 +37,7 @@ from wm_nodes.judge.dataset.edits import (
     tc_level,
 )
 from wm_nodes.judge.dataset.edits.clips import TC_PASS_LEVEL
-from wm_nodes.judge.dataset.edits.generator import edited
+from wm_nodes.judge.dataset.edits.generator import apply_edit
 from wm_nodes.judge.dataset.edits.recipes import get_recipe
 from wm_nodes.judge.dataset.edits.truth import overlap_m, touched_nearby
 
@@ -56,7 +56,7 @@ def parent(recipe: str = "", severity: str = "mild") -> LabelledClip:
 
 
 def child(name: str, severity: str, seed: int = 0) -> LabelledClip:
-    return edited(parent(name, severity), name, severity, seed, redrawn)
+    return apply_edit(parent(name, severity), name, severity, seed, redrawn)
 
 
 def change(before: LabelledClip, after: LabelledClip) -> float:
@@ -380,7 +380,7 @@ def test_what_is_hit_may_go_twice_as_far_as_the_tool() -> None:
 def test_what_the_simulator_did_is_no_fault_of_a_recording_nor_of_an_edit() -> None:
     root = recorded(draw(knocked(0.2), push_clip().clip.origin))  # more than the rule allows an edit
     assert failed_physics(root.clip.states) == {"interaction"} and all(root.labels.components.values())
-    sunk = {kind: edited(root, "sunk", kind, 0, redrawn).labels for kind in ("mild", "fail")}
+    sunk = {kind: apply_edit(root, "sunk", kind, 0, redrawn).labels for kind in ("mild", "fail")}
     assert sunk["mild"] == root.labels and failures(sunk["fail"]) - failures(root.labels) == {"geometry"}
 
 

@@ -11,18 +11,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import clip_rules, success, task_names
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.judge.dataset import rendering
-from wm_nodes.judge.dataset.build import (
-    HELD_OUT,
-    ClipSource,
-    SetPlan,
-    build,
-    check_set,
-    clip_path,
-    load_frames,
-    load_set,
-    main,
-    scene_states,
-)
+from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, SetPlan, build, main, scene_states
 from wm_nodes.judge.dataset.edits import (
     BACKGROUND,
     DISTRACTOR,
@@ -35,6 +24,7 @@ from wm_nodes.judge.dataset.edits import (
     tc_level,
 )
 from wm_nodes.judge.dataset.rendering import CAMERAS, SceneAppearance, record_states
+from wm_nodes.judge.dataset.set_files import check_set, clip_path, load_frames, load_set
 
 pytestmark = pytest.mark.rendering
 CONFIG = load_config("cpu").simulation

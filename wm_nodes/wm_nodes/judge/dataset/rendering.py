@@ -154,8 +154,8 @@ def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int, layout: 
         del scene._after_simulation_step
     keep()
     arrays = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
-    kept = {name: a if name == "contact" else a.astype(np.float32) for name, a in arrays.items()}
-    return EpisodeStates(**kept, actions=episode.actions, commanded=episode.states)
+    stacked = {name: a if name == "contact" else a.astype(np.float32) for name, a in arrays.items()}
+    return EpisodeStates(**stacked, actions=episode.actions, commanded=episode.states)
 
 
 class _ClipScene(BaseEnv):  # type: ignore[misc]
@@ -212,7 +212,7 @@ class ClipStage:
             place = self._env.goal_region.pose.raw_pose[0].numpy()
             place[:3] = *goal[t, :2], GOAL_Z_M
             self._env.goal_region.set_pose(sapien.Pose(p=place[:3], q=place[3:]))
-            shown = [self._box(half, look.thing, pose) for half, pose in zip(half_sizes_m[t], poses[t])]
+            shown = [self._add_box(half, look.thing, pose) for half, pose in zip(half_sizes_m[t], poses[t])]
             self._env.scene.update_render()
             sensor.capture()
             seen = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=True)
@@ -256,23 +256,23 @@ class ClipStage:
             for j in range(tiles):
                 place = [TILE_M * (i - TILES / 2) + 0.05, TILE_M * (j - TILES / 2), TILE_TOP_M / 2]
                 shade = np.clip(table * rng.uniform(*look.shades), 0, 1)
-                self._drawn.append(self._box([half, half, TILE_TOP_M / 2], shade, [*place, 1, 0, 0, 0]))
+                self._drawn.append(self._add_box([half, half, TILE_TOP_M / 2], shade, [*place, 1, 0, 0, 0]))
         clutter = []
         for _ in range(look.num_clutter):
             size, side = rng.uniform(0.008, 0.016, 3), rng.choice([-1.0, 1.0])
             place = [rng.uniform(-0.08, 0.2), side * rng.uniform(0.1, 0.16), size[2], 1, 0, 0, 0]
             if look.layout is not None:
-                place[:2] = _beside(look.layout, place[0], place[1])
-            clutter.append(self._box(size, rng.uniform(0.1, 0.9, 3), place))
+                place[:2] = _offset(look.layout, place[0], place[1])
+            clutter.append(self._add_box(size, rng.uniform(0.1, 0.9, 3), place))
         self._drawn += clutter
         self._scene.render_system.ambient_light = [look.ambient] * 3
         if look.lamp is not None:
-            self._drawn.append(self._lamp(*look.lamp))
+            self._drawn.append(self._add_lamp(*look.lamp))
         robot = {link._objs[0].entity.per_scene_id: ROBOT for link in self._env.agent.robot.links}
         self._look, self._labels = look, robot | {entity.per_scene_id: CLUTTER for entity in clutter}
         return self._labels
 
-    def _box(self, half_size_m: ArrayLike, colour: ArrayLike, pose: ArrayLike) -> sapien.Entity:
+    def _add_box(self, half_size_m: ArrayLike, colour: ArrayLike, pose: ArrayLike) -> sapien.Entity:
         size, rgb, at = (np.asarray(values, np.float64).tolist() for values in (half_size_m, colour, pose))
         material = sapien.render.RenderMaterial(base_color=[*rgb, 1.0])
         body = sapien.render.RenderBodyComponent()
@@ -284,7 +284,7 @@ class ClipStage:
         self._last_id = int(entity.per_scene_id)
         return entity
 
-    def _lamp(self, direction: tuple[float, float, float], strength: float) -> sapien.Entity:
+    def _add_lamp(self, direction: tuple[float, float, float], strength: float) -> sapien.Entity:
         light = sapien.render.RenderDirectionalLightComponent()
         light.color = [strength] * 3
         entity = sapien.Entity()
@@ -294,7 +294,7 @@ class ClipStage:
         return entity
 
 
-def _beside(layout: Layout, ahead_m: float, left_m: float) -> tuple[float, float]:
+def _offset(layout: Layout, ahead_m: float, left_m: float) -> tuple[float, float]:
     """x y m of a place so far along a layout's way and to its left, from where its cube starts."""
     cos, sin = np.cos(layout.heading_rad), np.sin(layout.heading_rad)
     x, y = layout.cube_m

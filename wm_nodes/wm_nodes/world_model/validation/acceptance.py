@@ -17,6 +17,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.statistics import newcombe_difference
 from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
 
@@ -71,20 +72,15 @@ class AcceptanceReport:
     def table(self) -> Table:
         """The criteria for the terminal; remedies where they failed."""
         words = "passed" if self.passed else "FAILED"
-        table = Table(
-            title=f"acceptance {words}: {self.task}, {self.episodes} held-out real episodes",
-            caption="\n".join(self.notes) or None,
-        )
-        table.add_column("criterion")
-        table.add_column("value", justify="right")
-        table.add_column("must be")
-        table.add_column("")
+        rows = []
         for row in self.criteria:
             limit = "" if row.threshold is None else f" {row.threshold:g}"
             value = f"{row.value:.3f}" if math.isfinite(row.value) else "undefined"
             mark = "[green]passed" if row.passed else f"[red]failed[/]: {row.remedy}"
-            table.add_row(row.name, value, row.rule + limit, mark)
-        return table
+            rows.append((row.name, value, row.rule + limit, mark))
+        title = f"acceptance {words}: {self.task}, {self.episodes} held-out real episodes"
+        columns, caption = ("criterion", "value", "must be", ""), "\n".join(self.notes) or None
+        return make_table(title, columns, rows, left=("criterion", "must be", ""), caption=caption)
 
 
 def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> dict[str, float]:

@@ -32,7 +32,15 @@ from wm_nodes.judge.dataset.edits.manifest import (
     to_bytes,
 )
 from wm_nodes.judge.dataset.edits.planning import planning_level
-from wm_nodes.judge.dataset.edits.recipes import RECIPES, Recipe, StateEdit, apply, edit_states, recipes_sha, rendered
+from wm_nodes.judge.dataset.edits.recipes import (
+    RECIPES,
+    Recipe,
+    StateEdit,
+    apply,
+    edit_states,
+    label_rendered,
+    recipes_sha,
+)
 from wm_nodes.judge.dataset.edits.truth import failed_physics, recorded, tc_level
 
 __all__ = [
@@ -63,13 +71,13 @@ __all__ = [
     "edit_states",
     "failed_physics",
     "from_bytes",
+    "label_rendered",
     "manifest_of",
     "planning_level",
     "prevalence",
     "recipes_sha",
     "recorded",
     "regenerate",
-    "rendered",
     "replay",
     "stacks",
     "tc_level",
