@@ -15,10 +15,9 @@ from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
-from wm_nodes.video_rl.reference_reward import mixed, score_clips
+from wm_nodes.video_rl.reference_reward import mixed, rewarded, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.video_rl.settings import EvaluationSettings, GroupSettings, VideoRlConfig
-from wm_nodes.video_rl.training_run import rewarded
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 

@@ -29,8 +29,9 @@ from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
+from wm_nodes.video_rl.reference_reward import rewarded
 from wm_nodes.video_rl.settings import load_video_config
-from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, rewarded, version_uri
+from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, version_uri
 from wm_nodes.video_rl.validation import alarm_text, validation_scores
 
 PARAMS = (

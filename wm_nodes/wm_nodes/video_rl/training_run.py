@@ -11,12 +11,10 @@ sampling_version follows from the run folder alone: a resumed run asks for what 
 import hashlib
 import json
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-
-import torch
 
 from wm_nodes.training.checkpoint import metadata_of
 from wm_nodes.training.metrics import MetricsWriter, read_metrics
@@ -195,9 +193,3 @@ def flat_metrics(report: BufferReport) -> dict[str, float]:
     for index, update in enumerate(updates, 1):
         found |= {f"{name}_{index}": float(value) for name, value in update.items()}
     return found
-
-
-def rewarded(buffer: RolloutBuffer, scores: Mapping[str, torch.Tensor], total: torch.Tensor) -> RolloutBuffer:
-    """The buffer with raw scores and the mixed reward `total`; a clip whose total is NaN is left out of training."""
-    raw = {name: values.double() for name, values in scores.items()}
-    return replace(buffer.with_rewards({"total": total}), rewards={**raw, "total": total.double()})
