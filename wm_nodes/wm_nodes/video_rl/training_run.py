@@ -74,8 +74,9 @@ class VideoRun:
         """Buffers trained on in the run folder."""
         if (run_dir / CHECKPOINT).is_file():
             self.iterations = self.learner.load(run_dir / CHECKPOINT)
-        self.previous_version = max((v for v in self._versions() if v < self.version), default=self.version)
-        """The version before the last training; before any, that of now."""
+        older = [] if self.learner.skipped else [version for version in self._versions() if version < self.version]
+        self.previous_version = max(older, default=self.version)
+        """The version before the last buffer; that of now before any, and after one that was skipped."""
         self.staleness = 0
         """Optimizer steps between sampling and training of the last buffer."""
         self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self._ranks.rank == 0 else None
@@ -100,7 +101,7 @@ class VideoRun:
         return self.previous_version if self.prefetches else self.version
 
     def train(self, buffer: RolloutBuffer, check: Callable[[], None] = lambda: None) -> BufferReport:
-        """Train on one buffer with rewards, then save.
+        """Train on one buffer with rewards, or skip it (see GrpoLearner.train), then save.
 
         Args:
             check: called before every call of the network; what it raises ends the training with nothing changed. With
