@@ -14,9 +14,10 @@ Anchor = Literal["buffer", "frozen", "lora_off", "moving", "dual"]
 @dataclass(frozen=True)
 class AdvantageSettings:
     """DD-13. clip: of the normalised advantage. mix: several rewards are added before they are normalised (reward), or
-    each is normalised and then weighed (advantage). best_of_n: videos of a group that train, best and worst; 0: all.
-    floor: a group with std < floor max(1, |mean|) has no spread. source: what is normalised, the reward, or (win_rate)
-    Pref-GRPO's share of wins against the others of the group.
+    each is normalised and then weighed (advantage). std_scope: which standard deviation normalises, see
+    group_advantages; flow_grpo's global_std is batch, not global. best_of_n: videos of a group that train, best and
+    worst; 0: all. floor: a group with std < floor max(1, |mean|) has no spread. source: what is normalised, the reward,
+    or (win_rate) Pref-GRPO's share of wins against the others of the group.
     """
 
     clip: float = 2.5
