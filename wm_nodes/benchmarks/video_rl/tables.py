@@ -18,14 +18,14 @@ LAST_UPDATE = ("clip_low_share_2", "clip_high_share_2", "kl_2")
 def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     table = _table(
         "diversity (DD-19) and quality, mean over contexts with 95 % bootstrap interval",
-        ("arm", "initial noise"), ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"),
+        ("sampler", "initial noise"), ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"),
     )
     for row in rows:
         mean, low, high = bootstrap_mean(row["diversity"], seed=seed)
         shown = ("diversity_dynamic", "reward_std", "reward", "background", "mass")
         values = [sum(row[name]) / len(row[name]) for name in shown]
         table.add_row(
-            row["arm"], _regime(row), f"{row['noise_share']:.3f}",
+            row["sampler"], _regime(row), f"{row['noise_share']:.3f}",
             f"{mean:.3f} ({low:.3f} to {high:.3f})", *(f"{value:.4f}" for value in values),
         )
     return table
@@ -33,28 +33,29 @@ def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
 
 def clip_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     table = _table(
-        f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("arm", "initial noise"),
+        f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("sampler", "initial noise"),
         ("noise rms/s", "diversity (DD-19)", "moving part", "object spread, cm", "reward std", "tracking", "scenery"),
     )
     for row in rows:
         mean, low, high = bootstrap_mean(row["diversity"], seed=seed)
         shown = ("diversity_dynamic", "object_spread_cm", "reward_std", "tracking", "scenery")
         table.add_row(
-            row["arm"], _regime(row), f"{_average(row, 'noise_share'):.3f}", f"{mean:.4f} ({low:.4f} to {high:.4f})",
-            *(f"{_average(row, name):.4f}" for name in shown),
+            row["sampler"], _regime(row), f"{_average(row, 'noise_share'):.3f}",
+            f"{mean:.4f} ({low:.4f} to {high:.4f})", *(f"{_average(row, name):.4f}" for name in shown),
         )
     return table
 
 
 def clip_comparison_table(comparisons: Sequence[dict[str, Any]]) -> Table:
     table = _table(
-        "DynDiff - CPS, paired over contexts, 95 % bootstrap interval", ("arm", "base", "initial noise"),
+        "DynDiff - CPS, paired over contexts, 95 % bootstrap interval", ("sampler", "base", "initial noise"),
         ("noise", "diversity (DD-19)", "moving part", "object spread, cm", "tracking"),
     )
     for row in comparisons:
         shown = ("diversity", "diversity_dynamic", "object_spread_cm", "tracking")
         intervals = ("{:+.4f} ({:+.4f} to {:+.4f})".format(*row[name]) for name in shown)
-        table.add_row(row["arm"], row["base"], _regime(row), "{:.2f}, {:.2f}".format(*row["noise_share"]), *intervals)
+        noise = "{:.2f}, {:.2f}".format(*row["noise_share"])
+        table.add_row(row["sampler"], row["base"], _regime(row), noise, *intervals)
     return table
 
 
@@ -67,20 +68,20 @@ def _average(row: dict[str, Any], name: str) -> float:
 
 
 def training_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per arm, means over its seeds: held-out scenes before and after; noise and diversity of its rollouts,
-    means over the buffers; the last buffer's second update.
+    """One line per sampler, means over its seeds: held-out scenes before and after; noise and diversity of its
+    rollouts, means over the buffers; the second update of the last buffer that was not skipped.
     """
     table = _table(
-        "held-out scenes, ODE, before and after; mean over seeds", ("arm",),
+        "held-out scenes, ODE, before and after; mean over seeds", ("sampler",),
         ("seeds", "reward", "obeyed", "bg", "mass", "noise", "diversity", "clip low/high @2", "KL @2", "seconds"),
     )
-    for arm in dict.fromkeys(row["arm"] for row in rows):
-        mine = [row for row in rows if row["arm"] == arm]
+    for sampler in dict.fromkeys(row["sampler"] for row in rows):
+        mine = [row for row in rows if row["sampler"] == sampler]
         first, last = ([row["evaluations"][i] for row in mine] for i in (0, -1))
-        update = {name: np.mean([row["buffers"][name][-1] for row in mine]) for name in LAST_UPDATE}
+        update = {name: np.mean([_last(row["buffers"][name]) for row in mine]) for name in LAST_UPDATE}
         course = (f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed"))
         table.add_row(
-            arm, str(len(mine)), *course,
+            sampler, str(len(mine)), *course,
             f"{_mean(last, 'background'):.4f}", f"{_mean(last, 'mass'):.3f}",
             *(_over_buffers(mine, name) for name in COURSE),
             f"{update['clip_low_share_2']:.2f}/{update['clip_high_share_2']:.2f}", f"{update['kl_2']:.1e}",
@@ -92,17 +93,22 @@ def training_table(rows: Sequence[dict[str, Any]]) -> Table:
 def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
     """One line per training: held-out contexts after - before, paired over them."""
     table = _table(
-        "held-out contexts by ODE, after - before, 95 % bootstrap interval over the contexts", ("arm",),
+        "held-out contexts by ODE, after - before, 95 % bootstrap interval over the contexts", ("sampler",),
         ("seed", "noise rms/s", "tracking before", *SCORES, "seconds"),
     )
     for row in rows:
         changes = (np.subtract(row["after"][name], row["before"][name]) for name in SCORES)
         intervals = ("{:+.3f} ({:+.3f} to {:+.3f})".format(*bootstrap_mean(one, seed=row["seed"])) for one in changes)
         table.add_row(
-            row["arm"], str(row["seed"]), _over_buffers([row], "noise_share"),
+            row["sampler"], str(row["seed"]), _over_buffers([row], "noise_share"),
             f"{_average(row['before'], 'tracking'):.3f}", *intervals, f"{sum(row['seconds'].values()):.0f}",
         )
     return table
+
+
+def _last(course: Sequence[float | None]) -> float:
+    """The last value that is known; NaN where none is, of a training whose buffers were all skipped."""
+    return next((value for value in reversed(course) if value is not None), np.nan)
 
 
 def _over_buffers(rows: Sequence[dict[str, Any]], name: str) -> str:
@@ -114,11 +120,11 @@ def _over_buffers(rows: Sequence[dict[str, Any]], name: str) -> str:
 def comparison_table(comparisons: Sequence[SamplerComparison]) -> Table:
     measures = tuple(comparisons[0].differences) if comparisons else ()
     table = _table(
-        "arm - base on the same seeds: mean, 95 % t interval, * if beside 0; _path: mean over a training",
-        ("arm", "base"), ("seeds", *measures),
+        "sampler - base on the same seeds: mean, 95 % t interval, * if beside 0; _path: mean over a training",
+        ("sampler", "base"), ("seeds", *measures),
     )
     for row in comparisons:
-        table.add_row(row.arm, row.base, str(len(row.seeds)), *(_shown(row.differences[name]) for name in measures))
+        table.add_row(row.sampler, row.base, str(len(row.seeds)), *(_shown(row.differences[name]) for name in measures))
     return table
 
 
@@ -144,7 +150,7 @@ def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
     for row in rows:
         first, last, proxy = row["evaluations"][0], row["evaluations"][-1], row["plan"]["proxy"]
         shown = (f"{first[name]:.4g} -> {last[name]:.4g}" for name in (proxy, "obeyed", "mass", "background"))
-        table.add_row(row["arm"], str(row["seed"]), *shown, ", ".join(alarms(row)) or "no alarm")
+        table.add_row(row["sampler"], str(row["seed"]), *shown, ", ".join(alarms(row)) or "no alarm")
     return table
 
 
