@@ -92,7 +92,7 @@ def test_two_runs_with_one_seed_give_bit_equal_weights_and_a_resumed_run_the_sam
     assert _run(tmp_path / "c", 2) == first
 
 
-def test_training_over_dds_gives_the_weights_of_the_same_loop_in_one_process(tmp_path: Path) -> None:
+def test_the_graph_gives_the_weights_of_policy_rl_train_bit_for_bit(tmp_path: Path) -> None:
     graph_weights = _run(tmp_path / "graph", 2)
     assert len(graph_weights) == 3
     toy.assert_trained_in_one_process(tmp_path / "graph" / "policies" / "policy_000003.safetensors", updates=2)

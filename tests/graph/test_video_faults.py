@@ -23,8 +23,9 @@ from wm_nodes.video_model.buffer import concatenate_buffers
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.recorded_buffers import read_clips
+from wm_nodes.video_rl.reference_reward import rewarded
 from wm_nodes.video_rl.sampling import rollout_settings
-from wm_nodes.video_rl.training_run import CHECKPOINT, rewarded
+from wm_nodes.video_rl.training_run import CHECKPOINT
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 

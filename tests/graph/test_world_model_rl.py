@@ -32,9 +32,10 @@ from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescore
-from wm_nodes.video_rl.reference_reward import ClipScores, load_probe, mixed, score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, evaluated_uri, rewarded, version_uri
+from wm_nodes.video_rl.reference_reward import ClipScores, load_probe
+from wm_nodes.video_rl.sampling import RecordedContexts
+from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, evaluated_uri, version_uri
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -82,19 +83,14 @@ def recorded(run_dir: Path) -> list[RecordedClips]:
 
 
 @pytest.mark.slow
-def test_post_training_over_dds_gives_the_weights_of_the_same_loop_in_one_process(
+def test_the_graph_gives_the_weights_of_video_rl_train_bit_for_bit(
     run_dir: Path, tmp_path: Path, config: VideoRlConfig, contexts: Clips, probe: PositionProbe
 ) -> None:
     folder = load_video_folder(run_dir / "video_model")
-    generator = ClipGenerator(folder, contexts, config)
     run = VideoRun(folder.network, config, tmp_path)
-    frames = []
-    for iteration in range(config.iterations):
-        request = generator.request(iteration, run.version)
-        buffer = generator.sample(request)
+    source, frames = RecordedContexts(folder, contexts, config, probe), []
+    for buffer, _ in post_train(run, source, config.iterations):
         frames.append(folder.codec.decode(buffer.rollout.latents))
-        scores = score_clips(frames[-1], generator.references(request), probe, 1).named()
-        run.train(rewarded(buffer, scores, mixed(scores, config.rewards)))
     run.close()
     for uri in (version_uri(4), evaluated_uri(4, config)):
         assert (tmp_path / uri).read_bytes() == (run_dir / uri).read_bytes()

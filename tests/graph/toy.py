@@ -13,8 +13,7 @@ from wm_nodes.core.specs import SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
-from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.rollouts import collect_rollout
+from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reward import RuleReward
 from wm_nodes.training.weights import pack_weights, unpack_weights
 
@@ -149,14 +148,11 @@ def make_policy(config: RunConfig) -> ImagePolicy:
 
 
 def assert_trained_in_one_process(file: Path, updates: int, tolerance: float = 0.0) -> None:
-    """Assert that a weights file holds what the same loop gives in this process; bit for bit with tolerance 0."""
-    config = load_config("smoke")
-    policy = make_policy(config)
-    learner = PpoLearner(policy, config.ppo, seed=config.seed)
-    environment = make_environment(config, num_envs=4, seed=0)
-    for version in range(1, updates + 1):
-        reward = RuleReward(config.reward.sparse_weight)
-        learner.update(collect_rollout(environment, policy, reward, config.ppo.num_steps, config.seed, version))
+    """Assert that a weights file holds what policy_rl/train.py gives; bit for bit with tolerance 0."""
+    config = load_config("smoke", {"ppo.num_envs": 4, "ppo.updates": updates})
+    policy, environment = make_policy(config), make_environment(config, num_envs=4, seed=0)
+    for _ in train_policy(policy, environment, RuleReward(config.reward.sparse_weight), config):
+        pass
     found, _ = unpack_weights(file.read_bytes())
     expected, _ = unpack_weights(pack_weights(policy).data)
     for name, tensor in expected.items():

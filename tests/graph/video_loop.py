@@ -1,6 +1,7 @@
 """A tiny loop 2: recorded contexts, an untrained video model, its nodes on a graph, and the loop in one process."""
 
 import signal
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,14 @@ from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.reference_reward import load_probe, mixed, score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator, rollout_settings
-from wm_nodes.video_rl.training_run import rewarded, version_uri
+from wm_nodes.video_rl.reference_reward import load_probe
+from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, rollout_settings
+from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.training_run import version_uri
 
 EPISODES, STEPS, STRIDE = 4, 4, 2
+ITERATIONS = 1000
+"""More than any test makes."""
 BLIND = 3
 """The context without simulator state: its clips cannot be judged."""
 MODEL_DIR = Path(str(shipped_model("push_cube")))
@@ -68,7 +72,7 @@ def make_video_folder(folder: Path, clips: Clips) -> Path:
 
 
 class LocalLoop:
-    """The training of the graph in this process, as far as it is asked for.
+    """The training of the graph by video_rl/train.py, in this process, as far as it is asked for.
 
     Args:
         lag: buffer i is sampled by the weights that buffer i - lag was trained on.
@@ -76,10 +80,13 @@ class LocalLoop:
 
     def __init__(self, config: VideoRlConfig, folder: Path, bag: Path, lag: int = 0) -> None:
         torch.set_num_threads(1)
-        self.config, self._lag, self._probe = config, lag, load_probe(MODEL_DIR)
-        self._generator = ClipGenerator(load_video_folder(folder), load_clips([bag], STRIDE), config)
+        self.config, self._lag = config, lag
+        self._source = RecordedContexts(
+            load_video_folder(folder), load_clips([bag], STRIDE), config, load_probe(MODEL_DIR)
+        )
         self._network = load_video_folder(folder).network
         self._learner = GrpoLearner(self._network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
+        self._training = post_train(self._learner, self, ITERATIONS)
         self._files = [self._packed()]
         self.versions = [0]
         """Before each iteration that was made, and now."""
@@ -89,9 +96,7 @@ class LocalLoop:
     def weights(self, iterations: int) -> bytes:
         """The file of the version that so many iterations make."""
         while len(self._files) <= iterations:
-            iteration = len(self._files) - 1
-            buffer = self.buffer(iteration, max(0, iteration - self._lag))
-            self._learner.train(buffer)
+            buffer, _ = next(self._training)
             self._files.append(self._packed())
             self.versions.append(self._learner.version)
             self.invalid.append(self.invalid[-1] + int((~buffer.valid).sum()))
@@ -99,13 +104,24 @@ class LocalLoop:
 
     def buffer(self, iteration: int, after: int, config: VideoRlConfig | None = None) -> RolloutBuffer:
         """The judged clips of an iteration, sampled by the weights that `after` iterations make."""
-        generator = ClipGenerator(self._generator.folder, self._generator.contexts, config or self.config)
-        load_weights(generator.folder.network, self.weights(after))
-        request = generator.request(iteration, self.versions[after])
-        buffer = generator.sample(request)
-        frames = generator.folder.codec.decode(buffer.rollout.latents)
-        scores = score_clips(frames, generator.references(request), self._probe, 1).named()
-        return rewarded(buffer, scores, mixed(scores, self.config.rewards))
+        source = copy(self._source)
+        source.config = config or self.config
+        load_weights(source.folder.network, self.weights(after))
+        request = source.request(iteration, self.versions[after])
+        return source.score(request, source.sample(request))
+
+    # What video_rl.train.ClipSource is: the weights of so many iterations ago sample.
+
+    def request(self, iteration: int, policy_version: int) -> GroupRequest:
+        after = max(0, iteration - self._lag)
+        load_weights(self._source.folder.network, self.weights(after))
+        return self._source.request(iteration, self.versions[after])
+
+    def sample(self, request: GroupRequest) -> RolloutBuffer:
+        return self._source.sample(request)
+
+    def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
+        return self._source.score(request, clips)
 
     def _packed(self) -> bytes:
         return pack_weights(self._network, {"version": str(self._learner.version)}).data

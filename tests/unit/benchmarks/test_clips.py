@@ -34,20 +34,20 @@ def test_clips_of_one_noise_by_ode_are_one_clip_and_arms_are_paired_within_their
     bags: tuple[Path, Path], tmp_path: Path
 ) -> None:
     path = tmp_path / "clips.json"
-    arms = ["--arms", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"]
+    samplers = ["--samplers", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"]
     size = ["--contexts", "2", "--group-size", "2", "--features", "pixels"]
-    assert main(["clips", "--context-bags", str(bags[1]), *size, *arms, "--json", str(path)]) == 0
+    assert main(["clips", "--context-bags", str(bags[1]), *size, *samplers, "--json", str(path)]) == 0
     assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     found = json.loads(path.read_text())
-    rows = {(row["arm"], row["shared_noise"]): row for row in found["rows"]}
+    rows = {(row["sampler"], row["shared_noise"]): row for row in found["rows"]}
     assert len(rows) == 6 and all(len(row["diversity"]) == len(row["tracking"]) == 2 for row in rows.values())
     assert rows["ODE", True]["diversity"] == pytest.approx([0, 0], abs=1e-6)
     assert rows["ODE", True]["reward_std"] == [0, 0] and rows["ODE", True]["object_spread_cm"] == [0, 0]
     assert all(min(row["diversity"]) > 1e-4 for key, row in rows.items() if key != ("ODE", True))
-    pairs = [(row["arm"], row["base"], row["shared_noise"]) for row in found["comparisons"]]
+    pairs = [(row["sampler"], row["base"], row["shared_noise"]) for row in found["comparisons"]]
     assert pairs == [("DynDiff 0.2 sparse, rms", "CPS 0.2", shared) for shared in (False, True)]
     noise = [row["noise_share"] for row in found["comparisons"]]
-    assert all(arm == pytest.approx(base, rel=0.02) for arm, base in noise), "not at one noise budget"
+    assert all(sampler == pytest.approx(base, rel=0.02) for sampler, base in noise), "not at one noise budget"
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def learning(bags: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) 
     """A call of clip-learning without its number of buffers, and its file."""
     path = tmp_path_factory.mktemp("clip_learning") / "found.json"
     given = ["--context-bags", str(bags[0]), "--heldout-bags", str(bags[1]), "--eval-contexts", "3"]
-    call = ["clip-learning", *given, "--seeds", "0", "1", "--arms", CPS, DYNDIFF, "--json", str(path)]
+    call = ["clip-learning", *given, "--seeds", "0", "1", "--samplers", CPS, DYNDIFF, "--json", str(path)]
     assert main([*call, "--iterations", "1"]) == 0
     return call, path
 
@@ -63,8 +63,8 @@ def learning(bags: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) 
 def test_arms_train_from_the_same_start_with_the_same_calls_and_end_apart(learning: tuple[list[str], Path]) -> None:
     _, path = learning
     found = json.loads(path.read_text())
-    rows: dict[tuple[str, int], dict[str, Any]] = {(row["arm"], row["seed"]): row for row in found["rows"]}
-    assert set(rows) == {(arm, seed) for arm in (CPS, DYNDIFF) for seed in (0, 1)}
+    rows: dict[tuple[str, int], dict[str, Any]] = {(row["sampler"], row["seed"]): row for row in found["rows"]}
+    assert set(rows) == {(sampler, seed) for sampler in (CPS, DYNDIFF) for seed in (0, 1)}
     for seed in (0, 1):
         cps, dyndiff = rows[CPS, seed], rows[DYNDIFF, seed]
         assert cps["before"] == dyndiff["before"] and cps["after"] != dyndiff["after"]
@@ -72,11 +72,11 @@ def test_arms_train_from_the_same_start_with_the_same_calls_and_end_apart(learni
         assert cps["evaluations"][-1]["psnr_db"] == pytest.approx(np.mean(cps["after"]["psnr_db"]), rel=1e-4)
         assert cps["buffers"]["kept"] == dyndiff["buffers"]["kept"]
     assert rows[CPS, 0]["before"] != rows[CPS, 1]["before"], "seeds have their own evaluation noise"
-    settings = {arm["name"]: arm for arm in found["arms"]}
+    settings = {sampler["name"]: sampler for sampler in found["samplers"]}
     assert settings[CPS]["grpo"] == settings[DYNDIFF]["grpo"]
-    steps = {name: arm["rollout"].pop("sampler") for name, arm in settings.items()}
+    steps = {name: sampler["rollout"].pop("sampler") for name, sampler in settings.items()}
     assert settings[CPS]["rollout"] == settings[DYNDIFF]["rollout"] and steps[CPS] != steps[DYNDIFF]
-    assert [(row["arm"], row["base"]) for row in found["comparisons"]] == [(DYNDIFF, CPS)]
+    assert [(row["sampler"], row["base"]) for row in found["comparisons"]] == [(DYNDIFF, CPS)]
     assert set(found["sha256"]) == {"codec.safetensors", "network.safetensors"}
     assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
 

@@ -15,29 +15,24 @@ import torch
 
 from benchmarks.video_rl import cost
 from benchmarks.video_rl.cli import LEARNER, main
+from benchmarks.video_rl.clock import clocked
 from benchmarks.video_rl.comparison import compare_samplers, paired_interval, value
-from benchmarks.video_rl.cost import ANCHORS, clocked, toy_rollout
-from benchmarks.video_rl.learning import (
-    LearningPlan,
-    alarms,
-    evaluate,
-    group_spread,
-    hacked,
-    sample_groups,
-    train_sampler,
-)
+from benchmarks.video_rl.cost import ANCHORS, toy_rollout
+from benchmarks.video_rl.learning import alarms, hacked, train_on_discs
 from benchmarks.video_rl.plots import family_of
-from benchmarks.video_rl.samplers import dyndiff, learning_samplers, sampler_setup
+from benchmarks.video_rl.samplers import DiscPlan, SamplerSetup, dyndiff, learning_samplers, sampler_setup
+from benchmarks.video_rl.sources import DiscSource, group_spread, sample_scenes
+from benchmarks.video_rl.tables import _last
 from benchmarks.video_rl.trials import ablation_trials, hacking_trials
 from wm_nodes.config.shipped import PRETRAINED
 from wm_nodes.video_rl.toy_scene import BASE, draw_scenes, load_base
 
-SHORT = LearningPlan(iterations=2, scenes=1, eval_scenes=4, eval_every=1)
+SHORT = DiscPlan(iterations=2, contexts=1, eval_contexts=4, eval_every=1)
 
 
-def training(arm: str, seed: int, *rewards: float) -> dict[str, Any]:
+def training(sampler: str, seed: int, *rewards: float) -> dict[str, Any]:
     points = [{"iteration": i, "reward": value, "obeyed": 0.5, "background": 0.001} for i, value in enumerate(rewards)]
-    return {"arm": arm, "seed": seed, "evaluations": points}
+    return {"sampler": sampler, "seed": seed, "evaluations": points}
 
 
 # intervals
@@ -68,7 +63,7 @@ def test_arms_are_compared_on_their_common_seeds_over_the_path_and_at_the_end() 
     assert found is not None and found.seeds == (0, 1)
     assert found.differences["reward"].mean == pytest.approx(0.1)
     assert found.differences["reward_path"].mean == pytest.approx((0.15 + 0.15) / 2)
-    assert value(rows[0], "reward_path") == pytest.approx(0.4), "what every arm starts from does not count"
+    assert value(rows[0], "reward_path") == pytest.approx(0.4), "what every sampler starts from does not count"
     assert compare_samplers(rows, "new", "other") is None
 
 
@@ -76,47 +71,53 @@ def test_arms_are_compared_on_their_common_seeds_over_the_path_and_at_the_end() 
 
 
 def test_every_training_of_an_ablation_makes_the_model_calls_of_its_base() -> None:
-    trials, pairs = ablation_trials(LEARNER, LearningPlan(iterations=20))
+    trials, pairs = ablation_trials(LEARNER, DiscPlan(iterations=20))
     calls = {}
     for trial in trials:
-        videos = trial.plan.iterations * trial.plan.scenes * trial.plan.group_size
-        calls[trial.arm.name] = videos * (1 if trial.arm.rollout.cfg == 1 else 2)
+        videos = trial.plan.iterations * trial.plan.contexts * trial.plan.group_size
+        calls[trial.sampler.name] = videos * (1 if trial.sampler.rollout.cfg == 1 else 2)
     assert all(calls[name] == calls[base] for name, base in pairs) and len(pairs) == 5
-    by_name = {trial.arm.name: trial for trial in trials}
-    guided = by_name["guidance 2"].arm
+    by_name = {trial.sampler.name: trial for trial in trials}
+    guided = by_name["guidance 2"].sampler
     assert guided.rollout.cfg == guided.grpo.cfg == 2, "another guidance in training than in sampling is another policy"
     for name, base in pairs:
-        assert by_name[name] != replace(by_name[base], arm=replace(by_name[base].arm, name=name)), "nothing is compared"
+        named = replace(by_name[base].sampler, name=name)
+        assert by_name[name] != replace(by_name[base], sampler=named), "nothing is compared"
 
 
 def test_a_window_makes_its_own_steps_stochastic_and_trains_as_many_as_the_others() -> None:
-    arms = {arm.name: arm for arm in learning_samplers(LEARNER)}
-    assert len(arms) == len(learning_samplers(LEARNER)), "names are unique"
-    mix, flow = arms["Mix-GRPO 0.7"], arms["Flow-GRPO 0.7"]
+    samplers = {sampler.name: sampler for sampler in learning_samplers(LEARNER)}
+    assert len(samplers) == len(learning_samplers(LEARNER)), "names are unique"
+    mix, flow = samplers["Mix-GRPO 0.7"], samplers["Flow-GRPO 0.7"]
     scenes, model = draw_scenes(1, 0, "test"), load_base()
-    windows = [sample_groups(model, mix, scenes, 2, 0, i, 0)[0].rollout.steps for i in (0, 7, 39)]
+    windows = [sample_scenes(model, mix, scenes, 2, 0, i).rollout.steps for i in (0, 7, 39)]
     assert windows == [(0, 1, 2, 3), (1, 2, 3, 4), (5, 6, 7, 8)]
     assert int(mix.grpo.step_fraction * 4) == int(flow.grpo.step_fraction * 9)
 
 
 def test_guidance_and_resolution_of_an_evaluation_are_those_of_its_arm_and_plan() -> None:
-    model, arm = load_base(), sampler_setup("CPS", dyndiff(0.6))
-    guided = replace(arm, rollout=replace(arm.rollout, cfg=2.0))
-    plan = LearningPlan(eval_scenes=32)
-    plain, strong = evaluate(model, arm, plan, 0), evaluate(model, guided, plan, 0)
+    model, sampler = load_base(), sampler_setup("CPS", dyndiff(0.6))
+    guided = replace(sampler, rollout=replace(sampler.rollout, cfg=2.0))
+    plan = DiscPlan(eval_contexts=32)
+
+    def evaluate(sampler: SamplerSetup, plan: DiscPlan) -> dict[str, float]:
+        found = DiscSource(model, sampler, plan, 0).validate()
+        return {name: sum(values) / len(values) for name, values in found.items()}
+
+    plain, strong = evaluate(sampler, plan), evaluate(guided, plan)
     assert strong["obeyed"] > plain["obeyed"] + 0.05, "guidance follows the command more often"
-    assert evaluate(model, arm, replace(plan, eval_side=20), 0)["background"] != plain["background"]
+    assert evaluate(sampler, replace(plan, eval_side=20))["background"] != plain["background"]
 
 
 @pytest.mark.parametrize(
-    ("arm", "family"),
+    ("sampler", "family"),
     [
         ("CPS 0.6", "CPS"), ("ODE", "ODE"), ("DynDiff 0.6 gated", "DynDiff literal"),
         ("DynDiff 0.6 sparse", "DynDiff literal"), ("DynDiff 0.2 sparse, rms", "DynDiff sparse, rms"),
     ],
 )
-def test_arms_of_one_kind_share_a_line_in_the_picture(arm: str, family: str) -> None:
-    assert family_of(arm) == family
+def test_arms_of_one_kind_share_a_line_in_the_picture(sampler: str, family: str) -> None:
+    assert family_of(sampler) == family
 
 
 # hacking
@@ -136,11 +137,11 @@ def test_a_reward_that_is_bought_with_too_much_mass_is_named_and_mass_that_becom
 
 def test_the_detector_names_what_a_hackable_reward_destroys_and_nothing_under_the_honest_one() -> None:
     """Temporal consistency rises because the disc fades: it obeys less and has less mass."""
-    plan = LearningPlan(iterations=8, scenes=3, eval_scenes=32, eval_every=2)
+    plan = DiscPlan(iterations=8, contexts=3, eval_contexts=32, eval_every=2)
     honest, hackable, _ = hacking_trials(LEARNER, plan)
     trained = [
-        train_sampler(load_base(), replace(t.arm, grpo=t.arm.grpo.with_values(learning_rate=3e-4)), t.plan, seed=0)
-        for t in (honest, hackable)
+        train_on_discs(load_base(), replace(sampler, grpo=sampler.grpo.with_values(learning_rate=3e-4)), plan, seed=0)
+        for sampler, plan in ((trial.sampler, trial.plan) for trial in (honest, hackable))
     ]
     assert [alarms(row) for row in trained] == [[], ["obeyed", "mass"]]
     first, last = trained[1]["evaluations"][0], trained[1]["evaluations"][-1]
@@ -167,10 +168,10 @@ def test_ablations_go_on_where_their_file_stops_and_refuse_another_plan(
 
 SHORT_CALL = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--seeds", "0", "1"]
 CALLS = {
-    "diversity": ["--contexts", "2", "--group-size", "2", "--arms", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"],
-    "learning": [*SHORT_CALL, "--arms", "CPS 0.6", "DynDiff 0.6 gated"],
-    "ablations": [*SHORT_CALL, "--arms", "base", "no KL"],
-    "hacking": [*SHORT_CALL, "--arms", "honest reward"],
+    "diversity": ["--contexts", "2", "--group-size", "2", "--samplers", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"],
+    "learning": [*SHORT_CALL, "--samplers", "CPS 0.6", "DynDiff 0.6 gated"],
+    "ablations": [*SHORT_CALL, "--samplers", "base", "no KL"],
+    "hacking": [*SHORT_CALL, "--samplers", "honest reward"],
     "cost": ["--repeats", "1"],
 }
 
@@ -195,18 +196,18 @@ def test_every_file_says_how_it_was_made_and_lies_beside_its_picture(
         kl = {(row["model"], row["anchor"]): row["kl_s"] / row["forward_s"] for row in found["rows"]}
         assert all(kl[model, "buffer"] < 0.1 < kl[model, "frozen"] for model in ("moving disc", "PushCube"))
     else:
-        assert {arm["name"] for arm in found["arms"]} == {row["arm"] for row in found["rows"]}
-        assert all(arm["rollout"]["num_steps"] == 10 and arm["grpo"]["kl"] for arm in found["arms"])
+        assert {sampler["name"] for sampler in found["samplers"]} == {row["sampler"] for row in found["rows"]}
+        assert all(sampler["rollout"]["num_steps"] == 10 and sampler["grpo"]["kl"] for sampler in found["samplers"])
 
 
 def test_a_training_keeps_the_spread_of_its_rollouts_and_the_noise_of_steps_that_a_window_leaves() -> None:
-    arm = {arm.name: arm for arm in learning_samplers(LEARNER)}["CPS 0.6, window"]
-    moving = replace(arm, window=arm.window.with_values(period=1))
-    found = train_sampler(load_base(), moving, SHORT, seed=0)["buffers"]
+    sampler = {sampler.name: sampler for sampler in learning_samplers(LEARNER)}["CPS 0.6, window"]
+    moving = replace(sampler, window=sampler.window.with_values(period=1))
+    found = train_on_discs(load_base(), moving, SHORT, seed=0)["buffers"]
     assert found["noise_share_step_0"][0] == pytest.approx(0.809, abs=1e-3) and found["noise_share_step_0"][1] is None
     assert found["noise_share_step_4"][0] is None and found["noise_share_step_4"][1] == pytest.approx(0.809, abs=1e-3)
     assert all(0 < value < 2 for value in found["rollout_diversity"])
-    buffer, _ = sample_groups(load_base(), moving, draw_scenes(2, 0, "test"), 3, 0, 0, 0)
+    buffer = sample_scenes(load_base(), moving, draw_scenes(2, 0, "test"), 3, 0)
     rewards = torch.tensor([1.0, 2, 3, 5, 5, 5], dtype=torch.float64)
     spread = group_spread(buffer.with_rewards({"total": rewards}), 3)
     assert spread["rollout_reward_std"] == pytest.approx((2 / 3) ** 0.5 / 2) and spread["rollout_diversity"] > 0.01
@@ -231,9 +232,20 @@ def test_a_rollout_reports_the_share_of_its_mask_and_of_its_caching() -> None:
     assert found["over_cps"] == pytest.approx(found["rollout_s"] / found["cps_s"])
 
 
+def test_a_file_of_an_earlier_version_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "learning.json"
+    path.write_text(json.dumps({"rows": [{"arm": "CPS 0.6", "seed": 0, "plan": {"scenes": 6}}]}))
+    assert main(["learning", "--arms", "CPS 0.6", "--json", str(path)]) == 2
+    assert "is of an earlier version of this benchmark; take another file" in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_last_buffer_that_was_trained_on_is_shown_and_none_is_not_a_number() -> None:
+    assert _last([0.1, 0.2, None]) == 0.2 and np.isnan(_last([None, None]))
+
+
 def test_an_unknown_arm_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["learning", "--arms", "CPS 7"]) == 2
-    assert "unknown arms CPS 7" in capsys.readouterr().out
+    assert main(["learning", "--samplers", "CPS 7"]) == 2
+    assert "unknown samplers CPS 7" in capsys.readouterr().out
 
 
 def test_a_base_of_another_architecture_and_a_count_of_zero_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,12 +5,22 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from wm_nodes.config.load import load_config
 from wm_nodes.environments.maniskill import collection
-from wm_nodes.policy_rl.pretraining import make_model
+from wm_nodes.policy_rl.pretraining import _tokenizer_folder, make_model
 from wm_nodes.recording import read_episodes
-from wm_nodes.world_model import load_model_folder, load_starts
+from wm_nodes.world_model import Tokenizer, load_model_folder, load_starts
+
+
+def test_the_untrained_model_beside_a_tokenizer_is_that_of_the_seed(tmp_path: Path) -> None:
+    config, files = load_config("smoke"), []
+    tokenizer = Tokenizer(config.tokenizer, 64, 128)
+    for name in ("a", "b"):
+        torch.rand(5)
+        files.append((_tokenizer_folder(config, tmp_path / name, tokenizer) / "action_model.safetensors").read_bytes())
+    assert files[0] == files[1]
 
 
 @pytest.mark.slow

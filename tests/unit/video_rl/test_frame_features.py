@@ -9,7 +9,7 @@ from model_folders import make_model_folder
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from benchmarks.video_rl.clip_diversity import MARGIN_PX, group_diversity, moving_part
+from benchmarks.video_rl.diversity import MARGIN_PX, group_diversity, moving_part
 from wm_nodes.video_rl.frame_features import (
     CentredPixels,
     FrameFeatures,

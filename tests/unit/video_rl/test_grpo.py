@@ -1,6 +1,7 @@
 """The GRPO learner on a tiny network: exact ratios and gradients, anchors, ranks, resume, refusals. Ids: spec 4.1."""
 
 import copy
+import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 import torch.multiprocessing as mp
-from safetensors.torch import save
+from safetensors.torch import load, save
 from torch import Tensor
 from torch.testing import assert_close
 from video_toys import (
@@ -29,11 +30,12 @@ from video_toys import (
 )
 
 from wm_nodes.config.video import GrpoConfig
+from wm_nodes.training.checkpoint import metadata_of
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError, RolloutSettings, StepContext, VideoNetwork, step
 from wm_nodes.video_rl.group_advantages import GroupAdvantages
-from wm_nodes.video_rl.grpo import GrpoLearner, mixed_reward
+from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner, mixed_reward
 from wm_nodes.video_rl.grpo_math import gaussian_logprob
 from wm_nodes.video_rl.ratio_and_kl import Rows
 
@@ -748,20 +750,78 @@ def test_a_group_with_too_few_valid_videos_trains_nothing_and_is_counted() -> No
     assert_equal(weights(learner.model), weights(other.model))
 
 
-@pytest.mark.parametrize(
-    ("rewards", "few"), [([math.nan] * 8, 2), ([0.7] * 8, 0), ([1.0] * 4 + [math.nan] * 3 + [2.0], 1)]
-)
-def test_a_buffer_from_which_nothing_can_be_learned_is_one_clear_error(rewards: list[float], few: int) -> None:
+EQUAL = [0.7] * 8
+"""Rewards of two groups of four."""
+
+
+def train_on(learner: GrpoLearner, *rewards: list[float]) -> list[BufferReport]:
+    """One buffer for each list of rewards."""
+    reports = []
+    for iteration, values in enumerate(rewards):
+        buffer = toy_buffer(learner.model, learner.rollout, version=learner.version, iteration=iteration)
+        reports.append(learner.train(buffer.with_rewards({"total": torch.tensor(values)})))
+    return reports
+
+
+@pytest.mark.parametrize("rewards", [[math.nan] * 8, [math.nan] * 7 + [2.0]])
+def test_a_buffer_without_a_group_of_valid_rewards_is_one_clear_error(rewards: list[float]) -> None:
     learner = make()
-    buffer, before = buffer_of(learner).with_rewards({"total": torch.tensor(rewards)}), weights(learner.model)
-    invalid = sum(math.isnan(reward) for reward in rewards)
+    before, invalid = weights(learner.model), sum(math.isnan(reward) for reward in rewards)
     with pytest.raises(
         ValueError,
-        match=f"{invalid} of 8 rewards are invalid, {few} of 2 groups have too few valid ones and {2 - few} no spread",
+        match=f"{invalid} of 8 rewards are invalid, 2 of 2 groups have too few valid ones and 0 no spread; 0 buffers",
     ):
-        learner.train(buffer)
+        train_on(learner, rewards)
     assert_equal(before, weights(learner.model))
     assert learner.version == 0
+
+
+def test_a_reward_that_is_marked_valid_and_not_finite_is_an_error_however_many_were_skipped() -> None:
+    learner = make()
+    buffer = buffer_of(learner)
+    broken = replace(buffer, rewards={"total": torch.tensor([math.inf] + [0.7] * 7).double()})
+    with pytest.raises(ValueError, match="reward of video 0 is inf; mark it valid=False"):
+        learner.train(broken)
+    assert learner.version == learner.skipped == 0
+
+
+@pytest.mark.parametrize(("rewards", "few", "invalid"), [(EQUAL, 0, 0), ([1.0] * 4 + [math.nan] * 3 + [2.0], 1, 3)])
+def test_a_buffer_whose_rewards_differ_in_no_group_is_skipped_and_counted(
+    rewards: list[float], few: int, invalid: int
+) -> None:
+    learner = make(ema_decay=0.5)
+    before, averaged = weights(learner.model), {name: value.clone() for name, value in learner.averaged.items()}
+    (report,) = train_on(learner, rewards)
+    assert (report.updates, report.kept, report.zero_std_ratio, report.skipped) == ((), 0, 1.0, 1)
+    assert (report.dropped_groups, report.invalid, math.isnan(report.advantage_abs_mean)) == (few, invalid, True)
+    assert learner.version == 0
+    assert_equal(before, weights(learner.model))
+    assert_equal(averaged, learner.averaged)
+
+
+def test_skipped_buffers_change_no_later_update_and_too_many_in_a_row_are_an_error() -> None:
+    learner, other = make(), make()
+    spread = [float(i) for i in range(8)]
+    reports = train_on(learner, EQUAL, EQUAL, EQUAL, EQUAL, spread, EQUAL)
+    assert [report.skipped for report in reports] == [1, 2, 3, 4, 0, 1]
+    buffer = toy_buffer(other.model, other.rollout, iteration=4)
+    other.train(buffer.with_rewards({"total": torch.tensor(spread)}))
+    assert_equal(weights(learner.model), weights(other.model))
+    with pytest.raises(ValueError, match="2 no spread; 4 buffers before it were skipped; look at the reward"):
+        train_on(learner, EQUAL, EQUAL, EQUAL, EQUAL)
+    assert learner.version == 2 and learner.skipped == 4
+
+
+def test_the_count_of_skipped_buffers_is_resumed_and_a_checkpoint_without_it_has_none(tmp_path: Path) -> None:
+    learner, resumed = make(), make()
+    train_on(learner, EQUAL, EQUAL)
+    learner.save(tmp_path / "state", iteration=2)
+    assert resumed.load(tmp_path / "state") == 2 and resumed.skipped == 2
+    data = (tmp_path / "state").read_bytes()
+    header = json.loads(metadata_of(data)["grpo"])
+    del header["skipped"]
+    (tmp_path / "older").write_bytes(save(load(data), {"grpo": json.dumps(header)}))
+    assert resumed.load(tmp_path / "older") == 2 and resumed.skipped == 0
 
 
 def test_a_buffer_of_videos_that_are_given_whole_is_one_clear_error() -> None:

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -120,6 +121,19 @@ def test_a_group_with_fewer_than_two_valid_videos_has_no_spread() -> None:
         found = advantages([1, 2, 3, 5, 6, 7], [0, 0, 0, 1, 1, 2], [1, 0, 0, 0, 0, 1], ddof=ddof)
         assert not found.kept_N.any() and not found.advantages_N.any()
         assert (found.num_groups, found.num_zero_std) == (3, 3)
+
+
+def test_a_batch_deviation_is_that_of_all_valid_rewards_about_their_common_mean_as_in_flow_grpo() -> None:
+    """PerPromptStatTracker(global_std=True): (reward - mean of its prompt) / np.std(rewards), less its 1e-4."""
+    rewards, groups = [0.0, 2, 10, 16, 5, 5], [0, 0, 1, 1, 2, 2]
+    found = advantages(rewards, groups, std_scope="batch")
+    expected = torch.tensor([-1, 1, -3, 3, 0, 0], dtype=torch.float64) / np.std(rewards)
+    assert_close(found.advantages_N, expected)
+    assert found.kept_N.tolist() == [True] * 4 + [False] * 2 and found.num_zero_std == 1
+    same = advantages([*rewards, math.nan], [*groups, 2], valid=[1] * 6 + [0], std_scope="batch")
+    assert_close(same.advantages_N[:6], expected)
+    apart = advantages(rewards, groups, std_scope="global").advantages_N
+    assert float(apart.abs().max()) > float(found.advantages_N.abs().max()), "unequal contexts make it larger"
 
 
 def test_a_global_deviation_is_that_of_all_groups_about_their_own_means() -> None:

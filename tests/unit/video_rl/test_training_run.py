@@ -166,3 +166,26 @@ def test_averaged_weights_are_scored_and_lie_beside_each_version_that_is_kept(
 def test_without_an_average_the_version_itself_is_evaluated_and_no_checkpoint_is_no_progress(tmp_path: Path) -> None:
     assert evaluated_uri(4, config()) == version_uri(4)
     assert progress(tmp_path) == (0, 0)
+
+
+def test_a_skipped_buffer_is_counted_in_the_log_and_a_resumed_run_samples_by_the_same_version(tmp_path: Path) -> None:
+    """The next buffer was sampled while this one was to be trained on, by the version that is still the newest."""
+    straight, stopped = tmp_path / "straight", tmp_path / "stopped"
+    settings = config(every=0, max_staleness=8)
+    for folder, restart in ((straight, False), (stopped, True)):
+        run = VideoRun(tiny_network(), settings, folder)
+        train(run, [1])
+        previous = run.previous_version
+        equal = toy_buffer(run.network, ROLLOUT, version=run.version, iteration=run.iterations)
+        report = run.train(equal.with_rewards({"total": torch.full((8,), 0.3)}))
+        assert not report.updates and (previous, run.version, run.iterations) == (0, 2, 2)
+        if restart:
+            run.close()
+            run = VideoRun(tiny_network(seed=4), settings, folder)
+        assert (run.sampling_version, run.version, run.iterations, run.learner.skipped) == (2, 2, 2, 1)
+        train(run, [2])
+        run.close()
+    assert [line["skipped"] for line in read_metrics(stopped, "grpo")] == [0, 1, 0]
+    assert "kl_1" not in read_metrics(stopped, "grpo")[1] and read_metrics(stopped, "grpo")[1]["kept"] == 0
+    assert progress(straight) == progress(stopped) == (4, 3)
+    assert (straight / version_uri(4)).read_bytes() == (stopped / version_uri(4)).read_bytes()

@@ -1,6 +1,7 @@
 """Losses, schedule, resume, and that rollouts of a trained model follow a scene with contact."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch.testing import assert_close
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.seeding import initial_weights
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.training.loop import LoopSettings, TrainingLoop
 from wm_nodes.world_model.training.dynamics import (
@@ -23,6 +25,8 @@ from wm_nodes.world_model.training.dynamics import (
     tokenise_episodes,
     train_action_model,
 )
+from wm_nodes.world_model.training.position_probe import train_position_probe
+from wm_nodes.world_model.training.text import train_text_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.open_loop import auc, detection_metrics, evaluate_rollouts, format_rollouts
 
@@ -158,6 +162,37 @@ def test_a_finished_stage_still_tells_its_last_metrics(tmp_path: Path) -> None:
     metrics = made.run(lambda i: {"loss": made.model.weight.square().sum()}, progress=False)
     again = TrainingLoop("toy", torch.nn.Linear(3, 2), LoopSettings(3, 0.1), tmp_path)
     assert again.run(lambda i: {}, progress=False) == metrics
+
+
+def test_every_model_of_one_seed_has_equal_weights_whatever_the_global_generator_did_before() -> None:
+    """Tokenizer, action model, text model, position probe; the generator is left as it was."""
+    config = config_of(
+        tokenizer__num_iterations=2, world_model__num_iterations=2, world_model__text_num_iterations=2,
+        world_model__rollout_steps=[2],
+    )
+    episodes = arrays(8)
+    episodes = replace(episodes, behaviours=("expert",) * len(episodes))
+
+    def trained() -> dict[str, torch.Tensor]:
+        tokenizer, _ = train_tokenizer(episodes, config, 3, None, progress=False)
+        data = tokenise_episodes(tokenizer, episodes)
+        action, _ = train_action_model(tokenizer, data, config, 3, None, progress=False)
+        text, _ = train_text_model(
+            tokenizer, action, episodes, data, ("push the square", "reach it"), config, 3, None, progress=False
+        )
+        probe, _ = train_position_probe(episodes, config, 3, None, progress=False)
+        models = {"tokenizer": tokenizer, "action": action, "text": text, "probe": probe}
+        return {f"{kind}.{name}": t.clone() for kind, model in models.items() for name, t in model.state_dict().items()}
+
+    first, before = trained(), torch.get_rng_state()
+    torch.rand(17)
+    second = trained()
+    assert not torch.equal(torch.get_rng_state(), before)
+    assert [name for name, tensor in first.items() if not torch.equal(tensor, second[name])] == []
+    disturbed = torch.get_rng_state()
+    with initial_weights(0, "some_init"):
+        torch.rand(3)
+    assert torch.equal(torch.get_rng_state(), disturbed)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 paper's ablations, and a reward that can be hacked; claims A and B on clips of recorded episodes, and their picture's
 size.
 
-Every --json file holds the command, the settings of each arm, and the sha256 of the weights that were measured; a
+Every --json file holds the command, the settings of each sampler, and the sha256 of the weights that were measured; a
 picture is drawn beside it (of ablations from two seeds on).
 """
 
@@ -22,28 +22,20 @@ from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
-from benchmarks.video_rl.clip_diversity import clip_comparisons, measure_clips
-from benchmarks.video_rl.clip_learning import MEASURES as CLIP_MEASURES
-from benchmarks.video_rl.clip_learning import TASK, ClipPlan, clip_learning_samplers, train_on_clips
+from benchmarks.video_rl import diversity, plots, tables
 from benchmarks.video_rl.clip_resolution import sample_clips, size_rows
-from benchmarks.video_rl.comparison import MEASURES, SamplerComparison, compare_samplers
+from benchmarks.video_rl.comparison import CLIP_MEASURES, MEASURES, SamplerComparison, compare_samplers
 from benchmarks.video_rl.cost import measure_anchors, pushcube_buffer, pushcube_rollout, toy_buffer, toy_rollout
-from benchmarks.video_rl.diversity import FEATURES, DiversityPlan, compare, measure_sampler
-from benchmarks.video_rl.learning import LearningPlan, train_sampler
-from benchmarks.video_rl.plots import plot_comparisons, plot_cost, plot_diversity, plot_hacking, plot_learning
-from benchmarks.video_rl.samplers import SamplerSetup, diversity_samplers, learning_samplers
-from benchmarks.video_rl.tables import (
-    clip_comparison_table,
-    clip_table,
-    clip_training_table,
-    comparison_table,
-    cost_table,
-    diversity_table,
-    hacking_table,
-    resolution_table,
-    rollout_table,
-    training_table,
+from benchmarks.video_rl.learning import train_on_discs, train_sampler
+from benchmarks.video_rl.samplers import (
+    DiscPlan,
+    LearningPlan,
+    SamplerSetup,
+    clip_learning_samplers,
+    diversity_samplers,
+    learning_samplers,
 )
+from benchmarks.video_rl.sources import TASK, RecordedSource
 from benchmarks.video_rl.trials import Plan, SamplerTrial, ablation_trials, hacking_trials
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
@@ -56,16 +48,9 @@ from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import load_video_folder
-from wm_nodes.video_rl.frame_features import (
-    CentredPixels,
-    FrameFeatures,
-    RandomFeatures,
-    TokenizerFeatures,
-    load_backbone,
-)
 from wm_nodes.video_rl.reference_reward import load_probe
+from wm_nodes.video_rl.sampling import RecordedContexts
 from wm_nodes.video_rl.toy_scene import BASE, NETWORK, load_base, training_batch
-from wm_nodes.world_model import load_model_folder
 
 BASE_ITERATIONS, BASE_BATCH = 4000, 16
 EPISODES = Path("runs/clip_contexts")
@@ -116,25 +101,18 @@ def _base(arguments: argparse.Namespace) -> None:
 
 
 def _diversity(arguments: argparse.Namespace) -> None:
-    model, plan = load_base(arguments.base), DiversityPlan(arguments.contexts, arguments.group_size)
-    rows, comparisons = list[dict[str, Any]](), list[dict[str, Any]]()
-    arms = _named({arm.name: arm for arm in diversity_samplers()}, arguments.arms)
-    with tqdm(total=2 * len(arms), desc="diversity", unit="arm") as bar:
+    model, plan = load_base(arguments.base), diversity.DiversityPlan(arguments.contexts, arguments.group_size)
+    rows, samplers = list[dict[str, Any]](), _chosen(arguments)
+    with tqdm(total=2 * len(samplers), desc="diversity", unit="sampler") as bar:
         for shared in (False, True):
-            regime = {}
-            for arm in arms:
-                regime[arm.name] = measure_sampler(model, replace(arm, shared_noise=shared), plan, arguments.seed)
-                rows.append(regime[arm.name])
+            for sampler in samplers:
+                rows.append(diversity.measure_discs(model, replace(sampler, shared_noise=shared), plan, arguments.seed))
                 bar.update()
-            bases = [name for name in regime if name.startswith("CPS")]
-            comparisons += [
-                compare(row, regime[base], arguments.seed)
-                for name, row in regime.items() if name.startswith("DynDiff") for base in bases
-            ]
-    of = {"plan": asdict(plan), "seed": arguments.seed, "features": FEATURES, **_settings(arms), **_base_of(arguments)}
-    write_results(arguments, {**of, "rows": rows, "comparisons": comparisons})
-    _draw(arguments, plot_diversity, rows, arguments.seed)
-    console.print(diversity_table(rows, arguments.seed))
+    of = {"plan": asdict(plan), "seed": arguments.seed, "features": diversity.FEATURES, **_settings(samplers)}
+    comparisons = diversity.disc_comparisons(rows, arguments.seed)
+    write_results(arguments, {**of, **_base_of(arguments), "rows": rows, "comparisons": comparisons})
+    _draw(arguments, plots.plot_diversity, rows, arguments.seed)
+    console.print(tables.diversity_table(rows, arguments.seed))
 
 
 def _clips(arguments: argparse.Namespace) -> None:
@@ -143,25 +121,21 @@ def _clips(arguments: argparse.Namespace) -> None:
     bags = arguments.context_bags or _episodes(arguments.contexts, HELDOUT_SEEDS, config.task)
     clips = load_clips(bags, folder.clip["stride"])
     drawn = numpy_stream(arguments.seed, "clip_diversity").permutation(len(clips))[: arguments.contexts]
-    contexts, features = clips.select(torch.from_numpy(drawn)), _features(arguments.features, config.task)
-    arms = _named({arm.name: arm for arm in diversity_samplers()}, arguments.arms)
-    rows = []
-    with tqdm(total=2 * len(arms) * len(contexts), desc="clips", unit="context") as bar:
+    contexts, features = clips.select(torch.from_numpy(drawn)), diversity.load_features(arguments.features, config.task)
+    samplers = _chosen(arguments)
+    rows, source = [], RecordedContexts(folder, contexts, config, probe)
+    with tqdm(total=2 * len(samplers) * len(contexts), desc="clips", unit="context") as bar:
         for shared in (False, True):
-            for arm in arms:
-                bar.set_postfix_str(arm.name)
-                named = replace(arm, shared_noise=shared)
-                rows.append(
-                    measure_clips(
-                        folder, contexts, named, features, probe, config, arguments.group_size, on_context=bar.update
-                    )
-                )
-    compared = clip_comparisons(rows, arguments.seed)
+            for sampler in samplers:
+                bar.set_postfix_str(sampler.name)
+                named = replace(sampler, shared_noise=shared)
+                rows.append(diversity.measure_clips(source, named, features, arguments.group_size, bar.update))
+    compared = diversity.clip_comparisons(rows, arguments.seed)
     size = {"contexts": len(contexts), "group_size": arguments.group_size, "features": features.name}
-    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(arms)}
+    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(samplers)}
     write_results(arguments, {**size, "seed": arguments.seed, **of, "rows": rows, "comparisons": compared})
-    _draw(arguments, plot_diversity, rows, arguments.seed)
-    console.print(clip_table(rows, arguments.seed), clip_comparison_table(compared))
+    _draw(arguments, plots.plot_diversity, rows, arguments.seed)
+    console.print(tables.clip_table(rows, arguments.seed), tables.clip_comparison_table(compared))
 
 
 def _resolution(arguments: argparse.Namespace) -> None:
@@ -180,7 +154,7 @@ def _resolution(arguments: argparse.Namespace) -> None:
             own = sample_clips(folder, clips, config)
         rows += size_rows(folder, clips, own, config, probe)
     write_results(arguments, {"seed": arguments.seed, "sha256": folder.manifest["sha256"], "rows": rows})
-    console.print(resolution_table(rows))
+    console.print(tables.resolution_table(rows))
 
 
 def _episodes(clips: int, first_seed: int, task: str, settings: Mapping[str, Any] | None = None) -> list[Path]:
@@ -191,17 +165,6 @@ def _episodes(clips: int, first_seed: int, task: str, settings: Mapping[str, Any
     return collect_plan(plan, scene, EPISODES / f"{task}_{first_seed}_{plan.num_episodes}{of}")
 
 
-def _features(name: str, task: str) -> FrameFeatures:
-    if name == "pixels":
-        return CentredPixels()
-    if name == "random":
-        return RandomFeatures()
-    if name == "tokenizer":
-        folder = shipped_model(task)
-        return TokenizerFeatures(load_model_folder(folder).tokenizer, folder.name)
-    return load_backbone(Path(name))
-
-
 def _clip_learning(arguments: argparse.Namespace) -> None:
     base, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(TASK))
     given = (arguments.context_bags, arguments.heldout_bags)
@@ -210,29 +173,30 @@ def _clip_learning(arguments: argparse.Namespace) -> None:
         load_clips(bags or _episodes(*what, TASK), base.clip["stride"])
         for bags, what in zip(given, wanted, strict=True)
     )
-    plan = ClipPlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
-    trials, of = [SamplerTrial(arm, plan) for arm in clip_learning_samplers()], {"sha256": base.manifest["sha256"]}
+    plan, of = LearningPlan(arguments.iterations, eval_contexts=arguments.eval_contexts), base.manifest["sha256"]
+    trials, of = [SamplerTrial(sampler, plan) for sampler in clip_learning_samplers()], {"sha256": of}
 
-    def train(trial: SamplerTrial[ClipPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
+    def train(trial: SamplerTrial[LearningPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
         folder = load_video_folder(arguments.video_model)
-        return train_on_clips(folder, contexts, heldout, probe, trial.arm, trial.plan, seed, on_iteration)
+        source = RecordedSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed)
+        return train_sampler(source, trial.sampler, trial.plan, seed, on_iteration)
 
     rows = _train(arguments, trials, train, of)
     comparisons = _compared(rows, _against_cps(rows), CLIP_MEASURES)
     _write_trainings(arguments, trials, rows, comparisons, of)
     if comparisons:
-        _draw(arguments, plot_comparisons, comparisons)
-    console.print(clip_training_table(rows), comparison_table(comparisons))
+        _draw(arguments, plots.plot_comparisons, comparisons)
+    console.print(tables.clip_training_table(rows), tables.comparison_table(comparisons))
 
 
 def _learning(arguments: argparse.Namespace) -> None:
     plan = _plan(arguments, eval_every=5)
-    trials = [SamplerTrial(arm, plan) for arm in learning_samplers(LEARNER)]
+    trials = [SamplerTrial(sampler, plan) for sampler in learning_samplers(LEARNER)]
     rows = _train_discs(arguments, trials)
     comparisons = _compared(rows, _against_cps(rows))
     _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
-    _draw(arguments, plot_learning, rows)
-    console.print(training_table(rows), comparison_table(comparisons))
+    _draw(arguments, plots.plot_learning, rows)
+    console.print(tables.training_table(rows), tables.comparison_table(comparisons))
 
 
 def _ablations(arguments: argparse.Namespace) -> None:
@@ -241,26 +205,26 @@ def _ablations(arguments: argparse.Namespace) -> None:
     comparisons = _compared(rows, pairs)
     _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
     if comparisons:
-        _draw(arguments, plot_comparisons, comparisons)
-    console.print(training_table(rows), comparison_table(comparisons))
+        _draw(arguments, plots.plot_comparisons, comparisons)
+    console.print(tables.training_table(rows), tables.comparison_table(comparisons))
 
 
 def _hacking(arguments: argparse.Namespace) -> None:
     rows = _train_discs(arguments, hacking_trials(LEARNER, _plan(arguments, eval_every=3)))
-    _draw(arguments, plot_hacking, rows)
-    console.print(hacking_table(rows))
+    _draw(arguments, plots.plot_hacking, rows)
+    console.print(tables.hacking_table(rows))
 
 
-def _plan(arguments: argparse.Namespace, eval_every: int) -> LearningPlan:
-    return LearningPlan(
-        iterations=arguments.iterations, scenes=arguments.scenes, eval_scenes=arguments.eval_scenes,
+def _plan(arguments: argparse.Namespace, eval_every: int) -> DiscPlan:
+    return DiscPlan(
+        iterations=arguments.iterations, contexts=arguments.scenes, eval_contexts=arguments.eval_scenes,
         eval_every=eval_every,
     )
 
 
-def _train_discs(arguments: argparse.Namespace, trials: list[SamplerTrial[LearningPlan]]) -> list[dict[str, Any]]:
-    def train(trial: SamplerTrial[LearningPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
-        return train_sampler(load_base(arguments.base), trial.arm, trial.plan, seed, on_iteration)
+def _train_discs(arguments: argparse.Namespace, trials: list[SamplerTrial[DiscPlan]]) -> list[dict[str, Any]]:
+    def train(trial: SamplerTrial[DiscPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
+        return train_on_discs(load_base(arguments.base), trial.sampler, trial.plan, seed, on_iteration)
 
     return _train(arguments, trials, train, _base_of(arguments))
 
@@ -269,32 +233,32 @@ def _train(
     arguments: argparse.Namespace, trials: list[SamplerTrial[Plan]],
     train: Callable[[SamplerTrial[Plan], int, Callable[[], object]], dict[str, Any]], of: dict[str, Any],
 ) -> list[dict[str, Any]]:
-    """The trials named by --arms, at every seed, but what --json holds already; it is written after each training.
+    """The trials named by --samplers, at every seed, but what --json holds already; it is written after each training.
 
     train: returns the row of a trial at a seed. of: what the file says beside the rows.
     """
     rows = _finished(arguments.json, trials)
-    done = {(row["arm"], row["seed"]) for row in rows}
-    wanted = _named({trial.arm.name: trial for trial in trials}, arguments.arms)
-    todo = [(trial, seed) for seed in arguments.seeds for trial in wanted if (trial.arm.name, seed) not in done]
+    done = {(row["sampler"], row["seed"]) for row in rows}
+    wanted = _named({trial.sampler.name: trial for trial in trials}, arguments.samplers)
+    todo = [(trial, seed) for seed in arguments.seeds for trial in wanted if (trial.sampler.name, seed) not in done]
     with tqdm(total=sum(trial.plan.iterations for trial, _ in todo), desc=arguments.claim, unit="buffer") as bar:
         for trial, seed in todo:
-            bar.set_postfix_str(f"{trial.arm.name}, seed {seed}")
+            bar.set_postfix_str(f"{trial.sampler.name}, seed {seed}")
             rows.append(train(trial, seed, bar.update))
             _write_trainings(arguments, trials, rows, [], of)
     return rows
 
 
 def _against_cps(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Every arm with every CPS arm."""
-    names = sorted({row["arm"] for row in rows})
+    """Every sampler with every CPS sampler."""
+    names = sorted({row["sampler"] for row in rows})
     return [(name, base) for name in names for base in names if base.startswith("CPS") and name != base]
 
 
 def _compared(
     rows: list[dict[str, Any]], pairs: list[tuple[str, str]], measures: Sequence[str] = MEASURES
 ) -> list[SamplerComparison]:
-    found = (compare_samplers(rows, arm, base, measures) for arm, base in pairs)
+    found = (compare_samplers(rows, sampler, base, measures) for sampler, base in pairs)
     return [comparison for comparison in found if comparison is not None]
 
 
@@ -302,14 +266,14 @@ def _write_trainings(
     arguments: argparse.Namespace, trials: Sequence[SamplerTrial[Any]], rows: list[dict[str, Any]],
     comparisons: list[SamplerComparison], of: dict[str, Any],
 ) -> None:
-    """The rows, the resolved settings of their arms, and the comparisons."""
-    names = {row["arm"] for row in rows}
-    arms = _settings([trial.arm for trial in trials if trial.arm.name in names])
-    write_results(arguments, {**of, **arms, "comparisons": [asdict(one) for one in comparisons], "rows": rows})
+    """The rows, the resolved settings of their samplers, and the comparisons."""
+    names = {row["sampler"] for row in rows}
+    samplers = _settings([trial.sampler for trial in trials if trial.sampler.name in names])
+    write_results(arguments, {**of, **samplers, "comparisons": [asdict(one) for one in comparisons], "rows": rows})
 
 
-def _settings(arms: list[SamplerSetup]) -> dict[str, Any]:
-    return {"arms": TypeAdapter(list[SamplerSetup]).dump_python(arms)}
+def _settings(samplers: list[SamplerSetup]) -> dict[str, Any]:
+    return {"samplers": TypeAdapter(list[SamplerSetup]).dump_python(samplers)}
 
 
 def _base_of(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -328,14 +292,19 @@ def _cost(arguments: argparse.Namespace) -> None:
     ]
     of = {"seed": arguments.seed, "learner": LEARNER.model_dump(), **_base_of(arguments)}
     write_results(arguments, {**of, "rollouts": rollouts, "rows": rows})
-    _draw(arguments, plot_cost, rows)
-    console.print(rollout_table(rollouts, arguments.repeats), cost_table(rows, arguments.repeats))
+    _draw(arguments, plots.plot_cost, rows)
+    console.print(tables.rollout_table(rollouts, arguments.repeats), tables.cost_table(rows, arguments.repeats))
+
+
+def _chosen(arguments: argparse.Namespace) -> list[SamplerSetup]:
+    """The samplers of claim A that --samplers names."""
+    return _named({sampler.name: sampler for sampler in diversity_samplers()}, arguments.samplers)
 
 
 def _named(known: dict[str, T], names: list[str] | None) -> list[T]:
     unknown = [name for name in names or [] if name not in known]
     if unknown:
-        raise ValueError(f"unknown arms {', '.join(unknown)}; choose among: {'; '.join(known)}")
+        raise ValueError(f"unknown samplers {', '.join(unknown)}; choose among: {'; '.join(known)}")
     return [known[name] for name in names or known]
 
 
@@ -344,12 +313,13 @@ def _finished(path: Path | None, trials: Sequence[SamplerTrial[Any]]) -> list[di
     if path is None or not path.is_file():
         return []
     rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
-    plans = {trial.arm.name: asdict(trial.plan) for trial in trials}
+    if any("sampler" not in row for row in rows):
+        raise ValueError(f"{path} is of an earlier version of this benchmark; take another file")
+    plans = {trial.sampler.name: asdict(trial.plan) for trial in trials}
     for row in rows:
-        if row["plan"] != plans.get(row["arm"], row["plan"]):
-            raise ValueError(
-                f"{path} holds {row['arm']} by plan {row['plan']}, this call has {plans[row['arm']]}; take another file"
-            )
+        plan, name = row["plan"], row["sampler"]
+        if plan != plans.get(name, plan):
+            raise ValueError(f"{path} holds {name} by plan {plan}, this call has {plans[name]}; take another file")
     return rows
 
 
@@ -371,10 +341,10 @@ def _parser() -> argparse.ArgumentParser:
     base = claims.add_parser("base", help="train the base model (minutes on one core)")
     base.add_argument("--iterations", type=_positive, default=BASE_ITERATIONS)
     base.add_argument("--out", type=Path, default=Path("runs/moving_disc"))
-    diversity = claims.add_parser("diversity", help="claim A: diversity at equal quality and noise budget")
-    diversity.add_argument("--contexts", type=_positive, default=100)
-    diversity.add_argument("--group-size", type=_positive, default=8)
-    learning = claims.add_parser("learning", help="claim B: reward against model calls, every arm on one learner")
+    spread = claims.add_parser("diversity", help="claim A: diversity at equal quality and noise budget")
+    spread.add_argument("--contexts", type=_positive, default=100)
+    spread.add_argument("--group-size", type=_positive, default=8)
+    learning = claims.add_parser("learning", help="claim B: reward against model calls, every sampler on one learner")
     ablations = claims.add_parser("ablations", help="in pairs: KL, advantage clip, guidance, resolution")
     hacking = claims.add_parser("hacking", help="a reward that can be hacked, and the detector of DD-2 on both")
     for claim, iterations in ((learning, 40), (ablations, 12), (hacking, 25)):
@@ -387,9 +357,9 @@ def _parser() -> argparse.ArgumentParser:
     clips = claims.add_parser("clips", help="claim A on a video model of recorded episodes")
     training = claims.add_parser("clip-learning", help="claim B on a video model of recorded episodes")
     training.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    training.add_argument("--iterations", type=_positive, default=ClipPlan.iterations)
+    training.add_argument("--iterations", type=_positive, default=LearningPlan.iterations)
     training.add_argument("--contexts", type=_positive, default=400, help="recorded episodes to draw contexts from")
-    training.add_argument("--eval-contexts", type=_positive, default=ClipPlan.eval_contexts)
+    training.add_argument("--eval-contexts", type=_positive, default=LearningPlan.eval_contexts)
     training.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and held-out ones")
     for claim in (clips, training):
         claim.add_argument(
@@ -412,12 +382,12 @@ def _parser() -> argparse.ArgumentParser:
         "--features", default="tokenizer",
         help="tokenizer, pixels, random, or the folder of a vision backbone, e.g. DINOv3 (default: tokenizer)",
     )
-    for claim in (base, diversity, cost, clips, resolution):
+    for claim in (base, spread, cost, clips, resolution):
         claim.add_argument("--seed", type=int, default=0)
-    for claim in (diversity, learning, ablations, hacking, clips, training):
-        claim.add_argument("--arms", nargs="+", metavar="NAME")
-    for claim in (diversity, learning, ablations, hacking, cost):
+    for claim in (spread, learning, ablations, hacking, clips, training):
+        claim.add_argument("--samplers", "--arms", nargs="+", metavar="NAME")
+    for claim in (spread, learning, ablations, hacking, cost):
         claim.add_argument("--base", type=Path, help="weights of another base model than the shipped one")
-    for claim in (diversity, learning, ablations, hacking, cost, clips, training, resolution):
+    for claim in (spread, learning, ablations, hacking, cost, clips, training, resolution):
         claim.add_argument("--json", type=Path, help="write every row here; trainings go on where the file stops")
     return parser

@@ -12,11 +12,12 @@ from wm_nodes.video_rl.reward_hacking import T_975
 PATH = "_path"
 """Ending of a measure that is a mean over the evaluations of a training, its area per model call, and not the last."""
 MEASURES = ("reward_path", "reward", "obeyed", "background")
+CLIP_MEASURES = ("tracking_path", "tracking", "object_cm", "tool_cm", "psnr_db")
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean and 95 % interval of arm - base over `seeds`, for one measure."""
+    """Mean and 95 % interval of sampler - base over `seeds`, for one measure."""
 
     mean: float
     low: float
@@ -29,29 +30,29 @@ class Difference:
 
 @dataclass(frozen=True)
 class SamplerComparison:
-    """arm against base on their common seeds; differences: one per measure."""
+    """sampler against base on their common seeds; differences: one per measure."""
 
-    arm: str
+    sampler: str
     base: str
     seeds: tuple[int, ...]
     differences: dict[str, Difference]
 
 
 def compare_samplers(
-    rows: Sequence[dict[str, Any]], arm: str, base: str, measures: Sequence[str] = MEASURES
+    rows: Sequence[dict[str, Any]], sampler: str, base: str, measures: Sequence[str] = MEASURES
 ) -> SamplerComparison | None:
-    """Compare trainings, whose rows hold `arm`, `seed` and `evaluations`, the first one of before; None where the two
-    have fewer than two seeds in common.
+    """Compare trainings, whose rows hold `sampler`, `seed` and `evaluations`, the first one of before; None where the
+    two have fewer than two seeds in common.
     """
-    of = {name: {row["seed"]: row for row in rows if row["arm"] == name} for name in (arm, base)}
-    seeds = sorted(of[arm].keys() & of[base].keys())
+    of = {name: {row["seed"]: row for row in rows if row["sampler"] == name} for name in (sampler, base)}
+    seeds = sorted(of[sampler].keys() & of[base].keys())
     if len(seeds) < 2:
         return None
     differences = {
-        measure: paired_interval([value(of[arm][seed], measure) - value(of[base][seed], measure) for seed in seeds])
+        measure: paired_interval([value(of[sampler][seed], measure) - value(of[base][seed], measure) for seed in seeds])
         for measure in measures
     }
-    return SamplerComparison(arm, base, tuple(seeds), differences)
+    return SamplerComparison(sampler, base, tuple(seeds), differences)
 
 
 def value(row: dict[str, Any], measure: str) -> float:

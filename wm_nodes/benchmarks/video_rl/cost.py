@@ -3,18 +3,16 @@ caching add to a rollout. DD-20.
 """
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from statistics import median
-from types import ModuleType
 from typing import Any
 
 import torch
 
-from benchmarks.video_rl.learning import sample_groups
+from benchmarks.video_rl.clock import clocked
 from benchmarks.video_rl.samplers import dyndiff, sampler_setup
+from benchmarks.video_rl.sources import sample_scenes
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import Anchor, GrpoConfig
@@ -103,29 +101,6 @@ def measure_rollout(
     return {**medians, "over_cps": medians["rollout_s"] / medians["cps_s"]}
 
 
-@contextmanager
-def clocked(module: ModuleType, *names: str) -> Iterator[list[float]]:
-    """Yield [seconds spent so far in functions of `module`], which are wrapped meanwhile."""
-    spent, originals = [0.0], {name: getattr(module, name) for name in names}
-
-    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
-            start = time.perf_counter()
-            result = function(*arguments)
-            spent[0] += time.perf_counter() - start
-            return result
-
-        return call
-
-    for name, function in originals.items():
-        setattr(module, name, timed(function))
-    try:
-        yield spent
-    finally:
-        for name, function in originals.items():
-            setattr(module, name, function)
-
-
 def toy_rollout(model: VideoNetwork, repeats: int, seed: int) -> dict[str, Any]:
     """measure_rollout of the moving disc: SCENES x GROUP videos, DynDiff 0.6 gated."""
     condition = draw_scenes(SCENES, seed, "cost").condition().repeat_interleave(GROUP)
@@ -136,9 +111,8 @@ def toy_rollout(model: VideoNetwork, repeats: int, seed: int) -> dict[str, Any]:
 
 def toy_buffer(model: VideoNetwork, seed: int) -> tuple[RolloutBuffer, RolloutSettings]:
     """SCENES x GROUP scored videos of the moving disc, DynDiff 0.4 sparse at an rms budget."""
-    arm = sampler_setup("DynDiff", dyndiff(0.4, "sparse", "rms"))
-    buffer, scores = sample_groups(model, arm, draw_scenes(SCENES, seed, "cost"), GROUP, seed, 0, 0)
-    return buffer.with_rewards({"total": scores.reward}), arm.rollout
+    sampler = sampler_setup("DynDiff", dyndiff(0.4, "sparse", "rms"))
+    return sample_scenes(model, sampler, draw_scenes(SCENES, seed, "cost"), GROUP, seed), sampler.rollout
 
 
 def pushcube_rollout(repeats: int, seed: int) -> dict[str, Any]:

@@ -28,7 +28,7 @@ SMOOTHED = 5
 
 
 def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> None:
-    """Diversity (DD-19) with its 95 % interval against the noise an arm spends; the two regimes of initial noise."""
+    """Diversity (DD-19) with its 95 % interval against the noise a sampler spends; the two regimes of initial noise."""
     figure = make_figure(10.5, 4.2)
     for axes, shared in zip(figure.subplots(1, 2, sharey=True), (False, True), strict=True):
         whose = "shared" if shared else "own"
@@ -36,7 +36,7 @@ def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> Non
         for (family, marker), colour in zip(FAMILIES.items(), COLOURS, strict=True):
             points = sorted(
                 (np.mean(row["noise_share"]), *bootstrap_mean(row["diversity"], seed=seed))
-                for row in rows if row["shared_noise"] == shared and family_of(row["arm"]) == family
+                for row in rows if row["shared_noise"] == shared and family_of(row["sampler"]) == family
             )
             if not points:
                 continue
@@ -45,7 +45,7 @@ def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> Non
                 x, mean, (mean - low, high - mean), marker=marker, markersize=5, elinewidth=0.8, capsize=2,
                 linewidth=0 if family == "DynDiff literal" else 1.4, color=colour, label=family,
             )
-        ode = [np.mean(row["diversity"]) for row in rows if row["arm"] == "ODE" and row["shared_noise"] == shared]
+        ode = [np.mean(row["diversity"]) for row in rows if row["sampler"] == "ODE" and row["shared_noise"] == shared]
         if ode:
             axes.axhline(ode[0], color="gray", linewidth=1, linestyle=":", label="ODE")
         add_legend(axes, "lower right")
@@ -53,39 +53,40 @@ def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> Non
 
 
 def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Held-out reward above the base model's over the buffers, mean with standard error over seeds; every arm's mean
-    over its training, by seed; and the diversity of its rollouts over the buffers, where the rows have it.
+    """Held-out reward above the base model's over the buffers, mean with standard error over seeds; every sampler's
+    mean over its training, by seed; and the diversity of its rollouts over the buffers, where the rows have it.
     """
     spread = [row for row in rows if "rollout_diversity" in row["buffers"]]
     figure = make_figure(17.0 if spread else 12.0, 4.8)
     left, right, *more = figure.subplots(1, 3 if spread else 2, width_ratios=(1.15, 1, 1)[: 3 if spread else 2])
-    arms = sorted({row["arm"] for row in rows}, key=lambda arm: np.mean(_gains(rows, arm)))
-    style_axes(left, f"arms with {CURVE_SEEDS} seeds or more", "buffers", "held-out reward above the base model's")
-    shown = [arm for arm in arms if len(_gains(rows, arm)) >= CURVE_SEEDS]
+    samplers = sorted({row["sampler"] for row in rows}, key=lambda sampler: np.mean(_gains(rows, sampler)))
+    style_axes(left, f"samplers with {CURVE_SEEDS} seeds or more", "buffers", "held-out reward above the base model's")
+    shown = [sampler for sampler in samplers if len(_gains(rows, sampler)) >= CURVE_SEEDS]
     colours = dict(zip(shown, (*COLOURS, *MORE_COLOURS), strict=False))
-    for arm in shown:
-        curves = np.array([[point["reward"] for point in row["evaluations"]] for row in rows if row["arm"] == arm])
+    for sampler in shown:
+        trained = [row["evaluations"] for row in rows if row["sampler"] == sampler]
+        curves = np.array([[point["reward"] for point in evaluations] for evaluations in trained])
         curves -= curves[:, :1]
-        x = [point["iteration"] for point in next(row for row in rows if row["arm"] == arm)["evaluations"]]
+        x = [point["iteration"] for point in trained[0]]
         mean, error = curves.mean(0), curves.std(0, ddof=1) / len(curves) ** 0.5
-        colour = colours.get(arm, "gray")
-        left.plot(x, mean, color=colour, linewidth=1.6, label=f"{arm} ({len(curves)})")
+        colour = colours.get(sampler, "gray")
+        left.plot(x, mean, color=colour, linewidth=1.6, label=f"{sampler} ({len(curves)})")
         left.fill_between(x, mean - error, mean + error, color=colour, alpha=0.12, linewidth=0)
     if shown:
         add_legend(left, "upper left", fontsize=7.5)
     style_axes(right, "mean over a training; a dot per seed", "held-out reward above the base model's", "")
-    for place, arm in enumerate(arms):
-        values = _gains(rows, arm)
-        right.plot(values, [place] * len(values), ".", color=colours.get(arm, "gray"), alpha=0.5, markersize=7)
+    for place, sampler in enumerate(samplers):
+        values = _gains(rows, sampler)
+        right.plot(values, [place] * len(values), ".", color=colours.get(sampler, "gray"), alpha=0.5, markersize=7)
         right.plot(np.mean(values), place, "|", color="black", markersize=13, markeredgewidth=1.8)
-    right.set_yticks(range(len(arms)), arms, fontsize=8)
+    right.set_yticks(range(len(samplers)), samplers, fontsize=8)
     for axes in more:
         style_axes(axes, f"rollouts, mean of {SMOOTHED} buffers and over seeds", "buffers", "diversity (DD-19)")
-        for place, arm in enumerate(dict.fromkeys(row["arm"] for row in spread)):
-            mean = np.mean([row["buffers"]["rollout_diversity"] for row in spread if row["arm"] == arm], 0)
+        for place, sampler in enumerate(dict.fromkeys(row["sampler"] for row in spread)):
+            mean = np.mean([row["buffers"]["rollout_diversity"] for row in spread if row["sampler"] == sampler], 0)
             size = min(SMOOTHED, len(mean))
             smooth = np.convolve(mean, np.full(size, 1 / size), "valid")
-            axes.plot(np.arange(size, len(mean) + 1), smooth, color=COLOURS[place % len(COLOURS)], label=arm)
+            axes.plot(np.arange(size, len(mean) + 1), smooth, color=COLOURS[place % len(COLOURS)], label=sampler)
         add_legend(axes, fontsize=7.5)
     save_figure(figure, path)
 
@@ -104,7 +105,7 @@ def plot_comparisons(comparisons: Sequence[SamplerComparison], path: Path) -> No
             colour = COLOURS[1] if difference.separable else COLOURS[0]
             axes.plot((difference.low, difference.high), (place, place), color=colour, linewidth=1.6)
             axes.plot(difference.mean, place, "o", color=colour, markersize=5)
-        labels = [f"{row.arm}\n- {row.base} ({len(row.seeds)} seeds)" for row in comparisons]
+        labels = [f"{row.sampler}\n- {row.base} ({len(row.seeds)} seeds)" for row in comparisons]
         axes.set_yticks(places, labels, fontsize=8)
     axes.invert_yaxis()
     save_figure(figure, path)
@@ -131,12 +132,12 @@ def plot_cost(rows: Sequence[dict[str, Any]], path: Path) -> None:
 def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """The reward that trains beside the truths held out of it, a panel per trial; mean over seeds, thin lines each."""
     figure = make_figure(12.0, 4.0)
-    arms = list(dict.fromkeys(row["arm"] for row in rows))
+    samplers = list(dict.fromkeys(row["sampler"] for row in rows))
     truths = {"obeyed": COLOURS[0], "mass": COLOURS[1]}
-    for axes, arm in zip(np.atleast_1d(figure.subplots(1, len(arms), sharey=True)), arms, strict=True):
-        mine = [row for row in rows if row["arm"] == arm]
+    for axes, sampler in zip(np.atleast_1d(figure.subplots(1, len(samplers), sharey=True)), samplers, strict=True):
+        mine = [row for row in rows if row["sampler"] == sampler]
         proxy, fired = mine[0]["plan"]["proxy"], sum(bool(alarms(row)) for row in mine)
-        style_axes(axes, f"{arm}: alarm in {fired} of {len(mine)} runs", "buffers", "held-out scenes")
+        style_axes(axes, f"{sampler}: alarm in {fired} of {len(mine)} runs", "buffers", "held-out scenes")
         for name, colour in {proxy: COLOURS[2], **truths}.items():
             for row in mine:
                 x, y = zip(*((point["iteration"], point[name]) for point in row["evaluations"]), strict=True)
@@ -149,13 +150,13 @@ def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
     save_figure(figure, path)
 
 
-def family_of(arm: str) -> str:
-    """The family of an arm of claim A."""
-    if not arm.startswith("DynDiff"):
-        return arm.split()[0]
-    return f"DynDiff {arm.split()[2]} rms" if arm.endswith("rms") else "DynDiff literal"
+def family_of(sampler: str) -> str:
+    """The family of a sampler of claim A."""
+    if not sampler.startswith("DynDiff"):
+        return sampler.split()[0]
+    return f"DynDiff {sampler.split()[2]} rms" if sampler.endswith("rms") else "DynDiff literal"
 
 
-def _gains(rows: Sequence[dict[str, Any]], arm: str) -> list[float]:
-    """Mean reward over each training of the arm, less that of its start."""
-    return [value(row, "reward_path") - row["evaluations"][0]["reward"] for row in rows if row["arm"] == arm]
+def _gains(rows: Sequence[dict[str, Any]], sampler: str) -> list[float]:
+    """Mean reward over each training of the sampler, less that of its start."""
+    return [value(row, "reward_path") - row["evaluations"][0]["reward"] for row in rows if row["sampler"] == sampler]

@@ -1,13 +1,49 @@
-"""The competing samplers of the DynDiff benchmark, by name; everything else of a run is shared by all arms."""
+"""The competing samplers of the DynDiff benchmark, by name; everything else of a run is shared by all samplers."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import GrpoConfig, WindowConfig
 from wm_nodes.video_model import MaskSettings, RolloutSettings, SamplerSettings
+from wm_nodes.video_rl.toy_scene import SIDE
 
-NUM_STEPS, SHIFT = 10, 3.0
-_BASE = load_video_config("base")
+NUM_STEPS, CLIP_STEPS, SHIFT = 10, 4, 3.0
+BASE = load_video_config("base")
+CLIP_LEARNER = BASE.grpo.with_values(
+    advantage=BASE.grpo.advantage.with_values(std_scope="global", best_of_n=4),
+    kl=BASE.grpo.kl.with_values(mode="none"), trains="condition", logprob_weight="cps", updates_per_buffer=1,
+    step_fraction=1.0, learning_rate=2e-4, weight_decay=0.0,
+)
+"""The setting in which the shipped video model was seen to learn from recorded contexts that it was not trained on:
+clips of few steps, only the weights that carry the condition, no KL."""
+
+
+@dataclass(frozen=True)
+class LearningPlan:
+    """iterations: buffers of contexts x group_size videos. eval_contexts: held out, one video each by ODE, before,
+    every eval_every buffers, and at the end.
+    """
+
+    iterations: int = 8
+    contexts: int = 16
+    group_size: int = 8
+    eval_contexts: int = 100
+    eval_every: int = 2
+
+
+@dataclass(frozen=True)
+class DiscPlan(LearningPlan):
+    """Of the moving disc. proxy: the score that trains, `reward` or one that can be hacked. side, eval_side: of the
+    videos that train and the held-out ones, px.
+    """
+
+    iterations: int = 40
+    contexts: int = 6
+    eval_every: int = 5
+    proxy: Literal["reward", "consistency"] = "reward"
+    side: int = SIDE
+    eval_side: int = SIDE
 
 
 @dataclass(frozen=True)
@@ -20,12 +56,12 @@ class SamplerSetup:
     rollout: RolloutSettings
     grpo: GrpoConfig
     shared_noise: bool = False
-    window: WindowConfig = _BASE.window
+    window: WindowConfig = BASE.window
 
 
 def sampler_setup(name: str, sampler: SamplerSettings, grpo: GrpoConfig | None = None) -> SamplerSetup:
     return SamplerSetup(
-        name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or _BASE.grpo
+        name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or BASE.grpo
     )
 
 
@@ -36,24 +72,24 @@ def dyndiff(eta: float, combine: str = "gated", budget: str = "literal", **knobs
 
 def diversity_samplers() -> list[SamplerSetup]:
     """Claim A: ODE, CPS at several noise levels, DynDiff as written, sparse, and at CPS's noise budget."""
-    arms = [sampler_setup("ODE", SamplerSettings("ode", 0.0))]
-    arms += [sampler_setup(f"CPS {eta:g}", SamplerSettings("cps", eta)) for eta in (0.2, 0.4, 0.6)]
-    arms += [sampler_setup(f"DynDiff {eta:g} gated", dyndiff(eta)) for eta in (0.6, 1.0)]
-    arms += [sampler_setup("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"))]
+    samplers = [sampler_setup("ODE", SamplerSettings("ode", 0.0))]
+    samplers += [sampler_setup(f"CPS {eta:g}", SamplerSettings("cps", eta)) for eta in (0.2, 0.4, 0.6)]
+    samplers += [sampler_setup(f"DynDiff {eta:g} gated", dyndiff(eta)) for eta in (0.6, 1.0)]
+    samplers += [sampler_setup("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"))]
     for eta in (0.2, 0.4, 0.6):
-        arms += [
+        samplers += [
             sampler_setup(f"DynDiff {eta:g} {kind}, rms", dyndiff(eta, kind, "rms")) for kind in ("gated", "sparse")
         ]
-    return arms
+    return samplers
 
 
 def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
-    """Claim B: every arm on one learner; `learner` holds what they share.
+    """Claim B: every sampler on one learner; `learner` holds what they share.
 
-    Mix-GRPO and the arms "window" train all four steps of a window that moves, as many as the others do of their nine.
+    Mix-GRPO and the samplers "window" train all four steps of a window that moves, as many as the others of their nine.
     """
     cps = learner.with_values(logprob_weight="cps")
-    frozen = _BASE.grpo.kl.with_values(beta=learner.kl.beta, anchor="frozen")
+    frozen = BASE.grpo.kl.with_values(beta=learner.kl.beta, anchor="frozen")
     plain = sampler_setup("CPS 0.6", SamplerSettings("cps", 0.6), cps)
     matched = sampler_setup("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps)
     sparse = sampler_setup("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps)
@@ -78,12 +114,28 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
         matched,
         sparse,
         gated,
-        *(replace(arm, name=f"{arm.name}, frozen", grpo=arm.grpo.with_values(kl=frozen)) for arm in (plain, matched)),
-        *(replace(arm, name=f"{arm.name}, shared", shared_noise=True) for arm in shared),
-        *(replace(_in_window(arm), name=f"{arm.name}, window") for arm in (plain, gated)),
+        *(replace(one, name=f"{one.name}, frozen", grpo=one.grpo.with_values(kl=frozen)) for one in (plain, matched)),
+        *(replace(sampler, name=f"{sampler.name}, shared", shared_noise=True) for sampler in shared),
+        *(replace(_in_window(sampler), name=f"{sampler.name}, window") for sampler in (plain, gated)),
     ]
 
 
-def _in_window(arm: SamplerSetup) -> SamplerSetup:
+def clip_learning_samplers() -> list[SamplerSetup]:
+    """Claim B on recorded contexts: CPS and DynDiff at one eta, CPS at the noise that DynDiff spends there, and DynDiff
+    as written.
+    """
+    samplers = {
+        "CPS 0.6": SamplerSettings("cps", 0.6),
+        "CPS 0.4": SamplerSettings("cps", 0.4),
+        "DynDiff 0.6 gated, rms": dyndiff(0.6, "gated", "rms"),
+        "DynDiff 0.6 gated": dyndiff(0.6),
+    }
+    return [
+        SamplerSetup(name, RolloutSettings(CLIP_STEPS, SHIFT, sampler=sampler), CLIP_LEARNER, shared_noise=True)
+        for name, sampler in samplers.items()
+    ]
+
+
+def _in_window(sampler: SamplerSetup) -> SamplerSetup:
     window = WindowConfig(strategy="progressive", size=4, period=7)
-    return replace(arm, grpo=arm.grpo.with_values(step_fraction=1.0), window=window, shared_noise=True)
+    return replace(sampler, grpo=sampler.grpo.with_values(step_fraction=1.0), window=window, shared_noise=True)

@@ -20,13 +20,13 @@ def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     shown = ("diversity_dynamic", "reward_std", "reward", "background", "mass")
     cells = (
         (
-            row["arm"], _regime(row), f"{row['noise_share']:.3f}",
+            row["sampler"], _regime(row), f"{row['noise_share']:.3f}",
             estimate(bootstrap_mean(row["diversity"], seed=seed), ".3f"), *(f"{_average(row, n):.4f}" for n in shown),
         )
         for row in rows
     )
     return _table(
-        "diversity (DD-19) and quality, mean over contexts with 95 % bootstrap interval", ("arm", "initial noise"),
+        "diversity (DD-19) and quality, mean over contexts with 95 % bootstrap interval", ("sampler", "initial noise"),
         ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"), cells,
     )
 
@@ -35,13 +35,13 @@ def clip_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     shown = ("diversity_dynamic", "object_spread_cm", "reward_std", "tracking", "scenery")
     cells = (
         (
-            row["arm"], _regime(row), f"{_average(row, 'noise_share'):.3f}",
+            row["sampler"], _regime(row), f"{_average(row, 'noise_share'):.3f}",
             estimate(bootstrap_mean(row["diversity"], seed=seed), ".4f"), *(f"{_average(row, n):.4f}" for n in shown),
         )
         for row in rows
     )
     return _table(
-        f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("arm", "initial noise"),
+        f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("sampler", "initial noise"),
         ("noise rms/s", "diversity (DD-19)", "moving part", "object spread, cm", "reward std", "tracking", "scenery"),
         cells,
     )
@@ -51,36 +51,37 @@ def clip_comparison_table(comparisons: Sequence[dict[str, Any]]) -> Table:
     shown = ("diversity", "diversity_dynamic", "object_spread_cm", "tracking")
     cells = (
         (
-            row["arm"], row["base"], _regime(row), "{:.2f}, {:.2f}".format(*row["noise_share"]),
+            row["sampler"], row["base"], _regime(row), "{:.2f}, {:.2f}".format(*row["noise_share"]),
             *(estimate(row[name]) for name in shown),
         )
         for row in comparisons
     )
     return _table(
-        "DynDiff - CPS, paired over contexts, 95 % bootstrap interval", ("arm", "base", "initial noise"),
+        "DynDiff - CPS, paired over contexts, 95 % bootstrap interval", ("sampler", "base", "initial noise"),
         ("noise", "diversity (DD-19)", "moving part", "object spread, cm", "tracking"), cells,
     )
 
 
 def training_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per arm, means over its seeds.
+    """One line per sampler, means over its seeds.
 
-    Held-out scenes before and after; noise and diversity of the arm's rollouts, means over the buffers; the last
-    buffer's second update.
+    Held-out scenes before and after; noise and diversity of the sampler's rollouts, means over the buffers; the last
+    second update of the last buffer that was not skipped.
     """
     cells = []
-    for arm in dict.fromkeys(row["arm"] for row in rows):
-        mine = [row for row in rows if row["arm"] == arm]
+    for sampler in dict.fromkeys(row["sampler"] for row in rows):
+        mine = [row for row in rows if row["sampler"] == sampler]
         first, last = ([row["evaluations"][i] for row in mine] for i in (0, -1))
-        low, high, kl = (np.mean([row["buffers"][name][-1] for row in mine]) for name in LAST_UPDATE)
+        low, high, kl = (np.mean([_last(row["buffers"][name]) for row in mine]) for name in LAST_UPDATE)
         cells.append((
-            arm, len(mine), *(f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed")),
+            sampler, len(mine),
+            *(f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed")),
             f"{_mean(last, 'background'):.4f}", f"{_mean(last, 'mass'):.3f}",
             *(_over_buffers(mine, name) for name in COURSE), f"{low:.2f}/{high:.2f}", f"{kl:.1e}",
             f"{np.mean([sum(row['seconds'].values()) for row in mine]):.0f}",
         ))
     return _table(
-        "held-out scenes, ODE, before and after; mean over seeds", ("arm",),
+        "held-out scenes, ODE, before and after; mean over seeds", ("sampler",),
         ("seeds", "reward", "obeyed", "bg", "mass", "noise", "diversity", "clip low/high @2", "KL @2", "seconds"),
         cells,
     )
@@ -92,12 +93,13 @@ def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
     for row in rows:
         changes = (np.subtract(row["after"][name], row["before"][name]) for name in SCORES)
         cells.append((
-            row["arm"], row["seed"], _over_buffers([row], "noise_share"), f"{_average(row['before'], 'tracking'):.3f}",
+            row["sampler"], row["seed"], _over_buffers([row], "noise_share"),
+            f"{_average(row['before'], 'tracking'):.3f}",
             *(estimate(bootstrap_mean(change, seed=row["seed"]), "+.3f") for change in changes),
             f"{sum(row['seconds'].values()):.0f}",
         ))
     return _table(
-        "held-out contexts by ODE, after - before, 95 % bootstrap interval over the contexts", ("arm",),
+        "held-out contexts by ODE, after - before, 95 % bootstrap interval over the contexts", ("sampler",),
         ("seed", "noise rms/s", "tracking before", *SCORES, "seconds"), cells,
     )
 
@@ -105,12 +107,12 @@ def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
 def comparison_table(comparisons: Sequence[SamplerComparison]) -> Table:
     measures = tuple(comparisons[0].differences) if comparisons else ()
     cells = (
-        (row.arm, row.base, len(row.seeds), *(_difference_text(row.differences[name]) for name in measures))
+        (row.sampler, row.base, len(row.seeds), *(_difference_text(row.differences[name]) for name in measures))
         for row in comparisons
     )
     return _table(
-        "arm - base on the same seeds: mean, 95 % t interval, * if beside 0; _path: mean over a training",
-        ("arm", "base"), ("seeds", *measures), cells,
+        "sampler - base on the same seeds: mean, 95 % t interval, * if beside 0; _path: mean over a training",
+        ("sampler", "base"), ("seeds", *measures), cells,
     )
 
 
@@ -125,7 +127,7 @@ def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
     for row in rows:
         first, last, proxy = row["evaluations"][0], row["evaluations"][-1], row["plan"]["proxy"]
         shown = (f"{first[name]:.4g} -> {last[name]:.4g}" for name in (proxy, "obeyed", "mass", "background"))
-        cells.append((row["arm"], row["seed"], *shown, ", ".join(alarms(row)) or "no alarm"))
+        cells.append((row["sampler"], row["seed"], *shown, ", ".join(alarms(row)) or "no alarm"))
     return _table(
         "reward hacking (DD-2), held-out scenes", ("trained on",),
         ("seed", "that reward", "obeyed", "mass", "background", "falls while it rises"), cells,
@@ -166,6 +168,11 @@ def _average(row: dict[str, Any], name: str) -> float:
 
 def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
     return float(np.mean([row[name] for row in rows]))
+
+
+def _last(course: Sequence[float | None]) -> float:
+    """The last value that is known; NaN where none is, of a training whose buffers were all skipped."""
+    return next((value for value in reversed(course) if value is not None), np.nan)
 
 
 def _over_buffers(rows: Sequence[dict[str, Any]], name: str) -> str:

@@ -1,14 +1,12 @@
 """What is trained to answer one question each: the paper's ablations, and a reward that can be hacked.
 
-Each ablation is a pair on one learner and one arm, with equal model calls.
+Each ablation is a pair on one learner and one sampler, with equal model calls.
 """
 
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
-from benchmarks.video_rl.clip_learning import ClipPlan
-from benchmarks.video_rl.learning import LearningPlan
-from benchmarks.video_rl.samplers import SamplerSetup, dyndiff, sampler_setup
+from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup, dyndiff, sampler_setup
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import GrpoConfig
 from wm_nodes.video_model import SamplerSettings
@@ -21,24 +19,24 @@ PAPER_GROUP = 16
 """Videos per context of Table 5: a clip of 2.5 can act from groups of 8 on, one of 5 only from 27 on."""
 
 
-Plan = TypeVar("Plan", bound=LearningPlan | ClipPlan)
+Plan = TypeVar("Plan", bound=LearningPlan)
 
 
 @dataclass(frozen=True)
 class SamplerTrial(Generic[Plan]):
-    """One arm trained by one plan; the arm's name is the trial's."""
+    """One sampler trained by one plan; the sampler's name is the trial's."""
 
-    arm: SamplerSetup
+    sampler: SamplerSetup
     plan: Plan
 
 
 def ablation_trials(
-    learner: GrpoConfig, plan: LearningPlan
-) -> tuple[list[SamplerTrial[LearningPlan]], list[tuple[str, str]]]:
+    learner: GrpoConfig, plan: DiscPlan
+) -> tuple[list[SamplerTrial[DiscPlan]], list[tuple[str, str]]]:
     """Return the trainings, and which is compared with which: (name, name of its base)."""
     cps = learner.with_values(logprob_weight="cps", learning_rate=SHORT_RATE)
     base = replace(sampler_setup("base", dyndiff(0.6, "gated", "rms"), cps), shared_noise=True)
-    groups = replace(plan, scenes=max(1, plan.scenes * plan.group_size // PAPER_GROUP), group_size=PAPER_GROUP)
+    groups = replace(plan, contexts=max(1, plan.contexts * plan.group_size // PAPER_GROUP), group_size=PAPER_GROUP)
     half = replace(plan, iterations=max(1, plan.iterations // 2), eval_every=max(1, plan.eval_every // 2))
     high = replace(plan, eval_side=HIGH_SIDE)
     guided, plain = replace(base.rollout, cfg=GUIDANCE), load_video_config("base").grpo
@@ -61,19 +59,19 @@ def ablation_trials(
     return trials, pairs
 
 
-def hacking_trials(learner: GrpoConfig, plan: LearningPlan) -> list[SamplerTrial[LearningPlan]]:
+def hacking_trials(learner: GrpoConfig, plan: DiscPlan) -> list[SamplerTrial[DiscPlan]]:
     """The honest reward; temporal consistency alone, which a picture that stands still, or has no disc, satisfies best;
     the same with a frozen anchor, which holds it back.
     """
     cps = learner.with_values(logprob_weight="cps", learning_rate=SHORT_RATE)
-    arm = replace(sampler_setup("honest reward", SamplerSettings("cps", 0.6), cps), shared_noise=True)
+    sampler = replace(sampler_setup("honest reward", SamplerSettings("cps", 0.6), cps), shared_noise=True)
     hackable, frozen = replace(plan, proxy="consistency"), learner.kl.with_values(anchor="frozen")
     return [
-        SamplerTrial(arm, plan),
-        SamplerTrial(_learning(arm, "consistency alone"), hackable),
-        SamplerTrial(_learning(arm, "consistency, frozen anchor", kl=frozen), hackable),
+        SamplerTrial(sampler, plan),
+        SamplerTrial(_learning(sampler, "consistency alone"), hackable),
+        SamplerTrial(_learning(sampler, "consistency, frozen anchor", kl=frozen), hackable),
     ]
 
 
-def _learning(arm: SamplerSetup, name: str, **changes: object) -> SamplerSetup:
-    return replace(arm, name=name, grpo=arm.grpo.with_values(**changes))
+def _learning(sampler: SamplerSetup, name: str, **changes: object) -> SamplerSetup:
+    return replace(sampler, name=name, grpo=sampler.grpo.with_values(**changes))

@@ -1,6 +1,6 @@
 """The evidence behind the README: several seeds and tasks, RL in the world model against RL in the simulator.
 
-In one process and in lock-step: the updates are bit-equal to those of the graph (tests/graph), without its start-up.
+By policy_rl/train.py, in one process: the updates are bit-equal to those of the graph, without its start-up.
 Each (task, seed, arm) is one line of results.jsonl; finished lines are not run again.
 """
 
@@ -29,9 +29,9 @@ from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment, models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
-from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.pretraining import load_arrays
-from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics
+from wm_nodes.policy_rl.rollouts import rollout_statistics
+from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reports import machine_facts, mean_gain
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
@@ -165,21 +165,15 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
 def _train(
     policy: ImagePolicy, env: Environment, config: RunConfig, arm: str, model_dir: Path
 ) -> list[dict[str, float]]:
-    """ppo.updates updates; in the simulator the same number of environment steps, SIMULATOR_ENVS slots at a time."""
+    """Train in place; return success rate, KL and environment steps of each update."""
     reward: RewardModel = RuleReward() if arm == "simulator" else make_endogenous_reward(config, model_dir)
-    learner = PpoLearner(policy, config.ppo, seed=config.seed)
-    steps = config.ppo.num_steps * config.ppo.num_envs // env.spec.num_envs
     course: list[dict[str, float]] = []
     with tqdm(total=config.ppo.updates, desc=f"{config.task} seed {config.seed} in {arm}", unit="update") as bar:
-        for update in range(config.ppo.updates):
-            rollout = collect_rollout(env, policy, reward, steps, config.seed, update + 1)
-            metrics, statistics = learner.update(rollout), rollout_statistics(rollout)
-            course.append({
-                "success_rate": statistics.success_rate, "kl_reference": metrics.kl_reference,
-                "steps": float(rollout.valid_TN.sum()),
-            })
+        for rollout, metrics in train_policy(policy, env, reward, config):
+            success_rate, steps = rollout_statistics(rollout).success_rate, float(rollout.valid_TN.sum())
+            course.append({"success_rate": success_rate, "kl_reference": metrics.kl_reference, "steps": steps})
             bar.update()
-            bar.set_postfix(success=f"{statistics.success_rate:.2f}", refresh=False)
+            bar.set_postfix(success=f"{success_rate:.2f}", refresh=False)
     return course
 
 

@@ -156,7 +156,8 @@ class AdvantageConfig(SettingsSection):
     """Of the normalised advantage."""
     mix: Literal["reward", "advantage"]
     """Several rewards are added before they are normalised, or each is normalised and then weighed."""
-    std_scope: Literal["group", "global", "running"]
+    std_scope: Literal["group", "global", "batch", "running"]
+    """Which standard deviation normalises, see video_rl/group_advantages.py; flow_grpo's global_std is batch."""
     ddof: NonNegativeInt
     best_of_n: NonNegativeInt
     """Videos of a group that train, best and worst; 0: all."""

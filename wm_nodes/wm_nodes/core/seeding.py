@@ -1,6 +1,8 @@
 """One root seed, named streams: every random number of a run comes from (root seed, name, indices)."""
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -19,3 +21,11 @@ def numpy_stream(root_seed: int, name: str, *indices: int) -> np.random.Generato
 def torch_stream(root_seed: int, name: str, *indices: int) -> torch.Generator:
     """A CPU generator; draw on the CPU and move, so that results do not depend on the device."""
     return torch.Generator().manual_seed(stream_seed(root_seed, name, *indices))
+
+
+@contextmanager
+def initial_weights(root_seed: int, name: str) -> Iterator[None]:
+    """Modules made inside draw their first weights from stream `name`; torch's global generator is left as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(numpy_stream(root_seed, name).integers(2**31)))
+        yield

@@ -1,5 +1,6 @@
 """learner of loop 2: asks for clips and their scores, trains the video model by GRPO, announces new versions."""
 
+import math
 import signal
 import sys
 import threading
@@ -30,7 +31,8 @@ from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
-from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, rewarded, version_uri
+from wm_nodes.video_rl.reference_reward import rewarded
+from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, version_uri
 from wm_nodes.video_rl.validation import alarm_text, validation_scores
 
 PARAMS = (
@@ -104,6 +106,8 @@ class VideoLearnerNode(ManagedNode):
                     if invalid:
                         self.diagnostics.count("invalid_rewards", invalid, text=f"{invalid} clips without reward")
                     report = self._run.train(buffer, work.check)
+                    if report.skipped:
+                        self.diagnostics.count("skipped_buffers", text="no group of a buffer has rewards that differ")
                     self._announce(self._run.version)
                     self._tell(work, report, done, count)
                     self._warn()
@@ -176,7 +180,8 @@ class VideoLearnerNode(ManagedNode):
         work.feedback(
             TrainVideo.Feedback(
                 iteration=done, policy_version=self._run.version, reward_mean=report.reward_mean,
-                zero_std_ratio=report.zero_std_ratio, kl=report.updates[-1].kl, progress=done / count,
+                zero_std_ratio=report.zero_std_ratio, progress=done / count,
+                kl=report.updates[-1].kl if report.updates else math.nan,
             )
         )
 

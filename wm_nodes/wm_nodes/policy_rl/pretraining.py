@@ -11,6 +11,7 @@ import torch
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, model_tasks
+from wm_nodes.core.seeding import initial_weights
 from wm_nodes.environments.maniskill.collection import CollectionPlan
 from wm_nodes.environments.record import (
     HELDOUT_SEEDS,
@@ -129,10 +130,11 @@ def _tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenizer) ->
     folder = run_dir / "tokenizer_only"
     if not (folder / "manifest.json").exists():
         tasks = model_tasks(config.task)
-        untrained = action_model_class(config.tokenizer.kind)(
-            config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
-            action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),
-        )
+        with initial_weights(config.seed, "action_model_init"):
+            untrained = action_model_class(config.tokenizer.kind)(
+                config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
+                action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),
+            )
         save_model_folder(
             folder, tokenizer, untrained, None, tokenizer_config=config.tokenizer,
             world_model_config=config.world_model, simulation=config.simulation, tasks=tasks, story={},

@@ -1,5 +1,9 @@
-"""Several learner processes under torchrun (gloo or nccl): every rank holds the whole rollout and a share of each
-minibatch; gradients are summed, so R ranks make the update of one."""
+"""Several learner processes under torchrun: every rank holds the whole rollout and a share of each minibatch; gradients
+are summed, so R ranks make the update of one.
+
+They talk by gloo, on every device: rollouts, flags and sums are host memory, which nccl cannot send, and gloo takes a
+GPU's gradients through the host. The policies and video models here are small enough for that.
+"""
 
 import json
 import os
@@ -13,6 +17,8 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from wm_nodes.core.types import Rollout
+
+BACKEND = "gloo"
 
 
 class Ranks:
@@ -58,7 +64,7 @@ def join() -> Ranks:
         return Ranks()
     if not dist.is_initialized():
         # A rank waits for the next rollout as long as the learner has no goal; torchrun ends it when another one dies.
-        dist.init_process_group("gloo", timeout=timedelta(days=365))
+        dist.init_process_group(BACKEND, timeout=timedelta(days=365))
     return Ranks(dist.get_rank(), size)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from wm_nodes.core.types import BoolArray
 
-StdScope = Literal["group", "global", "running"]
+StdScope = Literal["group", "global", "batch", "running"]
 
 
 @dataclass
@@ -61,7 +61,15 @@ def group_advantages(
 ) -> GroupAdvantages:
     """Return A_i = clip((R_i - mean_g R) / std_g R, -clip, clip) (DD-13) over the valid videos of each group.
 
-    The mean is the group's; the standard deviation is the group's, that of all groups together, or the running one.
+    The mean is always the group's. std_scope says which standard deviation:
+
+    - group: of the group's rewards.
+    - global: sqrt(mean (R_i - mean_g R)^2) over the videos of all groups with spread, about their groups' own means.
+      Contexts of unequal difficulty do not enter it. This is not the global_std of flow_grpo's code; that is batch.
+    - batch: of all valid rewards about their common mean, also those of groups without spread. Where contexts differ in
+      difficulty it is larger than global, and the advantages are smaller.
+    - running: as global, over every buffer so far.
+
     A group of fewer than two valid videos, or with std < floor max(1, |mean|), has advantages 0 and is counted.
 
     Args:
@@ -98,6 +106,8 @@ def group_advantages(
         running.add(deviations[kept])
     if std_scope == "global" and bool(kept.any()):
         stds = torch.full_like(stds, float(deviations[kept].square().mean().sqrt()))
+    elif std_scope == "batch" and bool(kept.any()):
+        stds = torch.full_like(stds, float(rewards[valid].std(correction=0)))
     elif std_scope == "running" and running is not None and running.std > 0:
         stds = torch.full_like(stds, running.std)
     advantages = (deviations / stds).clamp(-clip, clip)

@@ -42,6 +42,9 @@ from wm_nodes.video_rl.group_advantages import (
 from wm_nodes.video_rl.grpo_math import clip_tails, clipped_objective
 from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
 
+MAX_SKIPPED = 5
+"""So many buffers in a row whose rewards differ in no group end a training: nothing can be learned from the reward."""
+
 
 @dataclass(frozen=True)
 class UpdateReport:
@@ -64,10 +67,11 @@ class UpdateReport:
 
 @dataclass(frozen=True)
 class BufferReport:
-    """What one buffer gave. updates: one report per optimizer step, in order (index 0 is on-policy). dropped_groups:
-    those with fewer valid videos than contract.trainable asks for; they are in zero_std_ratio too. raw_rewards: mean of
-    each score beside the total over the videos that have it, NaN where none has. step_noise: noise_share of each
-    stochastic sampler step.
+    """What one buffer gave. updates: one report per optimizer step, in order (index 0 is on-policy); none where the
+    rewards differ in no group. skipped: such buffers in a row, up to this one. dropped_groups: those with fewer valid
+    videos than group_advantages.trainable asks for; they are in zero_std_ratio too. raw_rewards: mean of each score
+    beside the total over the videos that have it, NaN where none has. step_noise: noise_share of each stochastic
+    sampler step.
     """
 
     updates: tuple[UpdateReport, ...]
@@ -75,6 +79,7 @@ class BufferReport:
     advantage_abs_mean: float
     zero_std_ratio: float
     invalid: int
+    skipped: int
     dropped_groups: int
     kept: int
     group_size: float
@@ -118,6 +123,8 @@ class GrpoLearner:
         self.ranks, self.reward_weights = ranks or Ranks(), dict(reward_weights or {})
         self.version = 0
         """Optimizer steps made so far: the policy version of the weights."""
+        self.skipped = 0
+        """Buffers in a row, up to now, that no optimizer step was made on."""
         self.parameters = [p for p in model.parameters() if p.requires_grad]
         self._optimizer = torch.optim.AdamW(
             self.parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay
@@ -129,10 +136,12 @@ class GrpoLearner:
     def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Make `updates_per_buffer` optimizer steps; nothing has changed when it raises.
 
+        A buffer whose rewards differ in no group is skipped: its report has no updates, the weights stay.
+
         Raises:
             RolloutBufferError: another sampler configuration, or a stale buffer.
-            ValueError: no video that can train (every reward invalid or every group without spread), or no generated
-                frame.
+            ValueError: a reward that is marked valid and not finite, no group with enough valid ones, MAX_SKIPPED
+                buffers in a row without spread, or no generated frame.
             FloatingPointError: a loss or gradient is not finite.
         """
         buffer.check(self.rollout, self.version, self.settings.max_staleness)
@@ -149,23 +158,26 @@ class GrpoLearner:
         kept = best_of_n(
             advantages.advantages_N, buffer.group_ids, advantages.kept_N, self.settings.advantage.best_of_n
         )
-        if not bool(kept.any()):
+        skipped = 0 if bool(kept.any()) else self.skipped + 1
+        if not bool(trains.any()) or skipped >= MAX_SKIPPED:
             raise ValueError(
                 f"nothing to learn from: {invalid} of {len(buffer)} rewards are invalid, {dropped} of "
                 f"{advantages.num_groups} groups have too few valid ones and {advantages.num_zero_std - dropped} no "
-                "spread; look at the reward"
+                f"spread; {self.skipped} buffers before it were skipped; look at the reward"
             )
         try:
             updates = tuple(self._update(buffer, rows, advantages) for rows in self._passes(buffer, kept))
         except BaseException:
             self._restore(before)
             raise
+        self.skipped = skipped
         return BufferReport(
             updates=updates,
             reward_mean=float(rewards[buffer.valid].mean()),
             advantage_abs_mean=float(advantages.advantages_N[kept].abs().mean()),
             zero_std_ratio=advantages.num_zero_std / advantages.num_groups,
             invalid=invalid,
+            skipped=skipped,
             dropped_groups=dropped,
             kept=int(kept.sum()),
             group_size=len(buffer) / advantages.num_groups,
@@ -301,7 +313,7 @@ class GrpoLearner:
         tensors |= {f"averaged.{name}": value for name, value in self.averaged.items()}
         tensors |= {f"anchor.{name}": value for name, value in self._terms.anchor.items()}
         tensors |= {f"optimizer.{key}": value for key, value in optimizer_tensors(self._optimizer).items()}
-        header = {"version": self.version, "seed": self.seed, "iteration": iteration}
+        header = {"version": self.version, "seed": self.seed, "iteration": iteration, "skipped": self.skipped}
         header |= {f.name: getattr(self._running, f.name) for f in fields(self._running)}
         tensors = {name: _kept(tensor).contiguous() for name, tensor in tensors.items()}
         write_atomic(path, save(tensors, {"grpo": json.dumps(header)}))
@@ -333,7 +345,7 @@ class GrpoLearner:
         self._terms.anchor = {name: value.to(device) for name, value in section(tensors, "anchor.").items()}
         restore_optimizer(self._optimizer, section(tensors, "optimizer."))
         self._running = RunningStd(header["sum_of_squares"], header["count"])
-        self.version = header["version"]
+        self.version, self.skipped = header["version"], header.get("skipped", 0)  # older files have skipped none
         return int(header["iteration"])
 
 

@@ -21,8 +21,7 @@ from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.messages import stamp_ns
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_rl.reference_reward import mixed, score_clips
-from wm_nodes.video_rl.training_run import rewarded
+from wm_nodes.video_rl.reference_reward import mixed, rewarded, score_clips
 from wm_nodes.world_model.position_probe import PositionProbe
 
 

@@ -7,7 +7,7 @@ watched (DD-2).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from wm_nodes.core.types import FloatArray
+from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -107,6 +108,12 @@ def mixed(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
     if unknown or not weights:
         raise ValueError(f"unknown rewards {unknown}; weigh some of {', '.join(sorted(values))}")
     return torch.stack([weight * values[name].double() for name, weight in weights.items()]).sum(0)
+
+
+def rewarded(buffer: RolloutBuffer, scores: Mapping[str, Tensor], total: Tensor) -> RolloutBuffer:
+    """The buffer with raw scores and the mixed reward `total`; a clip whose total is NaN is left out of training."""
+    raw = {name: values.double() for name, values in scores.items()}
+    return replace(buffer.with_rewards({"total": total}), rewards={**raw, "total": total.double()})
 
 
 def _path_share(found: FloatArray, truth: FloatArray) -> FloatArray:

@@ -20,6 +20,8 @@ from wm_nodes.video_model import (
 )
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.reference_reward import mixed, rewarded, score_clips
+from wm_nodes.world_model.position_probe import PositionProbe
 
 _ROLLOUT = TypeAdapter(RolloutSettings)
 
@@ -108,6 +110,25 @@ class ClipGenerator:
         _, F, H, W, _ = self.contexts.frames.shape
         codec = self.folder.codec
         return codec.channels, F, H // codec.patch, W // codec.patch
+
+
+class RecordedContexts(ClipGenerator):
+    """Recorded contexts as a source of post-training (train.ClipSource): clips are scored against their recordings.
+
+    Args:
+        probe: reads positions off the clips.
+    """
+
+    def __init__(self, folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe) -> None:
+        super().__init__(folder, contexts, config)
+        self.probe = probe
+
+    def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
+        """The buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
+        frames = self.folder.codec.decode(clips.rollout.latents)
+        given = self.folder.clip["num_conditioning"]
+        scores = score_clips(frames, self.references(request), self.probe, given).named()
+        return rewarded(clips, scores, mixed(scores, self.config.rewards))
 
 
 def _seeds(seed: int, name: str, iteration: int, group: Tensor, sample: Tensor) -> Tensor:

@@ -14,9 +14,21 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from wm_nodes.config.shipped import PRETRAINED
-from wm_nodes.core.seeding import torch_stream
+from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.seeding import stream_seed, torch_stream
 from wm_nodes.training.weights import check_same_layout, unpack_weights
-from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
+from wm_nodes.video_model import (
+    Condition,
+    NetworkSettings,
+    RolloutBuffer,
+    VideoNetwork,
+    config_hash,
+    initial_noise,
+    sample_videos,
+    stochastic_steps,
+)
+from wm_nodes.video_rl.reference_reward import rewarded
+from wm_nodes.video_rl.sampling import rollout_settings
 
 CHANNELS, FRAMES, SIDE = 2, 6, 16
 NUM_ACTIONS = 4
@@ -31,6 +43,7 @@ MOVED_CELLS = 2.0
 """A disc that went further than this the commanded way obeyed."""
 NEAR = 3.0
 """Cells further than NEAR radii from the disc are background."""
+MAX_SEED = 2**62
 CHANGE = 0.02
 """Mean square change from frame to frame at which `consistency` is 1 / e; a moving disc makes about 0.025."""
 
@@ -70,6 +83,10 @@ class Scenes:
         """A Gaussian disc of `radius` cells at each centre (B, F, 2) in pixels: (B, F, H, W), 1 in its middle."""
         return opacity_at(centres, radius * self.scale, self.side)
 
+    def rows(self, index: Tensor) -> "Scenes":
+        """The scenes of `index`, int64 (B,)."""
+        return Scenes(self.background[index], self.start[index], self.speed[index], self.action[index])
+
     def condition(self) -> Condition:
         """The clean first frame and the commanded action, one-hot on every frame."""
         actions = F.one_hot(self.action, NUM_ACTIONS).float()[:, None].expand(-1, FRAMES - 1, -1).contiguous()
@@ -93,6 +110,9 @@ class Scores:
     def reward(self) -> Tensor:
         """The training reward: task + 0.3 mass - 10 background."""
         return self.task + 0.3 * self.mass - 10 * self.background
+
+    def named(self) -> dict[str, Tensor]:
+        return {"reward": self.reward, **vars(self)}
 
 
 def draw_scenes(count: int, seed: int, name: str, index: int = 0, side: int = SIDE) -> Scenes:
@@ -141,6 +161,74 @@ def score(videos: Tensor, scenes: Scenes) -> Scores:
         obeyed=((travelled > MOVED_CELLS) & ~lost[:, -1]).double(),
         consistency=torch.exp(-change / CHANGE).double(),
     )
+
+
+@dataclass(frozen=True)
+class SceneRequest:
+    """What to sample: a group of videos of each scene. iteration, policy_version: of the learner."""
+
+    scenes: Scenes
+    iteration: int
+    policy_version: int
+
+
+class ToyContexts:
+    """Scenes as a source of post-training (train.ClipSource), drawn anew for every iteration.
+
+    Args:
+        network: samples as it is, so loading newer weights into it is enough.
+        config: its seed, groups, window and rollout are used.
+        side: of the pictures, px.
+        reward: the score that trains, a name of Scores.
+    """
+
+    def __init__(
+        self, network: VideoNetwork, config: VideoRlConfig, *, side: int = SIDE, reward: str = "reward"
+    ) -> None:
+        self.network, self.config, self.side, self.reward = network, config, side, reward
+
+    def request(self, iteration: int, policy_version: int) -> SceneRequest:
+        scenes = draw_scenes(self.config.groups.contexts, self.config.seed, "rollouts", iteration, self.side)
+        return SceneRequest(scenes, iteration, policy_version)
+
+    def sample(self, request: SceneRequest) -> RolloutBuffer:
+        """A buffer of len(scenes) x group_size videos without rewards."""
+        settings, size = rollout_settings(self.config.rollout), self.config.groups.group_size
+        iteration = request.iteration
+        index = torch.arange(len(request.scenes)).repeat_interleave(size)
+        samples = torch.arange(size).repeat(len(request.scenes))
+        condition = request.scenes.rows(index).condition()
+        steps = stochastic_steps(settings.num_steps, self.config.window, iteration, self.config.seed)
+        first = index * size if self.config.groups.shared_noise else index * size + samples
+        noise = self._noise(request.scenes, self._seeds("initial", iteration, first))
+        seeds = self._seeds("steps", iteration, index * size + samples)
+        self.network.eval()
+        rollout = sample_videos(self.network, condition, noise, seeds, settings, steps)
+        return RolloutBuffer(
+            rollout, condition, index, samples, {}, torch.ones(len(index), dtype=torch.bool), request.policy_version,
+            iteration, config_hash(settings),
+        )
+
+    def score(self, request: SceneRequest, clips: RolloutBuffer) -> RolloutBuffer:
+        """The buffer with every score of its videos, and as `total` the one that trains."""
+        scores = score(clips.rollout.latents, request.scenes.rows(clips.group_ids)).named()
+        return rewarded(clips, scores, scores[self.reward])
+
+    def evaluate(self, scenes: Scenes) -> Scores:
+        """Score one video of each scene, sampled by ODE."""
+        seeds = self._seeds("evaluation", 0, torch.arange(len(scenes)))
+        self.network.eval()
+        noise = self._noise(scenes, seeds)
+        settings = rollout_settings(self.config.rollout)
+        rollout = sample_videos(self.network, scenes.condition(), noise, seeds, settings, stochastic=[])
+        return score(rollout.latents, scenes)
+
+    def _noise(self, scenes: Scenes, seeds: Tensor) -> Tensor:
+        return initial_noise((CHANNELS, FRAMES, scenes.side, scenes.side), seeds)
+
+    def _seeds(self, name: str, iteration: int, numbers: Tensor) -> Tensor:
+        seeds = (stream_seed(self.config.seed, f"moving_disc_{name}", iteration, int(number)) for number in numbers)
+        return torch.tensor([seed % MAX_SEED for seed in seeds])
 
 
 def centred_pixels(videos: Tensor) -> Tensor:

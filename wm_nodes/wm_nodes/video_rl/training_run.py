@@ -11,12 +11,10 @@ sampling_version follows from the run folder alone: a resumed run asks for what 
 import hashlib
 import json
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-
-import torch
 
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.training.checkpoint import metadata_of
@@ -78,8 +76,9 @@ class VideoRun:
         """Buffers trained on in the run folder."""
         if (run_dir / CHECKPOINT).is_file():
             self.iterations = self.learner.load(run_dir / CHECKPOINT)
-        self.previous_version = max((v for v in self._versions() if v < self.version), default=self.version)
-        """The version before the last training; before any, that of now."""
+        older = [] if self.learner.skipped else [version for version in self._versions() if version < self.version]
+        self.previous_version = max(older, default=self.version)
+        """The version before the last buffer; that of now before any, and after one that was skipped."""
         self.staleness = 0
         """Optimizer steps between sampling and training of the last buffer."""
         self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self._ranks.rank == 0 else None
@@ -104,7 +103,7 @@ class VideoRun:
         return self.previous_version if self.prefetches else self.version
 
     def train(self, buffer: RolloutBuffer, check: Callable[[], None] = lambda: None) -> BufferReport:
-        """Train on one buffer with rewards, then save.
+        """Train on one buffer with rewards, or skip it (see GrpoLearner.train), then save.
 
         Args:
             check: called before every call of the network; what it raises ends the training with nothing changed. With
@@ -197,9 +196,3 @@ def flat_metrics(report: BufferReport) -> dict[str, float]:
     for index, update in enumerate(updates, 1):
         found |= {f"{name}_{index}": float(value) for name, value in update.items()}
     return found
-
-
-def rewarded(buffer: RolloutBuffer, scores: Mapping[str, torch.Tensor], total: torch.Tensor) -> RolloutBuffer:
-    """The buffer with raw scores and the mixed reward `total`; a clip whose total is NaN is left out of training."""
-    raw = {name: values.double() for name, values in scores.items()}
-    return replace(buffer.with_rewards({"total": total}), rewards={**raw, "total": total.double()})

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import LoopSettings, TrainingLoop
 from wm_nodes.world_model.conditions import ActionCondition
@@ -136,8 +136,7 @@ def train_action_model(
 
 def new_action_model(tokenizer: Tokenizer, data: LatentEpisodes, config: RunConfig, seed: int) -> ActionModel:
     """A freshly initialised model whose state normalisation fits the data."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(numpy_stream(seed, "action_model_init").integers(2**31))
+    with initial_weights(seed, "action_model_init"):
         model = ActionModel(
             config.world_model,
             num_tokens=tokenizer.num_tokens,

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import LoopSettings, TrainingLoop
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -34,8 +34,7 @@ def train_position_probe(
     frames = np.flatnonzero(episodes.frame_mask.reshape(-1) & np.isfinite(truth).all(-1))
     if not len(frames):
         raise ValueError("no recorded frame has ground truth; the judge's probe needs simulator episodes")
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(numpy_stream(seed, "position_probe_init").integers(2**31))
+    with initial_weights(seed, "position_probe_init"):
         probe = PositionProbe(height, width)
     probe.mean.copy_(torch.from_numpy(truth[frames].mean(0)))
     probe.std.copy_(torch.from_numpy(truth[frames].std(0)).clamp_min(1e-4))

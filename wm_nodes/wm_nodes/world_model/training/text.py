@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, task_names
-from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.seeding import initial_weights, numpy_stream
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import LoopSettings, TrainingLoop
 from wm_nodes.world_model.dynamics import ActionModel
@@ -39,10 +39,11 @@ def train_text_model(
     if not len(rows):
         raise ValueError(f"no successful episode of {' or '.join(demonstrators())} to learn goals from; collect more")
     settings = config.world_model
-    model = TextModel(
-        settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
-        vocabulary=vocabulary_of(instructions), num_tasks=len(instructions),
-    )
+    with initial_weights(seed, "text_model_init"):
+        model = TextModel(
+            settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
+            vocabulary=vocabulary_of(instructions), num_tasks=len(instructions),
+        )
     shared = {name: t for name, t in action_model.state_dict().items() if not name.startswith("condition.")}
     model.load_state_dict(shared, strict=False)
     tokenizer.requires_grad_(False)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.training.loop import LoopSettings, TrainingLoop
 from wm_nodes.world_model.decoding import choose_codes, code_targets
 from wm_nodes.world_model.precision import compute_context
@@ -34,8 +34,7 @@ def train_token_model(
 ) -> tuple[TokenActionModel, dict[str, float]]:
     """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics."""
     settings = config.world_model
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(numpy_stream(seed, "token_model_init").integers(2**31))
+    with initial_weights(seed, "token_model_init"):
         model = TokenActionModel(
             settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
             action_dim=data.actions.shape[-1], state_dim=data.states.shape[-1], num_tasks=data.success.shape[-1],

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task
-from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import LoopSettings, TrainingLoop
@@ -46,8 +46,7 @@ def train_tokenizer(
     images = episodes.images.reshape(-1, height, width, 3)
     truth = probe_targets(episodes.ground_truth.reshape(len(images), -1), episodes.tasks[0])
     if tokenizer is None:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(numpy_stream(seed, "tokenizer_init").integers(2**31))
+        with initial_weights(seed, "tokenizer_init"):
             tokenizer = Tokenizer(settings, height, width)
         _set_statistics(tokenizer, images[frames], truth[frames], seed)
     codec = tokenizer

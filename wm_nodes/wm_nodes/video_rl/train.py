@@ -1,0 +1,59 @@
+"""Loop 2 on one screen: GRPO of a video model on groups of its own clips, in one process.
+
+The ROS graph is this loop with the video model, the reward evaluator and the learner in a process each, and gives the
+same weights bit for bit (tests/graph/test_world_model_rl.py). `python -m wm_nodes.video_rl.train` runs it, seconds per
+buffer: a video model whose disc goes the commanded way in 57 % of its clips learns to do so in two of three.
+"""
+
+from collections.abc import Iterator
+from typing import Protocol, TypeVar
+
+from wm_nodes.config.load import load_video_config
+from wm_nodes.video_model import RolloutBuffer
+from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
+from wm_nodes.video_rl.sampling import rollout_settings
+from wm_nodes.video_rl.toy_scene import ToyContexts, draw_scenes, load_base
+
+Request = TypeVar("Request")
+
+
+class ClipSource(Protocol[Request]):
+    """Where contexts come from, how clips of them are sampled, and what a clip is worth."""
+
+    def request(self, iteration: int, policy_version: int) -> Request: ...
+    def sample(self, request: Request) -> RolloutBuffer: ...
+    def score(self, request: Request, clips: RolloutBuffer) -> RolloutBuffer: ...
+
+
+class Learner(Protocol):
+    """GrpoLearner, or a VideoRun, which also writes versions, checkpoints and metrics."""
+
+    @property
+    def version(self) -> int: ...
+    def train(self, buffer: RolloutBuffer) -> BufferReport: ...
+
+
+def post_train(
+    learner: Learner, source: ClipSource[Request], iterations: int
+) -> Iterator[tuple[RolloutBuffer, BufferReport]]:
+    """Train on `iterations` buffers; yield each with the report of its optimizer steps."""
+    for iteration in range(iterations):
+        request = source.request(iteration, learner.version)  # which contexts, and which weights sample
+        clips = source.sample(request)  # a group of clips of each context
+        buffer = source.score(request, clips)  # a clip without reward is left out
+        report = learner.train(buffer)  # learner.version is new from here on
+        yield buffer, report
+
+
+def main() -> None:
+    changes = {"groups.contexts": 6, "groups.shared_noise": True, "rollout.shift": 3.0, "rollout.sampler.arm": "cps"}
+    config = load_video_config("base", {**changes, "grpo.learning_rate": 1e-4, "grpo.logprob_weight": "cps"})
+    source, heldout = ToyContexts(load_base(), config), draw_scenes(100, config.seed, "evaluation")
+    learner = GrpoLearner(source.network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
+    for iteration, (_, report) in enumerate(post_train(learner, source, 20), 1):
+        obeyed = source.evaluate(heldout).obeyed.mean()
+        print(f"buffer {iteration}: training reward {report.reward_mean:.2f}; {obeyed:.0%} of held-out clips obey")
+
+
+if __name__ == "__main__":
+    main()
