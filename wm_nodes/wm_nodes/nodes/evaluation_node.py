@@ -11,12 +11,13 @@ from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.training_run import weights_uri
 from wm_nodes.ros import convert
-from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.worker import Work
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),

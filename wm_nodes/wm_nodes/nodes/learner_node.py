@@ -31,11 +31,12 @@ from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining, 
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
-from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.training.weights import INLINE_LIMIT_BYTES, WeightsError, load_weights
 

@@ -18,13 +18,14 @@ from wm_msgs.msg import ClipScores, PolicyVersion
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
 from wm_nodes.ros import convert, diagnostics
-from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import Cancelled, PeerLost
+from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
@@ -64,7 +65,7 @@ class VideoLearnerNode(ManagedNode):
         self.own(self._run.close)
         self._watched = self._run.hacked
         self._versions = self.publish_on("video/version")
-        self._first_messages = StartBarrier(self)
+        self._first_messages = StartBarrier(self, self.links.book)
         self._generate = ActionClient(self, GenerateClips, "video/generate")
         self._evaluate = ActionClient(self, EvaluateClips, "clips/evaluate")
         self.own(self._generate.destroy)
