@@ -23,6 +23,7 @@ transformers = pytest.importorskip("transformers")
 pytest.importorskip("peft")
 
 from wm_nodes.apps.check_video_model import main as doctor  # noqa: E402
+from wm_nodes.core.model_folder import ModelFolderError  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
     Condition,
     RolloutBuffer,
@@ -38,7 +39,6 @@ from wm_nodes.video_model.adapters import (  # noqa: E402
     CosmosVelocity,
     LoadSettings,
     MissingPackageError,
-    ModelFolderError,
     PublicVelocity,
     TextEncoder,
     VideoCodec,

@@ -16,7 +16,6 @@ from wm_nodes.judge.evidence.pictures import pictures_of
 from wm_nodes.judge.evidence.pixels import pixel_evidence
 from wm_nodes.judge.evidence.world_model import MODEL_EVIDENCE, model_evidence
 from wm_nodes.world_model import WorldModels, load_model_folder
-from wm_nodes.world_model.folder import ModelFolderError
 
 
 class ClipEvidence:
@@ -71,7 +70,7 @@ class ClipEvidence:
     def _model(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
         try:
             return model_evidence(self._loaded(), clip.frames, task)
-        except (ValueError, ModelFolderError):  # of other cameras, another task, or without its actions
+        except ValueError:  # of other cameras, another task, or without its actions
             return {}
 
     def _loaded(self) -> WorldModels:
