@@ -22,7 +22,7 @@ from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reference_reward import load_probe, mixed, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.video_rl.settings import VideoRlConfig, dump_video_config, load_video_config
-from wm_nodes.video_rl.training_run import rewarded, version_uri
+from wm_nodes.video_rl.training_run import VIDEO_FILES, rewarded
 
 EPISODES, STEPS, STRIDE = 4, 4, 2
 BLIND = 3
@@ -168,7 +168,7 @@ class VideoLoop:
 
     def newest(self, result: TrainVideo.Result) -> bytes:
         """The weights file of a result's version."""
-        return (self.graph.folder / version_uri(result.policy_version)).read_bytes()
+        return (self.graph.folder / VIDEO_FILES.uri(result.policy_version)).read_bytes()
 
     def assert_undisturbed(self, result: TrainVideo.Result) -> None:
         """Assert that the goal finished, with the weights of the loop in this process, bit for bit."""
