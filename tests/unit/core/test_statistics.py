@@ -9,7 +9,6 @@ from wm_nodes.core.statistics import (
     mcnemar_exact,
     newcombe_difference,
     paired_difference,
-    proportions_agree,
     wilson_interval,
 )
 
@@ -31,12 +30,6 @@ def test_wilson_is_symmetric_and_says_nothing_without_episodes() -> None:
 
 def test_newcombe_difference_matches_the_published_example() -> None:
     assert newcombe_difference(56, 70, 48, 80) == pytest.approx((0.0524, 0.3339), abs=5e-5)
-
-
-def test_equal_rates_agree_and_far_ones_do_not() -> None:
-    assert proportions_agree(50, 100, 100, 200)
-    assert not proportions_agree(90, 100, 50, 100)
-    assert proportions_agree(0, 0, 7, 7)
 
 
 def test_mcnemar_is_the_two_sided_binomial_tail() -> None:

@@ -12,7 +12,6 @@ import numpy as np
 from wm_nodes.config.schema import SimulationConfig
 
 SOURCE_IMAGINED, SOURCE_SIMULATOR, SOURCE_REAL, SOURCE_REPLAY = 0, 1, 2, 3
-SOURCE_NAMES = ("imagined", "simulator", "real", "replay")
 
 GROUND_TRUTH_NAMES = (
     "cube_x", "cube_y", "cube_z", "cube_yaw", "tool_x", "tool_y", "tool_z", "goal_x", "goal_y",

@@ -58,14 +58,6 @@ def newcombe_difference(
     return p - q - math.hypot(p - low, other_high - q), p - q + math.hypot(high - p, q - other_low)
 
 
-def proportions_agree(
-    successes: int, episodes: int, other_successes: int, other_episodes: int, *, z: float = Z_95
-) -> bool:
-    """Return whether 0 lies in the Newcombe interval of the difference: two independent rates may be one."""
-    low, high = newcombe_difference(successes, episodes, other_successes, other_episodes, z=z)
-    return low <= 0.0 <= high
-
-
 def bootstrap_mean(
     values: Sequence[float] | NDArray[Any], *, seed: int, draws: int = 10_000
 ) -> tuple[float, float, float]:

@@ -82,6 +82,6 @@ class ClipEvidence:
 
 @functools.cache
 def pixel_names() -> frozenset[str]:
-    """The evidence that needs no model; definitions.EVIDENCE says what each is."""
+    """The evidence that needs no model; docs/embedded_judge_evidence.csv says what each is."""
     black = np.zeros((2, 8, 8, 3), np.uint8)
     return frozenset(pixel_evidence(pictures_of(black, black[0])))

@@ -7,7 +7,7 @@ loss = RS-10b clipped policy + value_weight * RS-10c value - entropy_weight * en
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -71,17 +71,15 @@ class PpoLearner:
     """Trains `policy` in place.
 
     Args:
-        reference: the policy that kl_reference_weight keeps it close to; None: `policy` as it is now.
         seed: of the minibatch order (stream `ppo_order`).
         ranks: this process's place among the learner's processes.
     """
 
     def __init__(
-        self, policy: ImagePolicy, config: PpoConfig, *, seed: int, reference: ImagePolicy | None = None,
-        ranks: Ranks | None = None,
+        self, policy: ImagePolicy, config: PpoConfig, *, seed: int, ranks: Ranks | None = None
     ) -> None:
         self.policy, self.config, self.seed = policy, config, seed
-        self.reference = reference if reference is not None else policy.clone()
+        self.reference = policy.clone()
         self.ranks = ranks or Ranks()
         self.updates = 0
         critic = list(policy.critic.parameters())
@@ -261,6 +259,3 @@ class PpoLearner:
             states = torch.from_numpy(rollout.next_states_TN[needed])
             values[torch.from_numpy(needed)] = self.policy.value(features, states)
         return values
-
-
-METRIC_NAMES = tuple(field.name for field in fields(PpoMetrics))

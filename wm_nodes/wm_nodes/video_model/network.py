@@ -7,7 +7,7 @@ sampler. Each frame is told its own time (0 where it is given clean), the action
 last given frame.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -45,9 +45,6 @@ class NetworkSettings:
     depth: int = 5
     patch: int = 2
     change_std: float = 0.0
-
-    def as_metadata(self) -> dict[str, float]:
-        return asdict(self)
 
 
 class VideoNetwork(nn.Module):

@@ -1,6 +1,5 @@
 """WM_txt and the goals it imagines (RS-6). Shapes: B batch, T frames, S tokens, D values per token, L words."""
 
-import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,7 +104,3 @@ def imagine_goals(
     found = crossed.any(1)
     first = np.where(found, crossed.argmax(1), signal_BT.argmax(1))
     return ImaginedGoals(np.stack(frames, 1), first.astype(np.int64) + 2, found)
-
-
-def frame_hash(image: UInt8Array) -> str:
-    return hashlib.sha256(np.ascontiguousarray(image).tobytes()).hexdigest()
