@@ -171,10 +171,6 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self._entities.append(grantor.close)
         return grantor
 
-    def tracker(self, name: str) -> GapTracker:
-        """The gap counts of a topic this node listens to."""
-        return self._trackers.setdefault(name, GapTracker())
-
     def serve(self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service until cleanup."""
         service = self.create_service(service_type, name, callback)
