@@ -6,8 +6,8 @@ import torch
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import model_tasks
 from wm_nodes.policy_rl.factories import ACTION_DIM, STATE_DIM
-from wm_nodes.policy_rl.pretraining import MODEL_TASKS
 from wm_nodes.world_model import Tokenizer, save_model_folder
 from wm_nodes.world_model.folder import action_model_class
 
@@ -15,7 +15,7 @@ from wm_nodes.world_model.folder import action_model_class
 def make_model_folder(folder: Path, config: RunConfig | None = None) -> Path:
     """Tokenizer and action model of the configuration (smoke by default), untrained, for its scene's tasks."""
     config = config or load_config("smoke")
-    tasks = MODEL_TASKS[config.task]
+    tasks = model_tasks(config.task)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         tokenizer = Tokenizer(config.tokenizer, 64, 128)

@@ -19,8 +19,8 @@ from wm_nodes.judge.dataset.edits import (
     SceneStates,
     SourceClip,
     StateEdit,
+    label_rendered,
     recorded,
-    rendered,
 )
 
 FRAMES, SIDE = 20, 96
@@ -91,7 +91,7 @@ def push_clip(behaviour: str = "expert", seed: int = 0, **origin: str) -> Labell
 
 
 def redrawn(parent: LabelledClip, edit: StateEdit) -> LabelledClip:
-    return rendered(parent, edit, draw(edit.states, parent.clip.origin))
+    return label_rendered(parent, edit, draw(edit.states, parent.clip.origin))
 
 
 def _table(scene: str, seed: int) -> NDArray[np.float64]:

@@ -6,8 +6,8 @@ when the square's centre has moved DONE_AT_M along x.
 
 import numpy as np
 
-from wm_nodes.core.specs import GROUND_TRUTH_NAMES
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
+from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 
 MAX_ACTION_M, DONE_AT_M, HALF_M = 0.08, 0.15, 0.07
 _INDEX = {name: i for i, name in enumerate(GROUND_TRUTH_NAMES)}

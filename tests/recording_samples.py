@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from wm_nodes.core.specs import GROUND_TRUTH_NAMES, EnvironmentSpec
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Episode
+from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 
 
 def make_spec(num_envs: int = 1, height: int = 8, width: int = 12, **changes: Any) -> EnvironmentSpec:

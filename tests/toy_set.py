@@ -4,8 +4,8 @@ from pathlib import Path
 
 from pushed_box import push_clip, redrawn
 
-from wm_nodes.judge.dataset.build import MANIFEST, clip_path, to_file
 from wm_nodes.judge.dataset.edits import Division, LabelledClip, Manifest, children, manifest_of, to_bytes
+from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 
 NAMES = ("blur", "freeze", "ghost_motion", "occlude_patch", "flatten", "object_vanish", "dark")
 

@@ -9,6 +9,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import AdvantageConfig, GrpoConfig, KlConfig
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import (
     Condition,
@@ -22,7 +24,6 @@ from wm_nodes.video_model import (
     sample_videos,
 )
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.grpo_settings import GrpoSettings
 
 ACTION_DIM = 2
 SHAPE = (3, 4, 5, 7)
@@ -82,6 +83,22 @@ def tiny_network(channels: int = SHAPE[0], *, text_dim: int = 0, seed: int = 0) 
     return network
 
 
+BASE = load_video_config("base").grpo
+
+
+def kl_config(*values: Any, **changes: Any) -> KlConfig:
+    """The base preset's, with values in the order of its fields, or by name."""
+    return BASE.kl.with_values(**dict(zip(KlConfig.model_fields, values)), **changes)
+
+
+def advantage_config(**changes: Any) -> AdvantageConfig:
+    return BASE.advantage.with_values(**changes)
+
+
+def grpo_config(**changes: Any) -> GrpoConfig:
+    return BASE.with_values(**changes)
+
+
 def toy_rollout_settings(**changes: Any) -> RolloutSettings:
     """Six steps of shift 3; names that SamplerSettings has go there."""
     sampler = {name: changes.pop(name) for name in tuple(changes) if name in SamplerSettings.__dataclass_fields__}
@@ -128,7 +145,7 @@ def weights(model: nn.Module) -> dict[str, Tensor]:
     return {name: tensor.detach().clone() for name, tensor in model.state_dict().items()}
 
 
-def video_learner_rank(rank: int, size: int, folder: str, settings: GrpoSettings) -> None:
+def video_learner_rank(rank: int, size: int, folder: str, settings: GrpoConfig) -> None:
     """One process of a learner; every rank samples the same buffer and saves its weights and its report."""
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=size)

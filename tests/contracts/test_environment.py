@@ -17,7 +17,7 @@ from wm_nodes.world_model import ImaginedEnvironment, WorldModels, load_model_fo
 N, LIMIT = 2, 3
 BASE = load_config("smoke")
 CONFIG = BASE.model_copy(update={"simulation": BASE.simulation.model_copy(update={"max_episode_steps": LIMIT})})
-SPEC = simulation_spec(CONFIG.task, "push", CONFIG.simulation, N)
+SPEC = simulation_spec(CONFIG.task, CONFIG.simulation, N)
 SEEDS = np.array([11, 12], np.uint64)
 Make = Callable[[int], Environment]
 

@@ -32,11 +32,11 @@ def start(arguments: list[str], domain: int) -> subprocess.CompletedProcess[str]
 
 
 @pytest.mark.slow
-def test_the_main_job_stops_at_the_gate_and_when_forced_leaves_summary_report_and_bag(
+def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_and_bag(
     ros_domain: int, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
-    arguments = ["--preset", "smoke", "--set", "gate.tool_error_ratio=0.001", "--run-dir", str(run_dir)]
+    arguments = ["--preset", "smoke", "--set", "acceptance.tool_error_ratio=0.001", "--run-dir", str(run_dir)]
     refused = start(arguments, ros_domain)
     assert refused.returncode == 3, refused.stdout + refused.stderr
     said = " ".join(refused.stdout.split())
@@ -55,7 +55,7 @@ def test_the_main_job_stops_at_the_gate_and_when_forced_leaves_summary_report_an
     played = [episode.behaviour for bag in bags for episode in read_episodes(bag, namespace="/wm/sim")]
     assert played.count("before") >= 4 and played.count("after") >= 4
     assert "data:image/png;base64" in (run_dir / "report.html").read_text()
-    assert json.loads((run_dir / "gate.json").read_text())["criteria"]
+    assert json.loads((run_dir / "acceptance.json").read_text())["criteria"]
     assert rescore([summary["bag"]]) == 0, "the recorded rewards, evaluated again, are others"
 
 

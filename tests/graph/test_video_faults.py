@@ -1,7 +1,6 @@
 """Loop 2 when its nodes die, are stopped, get garbage, or find no room: one clear end, and the next goal goes on from
 there. Whatever happened, the weights are those of the loop that nothing disturbed."""
 
-import dataclasses
 import hashlib
 import signal
 import time
@@ -25,6 +24,7 @@ from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.recorded_buffers import read_clips
+from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.training_run import CHECKPOINT, rewarded
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
@@ -92,8 +92,8 @@ def _without_rewards(loop: VideoLoop) -> Any:
 
 def _of_other_settings(loop: VideoLoop) -> Any:
     rollout = loop.config.rollout
-    other = dataclasses.replace(rollout, sampler=dataclasses.replace(rollout.sampler, eta=0.2))
-    return loop.local.buffer(0, 0, dataclasses.replace(loop.config, rollout=other))
+    other = rollout.with_values(sampler=rollout.sampler.with_values(eta=0.2))
+    return loop.local.buffer(0, 0, loop.config.with_values(rollout=other))
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,7 @@ def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpo
     log = loop.graph.log("/wm/video_learner")
     assert log.count("training ended") == errors + 1 and "Traceback" not in log
     network, config = load_video_folder(loop.model).network, loop.config
-    loaded = GrpoLearner(network, config.grpo, config.rollout, seed=config.seed)
+    loaded = GrpoLearner(network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
     assert loaded.load(checkpoint) == before.iterations
     full_disk(learner)
     again = loop.train(1)

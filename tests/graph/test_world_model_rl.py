@@ -20,7 +20,9 @@ from metric_docs import documented, written
 
 from wm_msgs.action import TrainVideo
 from wm_nodes.apps.train_video_model import main
+from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.nodes.video_model_node import film_strip
 from wm_nodes.recording import BagError
 from wm_nodes.recording.bag import Bag
@@ -32,7 +34,6 @@ from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescore
 from wm_nodes.video_rl.reference_reward import ClipScores, load_probe, mixed, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.settings import VideoRlConfig, load_video_config
 from wm_nodes.video_rl.training_run import CHECKPOINT, VIDEO_FILES, VideoRun, evaluated_uri, rewarded
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe

@@ -11,7 +11,9 @@ from graph.harness import Graph, Probe, wait_until
 from recording_samples import make_episode, make_spec
 
 from wm_msgs.action import TrainVideo
+from wm_nodes.config.load import dump_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.recording import EpisodeBagWriter
 from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.video_model import NetworkSettings, RolloutBuffer, VideoNetwork
@@ -20,8 +22,7 @@ from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reference_reward import load_probe, mixed, score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.settings import VideoRlConfig, dump_video_config, load_video_config
+from wm_nodes.video_rl.sampling import ClipGenerator, rollout_settings
 from wm_nodes.video_rl.training_run import VIDEO_FILES, rewarded
 
 EPISODES, STEPS, STRIDE = 4, 4, 2
@@ -78,7 +79,7 @@ class LocalLoop:
         self.config, self._lag, self._probe = config, lag, load_probe(MODEL_DIR)
         self._generator = ClipGenerator(load_video_folder(folder), load_clips([bag], STRIDE), config)
         self._network = load_video_folder(folder).network
-        self._learner = GrpoLearner(self._network, config.grpo, config.rollout, seed=config.seed)
+        self._learner = GrpoLearner(self._network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
         self._files = [self._packed()]
         self.versions = [0]
         """Before each iteration that was made, and now."""
@@ -117,7 +118,7 @@ class VideoLoop:
         self.graph, self.probe, self.config = graph, probe, config
         self.bag = write_contexts(graph.folder / "contexts")
         self.model = make_video_folder(graph.folder / "video_model", load_clips([self.bag], STRIDE))
-        (graph.folder / "video_config.yaml").write_text(dump_video_config(config))
+        (graph.folder / "video_config.yaml").write_text(dump_config(config))
         self.local = LocalLoop(config, self.model, self.bag, lag)
         self.links = probe.links()
 

@@ -72,6 +72,10 @@ def test_a_run_goes_on_with_its_own_options_only(tmp_path: Path) -> None:
     options = ["--from-scratch", "--reward agent"]
     run_dir = open_run_dir(tmp_path / "run", "name", text, begun_with=options)
     assert open_run_dir(run_dir, "name", text, begun_with=options) == run_dir
+    saved, old = run_dir / "config.yaml", {"acceptance:": "gate:", "model_refresh:": "rounds:"}
+    for name, former in old.items():  # as the folder of a run from before they were renamed
+        saved.write_text(saved.read_text().replace(f"\n{name}", f"\n{former}"))
+    assert open_run_dir(run_dir, "name", text, begun_with=options) == run_dir
     for changed, begun_with in ((other, options), (text, []), (text, options[:1]), (text, options[1:])):
         with pytest.raises(ConfigError, match="repeat its options or use a new folder"):
             open_run_dir(run_dir, "name", changed, begun_with=begun_with)

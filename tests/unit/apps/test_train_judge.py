@@ -9,11 +9,11 @@ from evidence_table import EVIDENCE
 from pushed_box import push_clip, redrawn
 
 from wm_nodes.apps.train_judge import main
-from wm_nodes.judge.dataset.build import MANIFEST, clip_path, to_file
 from wm_nodes.judge.dataset.edits import Division, LabelledClip, children, manifest_of, to_bytes
+from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 from wm_nodes.judge.evidence.segmentation import Segmenter
 from wm_nodes.judge.training.data import load_sets, rows_of, set_clips
-from wm_nodes.judge.training.segmenter import masks_hold, overlaps, segmentation_data, train_segmenter
+from wm_nodes.judge.training.segmenter import has_true_masks, overlaps, segmentation_data, train_segmenter
 from wm_nodes.judge.training.train import collect_evidence
 
 SHORT = ["--segmenter-steps", "2", "--trees", "2"]
@@ -86,7 +86,7 @@ def test_the_segmenter_learns_the_toy_and_leaves_out_masks_of_what_is_not_there(
     sets = load_sets([toy_set])
     clips = [*set_clips(sets, ["train", "validation"])]
     vanished = [clip for clip in clips if clip.row.edits and clip.row.labels.components.get("objective") is False]
-    assert vanished and not any(masks_hold(clip.row) for clip in vanished)
+    assert vanished and not any(has_true_masks(clip.row) for clip in vanished)
     images, masks = segmentation_data(clips, 0)
     assert len(images) == 4 * (len(clips) - len(vanished)) == len(masks)
     images, masks = images[:, 32:72, 16:56], masks[:, 32:72, 16:56]

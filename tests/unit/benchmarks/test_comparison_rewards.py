@@ -21,7 +21,7 @@ from benchmarks.judge.comparisons.protocols import read_flex, read_unified
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
 from wm_nodes.judge.backends import ChatTransport, Endpoint, RetryPolicy
 from wm_nodes.judge.backends.schemas import AnswerError
-from wm_nodes.judge.dataset.rows import chosen_rows
+from wm_nodes.judge.dataset.rows import select_rows
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (20, 24, 32, 3), np.uint8)
 CLIP, OTHER = clip_ref("one", FRAMES, 8.0), clip_ref("two", FRAMES[::-1].copy(), 8.0)
@@ -171,7 +171,7 @@ def test_domain_questions_are_read_asked_and_counted(tmp_path: Path) -> None:
     one, two = pai.load_questions(tmp_path)
     assert (one.video_id, one.answer, two.answer) == ("robot_1", "yes", "no")
 
-    async def steps(judge: ChatComparison) -> list[pai.Answered]:
+    async def steps(judge: ChatComparison) -> list[pai.AnsweredQuestion]:
         return [await pai.answer(judge, asked_of, CLIP) for asked_of in (one, two, one)]
 
     answers, requests = asked(steps, reply("Yes."), reply("yes"), reply("yes and no"), reply("maybe"))
@@ -202,7 +202,7 @@ def test_question_files_of_another_form_are_refused(tmp_path: Path) -> None:
 def test_a_reward_is_compared_by_how_it_ranks_and_whether_hacked_clips_win(tmp_path: Path) -> None:
     """A server that scores every clip alike: AUROC is a half, and every hacked clip ties with its recording."""
     manifest = write_toy_set(tmp_path)
-    rows = [row for row in chosen_rows(manifest, "test") if row.labels.pattern or not row.edits]
+    rows = [row for row in select_rows(manifest, "test") if row.labels.pattern or not row.edits]
     pairs = hacked_pairs(rows)
     assert len(pairs) == 4 and all(row.labels.pattern and clean.labels.overall for row, clean in pairs)
 

@@ -7,8 +7,8 @@ import pytest
 from pushed_box import push_clip, redrawn
 
 from benchmarks.judge.fault_visibility import changed_px, main
-from wm_nodes.judge.dataset.build import MANIFEST, clip_path, to_file
 from wm_nodes.judge.dataset.edits import Division, children, manifest_of, to_bytes
+from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 
 DIVISION = Division(validation=0.0, test=0.0)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.judge.imagined_vs_real import FIRST_SEED, ends, main
+from benchmarks.judge.imagined_vs_real import FIRST_SEED, episode_ends, main
 from wm_nodes.judge.backends.embedded import shipped_heads
 from wm_nodes.judge.evidence.head import load_head
 from wm_nodes.recording.episode_arrays import EpisodeArrays
@@ -25,7 +25,7 @@ def episodes(success: list[list[int]], lengths: list[int]) -> EpisodeArrays:
 
 def test_an_episode_ends_with_the_first_frame_of_success_or_when_it_is_over() -> None:
     success = [[0, 0, 1, 1, 0], [0, 0, 0, 0, 0], [0, 0, 0, 0, 1], [0, 0, 0, 1, 1]]
-    last, succeeded = ends(episodes(success, [4, 3, 4, 2]), "push_cube")
+    last, succeeded = episode_ends(episodes(success, [4, 3, 4, 2]), "push_cube")
     assert last.tolist() == [2, 3, 4, 2] and succeeded.tolist() == [True, False, True, False]
 
 

@@ -14,22 +14,23 @@ from toy_set import write_toy_set
 
 from benchmarks.judge.call_counter import CountingJudge
 from benchmarks.judge.cli import main, parser
-from benchmarks.judge.efficiency import economy, trials
+from benchmarks.judge.efficiency import measure_savings, trials
 from benchmarks.judge.judges import open_judge
 from benchmarks.judge.label_judge import LabelJudge, known_clips
 from benchmarks.judge.labels import truth_of
-from benchmarks.judge.metrics import agreement, cost_row, missed, missed_patterns, mistakes, pattern_rows
+from benchmarks.judge.metrics import agreement, cost_row, missed_patterns, missed_targets, mistakes, pattern_rows
 from benchmarks.judge.run import JudgeTrial, OutcomeFile, judge_rows
-from benchmarks.judge.test_split_log import LEDGER, notice, read_evaluations, record_evaluation
+from benchmarks.judge.test_split_log import LOG_NAME, notice, read_evaluations, record_evaluation
 from wm_nodes.judge.agent import RewardAgent, Verdict, load_rubric
 from wm_nodes.judge.agent.levels import first_vote, next_vote
 from wm_nodes.judge.agent.profiles import profile_media
 from wm_nodes.judge.agent.types import Capabilities, Profile, ReadRequest, Stage
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
-from wm_nodes.judge.dataset.build import BENCHMARK, drawn_origin, instruction_of, load_set
+from wm_nodes.judge.dataset.build import BENCHMARK, draw_origin, instruction_of
 from wm_nodes.judge.dataset.edits import ClipTruth, Edit, Manifest, ManifestError, Origin, planning_level
 from wm_nodes.judge.dataset.edits.clips import COMPONENTS
-from wm_nodes.judge.dataset.rows import chosen_rows, judged_clip
+from wm_nodes.judge.dataset.rows import read_clip, select_rows
+from wm_nodes.judge.dataset.set_files import load_set
 from wm_nodes.judge.decisions import PAPER, accepts, decisions_of, row_names
 from wm_nodes.judge.evidence.head import load_head
 
@@ -61,7 +62,7 @@ def oracle(manifest: Manifest, error: float = 0.0) -> LabelJudge:
 
 
 def judged(judge: Any, folder: Path, manifest: Manifest, path: Path, trial: JudgeTrial | None = None) -> list[Any]:
-    rows = chosen_rows(manifest, "test")
+    rows = select_rows(manifest, "test")
     wanted = trial or JudgeTrial("table", RUBRIC)
     return asyncio.run(judge_rows(judge, wanted, folder, rows, OutcomeFile(path)))
 
@@ -136,10 +137,10 @@ def test_a_judge_that_fails_or_cannot_say_decides_nothing() -> None:
 
 
 def test_a_judge_that_knows_the_labels_is_right_everywhere(folder: Path, manifest: Manifest, tmp_path: Path) -> None:
-    rows, outcomes = chosen_rows(manifest, "test"), judged(oracle(manifest), folder, manifest, tmp_path / "a.jsonl")
+    rows, outcomes = select_rows(manifest, "test"), judged(oracle(manifest), folder, manifest, tmp_path / "a.jsonl")
     table = {row.name: row for row in agreement(rows, outcomes, RUBRIC)}
     assert all(row.accuracy == 1.0 for row in table.values() if row.n), table
-    assert missed(list(table.values())) == [] and mistakes(rows, outcomes, RUBRIC) == []
+    assert missed_targets(list(table.values())) == [] and mistakes(rows, outcomes, RUBRIC) == []
     n = len(rows)
     assert table["overall"].n == n and table["clarity"].confusion == {"fail called fail": 4, "pass called pass": n - 4}
     assert table["clarity"].prevalence == pytest.approx(4 / n) and table["clarity"].kappa == 1
@@ -153,14 +154,14 @@ def test_a_judge_that_knows_the_labels_is_right_everywhere(folder: Path, manifes
 def test_a_judge_that_passes_everything_has_half_a_balanced_accuracy(
     folder: Path, manifest: Manifest, tmp_path: Path
 ) -> None:
-    rows = chosen_rows(manifest, "test")
+    rows = select_rows(manifest, "test")
     outcomes = judged(ScriptedJudge(clean_table(RUBRIC)), folder, manifest, tmp_path / "a.jsonl")
     table = {row.name: row for row in agreement(rows, outcomes, RUBRIC)}
     share = 1 - table["clarity"].prevalence
     assert (table["clarity"].accuracy, table["clarity"].balanced) == (pytest.approx(share), 0.5)
     assert table["clarity"].low < share < table["clarity"].high
     assert ("clarity", "blur fail") in mistakes(rows, outcomes, RUBRIC)
-    below = missed(list(table.values()))
+    below = missed_targets(list(table.values()))
     assert any("clarity" in text for text in below) and "overall balanced 50.0 < 85" in below
     patterns = pattern_rows(rows, outcomes, tuple(RUBRIC.hack.patterns))
     assert [text.split(" flagged")[0] for text in missed_patterns(patterns)] == [f"{p.pattern} 0.0 %" for p in patterns]
@@ -240,14 +241,14 @@ def test_calls_and_pixels_are_counted_as_a_chat_judge_makes_them() -> None:
 def test_the_reference_image_is_the_first_frame_of_the_recording(folder: Path, manifest: Manifest) -> None:
     row = next(row for row in manifest.rows if row.edits and row.edits[-1].recipe == "flatten")
     root = next(other for other in manifest.rows if other.sha256 == row.root)
-    clip, task = judged_clip(folder, row)
+    clip, task = read_clip(folder, row)
     assert clip.sha256 == row.sha256 and clip.fps == 8.0
-    assert (task.reference_frame == judged_clip(folder, root)[0].frames[0]).all()
+    assert (task.reference_frame == read_clip(folder, root)[0].frames[0]).all()
     assert not (task.reference_frame == clip.frames[0]).all()
     purple = Origin("push_cube", "near_side", "post/purple", "sand", 0)
     assert instruction_of(purple) == "push the purple post into the red target"
     with pytest.raises(ManifestError, match="no train clips"):
-        chosen_rows(manifest, "train")
+        select_rows(manifest, "train")
 
 
 def test_a_price_is_of_billed_tokens(folder: Path, manifest: Manifest, tmp_path: Path) -> None:
@@ -268,7 +269,7 @@ def test_early_exits_save_reads_and_a_perfect_judge_loses_nothing(
         trial.name: judged(oracle(manifest), folder, manifest, tmp_path / f"{trial.name}.jsonl", trial)
         for trial in trials("robot", 0)
     }
-    everything, voted, exhaustive = economy(chosen_rows(manifest, "test"), outcomes)
+    everything, voted, exhaustive = measure_savings(select_rows(manifest, "test"), outcomes)
     for found in (everything, voted, exhaustive):
         assert found.same == found.accuracy == found.other_accuracy == 1 and found.difference.difference == 0
         assert all(saved > 0 for saved in found.saved.values())
@@ -293,8 +294,8 @@ def test_the_test_split_is_not_read_by_a_second_judge_without_saying_so(manifest
     assert [one.judge for one in others] == ["a/chat/m/1"]
     said = notice(others, "weights of the next version")
     assert said.startswith("NOT A FIRST LOOK") and "weights of the next version" in said and "robot-1-x" in said
-    assert len((tmp_path / LEDGER).read_text().splitlines()) == 2
-    (tmp_path / LEDGER).write_text("nonsense\n")
+    assert len((tmp_path / LOG_NAME).read_text().splitlines()) == 2
+    (tmp_path / LOG_NAME).write_text("nonsense\n")
     with pytest.raises(ValueError, match="restore it"):
         record_evaluation(tmp_path, manifest, first, "robot-1-x", "")
 
@@ -302,17 +303,17 @@ def test_the_test_split_is_not_read_by_a_second_judge_without_saying_so(manifest
 def test_the_looks_behind_the_published_tables_count_wherever_the_set_is_built(
     manifest: Manifest, tmp_path: Path
 ) -> None:
-    drawn = [drawn_origin(task, seed, BENCHMARK.shapes) for task in BENCHMARK.tasks for seed in BENCHMARK.seeds(task)]
+    drawn = [draw_origin(task, seed, BENCHMARK.shapes) for task in BENCHMARK.tasks for seed in BENCHMARK.seeds(task)]
     rows = [replace(manifest.rows[0], origin=origin, part=BENCHMARK.held_out.part(origin)) for origin in drawn]
     again = replace(manifest, rows=tuple(rows))
     able = EmbeddedJudge(load_head(shipped_head())).capabilities
     earlier = record_evaluation(tmp_path, again, able, RUBRIC.version, "")
-    assert len(earlier) == 13 and not (tmp_path / LEDGER).exists(), "the judge that ships, with its rubric, has looked"
+    assert len(earlier) == 13 and not (tmp_path / LOG_NAME).exists(), "the shipped judge with its rubric is listed"
     with pytest.raises(ValueError, match=f"already seen by {read_evaluations(tmp_path)[-1].judge}"):
         record_evaluation(tmp_path, again, replace(able, judge_id="another"), RUBRIC.version, "")
     new_rubric = record_evaluation(tmp_path, again, able, "robot-2-x", "other thresholds")
-    assert len(new_rubric) == 14 and (tmp_path / LEDGER).read_text().count("\n") == 1
-    (tmp_path / LEDGER).write_text(json.dumps(vars(earlier[0])) + "\n")
+    assert len(new_rubric) == 14 and (tmp_path / LOG_NAME).read_text().count("\n") == 1
+    (tmp_path / LOG_NAME).write_text(json.dumps(vars(earlier[0])) + "\n")
     assert read_evaluations(tmp_path).count(earlier[0]) == 1, (
         "what is published and in the ledger, too, is one evaluation"
     )

@@ -25,9 +25,9 @@ from benchmarks.judge.hacking import (
 from benchmarks.judge.label_judge import KnownClip, LabelJudge
 from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent import TaskSpec, load_rubric
-from wm_nodes.judge.dataset.build import HELD_OUT, SetPlan, build, drawn_origin
+from wm_nodes.judge.dataset.build import HELD_OUT, SetPlan, build, draw_origin
 from wm_nodes.judge.dataset.edits import LabelledClip, apply
-from wm_nodes.judge.dataset.edits.generator import STATE_RECIPES, edited
+from wm_nodes.judge.dataset.edits.generator import STATE_RECIPES, apply_edit
 
 RUBRIC = load_rubric(overrides={"voting": {"audit_share": 0.0}})
 PLAN = SearchPlan(generations=4, candidates=4)
@@ -35,7 +35,7 @@ PLAN = SearchPlan(generations=4, candidates=4)
 
 def defective(seed: int = 0) -> SearchStart:
     root = push_clip("expert", seed)
-    return SearchStart(edited(root, "teleport", "fail", 0, redrawn), root)
+    return SearchStart(apply_edit(root, "teleport", "fail", 0, redrawn), root)
 
 
 def told(reward: Proxy, judge: LabelJudge) -> Proxy:
@@ -134,7 +134,7 @@ def test_a_missing_set_is_one_clear_error(tmp_path: Path, capsys: pytest.Capture
 
 @pytest.mark.rendering
 def test_the_command_climbs_from_recorded_successes_and_draws_each_reward_beside_the_truth(tmp_path: Path) -> None:
-    drawn = {seed: drawn_origin("push_cube", seed) for seed in range(100)}
+    drawn = {seed: draw_origin("push_cube", seed) for seed in range(100)}
     seed = next(s for s, origin in drawn.items() if origin.behaviour == "expert" and HELD_OUT.part(origin) == "test")
     plan = SetPlan(num_episodes=1, edits_per_clip=0, seed=seed)
     build(tmp_path / "set", plan, load_config("cpu").simulation, progress=False)

@@ -18,7 +18,7 @@ from benchmarks.judge.comparisons.video_reward import (  # noqa: E402
     REWARD_TOKENS,
     VIDEO_TOKEN,
     VideoPatches,
-    fitted,
+    fit_size,
     load_video_reward,
     to_patches,
 )
@@ -99,10 +99,10 @@ def test_patches_are_those_of_the_librarys_image_processor() -> None:
 
 
 def test_sizes_are_multiples_within_the_limits() -> None:
-    assert fitted(24, 32, PICTURES) == (24, 32) and fitted(27, 37, PICTURES) == (24, 40)
-    high, wide = fitted(480, 832, PICTURES)
+    assert fit_size(24, 32, PICTURES) == (24, 32) and fit_size(27, 37, PICTURES) == (24, 40)
+    high, wide = fit_size(480, 832, PICTURES)
     assert high * wide <= 4096 and high % 8 == wide % 8 == 0
-    small = fitted(4, 4, VideoPatches(PATCH, 2, 2, 256, 4096, MEAN, STD))
+    small = fit_size(4, 4, VideoPatches(PATCH, 2, 2, 256, 4096, MEAN, STD))
     assert small == (16, 16)
 
 

@@ -139,7 +139,7 @@ def test_the_detector_names_what_a_hackable_reward_destroys_and_nothing_under_th
     plan = LearningPlan(iterations=8, scenes=3, eval_scenes=32, eval_every=2)
     honest, hackable, _ = hacking_trials(LEARNER, plan)
     trained = [
-        train_sampler(load_base(), replace(t.arm, grpo=replace(t.arm.grpo, learning_rate=3e-4)), t.plan, seed=0)
+        train_sampler(load_base(), replace(t.arm, grpo=t.arm.grpo.with_values(learning_rate=3e-4)), t.plan, seed=0)
         for t in (honest, hackable)
     ]
     assert [alarms(row) for row in trained] == [[], ["obeyed", "mass"]]
@@ -201,7 +201,7 @@ def test_every_file_says_how_it_was_made_and_lies_beside_its_picture(
 
 def test_a_training_keeps_the_spread_of_its_rollouts_and_the_noise_of_steps_that_a_window_leaves() -> None:
     arm = {arm.name: arm for arm in learning_samplers(LEARNER)}["CPS 0.6, window"]
-    moving = replace(arm, window=replace(arm.window, period=1))
+    moving = replace(arm, window=arm.window.with_values(period=1))
     found = train_sampler(load_base(), moving, SHORT, seed=0)["buffers"]
     assert found["noise_share_step_0"][0] == pytest.approx(0.809, abs=1e-3) and found["noise_share_step_0"][1] is None
     assert found["noise_share_step_4"][0] is None and found["noise_share_step_4"][1] == pytest.approx(0.809, abs=1e-3)

@@ -2,7 +2,16 @@ from pathlib import Path
 
 import pytest
 
-from wm_nodes.config.load import ConfigError, dump_config, load_config, parse_override, preset_names
+from wm_nodes.config.load import (
+    ConfigError,
+    default_judge,
+    dump_config,
+    load_config,
+    load_video_config,
+    parse_override,
+    preset_names,
+    with_current_names,
+)
 from wm_nodes.config.shipped import PRETRAINED, shipped_model
 
 
@@ -23,6 +32,32 @@ def test_a_saved_configuration_comes_back_equal(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_text(dump_config(config))
     assert load_config(str(path)) == config
+
+
+def test_a_configuration_saved_before_sections_were_renamed_comes_back_equal(tmp_path: Path) -> None:
+    config = load_config("smoke", {"acceptance.num_episodes": 5, "model_refresh.num_rounds": 2})
+    text = dump_config(config).replace("\nacceptance:", "\ngate:").replace("\nmodel_refresh:", "\nrounds:")
+    assert "gate:\n" in text and "rounds:\n" in text and with_current_names(text) == dump_config(config)
+    (tmp_path / "config.yaml").write_text(text)
+    assert load_config(str(tmp_path / "config.yaml")) == config
+
+
+def test_a_renamed_section_is_refused_on_the_command_line_with_its_name_of_today() -> None:
+    with pytest.raises(ConfigError, match="unknown setting 'gate', now called 'acceptance'"):
+        load_config("smoke", {"gate.num_episodes": 5})
+
+
+def test_both_loops_have_the_judge_of_one_file() -> None:
+    assert load_config("base").judge == load_video_config("base").judge == default_judge()
+
+
+def test_a_changed_copy_is_checked_like_a_preset() -> None:
+    ppo = load_config("cpu").ppo
+    assert ppo.with_values(epochs=7).epochs == 7 and ppo.with_values(epochs=ppo.epochs) == ppo
+    with pytest.raises(ValueError, match="epochs"):
+        ppo.with_values(epochs=0)
+    with pytest.raises(ValueError, match="speed"):
+        ppo.with_values(speed=1)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from wm_nodes.core.reward_statistics import (
+from wm_nodes.core.statistics import (
     auroc,
     balanced_accuracy,
     effective_size,

@@ -32,6 +32,16 @@ def test_newcombe_difference_matches_the_published_example() -> None:
     assert newcombe_difference(56, 70, 48, 80) == pytest.approx((0.0524, 0.3339), abs=5e-5)
 
 
+def test_equal_rates_agree_and_far_ones_do_not() -> None:
+    def agree(*counts: int) -> bool:
+        low, high = newcombe_difference(*counts)
+        return low <= 0 <= high
+
+    assert agree(50, 100, 100, 200)
+    assert not agree(90, 100, 50, 100)
+    assert agree(0, 0, 7, 7)
+
+
 def test_mcnemar_is_the_two_sided_binomial_tail() -> None:
     assert mcnemar_exact(5, 0) == 2 / 32
     assert mcnemar_exact(0, 5) == 2 / 32

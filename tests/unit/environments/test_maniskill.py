@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
-from wm_nodes.core.specs import GROUND_TRUTH_NAMES, simulation_spec
+from wm_nodes.config.tasks import get_task, success, task_names
+from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.environments.maniskill import backend
 from wm_nodes.environments.maniskill.backend import NoRendererError, render_backend
@@ -20,12 +21,12 @@ from wm_nodes.environments.maniskill.behaviours import sample_style
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import planned_episode, scripted_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
-from wm_nodes.environments.maniskill.tasks import TASKS, get_task, success
+from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.environments.record import collect_plan, demonstration_plan
 from wm_nodes.recording import read_episodes
 
 CONFIG = load_config("smoke")
-SPEC = simulation_spec("push_cube", "push", CONFIG.simulation, 2)
+SPEC = simulation_spec("push_cube", CONFIG.simulation, 2)
 
 
 def truth(**values: float) -> np.ndarray:  # type: ignore[type-arg]
@@ -187,7 +188,7 @@ def test_a_near_miss_fails_and_is_cut_by_the_step_limit(env: ManiSkillEnvironmen
 
 
 def test_every_task_has_an_instruction_of_known_words() -> None:
-    assert {task.instruction for task in TASKS.values()} == {
+    assert {get_task(name).instruction for name in task_names()} == {
         "move the gripper above the blue cube", "push the blue cube into the red target",
         "pull the blue cube into the red target",
     }

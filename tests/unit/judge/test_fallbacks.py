@@ -14,7 +14,7 @@ from chat_server import Fault
 from judge_server import PickyServer, serving
 from scripted_judge import make_clip, make_task
 
-from wm_nodes.config.load import ConfigError, default_judge, load_config
+from wm_nodes.config.load import ConfigError, default_judge, dump_config, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.judge.agent import Status, Verdict, check_one_judge, pause_reason
 from wm_nodes.judge.audit import read_record, verify
@@ -23,7 +23,6 @@ from wm_nodes.judge.backends.factory import check_clips, check_judge, for_clips,
 from wm_nodes.judge.backends.limits import CircuitBreaker
 from wm_nodes.judge.episode_reward import EpisodeReward, check_agent
 from wm_nodes.judge.service import ClipJob, JudgeService
-from wm_nodes.video_rl.settings import dump_video_config, load_video_config
 
 FIRST, SECOND = "openai-chat:first", "openai-chat:second"
 NUM_CLIPS = 10
@@ -249,7 +248,7 @@ def test_fallbacks_that_are_nobody_or_the_judge_itself_are_refused_by_name(fallb
 def test_fallbacks_are_settings_of_loop_2_and_a_policys_judge_refuses_them(servers: Servers, tmp_path: Path) -> None:
     fallbacks = [{"kind": "embedded"}]
     config = load_video_config("smoke", {"judge.fallbacks": fallbacks})
-    (tmp_path / "config.yaml").write_text(dump_video_config(config))
+    (tmp_path / "config.yaml").write_text(dump_config(config))
     assert load_video_config(str(tmp_path / "config.yaml")) == config
     assert [judge.kind for judge in judges_of(config.judge)] == ["openai", "embedded"]
     with pytest.raises(ConfigError, match="fallback"):

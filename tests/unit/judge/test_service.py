@@ -20,19 +20,18 @@ from scripted_judge import make_clip, make_task
 
 from wm_nodes.apps.train_policy import main as main_job
 from wm_nodes.apps.train_video_model import main
-from wm_nodes.config.load import default_judge, judge_overrides, load_config
+from wm_nodes.config.load import default_judge, dump_config, judge_overrides, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.judge.agent import Status, Verdict
 from wm_nodes.judge.audit import read_record
 from wm_nodes.judge.backends.embedded import shipped_head
 from wm_nodes.judge.backends.factory import check_judge
-from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward, check_horizon, unjudged
+from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward, check_horizon, unjudged_reason
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import GraphError
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import terminate_at_episode_end
-from wm_nodes.video_rl.settings import dump_video_config, load_video_config
 
 JUDGE = ("--judge", "http://127.0.0.1:9/v1", "--judge-model", "judge")
 SPEC = make_spec(num_envs=2, height=8, width=8)
@@ -209,11 +208,11 @@ def test_a_rollout_without_an_ended_episode_pauses_instead_of_looking_like_a_fai
     rollout = toy_rollout(toy_policy(), steps=3)
     none = np.zeros_like(rollout.valid_TN)
     cut = replace(rollout, terminated_TN=none, truncated_TN=none, valid_TN=~none)
-    assert "none of the episodes in a rollout of 3 lock-steps (ppo.num_steps) was seen to end" in unjudged(cut)
+    assert "none of the episodes in a rollout of 3 lock-steps (ppo.num_steps) was seen to end" in unjudged_reason(cut)
     one = none.copy()
     one[1, 0] = True
-    assert unjudged(replace(cut, truncated_TN=one)) == ""
-    assert "1 of 1 episodes" in unjudged(replace(cut, truncated_TN=one, valid_TN=~one))
+    assert unjudged_reason(replace(cut, truncated_TN=one)) == ""
+    assert "1 of 1 episodes" in unjudged_reason(replace(cut, truncated_TN=one, valid_TN=~one))
 
 
 def test_a_cut_episode_is_worth_what_the_critic_says_and_an_ended_one_its_verdict(
@@ -269,7 +268,7 @@ def test_the_settings_of_loop_2_hold_the_judges_and_come_back_from_their_file(tm
     words = judge_overrides("http://a/v1, http://b/v1", "judge", "KEY")
     config = load_video_config("smoke", {"rewards": {"agent": 1.0}, **words})
     assert config.judge.endpoints == ["http://a/v1", "http://b/v1"]
-    (tmp_path / "config.yaml").write_text(dump_video_config(config))
+    (tmp_path / "config.yaml").write_text(dump_config(config))
     assert load_video_config(str(tmp_path / "config.yaml")) == config
     assert load_video_config("smoke").judge == load_config("smoke").judge
 

@@ -8,14 +8,14 @@ import pytest
 from evidence_table import EVIDENCE
 
 from wm_nodes.config.load import load_config
-from wm_nodes.environments.maniskill.tasks import TASKS
+from wm_nodes.config.tasks import task_names
 from wm_nodes.judge.agent import RewardAgent, load_rubric
 from wm_nodes.judge.agent.types import ClipRef, Stage, Status, TaskSpec, Verdict, clip_ref
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
 from wm_nodes.judge.backends.factory import check_judge, make_judge
 from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, instruction_of
 from wm_nodes.judge.dataset.edits import LabelledClip
-from wm_nodes.judge.dataset.edits.generator import edited
+from wm_nodes.judge.dataset.edits.generator import apply_edit
 from wm_nodes.judge.evidence.head import load_head
 from wm_nodes.judge.evidence.sequence import reading_names
 from wm_nodes.judge.training.heads import CONFORMAL
@@ -34,7 +34,7 @@ def test_it_is_small_says_how_it_was_made_and_knows_its_evidence() -> None:
     head = load_head(shipped_head())
     assert size < 3_000_000
     assert set(head.names) == {*EVIDENCE, *reading_names()} and len(head.readers) == FOLDS
-    assert set(head.story["tasks"]) == set(TASKS)
+    assert set(head.story["tasks"]) == set(task_names())
     assert {"made", "data", "seed", "segmenter", "trees", "validation"} <= head.story.keys()
     assert head.story["made"]["command"].startswith("python -m wm_nodes.learning.train_judge"), "of its commit"
     card = EmbeddedJudge(head).card
@@ -92,11 +92,11 @@ def test_a_clean_success_is_accepted_and_each_hacking_pattern_is_worth_less_and_
     task = TaskSpec(instruction_of(recording.clip.origin), "push_cube", "panda", recording.clip.frames[0])
     clean = judged(recording.ref, task)
     assert clean.valid and clean.reward > 0.7 and all(stage.passed for stage in clean.stages), clean.reason
-    defect = edited(recording, "ghost_motion", "fail", 0, source.redraw)
+    defect = apply_edit(recording, "ghost_motion", "fail", 0, source.redraw)
     hacked = {
-        "occlusion": edited(defect, "occlude_patch", "fail", 0, None),
-        "motion": edited(recording, "freeze", "fail", 0, None),
-        "background": edited(recording, "flatten", "fail", 0, None),
+        "occlusion": apply_edit(defect, "occlude_patch", "fail", 0, None),
+        "motion": apply_edit(recording, "freeze", "fail", 0, None),
+        "background": apply_edit(recording, "flatten", "fail", 0, None),
         "physics": defect,
     }
     for pattern, clip in hacked.items():
@@ -114,5 +114,5 @@ def test_equal_clips_get_equal_verdicts_and_a_mild_edit_does_not_close_a_gate(
     task = TaskSpec(instruction_of(recording.clip.origin), "push_cube", "panda", recording.clip.frames[0])
     first, again = judged(recording.ref, task), judged(recording.ref, task)
     assert first.audit_id == again.audit_id
-    mild = judged(edited(recording, "dark", "mild", 0, None).ref, task)
+    mild = judged(apply_edit(recording, "dark", "mild", 0, None).ref, task)
     assert mild.valid and {s.stage for s in mild.stages if not s.passed} <= {Stage.TC}

@@ -243,10 +243,10 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
     defaults = {action.arguments[0]: action.named["default_value"] for action in declared}
     assert defaults == {argument.name: argument.default for argument in ARGUMENTS if argument.name in defaults}
     nodes = start.named["function"]({**defaults, **values})
-    (lock,) = launch_face.HELD
+    (lock,) = launch_face.LOCKS
     with pytest.raises(DomainInUseError, match=r"ROS domain 7 is already in use .*domain_id:=8"):
         start.named["function"]({**defaults, **values})
-    launch_face.HELD.clear()
+    launch_face.LOCKS.clear()
     lock.release()
 
     runner = Runner(launch_arguments.prepare(scenario, values)[0], log=None, use_domain_lock=False)

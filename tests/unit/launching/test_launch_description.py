@@ -8,7 +8,7 @@ import pytest
 
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import Graph, GraphError
-from wm_nodes.launching.launch_description import prepared
+from wm_nodes.launching.launch_description import prepare_graph
 from wm_nodes.launching.scenarios import GRAPH_TOPICS
 from wm_nodes.recording import topics
 
@@ -44,15 +44,15 @@ def test_the_launch_face_needs_nothing_but_the_standard_library(repository: Path
 @pytest.mark.parametrize("scenario", ["online_training", "composed"])
 def test_the_graph_that_the_nodes_interpreter_makes_is_the_same(scenario: str, given: dict[str, str]) -> None:
     graph, _ = launch_arguments.prepare(scenario, given)
-    assert prepared(scenario, given, sys.executable) == graph
+    assert prepare_graph(scenario, given, sys.executable) == graph
     assert Graph.from_json(graph.to_json()) == graph
 
 
 def test_a_wrong_argument_reaches_the_user_of_ros2_launch_as_one_line(given: dict[str, str]) -> None:
     with pytest.raises(RuntimeError, match=r"^num_envs must be a whole number, got 'many'$"):
-        prepared("online_training", {**given, "num_envs": "many"}, sys.executable)
+        prepare_graph("online_training", {**given, "num_envs": "many"}, sys.executable)
     with pytest.raises(RuntimeError, match="set WM_PYTHON"):
-        prepared("online_training", given, "/bin/false")
+        prepare_graph("online_training", given, "/bin/false")
 
 
 def test_both_recording_scenarios_record_the_episodes_of_the_simulator(given: dict[str, str]) -> None:

@@ -21,7 +21,8 @@ from wm_nodes.world_model import load_model_folder
 
 @pytest.fixture(scope="module")
 def config() -> RunConfig:
-    return load_config("smoke", {"data.num_workers": 1, "rounds.episodes_per_round": 3, "rounds.heldout_episodes": 2})
+    sizes = {"model_refresh.episodes_per_round": 3, "model_refresh.heldout_episodes": 2}
+    return load_config("smoke", {"data.num_workers": 1, **sizes})
 
 
 @pytest.fixture(scope="module")

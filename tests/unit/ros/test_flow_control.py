@@ -40,17 +40,17 @@ def test_publishers_that_take_turns_lose_nothing_and_a_gap_in_one_of_them_is_cou
 
 def test_the_producer_waits_for_every_consumer_and_drops_the_silent_one() -> None:
     ledger = ProducerCredits("env/transition", session=7)
-    assert ledger.holding(1000) == []
+    assert ledger.blocking_consumers(1000) == []
     for name, granted in (("fast", 20), ("slow", 10)):
         grant = Credit(consumer=name, topic="env/transition", stream_session=7, granted_seq=granted)
         ledger.note(grant, now=100.0)
     ledger.note(Credit(consumer="other", topic="reward", stream_session=7), now=100.0)
     ledger.note(Credit(consumer="old", topic="env/transition", stream_session=6), now=100.0)
-    assert ledger.holding(10) == []
-    assert ledger.holding(11) == ["slow"]
+    assert ledger.blocking_consumers(10) == []
+    assert ledger.blocking_consumers(11) == ["slow"]
     assert ledger.drop_silent(11, now=100.0 + SILENT_S) == []
     assert ledger.drop_silent(11, now=100.1 + SILENT_S) == ["slow"]
-    assert ledger.holding(20) == []
+    assert ledger.blocking_consumers(20) == []
 
 
 class GrantingNode:
@@ -79,7 +79,7 @@ def test_a_withheld_grant_is_repeated_but_does_not_grow_until_it_is_given_again(
     def consume(session: int, *seqs: int) -> None:
         for seq in seqs:
             tracker.observe(session, seq)
-            grantor.consumed(tracker)
+            grantor.record_consumed(tracker)
 
     consume(1, 0)
     grantor.withhold(True)

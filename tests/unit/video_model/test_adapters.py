@@ -22,6 +22,8 @@ diffusers = pytest.importorskip("diffusers")
 transformers = pytest.importorskip("transformers")
 pytest.importorskip("peft")
 
+from video_toys import grpo_config, kl_config  # noqa: E402
+
 from wm_nodes.apps.check_video_model import main as doctor  # noqa: E402
 from wm_nodes.core.model_folder import ModelFolderError  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
@@ -51,7 +53,6 @@ from wm_nodes.video_model.adapters import (  # noqa: E402
 )
 from wm_nodes.video_model.kernels import ode_step, with_conditioning  # noqa: E402
 from wm_nodes.video_rl.grpo import GrpoLearner  # noqa: E402
-from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings  # noqa: E402
 
 C, L, E = 4, 6, 8
 FRAMES, SIDE = 3, 4  # latent; 9 camera frames of 32x32
@@ -450,8 +451,8 @@ class TestTraining:
         anchor: Any = "lora_off" if lora else "frozen"
         learner = GrpoLearner(
             model,
-            GrpoSettings(
-                AdvantageSettings(), KlSettings(beta=0.1, anchor=anchor), learning_rate=1e-2, updates_per_buffer=2,
+            grpo_config(
+                kl=kl_config(beta=0.1, anchor=anchor), learning_rate=1e-2, updates_per_buffer=2,
                 step_fraction=1.0, micro_batch=4, cfg=2.0,
             ),
             settings,
@@ -615,7 +616,7 @@ class TestFolder:
         assert str(tmp_path) in capsys.readouterr().out.replace("\n", "")
 
     def test_the_documented_training_runs_as_written_and_its_adapter_loads(self, folder: Path, tmp_path: Path) -> None:
-        page = (Path(__file__).parents[3] / "wm_nodes" / "docs" / "dyndiff.md").read_text()
+        page = (Path(__file__).parents[3] / "wm_nodes" / "docs" / "public_video_models.md").read_text()
         (block,) = re.findall(r"## Training a public model.*?```python\n(.*?)```", page, re.DOTALL)
         small = {"rollout.num_steps": 4, "groups.group_size": 4, "grpo.advantage.best_of_n": 2}
         scope: dict[str, Any] = {

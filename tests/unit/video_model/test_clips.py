@@ -7,18 +7,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from wm_nodes.config.load import ConfigError
+from wm_nodes.config.load import VIDEO, ConfigError, dump_config, load_video_config, preset_names
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.seeding import torch_stream
-from wm_nodes.environments.maniskill.tasks import GROUND_TRUTH_NAMES
+from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.recording.episode_arrays import EpisodeArrays
-from wm_nodes.video_model import NetworkSettings, VideoNetwork
+from wm_nodes.video_model import NetworkSettings, RolloutSettings, VideoNetwork
 from wm_nodes.video_model.clips import Clips, cut_clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.reference_reward import mixed, score_clips
-from wm_nodes.video_rl.settings import dump_video_config, load_video_config, video_preset_names
+from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
 
 
@@ -96,7 +96,7 @@ def recorded(positions_cm: Tensor) -> Clips:
     truth = np.zeros((N, F, len(GROUND_TRUTH_NAMES)), np.float32)
     for index, name in enumerate(PROBE_NAMES):
         truth[..., GROUND_TRUTH_NAMES.index(name)] = positions_cm[..., index].numpy() / 100
-    return Clips(frames, torch.zeros(N, F - 1, 6), truth, ("push",) * N)
+    return Clips(frames, torch.zeros(N, F - 1, 6), truth, ("push",) * N, "push_cube")
 
 
 def test_a_clip_equal_to_its_recording_has_full_scores_and_a_shifted_object_loses_by_the_formula() -> None:
@@ -122,10 +122,10 @@ def test_rewards_are_mixed_by_weight_and_an_unknown_one_is_named() -> None:
         mixed(values, {"beauty": 1.0})
 
 
-@pytest.mark.parametrize("preset", video_preset_names())
+@pytest.mark.parametrize("preset", preset_names(VIDEO))
 def test_every_preset_loads_and_its_dump_loads_to_the_same(preset: str, tmp_path: Path) -> None:
     config = load_video_config(preset)
-    (tmp_path / "saved.yaml").write_text(dump_video_config(config))
+    (tmp_path / "saved.yaml").write_text(dump_config(config))
     assert load_video_config(str(tmp_path / "saved.yaml")) == config
 
 
@@ -150,12 +150,20 @@ def test_the_paper_s_preset_is_its_table_5() -> None:
         ({"rollout.sampler.eta": 1.2}, "eta must be in"),
         ({"rollout.samplr.eta": 0.5}, "unknown setting 'rollout.samplr'"),
         ({"grpo.learning_rate": "fast"}, "grpo.learning_rate"),
-        ({"evaluation.window": 2}, r"window >= 3, got 2, 4, 1 and 2"),
+        ({"rollout.noise_store": "seed", "rollout.storage_dtype": "bfloat16"}, r"noise_store: seed needs .* float32"),
+        ({"rollout.sampler.mask.m_min": 0}, r"m_min.*greater than 0 \(got 0\)"),
+        ({"task": "fly"}, r"task.*push_cube.*'fly'"),
+        ({"evaluation.window": 2}, r"evaluation\.window.*greater than or equal to 3 \(got 2\)"),
     ],
 )
 def test_a_wrong_setting_is_refused_by_name(overrides: dict[str, object], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         load_video_config("smoke", overrides)
+
+
+def test_the_base_preset_samples_as_the_sampler_does_by_default() -> None:
+    """So no number of the sampler is set in two ways."""
+    assert rollout_settings(load_video_config("base").rollout) == RolloutSettings()
 
 
 def test_one_reward_can_be_weighed_without_losing_the_others() -> None:

@@ -7,15 +7,16 @@ import torch
 from torch import Tensor
 from video_toys import ACTION_DIM, randn, times, tiny_network
 
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import FlowMatchingConfig
 from wm_nodes.core.seeding import torch_stream
-from wm_nodes.environments.maniskill.tasks import GROUND_TRUTH_NAMES
+from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork, guided_velocity
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.codec import PatchCodec
-from wm_nodes.video_model.flow_matching import FlowMatchingSettings, flow_matching_loss, train_video_model
+from wm_nodes.video_model.flow_matching import flow_matching_loss, train_video_model
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest
-from wm_nodes.video_rl.settings import load_video_config
 
 SHAPE = (2, 3, 4, 4)
 
@@ -87,7 +88,7 @@ def commanded(count: int, iteration: int) -> tuple[Tensor, Condition]:
 def test_a_trained_model_obeys_its_actions_and_without_them_knows_only_the_mean() -> None:
     torch.manual_seed(0)
     model = VideoNetwork(NetworkSettings(1, ACTION_DIM, width=16, depth=2))
-    settings = FlowMatchingSettings(400, learning_rate=3e-3, drop=0.2)
+    settings = FlowMatchingConfig(num_iterations=400, learning_rate=3e-3, drop=0.2)
     train_video_model(model, lambda i: commanded(16, i), settings, seed=0, run_dir=None, progress=False)
     latents, condition = commanded(64, -1)
     noise = torch.randn(latents.shape, generator=torch_stream(0, "test_noise"))
@@ -107,7 +108,7 @@ def test_a_trained_model_obeys_its_actions_and_without_them_knows_only_the_mean(
 def contexts(count: int, height: int, width: int) -> Clips:
     frames = torch.randint(0, 256, (count, 3, height, width, 3), generator=torch_stream(0, "pixels"), dtype=torch.uint8)
     truth = torch.zeros(count, 3, len(GROUND_TRUTH_NAMES)).numpy()
-    return Clips(frames, torch.zeros(count, 2, ACTION_DIM), truth, ("push",) * count)
+    return Clips(frames, torch.zeros(count, 2, ACTION_DIM), truth, ("push",) * count, "push_cube")
 
 
 @pytest.mark.parametrize(("height", "width"), [(8, 12), (16, 24), (20, 8)])

@@ -6,13 +6,21 @@ import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
-from video_toys import Analytic, randn, times, toy_buffer, toy_condition, toy_rollout_settings
+from video_toys import (
+    Analytic,
+    grpo_config,
+    kl_config,
+    randn,
+    times,
+    toy_buffer,
+    toy_condition,
+    toy_rollout_settings,
+)
 
 from wm_nodes.video_model import MaskSettings, SamplerSettings, StepContext, dynamic_mask, step
 from wm_nodes.video_model.kernels import SIGMA_LIMIT
 from wm_nodes.video_model.mask import quantile, residual
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.grpo_settings import GrpoSettings, KlSettings
 from wm_nodes.video_rl.toy_scene import draw_scenes, opacity_at
 
 BIG = (2, 4, 8, 16, 16)
@@ -319,8 +327,8 @@ def test_a_recomputed_mask_throws_most_ratios_out_of_the_clip_range_and_a_cached
     model = Analytic(lambda x, t: torch.sin(x.roll(1, 3)) + 0.3 * x + change[0] * randn(*shape, seed=11))
     buffer = toy_buffer(model, settings, groups=2, size=4, shape=shape, given=1)
     change[0] = 1e-3
-    grpo = GrpoSettings(
-        mask_source=source, step_select="tmin", step_fraction=0.5, updates_per_buffer=1, kl=KlSettings("none"),  # type: ignore[arg-type]
+    grpo = grpo_config(
+        mask_source=source, step_select="tmin", step_fraction=0.5, updates_per_buffer=1, kl=kl_config("none"),  # type: ignore[arg-type]
         learning_rate=0.0,
     )
     report = GrpoLearner(model, grpo, settings, seed=0).train(buffer).updates[0]
@@ -334,7 +342,7 @@ def test_a_recomputed_mask_of_unchanged_weights_leaves_the_ratio_at_one(mask_on:
     settings = toy_rollout_settings(eta=0.8, mask_on=mask_on, mask=MaskSettings(budget=budget))  # type: ignore[arg-type]
     model = Analytic(lambda x, t: torch.sin(x.roll(1, 3)) + 0.3 * x)
     buffer = toy_buffer(model, settings)
-    grpo = GrpoSettings(mask_source="recompute", updates_per_buffer=1, learning_rate=0.0)
+    grpo = grpo_config(mask_source="recompute", updates_per_buffer=1, learning_rate=0.0)
     report = GrpoLearner(model, grpo, settings, seed=0).train(buffer).updates[0]
     assert report.ratio_mean == pytest.approx(1.0, abs=1e-6) and report.kl < 1e-12
 
@@ -358,7 +366,7 @@ def test_a_recomputed_ratio_and_kl_are_those_of_the_two_normal_distributions(mas
     for law in laws:
         std = law.std[:, :, 1:].expand_as(gap)
         logps.append(torch.distributions.Normal(law.mean[:, :, 1:], std).log_prob(x_s[:, :, 1:]).mean((1, 2, 3, 4)))
-    grpo = GrpoSettings(mask_source="recompute", updates_per_buffer=1, learning_rate=0.0, step_fraction=1.0)
+    grpo = grpo_config(mask_source="recompute", updates_per_buffer=1, learning_rate=0.0, step_fraction=1.0)
     report = GrpoLearner(model, grpo, settings, seed=0).train(buffer).updates[0]
     assert report.ratio_mean == pytest.approx(float((logps[1] - logps[0]).exp().mean()), rel=1e-4)
     assert report.kl == pytest.approx(float((gap / laws[0].std[:, :, 1:]).square().mean() / 2), rel=1e-3)

@@ -5,13 +5,14 @@ import torch
 from torch import Tensor
 from video_toys import times
 
-from wm_nodes.video_model import WindowSettings, flow_times, select_steps, stochastic_steps
+from wm_nodes.config.video import WindowConfig
+from wm_nodes.video_model import flow_times, select_steps, stochastic_steps
 
 
 def window(
     strategy: str, iteration: int, *, num_steps: int = 10, size: int = 4, period: int = 25, seed: int = 0
 ) -> list[int]:
-    return stochastic_steps(num_steps, WindowSettings(strategy, size, period), iteration, seed)  # type: ignore[arg-type]
+    return stochastic_steps(num_steps, WindowConfig(strategy=strategy, size=size, period=period), iteration, seed)  # type: ignore[arg-type]
 
 
 def selected(num_steps: int = 11, num_samples: int = 3, **changes: object) -> Tensor:
@@ -80,8 +81,8 @@ def test_a_decaying_window_stays_linearly_shorter_towards_a_quarter_of_its_perio
 
 @pytest.mark.parametrize("bad", [{"size": 0}, {"period": 0}])
 def test_an_empty_window_or_period_is_refused(bad: dict[str, int]) -> None:
-    with pytest.raises(ValueError, match="must be >= 1"):
-        WindowSettings("random", **bad)
+    with pytest.raises(ValueError, match="greater than or equal to 1"):
+        WindowConfig(**{"strategy": "random", "size": 4, "period": 25, **bad})
 
 
 # which of them train

@@ -9,14 +9,13 @@ from model_folders import make_model_folder
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_model.tokenizer_codec import TokenizerCodec, codec_of_world_model
 from wm_nodes.video_rl.pretraining import shipped_video_model
-from wm_nodes.video_rl.settings import load_video_config
 from wm_nodes.world_model import load_model_folder
 
 

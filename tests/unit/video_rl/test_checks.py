@@ -5,14 +5,20 @@ from typing import Any
 
 import pytest
 import torch
-from video_toys import Analytic, toy_condition
+from video_toys import (
+    Analytic,
+    grpo_config,
+    kl_config,
+    toy_condition,
+)
 
 from wm_nodes.apps.check_video_model import main
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import GrpoConfig
 from wm_nodes.video_model import Condition, RolloutSettings, SamplerSettings, Step, VideoNetwork
 from wm_nodes.video_rl import checks
 from wm_nodes.video_rl.checks import CheckResult, examine
-from wm_nodes.video_rl.grpo_settings import GrpoSettings, KlSettings
-from wm_nodes.video_rl.settings import load_video_config
+from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.toy_scene import draw_scenes, load_base
 
 SHAPE = (2, 6, 16, 16)
@@ -24,27 +30,27 @@ RATIO, KL, ODE, MEMORY = (
 
 
 def findings(
-    rollout: RolloutSettings = ROLLOUT, grpo: GrpoSettings | None = None, model: Any = None, **more: int
+    rollout: RolloutSettings = ROLLOUT, grpo: GrpoConfig | None = None, model: Any = None, **more: int
 ) -> dict[str, CheckResult]:
     condition = draw_scenes(4, 0, "doctor").condition()
-    return {f.name: f for f in examine(model or load_base(), condition, SHAPE, rollout, grpo or GrpoSettings(), **more)}
+    return {f.name: f for f in examine(model or load_base(), condition, SHAPE, rollout, grpo or grpo_config(), **more)}
 
 
 @pytest.mark.parametrize("arm", ["cps", "dyndiff", "flow", "dance", "sage"])
 @pytest.mark.parametrize("anchor", ["buffer", "frozen", "moving", "dual"])
 def test_a_sound_model_passes_with_every_sampler_and_anchor(arm: Any, anchor: Any) -> None:
-    found = findings(replace(ROLLOUT, sampler=SamplerSettings(arm, 0.6)), GrpoSettings(kl=KlSettings(anchor=anchor)))
+    found = findings(replace(ROLLOUT, sampler=SamplerSettings(arm, 0.6)), grpo_config(kl=kl_config(anchor=anchor)))
     assert [name for name, finding in found.items() if not finding.passed] == []
     assert anchor in found[KL].value and arm in found[ODE].value
 
 
 def test_guidance_in_the_rollout_alone_is_named_though_the_mean_ratio_hardly_moves() -> None:
     config = load_video_config("recommended")
-    guided = replace(config.rollout, cfg=2.0)
+    guided = replace(rollout_settings(config.rollout), cfg=2.0)
     ratio = findings(guided, config.grpo)[RATIO]
     assert not ratio.passed and "rollout.cfg and grpo.cfg" in ratio.remedy
     assert float(ratio.value.split(" by ")[1].split(",")[0]) < checks.RATIO_LIMIT
-    assert findings(guided, replace(config.grpo, cfg=2.0))[RATIO].passed
+    assert findings(guided, config.grpo.with_values(cfg=2.0))[RATIO].passed
 
 
 @pytest.mark.parametrize("changes", [{"mean": 1.01}, {"std": 0.1}])
@@ -62,7 +68,7 @@ def test_a_step_that_is_not_the_ode_s_without_noise_is_named(
 
 def test_an_image_is_explored_everywhere_and_passes() -> None:
     rows = Condition(torch.zeros(4, 2, 0, 8, 8), torch.zeros(4, 0, 4), torch.zeros(4, 1, 0))
-    found = {f.name: f for f in examine(load_base(), rows, (2, 1, 8, 8), ROLLOUT, GrpoSettings())}
+    found = {f.name: f for f in examine(load_base(), rows, (2, 1, 8, 8), ROLLOUT, grpo_config())}
     assert all(finding.passed for finding in found.values()) and "single frame" in found["the mask is not flat"].value
 
 
@@ -77,7 +83,7 @@ def test_the_memory_is_that_of_what_trains_and_of_a_whole_buffer() -> None:
     asked = [p.requires_grad for p in model.parameters()]
 
     def memory(trains: Any, **more: int) -> str:
-        return findings(grpo=GrpoSettings(trains=trains), model=model, **more)[MEMORY].value
+        return findings(grpo=grpo_config(trains=trains), model=model, **more)[MEMORY].value
 
     assert f"{size(model, model.parameters()):.2f} MiB of weights that train" in memory("all")
     assert f"{size(model, model.condition_parameters()):.2f} MiB of weights that train" in memory("condition")
@@ -112,7 +118,8 @@ def test_settings_that_cannot_train_are_one_clear_error(
 def test_the_doctor_passes_the_shipped_toy_model_and_leaves_it_as_it_was() -> None:
     model, config = load_base(), load_video_config("recommended")
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-    findings = examine(model, draw_scenes(4, 0, "doctor").condition(), (2, 6, 16, 16), config.rollout, config.grpo)
+    rollout, scenes = rollout_settings(config.rollout), draw_scenes(4, 0, "doctor")
+    findings = examine(model, scenes.condition(), (2, 6, 16, 16), rollout, config.grpo)
     assert [finding.name for finding in findings if not finding.passed] == []
     assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
 
@@ -121,7 +128,8 @@ def test_the_doctor_names_a_flat_mask_and_a_ratio_that_is_not_1() -> None:
     config = load_video_config("recommended")
     condition = toy_condition(3, (2, 5, 8, 8))
     restless = Analytic(lambda x, t: x + 0.3 * torch.randn_like(x))  # other noise on every call, as dropout would give
-    findings = {f.name: f for f in examine(restless, condition, (2, 5, 8, 8), config.rollout, config.grpo)}
+    rollout = rollout_settings(config.rollout)
+    findings = {f.name: f for f in examine(restless, condition, (2, 5, 8, 8), rollout, config.grpo)}
     assert not findings["ratio is 1 on the first update"].passed
     assert "dropout" in findings["ratio is 1 on the first update"].remedy
     assert not findings["eta = 0 is the Euler ODE step"].passed

@@ -17,6 +17,9 @@ from torch.testing import assert_close
 from video_toys import (
     SHAPE,
     Analytic,
+    advantage_config,
+    grpo_config,
+    kl_config,
     tiny_network,
     toy_buffer,
     toy_rollout_settings,
@@ -25,22 +28,22 @@ from video_toys import (
     weights,
 )
 
+from wm_nodes.config.video import GrpoConfig
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError, RolloutSettings, StepContext, VideoNetwork, step
 from wm_nodes.video_rl.group_advantages import GroupAdvantages
 from wm_nodes.video_rl.grpo import GrpoLearner, mixed_reward
 from wm_nodes.video_rl.grpo_math import gaussian_logprob
-from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
 from wm_nodes.video_rl.ratio_and_kl import Rows
 
-NO_KL = KlSettings("none")
+NO_KL = kl_config("none")
 MODES = ["mean", "logk2", "logk3", "velocity"]
 
 
-def grpo(**changes: Any) -> GrpoSettings:
+def grpo(**changes: Any) -> GrpoConfig:
     """Batches of 8 rows, as at rollout, so that network calls have one shape and the ratio is exactly 1."""
-    return GrpoSettings(**{"learning_rate": 1e-3, "micro_batch": 8, "step_fraction": 0.8, **changes})
+    return grpo_config(**{"learning_rate": 1e-3, "micro_batch": 8, "step_fraction": 0.8, **changes})
 
 
 def make(rollout: RolloutSettings | None = None, *, network: VideoNetwork | None = None, seed: int = 0,
@@ -188,7 +191,7 @@ def test_the_equaliser_gives_every_step_the_median_sensitivity_s_share() -> None
 @pytest.mark.parametrize("anchor", ["buffer", "frozen", "moving", "dual"])
 def test_the_kl_has_no_gradient_at_its_anchor(mode: str, anchor: str) -> None:
     """With no advantage nothing else is left."""
-    learner = make(kl=KlSettings(mode, 10.0, anchor))  # type: ignore[arg-type]
+    learner = make(kl=kl_config(mode, 10.0, anchor))  # type: ignore[arg-type]
     buffer = buffer_of(learner)
     assert not gradient(learner, buffer, signal=known([0.0] * 8)).any()
     assert gradient(learner, buffer).any()
@@ -208,7 +211,7 @@ def test_training_leaves_no_gradient_on_what_was_stored() -> None:
 # accumulation and ranks
 
 
-@pytest.mark.parametrize("changes", [{}, {"equalise": True, "kl": KlSettings("mean", 0.5, "frozen")}])
+@pytest.mark.parametrize("changes", [{}, {"equalise": True, "kl": kl_config("mean", 0.5, "frozen")}])
 def test_the_size_of_a_micro_batch_does_not_change_the_gradient(changes: dict[str, Any]) -> None:
     whole = make(micro_batch=1000, clip_low=0.5, clip_high=0.5, **changes)
     buffer = buffer_of(whole)
@@ -258,7 +261,7 @@ def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
         clip_low=0.1,
         clip_high=0.1,
         learning_rate=1e-4,
-        kl=KlSettings(anchor="dual", dual_every=1),
+        kl=kl_config(anchor="dual", dual_every=1),
         ema_decay=0.9,
     )
     one = GrpoLearner(tiny_network(), settings, toy_rollout_settings(), seed=5)
@@ -278,7 +281,7 @@ def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mode", [*MODES, "none"])
 def test_every_kl_is_zero_on_the_first_update_of_a_buffer_and_then_its_own_size(mode: str) -> None:
     """The log-space forms are far weaker."""
-    learner = make(kl=KlSettings(mode), updates_per_buffer=2)  # type: ignore[arg-type]
+    learner = make(kl=kl_config(mode), updates_per_buffer=2)  # type: ignore[arg-type]
     for iteration in range(2):
         first, second = learner.train(buffer_of(learner, iteration=iteration)).updates
         assert first.kl == 0.0
@@ -296,7 +299,7 @@ def kl_by_version(rounds: int = 4, **changes: Any) -> list[float]:
 def test_each_anchor_is_where_it_says(mode: str) -> None:
     """Versions 0 to 7, two to a buffer. The first KL after an anchor moved to the weights is 0."""
     zero = {
-        anchor: [kl == 0.0 for kl in kl_by_version(kl=KlSettings(mode, 0.5, anchor, 3, 4))]  # type: ignore[arg-type]
+        anchor: [kl == 0.0 for kl in kl_by_version(kl=kl_config(mode, 0.5, anchor, 3, 4))]  # type: ignore[arg-type]
         for anchor in ("buffer", "frozen", "moving", "dual")
     }
     assert zero["buffer"] == [True, False] * 4
@@ -306,7 +309,7 @@ def test_each_anchor_is_where_it_says(mode: str) -> None:
 
 
 def test_a_dual_anchor_adds_the_frozen_one_to_the_buffer_s() -> None:
-    frozen, dual = make(kl=KlSettings(anchor="frozen")), make(kl=KlSettings(anchor="dual", dual_every=1))
+    frozen, dual = make(kl=kl_config(anchor="frozen")), make(kl=kl_config(anchor="dual", dual_every=1))
     buffer = make()
     for learner in (frozen, dual, buffer):
         train_rounds(learner, range(1))
@@ -349,7 +352,7 @@ class Adapted(VideoNetwork):
 def test_with_its_adapter_off_the_model_is_its_own_frozen_anchor() -> None:
     found = []
     for anchor in ("lora_off", "frozen"):
-        learner = make(network=Adapted(), kl=KlSettings(anchor=anchor), learning_rate=0.05)  # type: ignore[arg-type]
+        learner = make(network=Adapted(), kl=kl_config(anchor=anchor), learning_rate=0.05)  # type: ignore[arg-type]
         train_rounds(learner, range(2))
         found.append(learner.train(buffer_of(learner, iteration=2)).updates[0].kl)
         assert list(learner._terms.anchor) == ([] if anchor == "lora_off" else ["adapter"])
@@ -359,7 +362,7 @@ def test_with_its_adapter_off_the_model_is_its_own_frozen_anchor() -> None:
 
 def test_switching_off_an_adapter_that_a_model_does_not_have_is_an_error() -> None:
     with pytest.raises(ValueError, match="lora_off needs a model with a LoRA adapter"):
-        make(kl=KlSettings(anchor="lora_off"))
+        make(kl=kl_config(anchor="lora_off"))
 
 
 @pytest.mark.parametrize(
@@ -372,11 +375,11 @@ def test_switching_off_an_adapter_that_a_model_does_not_have_is_an_error() -> No
 )
 def test_two_settings_of_which_one_would_be_ignored_are_refused(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        GrpoSettings(**changes)
+        grpo_config(**changes)
 
 
 def test_training_the_condition_alone_moves_its_layers_and_no_other_weight_by_a_bit(tmp_path: Path) -> None:
-    learner = make(trains="condition", kl=KlSettings(anchor="dual"), weight_decay=0.1)
+    learner = make(trains="condition", kl=kl_config(anchor="dual"), weight_decay=0.1)
     before = weights(learner.model)
     train_rounds(learner, range(2))
     after = weights(learner.model)
@@ -386,7 +389,7 @@ def test_training_the_condition_alone_moves_its_layers_and_no_other_weight_by_a_
     condition = ("action.", "text.", "time.", "blocks.0.film.")
     assert set(learner._terms.anchor) == {name for name in before if name.startswith(condition)}
     learner.save(tmp_path / "learner.safetensors", iteration=2)
-    resumed = make(trains="condition", kl=KlSettings(anchor="dual"), weight_decay=0.1)
+    resumed = make(trains="condition", kl=kl_config(anchor="dual"), weight_decay=0.1)
     assert resumed.load(tmp_path / "learner.safetensors") == 2
     assert_equal(weights(resumed.model), after)
     with pytest.raises(WeightsError, match=r"learner\.safetensors"):
@@ -403,7 +406,7 @@ def test_a_model_that_does_not_say_which_weights_are_its_condition_is_refused_an
 @pytest.mark.parametrize("mode", ["logk2", "logk3"])
 def test_a_log_space_kl_measures_against_its_own_anchor(mode: str) -> None:
     """From DD-12: log r of the weights now to those of the anchor, at the stored x_s; not to those that sampled."""
-    learner = make(kl=KlSettings(mode, 0.5, "frozen"))  # type: ignore[arg-type]
+    learner = make(kl=kl_config(mode, 0.5, "frozen"))  # type: ignore[arg-type]
     anchor = tiny_network()
     with torch.no_grad():
         for parameter in learner.parameters:
@@ -434,7 +437,7 @@ def _logprob(model: torch.nn.Module, learner: GrpoLearner, buffer: RolloutBuffer
 
 def test_a_larger_kl_weight_keeps_the_model_nearer_to_its_anchor() -> None:
     ends = [
-        kl_by_version(6, kl=KlSettings("mean", beta, "frozen"), clip_low=0.2, clip_high=0.2)[-1]
+        kl_by_version(6, kl=kl_config("mean", beta, "frozen"), clip_low=0.2, clip_high=0.2)[-1]
         for beta in (1e-6, 50.0)
     ]
     assert ends[1] < 0.5 * ends[0]
@@ -448,7 +451,7 @@ def test_mixed_advantages_do_not_depend_on_a_reward_s_unit_and_mixed_rewards_do(
     for mix, found in trained.items():
         for unit in (1.0, 1024.0):
             learner = GrpoLearner(
-                tiny_network(), grpo(advantage=AdvantageSettings(mix=mix)), toy_rollout_settings(micro_batch=8),  # type: ignore[arg-type]
+                tiny_network(), grpo(advantage=advantage_config(mix=mix)), toy_rollout_settings(micro_batch=8),  # type: ignore[arg-type]
                 seed=0, reward_weights={"brightness": 1.0, "contrast": 0.5},
             )
             buffer = buffer_of(learner)
@@ -468,7 +471,7 @@ def test_win_rates_train_by_rank_alone_whatever_the_scale_of_the_reward() -> Non
     rewards = torch.tensor([0.0, 1, 2, 5, 3, 7, -1, 4], dtype=torch.float64)
     for source, found in trained.items():
         for values in (rewards, rewards**3):
-            learner = make(advantage=AdvantageSettings(source=source))  # type: ignore[arg-type]
+            learner = make(advantage=advantage_config(source=source))  # type: ignore[arg-type]
             report = learner.train(buffer_of(learner).with_rewards({"total": values}))
             assert report.reward_mean == pytest.approx(float(values.mean())), "the log has the reward, not the rank"
             found.append(weights(learner.model))
@@ -479,7 +482,7 @@ def test_win_rates_train_by_rank_alone_whatever_the_scale_of_the_reward() -> Non
 
 def test_win_rates_are_of_each_reward_where_advantages_are_mixed_and_leave_invalid_videos_out() -> None:
     learner = GrpoLearner(
-        tiny_network(), grpo(advantage=AdvantageSettings(mix="advantage", source="win_rate")),
+        tiny_network(), grpo(advantage=advantage_config(mix="advantage", source="win_rate")),
         toy_rollout_settings(micro_batch=8), seed=0, reward_weights={"a": 1.0, "b": 1.0},
     )
     a = torch.tensor([0.0, 1, 2, math.nan, 0, 0, 0, 0], dtype=torch.float64)
@@ -495,7 +498,7 @@ def test_win_rates_are_of_each_reward_where_advantages_are_mixed_and_leave_inval
 def test_the_floor_of_a_group_s_spread_is_a_setting() -> None:
     rewards = torch.tensor([0.0, 0.01, 0.0, 0.01, 0.0, 1.0, 0.0, 1.0])
     for floor, flat in ((1e-6, 0.0), (0.1, 0.5)):
-        learner = make(advantage=AdvantageSettings(floor=floor))
+        learner = make(advantage=advantage_config(floor=floor))
         assert learner.train(buffer_of(learner).with_rewards({"total": rewards})).zero_std_ratio == flat
 
 
@@ -506,7 +509,7 @@ def test_a_recomputed_mask_warns_that_it_is_an_ablation() -> None:
 
 def test_one_running_deviation_for_several_advantages_is_refused() -> None:
     with pytest.raises(ValueError, match="std_scope running is of one reward"):
-        make(advantage=AdvantageSettings(mix="advantage", std_scope="running"))
+        make(advantage=advantage_config(mix="advantage", std_scope="running"))
 
 
 def test_full_passes_train_the_whole_buffer_every_time_and_parts_their_own_videos() -> None:
@@ -568,7 +571,7 @@ def test_videos_that_do_not_train_change_nothing_whatever_they_hold() -> None:
 
 
 def test_best_of_2_trains_the_best_and_the_worst_video_of_each_group() -> None:
-    learner = make(advantage=AdvantageSettings(best_of_n=2), step_fraction=1.0)
+    learner = make(advantage=advantage_config(best_of_n=2), step_fraction=1.0)
     buffer = buffer_of(learner).with_rewards({"total": torch.tensor([0.0, 1, 2, 3, 8, 5, 9, 6])})
     report = learner.train(buffer)
     assert report.kept == 4 and report.updates[0].transitions == 4 * 5
@@ -630,9 +633,9 @@ def test_without_an_average_the_weights_in_evaluation_are_the_learner_s_own() ->
 
 STATEFUL = [
     {},
-    {"ema_decay": 0.9, "kl": KlSettings(anchor="moving", moving_updates=3)},
-    {"advantage": AdvantageSettings(std_scope="running"), "kl": KlSettings(anchor="dual", dual_every=2)},
-    {"passes": "parts", "kl": KlSettings(anchor="frozen"), "equalise": True},
+    {"ema_decay": 0.9, "kl": kl_config(anchor="moving", moving_updates=3)},
+    {"advantage": advantage_config(std_scope="running"), "kl": kl_config(anchor="dual", dual_every=2)},
+    {"passes": "parts", "kl": kl_config(anchor="frozen"), "equalise": True},
 ]
 
 
@@ -676,7 +679,7 @@ def test_a_checkpoint_of_another_seed_or_architecture_is_refused(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("changes", "knob"), [({"kl": KlSettings(anchor="frozen")}, "kl.anchor"), ({"ema_decay": 0.9}, "ema_decay")]
+    ("changes", "knob"), [({"kl": kl_config(anchor="frozen")}, "kl.anchor"), ({"ema_decay": 0.9}, "ema_decay")]
 )
 def test_a_checkpoint_without_the_anchor_or_average_that_a_run_has_is_refused(
     tmp_path: Path, changes: dict[str, Any], knob: str

@@ -10,29 +10,32 @@ import torch
 from metric_docs import documented, written
 from video_toys import tiny_network, toy_buffer, toy_rollout_settings, weights
 
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import RolloutConfig, VideoRlConfig
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl.reference_reward import ClipScores, more_is_better
-from wm_nodes.video_rl.settings import EvaluationSettings, VideoRlConfig, load_video_config
 from wm_nodes.video_rl.training_run import VIDEO_FILES, VideoRun, evaluated_uri, progress
 from wm_nodes.video_rl.validation import alarm_text, alarms_of, hacked_now
 
+ROLLOUT = toy_rollout_settings(micro_batch=8)
 SCORES = set(ClipScores.__dataclass_fields__)
 
 
 def config(*, every: int = 1, **grpo: Any) -> VideoRlConfig:
     plain = load_video_config("smoke")
-    return replace(
-        plain, rollout=toy_rollout_settings(micro_batch=8), evaluation=EvaluationSettings(every=every, window=3),
-        grpo=replace(plain.grpo, learning_rate=1e-3, **grpo),
+    return plain.with_values(
+        rollout=RolloutConfig.model_validate(ROLLOUT, from_attributes=True),
+        evaluation=plain.evaluation.with_values(every=every, window=3),
+        grpo=plain.grpo.with_values(learning_rate=1e-3, **grpo),
     )
 
 
 def train(run: VideoRun, totals: list[float]) -> None:
     """One buffer for each; its mean reward is the number."""
     for total in totals:
-        buffer = toy_buffer(run.network, run.config.rollout, version=run.version, iteration=run.iterations)
+        buffer = toy_buffer(run.network, ROLLOUT, version=run.version, iteration=run.iterations)
         spread = torch.tensor([-1.0, 1.0, -1.0, 1.0]).repeat(2)
         scored = buffer.with_rewards({"total": total + spread})
         raw = {"tracking": spread, "psnr_db": torch.full((8,), math.nan)}
@@ -120,7 +123,7 @@ def test_held_out_scores_are_written_every_so_many_buffers_and_the_alarm_with_th
 
 def test_raw_rewards_and_the_noise_of_each_step_are_in_the_log(tmp_path: Path, network: VideoNetwork) -> None:
     run = VideoRun(network, config(every=0), tmp_path)
-    buffer = toy_buffer(network, run.config.rollout)
+    buffer = toy_buffer(network, ROLLOUT)
     raw = {"total": torch.arange(8.0), "tracking": torch.arange(8.0), "object_cm": 10 * torch.arange(8.0)}
     raw["object_cm"][7] = math.nan
     scored = replace(buffer.with_rewards({"total": raw["total"]}), rewards=raw)

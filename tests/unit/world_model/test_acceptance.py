@@ -1,4 +1,4 @@
-"""The gate: which numbers let a world model through, and what it refuses to judge."""
+"""Acceptance: which numbers let a world model through, and what is refused to be judged."""
 
 import json
 from dataclasses import replace
@@ -25,12 +25,13 @@ GOOD = {
 }
 
 
-def settings(task: str = "push_cube", **gate: object) -> RunConfig:
+def settings(task: str = "push_cube", **changes: object) -> RunConfig:
     limits = {
         "object_error_ratio": 0.6, "tool_error_ratio": 0.3, "done_precision": 0.8, "done_recall": 0.6,
         "require_success_agreement": True,
     }
-    return load_config("smoke", {"task": task} | {f"gate.{name}": value for name, value in (limits | gate).items()})
+    overrides = {f"acceptance.{name}": value for name, value in (limits | changes).items()}
+    return load_config("smoke", {"task": task, **overrides})
 
 
 def judged(metrics: dict[str, float], config: RunConfig, imagined=(40, 100), real=(80, 200)) -> AcceptanceReport:  # type: ignore[no-untyped-def]
@@ -98,7 +99,7 @@ def test_the_table_shows_every_criterion_and_the_remedy_of_a_failed_one() -> Non
     console = Console(width=200, record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
     console.print(judged(GOOD | {"tool_ratio_h16": 0.9}, settings()).table())
     text = console.export_text()
-    assert "gate FAILED" in text and "done recall on rollouts" in text and "train longer" in text
+    assert "acceptance FAILED" in text and "done recall on rollouts" in text and "train longer" in text
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ def test_a_trained_probe_reads_positions_of_episodes_it_has_not_seen(tmp_path: P
     probe, metrics = train_position_probe(arrays(120), config, 0, tmp_path, progress=False)
     assert metrics["error_m"] < 0.02
     unseen = arrays(16, 10_000)
-    truth = probe_targets(unseen.ground_truth)
+    truth = probe_targets(unseen.ground_truth, "push_cube")
     assert probe.read(unseen.images).shape == truth.shape
     guess = np.linalg.norm(truth[..., CUBE] - truth[..., CUBE].mean((0, 1)), axis=-1).mean()
     found = np.linalg.norm((probe.read(unseen.images) - truth)[..., CUBE], axis=-1).mean()

@@ -15,7 +15,7 @@ TEXT_TOKENS = 250
 
 
 @dataclass(frozen=True)
-class Asked:
+class CallCounts:
     """What one clip's reads amount to. reads: answers on one component. pixels: of all images of all calls."""
 
     reads: int = 0
@@ -24,8 +24,8 @@ class Asked:
     pixels: int = 0
     tokens: int = 0
 
-    def __add__(self, other: "Asked") -> "Asked":
-        return Asked(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
+    def __add__(self, other: "CallCounts") -> "CallCounts":
+        return CallCounts(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
 
 
 class CountingJudge:
@@ -33,26 +33,26 @@ class CountingJudge:
 
     def __init__(self, judge: Judge) -> None:
         self.judge = judge
-        self.asked = Asked()
+        self.asked = CallCounts()
 
     @property
     def capabilities(self) -> Capabilities:
         return self.judge.capabilities
 
     async def read(self, request: ReadRequest) -> list[Read]:
-        self.asked += asked_by(request)
+        self.asked += count_request(request)
         return await self.judge.read(request)
 
     async def health(self) -> Health:
         return await self.judge.health()
 
 
-def asked_by(request: ReadRequest) -> Asked:
+def count_request(request: ReadRequest) -> CallCounts:
     calls = sum(1 if vote.kind == "json" else len(request.components) for vote in request.votes)
     images = len(request.media)
     height, width = request.clip.frames.shape[1:3]
     tokens = images * math.ceil(height / TOKEN_PX) * math.ceil(width / TOKEN_PX) + TEXT_TOKENS
-    return Asked(
+    return CallCounts(
         len(request.components) * len(request.votes), calls, calls * images, calls * images * height * width,
         calls * tokens,
     )

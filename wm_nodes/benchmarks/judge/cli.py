@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from tqdm import tqdm
 
-from benchmarks.judge.compared import PROTOCOLS, AnswerFile, ComparedRow, compared, compared_table, num_answers
-from benchmarks.judge.efficiency import ARMS, economy, economy_table, trials
+from benchmarks.judge.compared import PROTOCOLS, AnswerFile, ComparedRow, compared, comparison_table, num_answers
+from benchmarks.judge.efficiency import ARMS, measure_savings, savings_table, trials
 from benchmarks.judge.hacking import (
     Proxy,
     SearchPlan,
@@ -32,12 +32,12 @@ from benchmarks.judge.metrics import (
     agreement,
     by_split,
     cost_row,
-    missed,
     missed_patterns,
+    missed_targets,
     mistakes,
+    most_frequent,
     pattern_rows,
     statuses,
-    worst,
 )
 from benchmarks.judge.run import JudgeTrial, Outcome, OutcomeFile, judge_rows
 from benchmarks.judge.search_starts import hacking_starts
@@ -47,11 +47,11 @@ from benchmarks.speed.results import write_results
 from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent import Judge, Rubric, TaskSpec, load_rubric
 from wm_nodes.judge.agent.types import Stage
-from wm_nodes.judge.dataset.build import load_set
 from wm_nodes.judge.dataset.edits import LabelledClip, Manifest
 from wm_nodes.judge.dataset.edits.generator import SEVERITIES
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
-from wm_nodes.judge.dataset.rows import MIN_TEST_CLIPS, chosen_rows
+from wm_nodes.judge.dataset.rows import MIN_TEST_CLIPS, select_rows
+from wm_nodes.judge.dataset.set_files import load_set
 
 LOG_COLUMNS = 180
 JUDGED = "judged"
@@ -80,74 +80,74 @@ def main(argv: Sequence[str]) -> int:
 
 async def _table(arguments: argparse.Namespace) -> None:
     rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
-    rows = chosen_rows(manifest, arguments.part, arguments.clips)
+    rows = select_rows(manifest, arguments.part, arguments.clips)
     async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
-        said = _looked(arguments, manifest, judge, rubric)
-        outcomes = await _judged(arguments, judge, [JudgeTrial("table", rubric, seed=arguments.seed)], rows)
+        said = _record_test_evaluation(arguments, manifest, judge, rubric)
+        outcomes = await _judge_trials(arguments, judge, [JudgeTrial("table", rubric, seed=arguments.seed)], rows)
         who = judge_name(judge.capabilities)
-    found = outcomes["table"]
-    agreements, patterns = agreement(rows, found, rubric), pattern_rows(rows, found, tuple(rubric.hack.patterns))
-    caption = f"{who}; rubric {rubric.version}; {arguments.part}, {len(rows)} clips: {statuses(found)}"
-    splits = by_split(rows, found, rubric)
+    results = outcomes["table"]
+    agreements, patterns = agreement(rows, results, rubric), pattern_rows(rows, results, tuple(rubric.hack.patterns))
+    caption = f"{who}; rubric {rubric.version}; {arguments.part}, {len(rows)} clips: {statuses(results)}"
+    splits = by_split(rows, results, rubric)
     console.print(table2(agreements, caption), split_table(splits), confusion_table(agreements, patterns))
     console.print(pattern_table(patterns))
-    cost = cost_row(found, arguments.price)
+    cost = cost_row(results, arguments.price)
     console.print(cost_table({"agent, benchmark mode": cost}))
-    below = [*missed(agreements), *missed_patterns(patterns)]
-    _say_what_is_missing(arguments, len(rows), said, below, worst(mistakes(rows, found, rubric)))
+    below = [*missed_targets(agreements), *missed_patterns(patterns)]
+    _print_notes(arguments, len(rows), said, below, most_frequent(mistakes(rows, results, rubric)))
     write_results(arguments, {
         "claim": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
-        "seed": arguments.seed, "notice": said, "statuses": statuses(found), "cost": cost,
-        "splits": {name: [asdict(row) for row in found] for name, found in splits.items()},
+        "seed": arguments.seed, "notice": said, "statuses": statuses(results), "cost": cost,
+        "splits": {name: [asdict(row) for row in table] for name, table in splits.items()},
         "rows": [asdict(row) for row in agreements], "patterns": [asdict(row) for row in patterns],
-        "missed": below, "mistakes": worst(mistakes(rows, found, rubric), 40),
+        "missed": below, "mistakes": most_frequent(mistakes(rows, results, rubric), 40),
     })
 
 
 async def _efficiency(arguments: argparse.Namespace) -> None:
     rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
-    rows = chosen_rows(manifest, arguments.part, arguments.clips)
+    rows = select_rows(manifest, arguments.part, arguments.clips)
     async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
-        said = _looked(arguments, manifest, judge, rubric)
-        outcomes = await _judged(arguments, judge, trials(arguments.rubric, arguments.seed), rows)
+        said = _record_test_evaluation(arguments, manifest, judge, rubric)
+        outcomes = await _judge_trials(arguments, judge, trials(arguments.rubric, arguments.seed), rows)
         who = judge_name(judge.capabilities)
-    costs = {ARMS[name]: cost_row(found, arguments.price) for name, found in outcomes.items()}
-    compared = economy(rows, outcomes)
-    console.print(cost_table(costs), economy_table(compared, f"{who}; {arguments.part}, {len(rows)} clips"))
-    _say_what_is_missing(arguments, len(rows), said, [], [])
+    costs = {ARMS[name]: cost_row(outcomes_of_arm, arguments.price) for name, outcomes_of_arm in outcomes.items()}
+    compared = measure_savings(rows, outcomes)
+    console.print(cost_table(costs), savings_table(compared, f"{who}; {arguments.part}, {len(rows)} clips"))
+    _print_notes(arguments, len(rows), said, [], [])
     write_results(arguments, {
         "claim": "efficiency", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
-        "seed": arguments.seed, "notice": said, "per_clip": costs, "compared": [asdict(one) for one in compared],
+        "seed": arguments.seed, "notice": said, "per_clip": costs, "compared": [asdict(row) for row in compared],
     })
 
 
 async def _hacking(arguments: argparse.Namespace) -> None:
     rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
     plan = SearchPlan(arguments.generations, arguments.candidates, severities=tuple(arguments.severities))
-    part = chosen_rows(manifest, arguments.part)
+    part = select_rows(manifest, arguments.part)
     config = load_config("cpu").simulation
     starts, curves = [], []
     async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
         who = judge_name(judge.capabilities)
-        said = _looked(arguments, manifest, judge, rubric)
+        said = _record_test_evaluation(arguments, manifest, judge, rubric)
         rewards: dict[str, Proxy] = {
             "agent": agent_reward(judge, rubric, arguments.seed),
             "mean score": mean_score(judge, rubric, arguments.seed),
             "pixel similarity": pixel_similarity,
         }
-        told = {name: _told(reward, judge) for name, reward in rewards.items()}
+        proxies = {name: _with_labels(reward, judge) for name, reward in rewards.items()}
         with tqdm(total=arguments.starts, desc="clips with a defect") as bar:
             for start in hacking_starts(part, manifest.division, config, arguments.seed):
-                if await has_numbers(start, told.values()):
+                if await has_numbers(start, proxies.values()):
                     starts.append(start)
                     bar.update()
                 if len(starts) == arguments.starts:
                     break
         if not starts:
-            raise ValueError(f"no clip with a defect has a number of {', '.join(told)}; nothing can be climbed")
+            raise ValueError(f"no clip with a defect has a number of {', '.join(proxies)}; nothing can be climbed")
         most = len(rewards) * len(starts) * (1 + plan.generations * plan.candidates)
         with tqdm(total=most, desc="search", unit="clip") as bar:
-            for name, reward in told.items():
+            for name, reward in proxies.items():
                 climbs = [await climb(start, reward, plan, arguments.seed, on_clip=bar.update) for start in starts]
                 curves.append(curve(name, [one for one in climbs if one is not None]))
     console.print(curve_table(curves, f"{who}; {arguments.part}, {len(starts)} clips with a defect"))
@@ -164,27 +164,27 @@ async def _hacking(arguments: argparse.Namespace) -> None:
 
 async def _comparisons(arguments: argparse.Namespace) -> None:
     manifest = load_set(arguments.set)
-    rows = chosen_rows(manifest, arguments.part, arguments.clips)
-    found: list[ComparedRow] = []
+    rows = select_rows(manifest, arguments.part, arguments.clips)
+    results: list[ComparedRow] = []
     async with open_comparison(arguments) as judge:
         with tqdm(total=sum(num_answers(name, rows) for name in arguments.protocols), desc="asked") as bar:
             for name in arguments.protocols:
                 bar.set_postfix_str(name)
                 file = AnswerFile(arguments.set / JUDGED, name, arguments.model, arguments.seed)
-                found.append(
+                results.append(
                     await compared(
                         judge, name, arguments.set, rows, file, at_once=arguments.at_once, on_answer=bar.update
                     )
                 )
     caption = f"{arguments.model}; {arguments.part}, {len(rows)} clips; wins: hacked scores >= its clean recording"
-    console.print(compared_table(found, caption))
+    console.print(comparison_table(results, caption))
     write_results(arguments, {
         "claim": "comparisons", "model": arguments.model, "part": arguments.part, "clips": len(rows),
-        "seed": arguments.seed, "rows": [asdict(row) for row in found],
+        "seed": arguments.seed, "rows": [asdict(row) for row in results],
     })
 
 
-def _told(reward: Proxy, judge: Judge) -> Proxy:
+def _with_labels(reward: Proxy, judge: Judge) -> Proxy:
     """The control judge must be told the labels of every new clip; others look."""
     if not isinstance(judge, LabelJudge):
         return reward
@@ -196,21 +196,21 @@ def _told(reward: Proxy, judge: Judge) -> Proxy:
     return proxy
 
 
-async def _judged(
+async def _judge_trials(
     arguments: argparse.Namespace, judge: Judge, wanted: Sequence[JudgeTrial], rows: Sequence[ManifestRow]
 ) -> dict[str, list[Outcome]]:
-    found = {}
+    outcomes = {}
     with tqdm(total=len(wanted) * len(rows), desc="judged", unit="clip") as bar:
         for trial in wanted:
             bar.set_postfix_str(trial.name)
             path = arguments.set / JUDGED / f"{trial.key(judge.capabilities)}.jsonl"
-            found[trial.name] = await judge_rows(
+            outcomes[trial.name] = await judge_rows(
                 judge, trial, arguments.set, rows, OutcomeFile(path), at_once=arguments.at_once, on_clip=bar.update
             )
-    return found
+    return outcomes
 
 
-def _looked(arguments: argparse.Namespace, manifest: Manifest, judge: Judge, rubric: Rubric) -> str:
+def _record_test_evaluation(arguments: argparse.Namespace, manifest: Manifest, judge: Judge, rubric: Rubric) -> str:
     """Record an evaluation on the test split; return what the output must say of it. Controls are not recorded."""
     if arguments.part != "test" or arguments.judge == "simulator":
         return ""
@@ -218,7 +218,7 @@ def _looked(arguments: argparse.Namespace, manifest: Manifest, judge: Judge, rub
     return notice(others, arguments.again)
 
 
-def _say_what_is_missing(
+def _print_notes(
     arguments: argparse.Namespace, count: int, said: str, below: Sequence[str], wrong: Sequence[tuple[str, int]]
 ) -> None:
     lines = [said] if said else []
@@ -266,9 +266,9 @@ def parser() -> argparse.ArgumentParser:
         ("efficiency", "calls, images, pixels and tokens against reading everything of every clip"),
         ("comparisons", "other papers' rewards through a chat server: ranking, hacked clips that win"),
     ):
-        one = claims.add_parser(name, help=text, parents=[common])
-        one.add_argument("--clips", type=int, help="the first so many in the order of their hashes; all by default")
-    one.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
+        command = claims.add_parser(name, help=text, parents=[common])
+        command.add_argument("--clips", type=int, help="the first so many in the order of their hashes; all by default")
+    command.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     hacking = claims.add_parser("hacking", help="climb the agent and single scores, truth beside", parents=[common])
     hacking.add_argument("--starts", type=int, default=12, help="clips with a defect to begin with")
     hacking.add_argument("--generations", type=int, default=8)

@@ -1,4 +1,4 @@
-"""Other papers' rewards on the same clips: how well they rank, and whether they fall for a hacked clip.
+"""Other papers' rewards on the same clips: how well they rank them, and how often a hacked clip wins.
 
 A score is measured without a threshold, since each has a scale of its own: AUROC of good clips against others, and the
 share of hacked clips that score at least as high as their clean recording. Answers are kept, one JSON line each.
@@ -17,9 +17,10 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.judge.comparisons import PAIRWISE, POINTWISE, ChatComparison
-from wm_nodes.core.reward_statistics import auroc, wilson_interval
+from wm_nodes.core.statistics import auroc, wilson_interval
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
-from wm_nodes.judge.dataset.rows import judged_clip
+from wm_nodes.judge.dataset.rows import read_clip
+from wm_nodes.reports.console_table import decimal, make_table, percent, percent_interval
 
 PROTOCOLS = (*POINTWISE, *PAIRWISE)
 
@@ -77,12 +78,12 @@ class AnswerFile:
         if known is None or known.value is None:
             known = self.kept[key] = await ask()
             with self._path.open("a") as file:
-                file.write("\n" * bool(self._torn()) + json.dumps({"of": key, **asdict(known)}) + "\n")
+                file.write("\n" * bool(self._is_torn()) + json.dumps({"of": key, **asdict(known)}) + "\n")
                 file.flush()
                 os.fsync(file.fileno())
         return known
 
-    def _torn(self) -> bool:
+    def _is_torn(self) -> bool:
         data = self._path.read_bytes()
         return bool(data) and not data.endswith(b"\n")
 
@@ -106,13 +107,13 @@ async def compared(
     gate = asyncio.Semaphore(at_once)
     pairs = hacked_pairs(rows)
 
-    async def one(row: ManifestRow) -> ComparedAnswer:
+    async def score_clip(row: ManifestRow) -> ComparedAnswer:
         async with gate:
             answer = await file.get(row.sha256, lambda: _score(judge, protocol, folder, row))
             on_answer()
             return answer
 
-    async def two(hacked: ManifestRow, clean: ManifestRow) -> ComparedAnswer:
+    async def compare_pair(hacked: ManifestRow, clean: ManifestRow) -> ComparedAnswer:
         async with gate:
             key = f"{hacked.sha256}/{clean.sha256}"
             answer = await file.get(key, lambda: _prefer(judge, protocol, folder, hacked, clean))
@@ -120,10 +121,10 @@ async def compared(
             return answer
 
     if protocol in PAIRWISE:
-        answers = list(await asyncio.gather(*(two(*pair) for pair in pairs)))
+        answers = list(await asyncio.gather(*(compare_pair(*pair) for pair in pairs)))
         wins = [answer.value <= 0.5 for answer in answers if answer.value is not None]
         return _row(protocol, answers, float("nan"), wins)
-    answers = list(await asyncio.gather(*(one(row) for row in rows)))
+    answers = list(await asyncio.gather(*(score_clip(row) for row in rows)))
     values = {row.sha256: answer.value for row, answer in zip(rows, answers)}
     known = [(row.labels.overall, value) for row in rows if (value := values[row.sha256]) is not None]
     both = [(values[hacked.sha256], values[clean.sha256]) for hacked, clean in pairs]
@@ -135,38 +136,35 @@ def num_answers(protocol: str, rows: Sequence[ManifestRow]) -> int:
     return len(hacked_pairs(rows)) if protocol in PAIRWISE else len(rows)
 
 
-def compared_table(rows: Sequence[ComparedRow], caption: str) -> Table:
-    table = Table(title="comparison rewards", caption=caption)
-    table.add_column("reward")
-    for name in ("n", "invalid", "AUROC", "hacked pairs", "hacked wins", "95 % Wilson", "calls", "tokens", "images"):
-        table.add_column(name, justify="right")
-    for row in rows:
-        area = "-" if row.area != row.area else f"{row.area:.3f}"
-        wins = "-" if row.win_rate != row.win_rate else f"{100 * row.win_rate:.1f}"
-        table.add_row(
-            row.name, str(row.n), str(row.invalid), area, str(row.pairs), wins,
-            f"{100 * row.low:.1f} to {100 * row.high:.1f}", f"{row.calls:.2f}", f"{row.tokens:.0f}",
-            f"{row.images:.1f}",
+def comparison_table(rows: Sequence[ComparedRow], caption: str) -> Table:
+    columns = ("reward", "n", "invalid", "AUROC", "hacked pairs", "hacked wins", "95 % Wilson", "calls", "tokens",
+               "images")
+    cells = (
+        (
+            row.name, row.n, row.invalid, decimal(row.area), row.pairs, percent(row.win_rate),
+            percent_interval(row.low, row.high), f"{row.calls:.2f}", f"{row.tokens:.0f}", f"{row.images:.1f}",
         )
-    return table
+        for row in rows
+    )
+    return make_table("comparison rewards", columns, cells, caption=caption)
 
 
 async def _score(judge: ChatComparison, protocol: str, folder: Path, row: ManifestRow) -> ComparedAnswer:
-    found = await judge.score(POINTWISE[protocol], *judged_clip(folder, row))
-    return _answer(found.value if found.valid else None, found)
+    scored = await judge.score(POINTWISE[protocol], *read_clip(folder, row))
+    return _answer(scored.value if scored.valid else None, scored)
 
 
 async def _prefer(
     judge: ChatComparison, protocol: str, folder: Path, hacked: ManifestRow, clean: ManifestRow
 ) -> ComparedAnswer:
-    other, task = judged_clip(folder, clean)
-    found = await judge.compare(PAIRWISE[protocol], other, judged_clip(folder, hacked)[0], task)
-    return _answer(found.preference if found.valid else None, found)
+    other, task = read_clip(folder, clean)
+    preferred = await judge.compare(PAIRWISE[protocol], other, read_clip(folder, hacked)[0], task)
+    return _answer(preferred.preference if preferred.valid else None, preferred)
 
 
-def _answer(value: float | None, found: Any) -> ComparedAnswer:
-    cost = found.cost
-    return ComparedAnswer(value, found.reason, cost.calls, cost.prompt_tokens + cost.completion_tokens, cost.images)
+def _answer(value: float | None, result: Any) -> ComparedAnswer:
+    cost = result.cost
+    return ComparedAnswer(value, result.reason, cost.calls, cost.prompt_tokens + cost.completion_tokens, cost.images)
 
 
 def _row(name: str, answers: Sequence[ComparedAnswer], area: float, wins: Sequence[bool]) -> ComparedRow:

@@ -16,6 +16,7 @@ from wm_nodes.judge.agent import load_rubric
 from wm_nodes.judge.agent.types import GATED, NUM_PLAN_LEVELS
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.decisions import OVERALL
+from wm_nodes.reports.console_table import estimate, make_table, percent
 
 ARMS = {
     "agent": "agent", "everything": "everything, no early exit", "voted": "every component voted",
@@ -27,7 +28,7 @@ MEASURES = ("reads", "calls", "images", "pixels", "tokens")
 
 
 @dataclass(frozen=True)
-class Economy:
+class Savings:
     """The agent against another way, on the n clips that both decide. saved: share of the other's measures, by name.
     same: share of them with the same decision. accuracy, other_accuracy: of accepting, against the labels.
     difference: agent - other on the same clips, with Tango's interval.
@@ -51,42 +52,40 @@ def trials(rubric: str, seed: int) -> list[JudgeTrial]:
     ]
 
 
-def economy(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence[Outcome]]) -> list[Economy]:
+def measure_savings(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence[Outcome]]) -> list[Savings]:
     """The agent against each of the others.
 
     Raises:
         ValueError: no clip that both decide.
     """
-    found = []
+    comparisons = []
     for name in list(ARMS)[1:]:
-        kept = [
-            (row, one, other) for row, one, other in zip(rows, outcomes["agent"], outcomes[name])
-            if OVERALL in one.decisions and OVERALL in other.decisions
+        decided = [
+            (row, mine, other) for row, mine, other in zip(rows, outcomes["agent"], outcomes[name])
+            if OVERALL in mine.decisions and OVERALL in other.decisions
         ]
-        both = [(row.labels.overall, a.decisions[OVERALL].value, b.decisions[OVERALL].value) for row, a, b in kept]
+        both = [(row.labels.overall, a.decisions[OVERALL].value, b.decisions[OVERALL].value) for row, a, b in decided]
         if not both:
             raise ValueError(f"no clip is decided by the agent and by {ARMS[name]}; see the statuses of the table")
         right = [said == label for label, said, _ in both]
         other_right = [said == label for label, _, said in both]
-        cost, other_cost = cost_row([one for _, one, _ in kept]), cost_row([other for _, _, other in kept])
+        cost, other_cost = cost_row([mine for _, mine, _ in decided]), cost_row([other for _, _, other in decided])
         saved = {part: 1 - cost[part] / other_cost[part] for part in MEASURES}
-        same = [one == other for _, one, other in both]
+        same = [mine == other for _, mine, other in both]
         agreed, mine_right, its_right = (sum(decisions) / len(both) for decisions in (same, right, other_right))
         paired = paired_difference(other_right, right)
-        found.append(Economy(ARMS[name], len(both), saved, agreed, mine_right, its_right, paired))
-    return found
+        comparisons.append(Savings(ARMS[name], len(both), saved, agreed, mine_right, its_right, paired))
+    return comparisons
 
 
-def economy_table(rows: Sequence[Economy], caption: str) -> Table:
-    table = Table(title="saved by the agent, and what it costs in agreement", caption=caption)
-    table.add_column("against")
-    for name in ("n", *MEASURES, "same decision", "accuracy", "other's", "difference (95 %)"):
-        table.add_column(name, justify="right")
+def savings_table(rows: Sequence[Savings], caption: str) -> Table:
+    columns = ("against", "n", *MEASURES, "same decision", "accuracy", "other's", "difference (95 %)")
+    cells = []
     for row in rows:
         d = row.difference
-        table.add_row(
-            row.against, str(row.n), *(f"-{100 * row.saved[part]:.1f} %" for part in MEASURES), f"{100 * row.same:.1f}",
-            f"{100 * row.accuracy:.1f}", f"{100 * row.other_accuracy:.1f}",
-            f"{100 * d.difference:+.1f} ({100 * d.low:+.1f} to {100 * d.high:+.1f})",
-        )
-    return table
+        cells.append((
+            row.against, row.n, *(f"-{percent(row.saved[part])} %" for part in MEASURES), percent(row.same),
+            percent(row.accuracy), percent(row.other_accuracy),
+            estimate((100 * d.difference, 100 * d.low, 100 * d.high), "+.1f"),
+        ))
+    return make_table("saved by the agent, and what it costs in agreement", columns, cells, caption=caption)

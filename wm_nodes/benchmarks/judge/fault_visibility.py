@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from wm_nodes.judge.dataset.build import load_frames
 from wm_nodes.judge.dataset.edits import RECIPES, Manifest
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
 from wm_nodes.judge.dataset.edits.recipes import SEEN_LEVELS
+from wm_nodes.judge.dataset.set_files import load_frames
 from wm_nodes.judge.training.data import load_sets, rows_of
 
 FAINT_PX = 9
@@ -39,13 +39,13 @@ def changed_px(folder: Path, row: ManifestRow) -> int:
 
 def visibility(sets: Sets, part: Part) -> dict[Kind, list[int]]:
     """changed_px of every clip, by severity and recipe; several edits, and other recipes, are left out."""
-    found: dict[Kind, list[int]] = defaultdict(list)
-    for folder, row in tqdm(list(_chosen(sets, part)), desc="compared", unit="clip"):
-        found[row.edits[0].severity, row.edits[0].recipe].append(changed_px(folder, row))
-    return dict(sorted(found.items()))
+    counts: dict[Kind, list[int]] = defaultdict(list)
+    for folder, row in tqdm(list(_select_clips(sets, part)), desc="compared", unit="clip"):
+        counts[row.edits[0].severity, row.edits[0].recipe].append(changed_px(folder, row))
+    return dict(sorted(counts.items()))
 
 
-def _chosen(sets: Sets, part: Part) -> Iterator[tuple[Path, ManifestRow]]:
+def _select_clips(sets: Sets, part: Part) -> Iterator[tuple[Path, ManifestRow]]:
     for folder, manifest in sets:
         for row in rows_of(manifest, [part]):
             if len(row.edits) == 1 and RECIPES[row.edits[0].recipe].kind == "S":
@@ -59,15 +59,15 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--part", choices=("train", "validation", "test"), default="train")
     arguments = parser.parse_args(argv)
     try:
-        found = visibility(load_sets(arguments.sets), arguments.part)
-        if not found:
+        counts = visibility(load_sets(arguments.sets), arguments.part)
+        if not counts:
             raise ValueError(f"no {arguments.part} clip has one edit of its states; build larger sets")
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(f"pixels changed by more than {SEEN_LEVELS} of 255 in the most changed frame")
     print(f"{'severity':8} {'recipe':14} {'n':>5} {'least':>6} {'5 %':>6} {'median':>6} {'faint':>6}")
-    for (severity, recipe), values in found.items():
+    for (severity, recipe), values in counts.items():
         low, middle = np.quantile(values, (0.05, 0.5))
         faint = sum(value <= FAINT_PX for value in values)
         print(f"{severity:8} {recipe:14} {len(values):5} {min(values):6} {low:6.0f} {middle:6.0f} {faint:6}")

@@ -8,11 +8,9 @@ import math
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.video_rl.plots import figure_of, save_figure, style_axes
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.agent import Judge, ReadRequest, RewardAgent, Rubric, TaskSpec
 from wm_nodes.judge.agent.levels import first_vote, score_of
@@ -23,7 +21,7 @@ from wm_nodes.judge.dataset.edits import COMPONENTS, LabelledClip, NotApplicable
 from wm_nodes.judge.dataset.edits.clips import Severity
 from wm_nodes.judge.dataset.edits.generator import FRAME_RECIPES, SEVERITIES
 from wm_nodes.judge.dataset.rows import ROBOT
-from wm_nodes.reports.curves import COLOURS
+from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figure, style_axes
 from wm_nodes.video_rl.reward_hacking import HackedMetric, hacked_metrics
 
 Proxy = Callable[[LabelledClip, TaskSpec], Awaitable[float | None]]
@@ -139,33 +137,33 @@ async def climb(
     if best is None:
         return None
     clean = await proxy(start.clean, start.task)
-    found = Climb([best], [true_value(chain)], math.nan if clean is None else clean)
+    search = Climb([best], [true_value(chain)], math.nan if clean is None else clean)
     for generation in range(plan.generations):
         rng = numpy_stream(seed, f"hack_search/{start.clip.sha256}/{generation}")
-        for child in _children(chain, plan, rng) if len(found.edits) < plan.max_edits else []:
+        for child in _make_children(chain, plan, rng) if len(search.edits) < plan.max_edits else []:
             value = await proxy(child, start.task)
             on_clip()
             if value is not None and value > best:
-                best, chain = value, [*chain[: len(found.edits) + 1], child]
-        if len(chain) > len(found.edits) + 1:
-            found.edits.append(f"{chain[-1].recipe} {chain[-1].edits[-1].severity}")
-        found.proxy.append(best)
-        found.truth.append(true_value(chain))
-    return found
+                best, chain = value, [*chain[: len(search.edits) + 1], child]
+        if len(chain) > len(search.edits) + 1:
+            search.edits.append(f"{chain[-1].recipe} {chain[-1].edits[-1].severity}")
+        search.proxy.append(best)
+        search.truth.append(true_value(chain))
+    return search
 
 
-def _children(chain: Sequence[LabelledClip], plan: SearchPlan, rng: np.random.Generator) -> list[LabelledClip]:
-    made: list[LabelledClip] = []
+def _make_children(chain: Sequence[LabelledClip], plan: SearchPlan, rng: np.random.Generator) -> list[LabelledClip]:
+    children: list[LabelledClip] = []
     for _ in range(4 * plan.candidates):
-        if len(made) == plan.candidates:
+        if len(children) == plan.candidates:
             break
         name = FRAME_RECIPES[rng.integers(len(FRAME_RECIPES))]
         severity = plan.severities[rng.integers(len(plan.severities))]
         try:
-            made.append(apply(chain[-1], name, severity, int(rng.integers(2**31))))
+            children.append(apply(chain[-1], name, severity, int(rng.integers(2**31))))
         except (NotApplicableError, ValueError):  # the second: labels of such a chain would be unknown throughout
             continue
-    return made
+    return children
 
 
 @dataclass(frozen=True)
@@ -186,29 +184,30 @@ class Curve:
 
 
 def curve(name: str, climbs: Sequence[Climb]) -> Curve:
-    proxy = np.mean([one.proxy for one in climbs], 0).tolist()
-    truth = np.mean([one.truth for one in climbs], 0).tolist()
-    used = [edit for one in climbs for edit in one.edits]
+    proxy = np.mean([search.proxy for search in climbs], 0).tolist()
+    truth = np.mean([search.truth for search in climbs], 0).tolist()
+    used = [edit for search in climbs for edit in search.edits]
     ranked = sorted(set(used), key=lambda edit: (-used.count(edit), edit))
     alarms = hacked_metrics(proxy, {"truth": truth}, window=len(proxy)) if len(proxy) >= 3 else []
-    pairs = [(one.proxy[0] >= one.clean, one.proxy[-1] >= one.clean) for one in climbs if not math.isnan(one.clean)]
+    known = [search for search in climbs if not math.isnan(search.clean)]
+    pairs = [(search.proxy[0] >= search.clean, search.proxy[-1] >= search.clean) for search in known]
     before, wins = np.mean(pairs, 0).tolist() if pairs else (math.nan, math.nan)
-    clean = float(np.nanmean([one.clean for one in climbs])) if pairs else math.nan
+    clean = float(np.nanmean([search.clean for search in climbs])) if pairs else math.nan
     most_used = [f"{edit} x{used.count(edit)}" for edit in ranked[:5]]
     return Curve(name, len(climbs), proxy, truth, clean, before, wins, alarms, most_used)
 
 
 def plot_curves(curves: Sequence[Curve], path: Path) -> None:
     """The reward that is climbed beside the truth, a panel per reward."""
-    figure: Any = figure_of(4.2 * len(curves), 3.8)
+    figure = make_figure(4.2 * len(curves), 3.8)
     panels = np.atleast_1d(figure.subplots(1, len(curves), sharey=True))
-    for axes, one in zip(panels, curves, strict=True):
-        alarm = "alarm" if one.alarms else "no alarm"
-        style_axes(axes, f"{one.reward}: {alarm}, {one.searches} clips", "generation", "mean over clips")
-        axes.plot(one.proxy, color=COLOURS[2], linewidth=2, label="reward that is climbed")
-        axes.plot(one.truth, color=COLOURS[0], linewidth=2, linestyle="--", label="truth")
-        if not math.isnan(one.clean):
-            axes.axhline(one.clean, color="gray", linewidth=1, linestyle=":", label="reward of the clean recording")
+    for axes, course in zip(panels, curves, strict=True):
+        alarm = "alarm" if course.alarms else "no alarm"
+        style_axes(axes, f"{course.reward}: {alarm}, {course.searches} clips", "generation", "mean over clips")
+        axes.plot(course.proxy, color=COLOURS[2], linewidth=2, label="reward that is climbed")
+        axes.plot(course.truth, color=COLOURS[0], linewidth=2, linestyle="--", label="truth")
+        if not math.isnan(course.clean):
+            axes.axhline(course.clean, color="gray", linewidth=1, linestyle=":", label="reward of the clean recording")
         axes.set_ylim(0, 1.02)
-        axes.legend(fontsize=8, frameon=False, loc="lower left")
+        add_legend(axes, "lower left")
     save_figure(figure, path)

@@ -1,4 +1,4 @@
-"""Does a judge of the loops' clips know what the same actions do in the simulator? RA-17 to RA-20.
+"""Compare verdicts on imagined and on recorded clips with the success that the simulator measured (RA-17 to RA-20).
 
 Held-out episodes are recorded in the simulator, and imagined by a world model from their first frames with the same
 actions; the judge sees both kinds as an episode's clip, up to the step on which the real one succeeds. The label is the
@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import default_task, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import BoolArray
-from wm_nodes.environments.maniskill.tasks import instruction
 from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.judge.agent import RewardAgent, TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.agent.types import GATED, Status
@@ -64,7 +64,7 @@ class ImaginedAgreement:
     reward_failure: float
 
 
-def ends(episodes: EpisodeArrays, task: str) -> tuple[NDArray[np.int64], BoolArray]:
+def episode_ends(episodes: EpisodeArrays, task: str) -> tuple[NDArray[np.int64], BoolArray]:
     """(last frame, succeeded) of each episode, int64 and bool (E,): the first frame of success, else the last one."""
     won = episodes.success[:, 1:, episodes.tasks.index(task)] & episodes.step_mask
     succeeded = won.any(1)
@@ -80,7 +80,8 @@ def jobs(
         for kind, after in (("recorded", episodes.images[e, 1:]), ("imagined", imagined.frames[e])):
             clip = clip_ref(f"{kind} {e}", np.concatenate([first, after[:end]]), config.simulation.control_hz)
             task = TaskSpec(
-                instruction(config.task), config.task, config.judge.robot, first[0], actions=episodes.actions[e, :end]
+                get_task(config.task).instruction, config.task, config.judge.robot, first[0],
+                actions=episodes.actions[e, :end],
             )  # both tasks are recorded in one scene, under the instruction of one
             yield kind, ClipJob(clip, task)
 
@@ -91,23 +92,24 @@ def agreement(kind: str, verdicts: Sequence[Verdict], succeeded: BoolArray) -> I
     Raises:
         ValueError: no clip got a reward.
     """
-    kept = [(v, bool(real)) for v, real in zip(verdicts, succeeded, strict=True) if v.valid and accepts(v) is not None]
-    if not kept:
+    both = zip(verdicts, succeeded, strict=True)
+    judged = [(v, bool(real)) for v, real in both if v.valid and accepts(v) is not None]
+    if not judged:
         raise ValueError(f"none of {len(verdicts)} {kind} clips got a reward; the first says: {verdicts[0].reason}")
-    found = match(OVERALL, [real for _, real in kept], [decisions_of(v)[OVERALL] for v, _ in kept])
-    rewards, real = np.array([v.reward for v, _ in kept]), np.array([real for _, real in kept])
+    agreed = match(OVERALL, [real for _, real in judged], [decisions_of(v)[OVERALL] for v, _ in judged])
+    rewards, real = np.array([v.reward for v, _ in judged]), np.array([real for _, real in judged])
     closed = {
-        str(stage): sum(s.status is Status.OK and not s.passed for v, _ in kept for s in v.stages if s.stage is stage)
+        str(stage): sum(s.status is Status.OK and not s.passed for v, _ in judged for s in v.stages if s.stage is stage)
         for stage in GATED
     }
     means = [float(rewards[rows].mean()) if rows.any() else float("nan") for rows in (real, ~real)]
     return ImaginedAgreement(
-        kind, len(verdicts), len(kept), float(real.mean()), found.accuracy, found.low, found.high, found.balanced,
+        kind, len(verdicts), len(judged), float(real.mean()), agreed.accuracy, agreed.low, agreed.high, agreed.balanced,
         auc(rewards, real), closed, *means,
     )
 
 
-async def _judged(agent: RewardAgent, asked: Sequence[ClipJob]) -> list[Verdict]:
+async def _judge_clips(agent: RewardAgent, asked: Sequence[ClipJob]) -> list[Verdict]:
     return [await agent.evaluate(job.clip, job.task) for job in tqdm(asked, desc="judged", unit="clip")]
 
 
@@ -118,12 +120,12 @@ def _measure(arguments: argparse.Namespace) -> dict[str, object]:
     bags = collect_plan(scripted_plan(config, arguments.episodes, FIRST_SEED), config, arguments.folder)
     episodes = load_arrays(bags, config)
     imagined = imagine_episodes(models.tokenizer, models.action, episodes)
-    last, succeeded = ends(episodes, config.task)
+    last, succeeded = episode_ends(episodes, config.task)
     rubric = load_rubric(config.judge.rubric)
     opened = make_judge(episode_judge(config), rubric)
     agent = RewardAgent(opened.judge, rubric, seed=config.seed)
     asked = list(jobs(episodes, imagined, config, last))
-    verdicts = asyncio.run(_judged(agent, [job for _, job in asked]))
+    verdicts = asyncio.run(_judge_clips(agent, [job for _, job in asked]))
     signal = imagined.signals[..., models.task_index(config.task)]
     strongest = np.array([signal[e, :end].max() for e, end in enumerate(last)])
     fired = strongest > config.reward.success_threshold
@@ -148,7 +150,7 @@ def main(argv: Sequence[str]) -> int:
     """Measure and print. Return the exit code: 0 done, 2 a clear error."""
     parser = argparse.ArgumentParser(prog="judge_dreams", description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="of the recorded episodes; finished ones are taken up again")
-    parser.add_argument("--task", choices=("reach", "push_cube"), default="push_cube")
+    parser.add_argument("--task", choices=task_names(), default=default_task())
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--judge", type=Path, help="folder of a trained judge; default: the shipped one")
     parser.add_argument("--model-dir", type=Path, help="world model; default: the shipped one")
@@ -156,13 +158,13 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     keep_freed_memory()
     try:
-        found = _measure(arguments)
+        results = _measure(arguments)
         if arguments.json:
-            write_atomic(arguments.json, (json.dumps(found, indent=1) + "\n").encode())
+            write_atomic(arguments.json, (json.dumps(results, indent=1) + "\n").encode())
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(json.dumps({name: value for name, value in found.items() if name not in ("machine", "silent")}, indent=1))
+    print(json.dumps({name: value for name, value in results.items() if name not in ("machine", "silent")}, indent=1))
     return 0
 
 

@@ -1,7 +1,7 @@
-"""A judge that knows the labels and errs at a known rate: the control of the benchmark, never a reward.
+"""A judge that knows the labels and errs at a known rate: a control of the benchmark, never a reward.
 
-It shows what the agent's machinery does with a judge of a given quality: what Table 2 can reach at all, what the early
-exits cost and save, how votes mend independent errors.
+It shows how the agent works with a judge of a given accuracy: the upper bound of Table 2, what early exits cost and
+save, and how far votes correct independent errors.
 """
 
 import hashlib
@@ -72,7 +72,8 @@ class LabelJudge:
         errs = bool(rng.random() < self._error)
         if name == PLANNING:
             level = planning_level(known.labels, known.edits)
-            levels = _spread(_beside(level if level is not None else 2, errs, NUM_PLAN_LEVELS), NUM_PLAN_LEVELS)
+            level = _neighbour_level(2 if level is None else level, errs, NUM_PLAN_LEVELS)
+            levels = _spread(level, NUM_PLAN_LEVELS)
         else:
             levels = _spread(self._level(request.stage, known.labels, name, errs), 5)
         cost = Cost(calls=1, images=len(request.media))
@@ -94,7 +95,7 @@ def known_clips(rows: Iterable[tuple[str, ClipTruth, tuple[Edit, ...]]]) -> dict
     return {sha: KnownClip(labels, edits) for sha, labels, edits in rows}
 
 
-def _beside(level: int, errs: bool, count: int) -> int:
+def _neighbour_level(level: int, errs: bool, count: int) -> int:
     return level if not errs else level + 1 if level + 1 < count else level - 1
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.judge.labels import Known, truth_of
 from benchmarks.judge.run import Outcome
-from wm_nodes.core.reward_statistics import auroc, recall_at, wilson_interval
+from wm_nodes.core.statistics import auroc, recall_at, wilson_interval
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING
 from wm_nodes.judge.dataset.edits import SPLITS, TC
@@ -56,13 +56,13 @@ def by_split(
 ) -> dict[str, list[LabelAgreement]]:
     """The stages, TC and overall for each split of the set that has clips."""
     shown = (PLANNING, *map(str, STAGES), TC, OVERALL)
-    found: dict[str, list[LabelAgreement]] = {}
+    splits: dict[str, list[LabelAgreement]] = {}
     for split in SPLITS:
         pairs = [(row, outcome) for row, outcome in zip(rows, outcomes) if row.split == split]
         if pairs:
             table = agreement([row for row, _ in pairs], [outcome for _, outcome in pairs], rubric)
-            found[split] = [row for row in table if row.name in shown]
-    return found
+            splits[split] = [row for row in table if row.name in shown]
+    return splits
 
 
 def _agreement(name: str, labels: Sequence[Known], outcomes: Sequence[Outcome]) -> LabelAgreement:
@@ -112,7 +112,7 @@ class PatternRow:
 def pattern_rows(rows: Sequence[ManifestRow], outcomes: Sequence[Outcome], patterns: Sequence[str]) -> list[PatternRow]:
     by_sha = {outcome.sha256: outcome for outcome in outcomes}
     good = {row.sha256 for row in rows if not row.edits and row.labels.overall}
-    found = []
+    result = []
     for name in patterns:
         read = [
             (row, flag, outcome)
@@ -141,11 +141,13 @@ def pattern_rows(rows: Sequence[ManifestRow], outcomes: Sequence[Outcome], patte
             "there, flagged": sum(hits), "there, not flagged": len(hits) - sum(hits),
             "not there, flagged": sum(false), "not there, not flagged": len(false) - sum(false),
         }
-        by_recipe = (dict(Counter(edit for there, edit in wrong if there is of).most_common()) for of in (True, False))
-        found.append(
+        by_recipe = (
+            dict(Counter(edit for is_there, edit in wrong if is_there is kind).most_common()) for kind in (True, False)
+        )
+        result.append(
             PatternRow(name, len(hits), len(false), *numbers, len(gaps), wins, _mean(gaps), confusion, *by_recipe)
         )
-    return found
+    return result
 
 
 def cost_row(outcomes: Sequence[Outcome], price: Sequence[float] = ()) -> dict[str, float]:
@@ -154,21 +156,21 @@ def cost_row(outcomes: Sequence[Outcome], price: Sequence[float] = ()) -> dict[s
     Args:
         price: USD per million prompt tokens, and per million completion tokens; of billed ones.
     """
-    found = {name: _mean([getattr(o.asked, name) for o in outcomes]) for name in outcomes[0].asked.__dataclass_fields__}
+    means = {name: _mean([getattr(o.asked, name) for o in outcomes]) for name in outcomes[0].asked.__dataclass_fields__}
     for name in ("calls", "prompt_tokens", "cached_tokens", "completion_tokens", "images", "retries"):
-        found[f"billed_{name}"] = _mean([getattr(outcome.cost, name) for outcome in outcomes])
+        means[f"billed_{name}"] = _mean([getattr(outcome.cost, name) for outcome in outcomes])
     known = [outcome.cost.usd for outcome in outcomes if outcome.cost.usd is not None]
     usd = _mean(known)
     if price:
-        usd = (price[0] * found["billed_prompt_tokens"] + price[1] * found["billed_completion_tokens"]) / 1e6
-    return {**found, "usd": usd, "wall_s": _mean([outcome.wall_s for outcome in outcomes])}
+        usd = (price[0] * means["billed_prompt_tokens"] + price[1] * means["billed_completion_tokens"]) / 1e6
+    return {**means, "usd": usd, "wall_s": _mean([outcome.wall_s for outcome in outcomes])}
 
 
 def statuses(outcomes: Sequence[Outcome]) -> dict[str, int]:
     return dict(Counter(outcome.status for outcome in outcomes))
 
 
-def missed(agreements: Sequence[LabelAgreement], targets: Mapping[str, float] = PAPER) -> list[str]:
+def missed_targets(agreements: Sequence[LabelAgreement], targets: Mapping[str, float] = PAPER) -> list[str]:
     """The rows below their figure in the paper, in words; and "overall", where its balanced accuracy is too low."""
     below = [
         f"{row.name} {100 * row.accuracy:.1f} < {targets[row.name]:.0f}"
@@ -191,19 +193,19 @@ def missed_patterns(rows: Sequence[PatternRow]) -> list[str]:
     ]
 
 
-def worst(confusions: Sequence[tuple[str, str]], count: int = 6) -> list[tuple[str, int]]:
+def most_frequent(confusions: Sequence[tuple[str, str]], count: int = 6) -> list[tuple[str, int]]:
     """Which recipe makes a row wrong most often: (row, recipe) pairs counted."""
     return [(f"{name}: {recipe}", times) for (name, recipe), times in Counter(confusions).most_common(count)]
 
 
 def mistakes(rows: Sequence[ManifestRow], outcomes: Sequence[Outcome], rubric: Rubric) -> list[tuple[str, str]]:
     """(row of the table, last recipe and severity) of every wrong decision."""
-    found = []
+    pairs = []
     for row, outcome in zip(rows, outcomes):
         truth = truth_of(row, rubric)
         wrong = (n for n, d in outcome.decisions.items() if truth.get(n) is not None and truth[n] != d.value)
-        found += list(itertools.product(wrong, [last_edit(row)]))
-    return found
+        pairs += list(itertools.product(wrong, [last_edit(row)]))
+    return pairs
 
 
 def last_edit(row: ManifestRow) -> str:

@@ -39,15 +39,15 @@ BACKBONE_METRICS = {"subject": ("subject_consistency", "i2v_subject"),
 
 def metrics_of(clip: ClipRef, image: UInt8Array | None, backbones: dict[str, FrameFeatures]) -> dict[str, float]:
     """The metrics that these backbones give, percent; those with the conditioning image only where there is one."""
-    found = {}
+    metrics = {}
     for kind, features in backbones.items():
         alone, with_image = BACKBONE_METRICS[kind]
         rows = features(torch.from_numpy(np.ascontiguousarray(clip.frames))).numpy()
-        found[alone] = 100 * pai.consistency(rows)
+        metrics[alone] = 100 * pai.consistency(rows)
         if image is not None:
             first = features(torch.from_numpy(np.ascontiguousarray(image))[None]).numpy()[0]
-            found[with_image] = 100 * pai.image_consistency(rows, first)
-    return found
+            metrics[with_image] = 100 * pai.image_consistency(rows, first)
+    return metrics
 
 
 def quality(videos: Sequence[Path], images: Path | None, backbones: dict[str, FrameFeatures]) -> dict[str, float]:
@@ -67,11 +67,11 @@ async def domain(arguments: argparse.Namespace, videos: Sequence[Path]) -> tuple
         ValueError: no question is about one of these videos, or not one was answered.
     """
     by_name = {path.stem: path for path in videos}
-    asked = [one for one in pai.load_questions(arguments.questions) if one.video_id in by_name]
+    asked = [question for question in pai.load_questions(arguments.questions) if question.video_id in by_name]
     if not asked:
         raise ValueError(f"no question of {arguments.questions} is about a video of {arguments.videos}")
     transport = ChatTransport([Endpoint(url, arguments.model, arguments.api_key_env) for url in arguments.url])
-    answers: list[pai.Answered] = []
+    answers: list[pai.AnsweredQuestion] = []
     try:
         judge, clip = ChatComparison(transport, seed=arguments.seed), None
         for question in tqdm(asked, "domain"):
@@ -109,22 +109,22 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE")
     arguments = parser.parse_args(argv)
     try:
-        found = _measured(arguments)
+        results = _measure(arguments)
     except (ValueError, OSError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    for name, value in found["scores"].items():
+    for name, value in results["scores"].items():
         print(f"{name:24} {value:7.2f}")
-    if "answered" in found:
-        print(f"questions answered: {found['answered']}, not answered and left out: {found['unanswered']}")
-    if found["missing"]:
-        print(f"no Quality and no Overall: {', '.join(found['missing'])} not given")
+    if "answered" in results:
+        print(f"questions answered: {results['answered']}, not answered and left out: {results['unanswered']}")
+    if results["missing"]:
+        print(f"no Quality and no Overall: {', '.join(results['missing'])} not given")
     if arguments.json is not None:
-        write_atomic(arguments.json, (json.dumps(found, indent=1) + "\n").encode())
+        write_atomic(arguments.json, (json.dumps(results, indent=1) + "\n").encode())
     return 0
 
 
-def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
+def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     videos = sorted(arguments.videos.glob("*.mp4"))
     if not videos:
         raise ValueError(f"{arguments.videos} holds no .mp4")
@@ -137,17 +137,17 @@ def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
     metrics = quality(videos, arguments.images, backbones)
     if arguments.metrics is not None:
         metrics |= {name: float(value) for name, value in json.loads(arguments.metrics.read_text()).items()}
-    found: dict[str, Any] = {
+    results: dict[str, Any] = {
         "videos": len(videos), "model": arguments.model, "backbones": {k: b.name for k, b in backbones.items()},
         "scores": dict(metrics), "missing": sorted(set(pai.QUALITY) - set(metrics)),
     }
     score = math.nan
     if arguments.questions:
-        score, found["answered"], found["unanswered"] = asyncio.run(domain(arguments, videos))
-        found["scores"]["domain"] = score
-    if arguments.questions and not found["missing"]:
-        found["scores"] |= pai.summary(score, metrics)
-    return found
+        score, results["answered"], results["unanswered"] = asyncio.run(domain(arguments, videos))
+        results["scores"]["domain"] = score
+    if arguments.questions and not results["missing"]:
+        results["scores"] |= pai.summary(score, metrics)
+    return results
 
 
 if __name__ == "__main__":

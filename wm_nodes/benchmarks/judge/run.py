@@ -11,13 +11,13 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from benchmarks.judge.call_counter import Asked, CountingJudge
+from benchmarks.judge.call_counter import CallCounts, CountingJudge
 from benchmarks.judge.labels import pattern_scores
 from wm_nodes.judge.agent import RewardAgent, Rubric
 from wm_nodes.judge.agent.machine import Mode
 from wm_nodes.judge.agent.types import Capabilities, Cost, Judge, Verdict
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
-from wm_nodes.judge.dataset.rows import judged_clip
+from wm_nodes.judge.dataset.rows import read_clip
 from wm_nodes.judge.decisions import Decision, decisions_of
 
 
@@ -31,7 +31,7 @@ class Outcome:
     reward: float | None
     decisions: dict[str, Decision]
     patterns: dict[str, dict[str, Any]]
-    asked: Asked
+    asked: CallCounts
     cost: Cost
     wall_s: float
 
@@ -74,7 +74,7 @@ class OutcomeFile:
             os.fsync(file.fileno())
 
 
-def outcome_of(verdict: Verdict, asked: Asked) -> Outcome:
+def outcome_of(verdict: Verdict, asked: CallCounts) -> Outcome:
     return Outcome(
         verdict.provenance.media_sha, str(verdict.status), verdict.reason, verdict.reward if verdict.valid else None,
         decisions_of(verdict), pattern_scores(verdict), asked, replace(verdict.cost, wall_s=0.0),
@@ -104,11 +104,11 @@ async def judge_rows(
     gate = asyncio.Semaphore(at_once)
     fresh: dict[str, Outcome] = {}
 
-    async def one(row: ManifestRow) -> None:
+    async def judge_row(row: ManifestRow) -> None:
         async with gate:
             known = file.kept.get(row.sha256)
             if known is None or known.status == "ERROR":
-                clip, task = judged_clip(folder, row)
+                clip, task = read_clip(folder, row)
                 metered = CountingJudge(judge)
                 agent = RewardAgent(
                     metered, trial.rubric, mode=trial.mode, seed=trial.seed, max_reads=trial.max_reads,
@@ -121,7 +121,7 @@ async def judge_rows(
 
     async with asyncio.TaskGroup() as group:
         for row in rows:
-            group.create_task(one(row))
+            group.create_task(judge_row(row))
     return [fresh[row.sha256] for row in rows]
 
 

@@ -7,7 +7,7 @@ from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.dataset.build import ClipSource
 from wm_nodes.judge.dataset.edits import Division, LabelledClip, ManifestError, NotApplicableError
-from wm_nodes.judge.dataset.edits.generator import STATE_RECIPES, edited
+from wm_nodes.judge.dataset.edits.generator import STATE_RECIPES, apply_edit
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 
 
@@ -32,17 +32,17 @@ def hacking_starts(
                     raise ManifestError(
                         f"clip {row.sha256[:12]} came out as {parent.sha256[:12]}: another renderer; build the set here"
                     )
-                start = _defective(parent, source, seed)
+                start = _make_defect(parent, source, seed)
                 if start is not None:
                     yield SearchStart(start, parent)
         finally:
             source.close()
 
 
-def _defective(parent: LabelledClip, source: ClipSource, seed: int) -> LabelledClip | None:
+def _make_defect(parent: LabelledClip, source: ClipSource, seed: int) -> LabelledClip | None:
     for index in numpy_stream(seed, f"hack_start/{parent.sha256}").permutation(len(STATE_RECIPES)):
         try:
-            return edited(parent, STATE_RECIPES[index], "fail", seed, source.redraw)
+            return apply_edit(parent, STATE_RECIPES[index], "fail", seed, source.redraw)
         except NotApplicableError:
             continue
     return None

@@ -74,11 +74,11 @@ def main(argv: Sequence[str]) -> int:
     try:
         with ProcessPoolExecutor(arguments.cores, mp_context=mp.get_context("spawn")) as pool:
             jobs = [pool.submit(read_clips, arguments.folder, arguments.clips, seed) for seed in range(arguments.cores)]
-            found = [job.result() for job in jobs]
+            seconds = [job.result() for job in jobs]
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    processor_s, wall_s = (float(np.mean(column)) for column in zip(*found))
+    processor_s, wall_s = (float(np.mean(column)) for column in zip(*seconds))
     clips_per_s, clips_per_s_now = arguments.cores / processor_s, arguments.cores / wall_s
     facts = machine_facts()
     if arguments.json:

@@ -1,8 +1,8 @@
-"""Which judges were evaluated on the test split, so that a table says when a judge was tuned on it.
+"""A log of the evaluations on the test split, so that a table says when a judge may have been tuned on it.
 
-A file beside the set has one line per first evaluation of a judge with a rubric. The evaluations behind the published
-tables come with this package, so that building the set again forgets none. The same judge with the same rubric may be
-evaluated again: nothing was changed in between.
+A file beside the set has one line for the first evaluation of each judge with a rubric. The evaluations behind the
+published tables are part of this package, so that a set that is built again has them, too. The same judge with the same
+rubric may be evaluated again, because nothing was tuned in between.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.types import Capabilities
 from wm_nodes.judge.dataset.edits import Manifest
 
-LEDGER = "test_ledger.jsonl"
+LOG_NAME = "test_ledger.jsonl"
 PUBLISHED = Path(__file__).with_name("published_evaluations.json")
 
 
@@ -46,17 +46,17 @@ def test_sha(manifest: Manifest) -> str:
 
 
 def read_evaluations(folder: Path) -> list[TestSplitEvaluation]:
-    """The published evaluations, then those that only the ledger of a set has, oldest first.
+    """The published evaluations, then those that only the log of the set has, oldest first.
 
     Raises:
-        ValueError: a line that no ledger has; it is not to be edited.
+        ValueError: a line that cannot be read; the file must not be edited.
     """
-    published = [TestSplitEvaluation(**one) for one in json.loads(PUBLISHED.read_text())]
-    return [*published, *(one for one in _beside(folder) if one not in published)]
+    published = [TestSplitEvaluation(**entry) for entry in json.loads(PUBLISHED.read_text())]
+    return [*published, *(entry for entry in _read_log(folder) if entry not in published)]
 
 
-def _beside(folder: Path) -> list[TestSplitEvaluation]:
-    path = folder / LEDGER
+def _read_log(folder: Path) -> list[TestSplitEvaluation]:
+    path = folder / LOG_NAME
     if not path.is_file():
         return []
     try:
@@ -75,16 +75,16 @@ def record_evaluation(
     """
     now = TestSplitEvaluation(judge_name(able), rubric_version, test_sha(manifest), time.strftime("%Y-%m-%d"), reason)
     known = read_evaluations(folder)
-    others = [one for one in known if one.who != now.who and one.test_sha256 == now.test_sha256]
-    if now.who in {one.who for one in known}:
+    others = [entry for entry in known if entry.who != now.who and entry.test_sha256 == now.test_sha256]
+    if now.who in {entry.who for entry in known}:
         return others
     if others and not reason:
         raise ValueError(
-            f"the test split of {folder} was already seen by {_named(others[-1])}: choose on --part validation, or say "
-            "with --again REASON why the test split is read once more; the reason is printed with the table"
+            f"the test split of {folder} was already seen by {_describe(others[-1])}: choose on --part validation, or "
+            "say with --again REASON why the test split is read once more; the reason is printed with the table"
         )
-    lines = [json.dumps(asdict(one), sort_keys=True) + "\n" for one in [*_beside(folder), now]]
-    write_atomic(folder / LEDGER, "".join(lines).encode())
+    lines = [json.dumps(asdict(entry), sort_keys=True) + "\n" for entry in [*_read_log(folder), now]]
+    write_atomic(folder / LOG_NAME, "".join(lines).encode())
     return others
 
 
@@ -93,10 +93,10 @@ def notice(others: Sequence[TestSplitEvaluation], reason: str) -> str:
     if not others:
         return ""
     return (
-        f"NOT A FIRST LOOK: the test split was seen before by {'; '.join(map(_named, others))}. "
+        f"NOT A FIRST LOOK: the test split was seen before by {'; '.join(map(_describe, others))}. "
         f"Reason given now: {reason or 'none, this judge and rubric had looked before'}"
     )
 
 
-def _named(one: TestSplitEvaluation) -> str:
-    return f"{one.judge} with rubric {one.rubric} on {one.date}" + (f" ({one.reason})" if one.reason else "")
+def _describe(entry: TestSplitEvaluation) -> str:
+    return f"{entry.judge} with rubric {entry.rubric} on {entry.date}" + (f" ({entry.reason})" if entry.reason else "")

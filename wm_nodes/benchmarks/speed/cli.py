@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.table import Table
 
 from benchmarks.speed.graph import measure_graph
 from benchmarks.speed.inputs import Effort, console, prepare_model, random_model
@@ -22,6 +21,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.files import write_atomic
 from wm_nodes.reports import machine_facts
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 
 FULL, QUICK = Effort(60, 5000, 5, 30), Effort(3, 500, 2, 8)
@@ -38,14 +38,14 @@ def main(argv: Sequence[str]) -> int:
             folder, model = Path(name), arguments.model_dir
             if untrained is not None:
                 model = random_model(config, folder / "model")
-            found = measure(config, effort, folder, model)
+            results = measure(config, effort, folder, model)
     except (ValueError, OSError, RuntimeError) as error:
         console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
         return 2
-    found |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
-    show(found)
+    results |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
+    show(results)
     if arguments.json:
-        write_atomic(arguments.json, (json.dumps(plain(found), indent=1) + "\n").encode())
+        write_atomic(arguments.json, (json.dumps(plain(results), indent=1) + "\n").encode())
         console.print(f"written {arguments.json}", highlight=False)
     return 0
 
@@ -57,52 +57,46 @@ def measure(config: RunConfig, effort: Effort, folder: Path, model_dir: Path | N
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     model, starts, description = prepare_model(config, folder, model_dir)
     console.print(f"world model: {description}; {torch.get_num_threads()} torch threads", highlight=False)
-    found: dict[str, Any] = {"model": description, "torch_threads": torch.get_num_threads()}
-    found |= measure_graph(config, effort, folder, model, starts)
-    found |= measure_simulator(config, effort, model, starts)
-    found["stages"] = measure_stages(config, effort, model, starts)
-    return {**found, "machine": machine_facts(), "date": time.strftime("%Y-%m-%d"), "platform": platform.platform()}
+    results: dict[str, Any] = {"model": description, "torch_threads": torch.get_num_threads()}
+    results |= measure_graph(config, effort, folder, model, starts)
+    results |= measure_simulator(config, effort, model, starts)
+    results["stages"] = measure_stages(config, effort, model, starts)
+    return {**results, "machine": machine_facts(), "date": time.strftime("%Y-%m-%d"), "platform": platform.platform()}
 
 
-def show(found: dict[str, Any]) -> None:
+def show(results: dict[str, Any]) -> None:
     """The tables on the screen."""
-    graph, simulator, facts = found["graph"], found["simulator"], found["machine"]
-    table = Table(title=f"{facts['processor']}, {facts['cores']} cores, {found['date']}", caption=found["model"])
-    for name in ("", "value", "goal", "measured"):
-        table.add_column(name, justify="right" if name == "value" else "left", no_wrap=not name)
-    table.add_row(
-        "graph_overhead", f"{found['graph_overhead']:.3f}", "<= 1.10",
-        f"{graph['num_envs']} x {graph['image']} step: {graph['dds_step_ms']:.1f} ms over DDS, "
-        f"{graph['in_process_step_ms']:.1f} ms in one process, {graph['threads_each']} thread each; 95 %: "
-        f"{graph['overhead_95'][0]:.2f} to {graph['overhead_95'][1]:.2f} over {graph['pairs']} pairs of episodes",
-    )
-    table.add_row(
-        "step_growth",
-        f"{found['step_growth']:.3f}",
-        "about 1",
-        f"{graph['growth_steps']} steps, first and last tenth: {graph['growth_first_ms']:.2f} and "
-        f"{graph['growth_last_ms']:.2f} ms (10 % quantiles: {graph['growth_first_p10_ms']:.2f} and "
-        f"{graph['growth_last_p10_ms']:.2f} ms)",
-    )
+    graph, simulator, facts = results["graph"], results["simulator"], results["machine"]
+    rows = [
+        (
+            "graph_overhead", f"{results['graph_overhead']:.3f}", "<= 1.10",
+            f"{graph['num_envs']} x {graph['image']} step: {graph['dds_step_ms']:.1f} ms over DDS, "
+            f"{graph['in_process_step_ms']:.1f} ms in one process, {graph['threads_each']} thread each; 95 %: "
+            f"{graph['overhead_95'][0]:.2f} to {graph['overhead_95'][1]:.2f} over {graph['pairs']} pairs of episodes",
+        ),
+        (
+            "step_growth", f"{results['step_growth']:.3f}", "about 1",
+            f"{graph['growth_steps']} steps, first and last tenth: {graph['growth_first_ms']:.2f} and "
+            f"{graph['growth_last_ms']:.2f} ms (10 % quantiles: {graph['growth_first_p10_ms']:.2f} and "
+            f"{graph['growth_last_p10_ms']:.2f} ms)",
+        ),
+    ]
     for kind, what in (("simulator", "our scene"), ("stock_simulator", "its own task")):
-        ratio, rate = found[f"imagined_over_{kind}"], simulator.get(f"{kind.removesuffix('_simulator')}_steps_per_s")
+        ratio, rate = results[f"imagined_over_{kind}"], simulator.get(f"{kind.removesuffix('_simulator')}_steps_per_s")
         processes = f"ManiSkill with rendering, {what}, {simulator['simulator_processes']} processes"
         missing = ("-", simulator["missing"] or "ManiSkill has no such task")
         value, measured = missing if ratio is None else (f"{ratio:.1f}", f"{processes}: {rate:.1f} steps/s")
-        table.add_row(f"imagined_over_{kind}", value, ">= 10", measured)
-    table.add_row(
-        "imagined_steps_per_s",
-        f"{found['imagined_steps_per_s']:.0f}",
-        ">= 250",
+        rows.append((f"imagined_over_{kind}", value, ">= 10", measured))
+    rows.append((
+        "imagined_steps_per_s", f"{results['imagined_steps_per_s']:.0f}", ">= 250",
         f"{simulator['imagined_envs']} environments with {simulator['reward']} reward",
-    )
-    console.print(table)
-    stages = Table(title=f"one batch of {IMAGINED_ENVS}")
-    for name in ("stage", "ms", "peak memory, MiB"):
-        stages.add_column(name, justify="left" if name == "stage" else "right")
-    for name, values in found["stages"].items():
-        stages.add_row(name, f"{values['ms']:.1f}", f"{values['peak_mib']:.1f}")
-    console.print(stages)
+    ))
+    title = f"{facts['processor']}, {facts['cores']} cores, {results['date']}"
+    columns = ("", "value", "goal", "measured")
+    left = ("", "goal", "measured")
+    console.print(make_table(title, columns, rows, left=left, caption=results["model"], no_wrap=("",)))
+    stages = ((name, f"{v['ms']:.1f}", f"{v['peak_mib']:.1f}") for name, v in results["stages"].items())
+    console.print(make_table(f"one batch of {IMAGINED_ENVS}", ("stage", "ms", "peak memory, MiB"), stages))
 
 
 def _parser() -> argparse.ArgumentParser:

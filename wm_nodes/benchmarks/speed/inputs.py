@@ -17,12 +17,11 @@ from safetensors.torch import save_file
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import get_task, model_tasks
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Environment, FloatArray, UInt64Array
-from wm_nodes.environments.maniskill.tasks import instruction
 from wm_nodes.policy_rl.factories import models_of
-from wm_nodes.policy_rl.pretraining import MODEL_TASKS
 from wm_nodes.world_model import load_starts, save_model_folder
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.text import TextModel, vocabulary_of
@@ -74,11 +73,12 @@ def prepare_model(config: RunConfig, folder: Path, given: Path | None) -> tuple[
 def random_model(config: RunConfig, folder: Path) -> Path:
     """A model folder of the configuration's size, untrained."""
     torch.manual_seed(stream_seed(config.seed, "benchmark_model") % 2**31)
-    size, tasks = config.simulation.image_size, MODEL_TASKS[config.task]
+    size, tasks = config.simulation.image_size, model_tasks(config.task)
     tokenizer = Tokenizer(config.tokenizer, size, size * len(config.simulation.cameras))
     sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_tasks": len(tasks)}
     action = ActionModel(config.world_model, action_dim=3, state_dim=3, **sizes)
-    text = TextModel(config.world_model, vocabulary=vocabulary_of(tuple(map(instruction, tasks))), **sizes)
+    words = vocabulary_of(tuple(get_task(task).instruction for task in tasks))
+    text = TextModel(config.world_model, vocabulary=words, **sizes)
     return save_model_folder(
         folder, tokenizer, action, text, tokenizer_config=config.tokenizer, world_model_config=config.world_model,
         simulation=config.simulation, tasks=tasks, story={"data": "none: random weights for benchmarks"},
@@ -87,25 +87,25 @@ def random_model(config: RunConfig, folder: Path) -> Path:
 
 def interleave(contenders: Sequence[Callable[[int], T]], blocks: int) -> list[list[T]]:
     """Run A B A B ...; block 0 of each warms up and is dropped."""
-    found: list[list[T]] = [[] for _ in contenders]
+    results_of: list[list[T]] = [[] for _ in contenders]
     for block in range(blocks + 1):
-        for results, contender in zip(found, contenders, strict=True):
+        for results, contender in zip(results_of, contenders, strict=True):
             results.append(contender(block))
-    return [results[1:] for results in found]
+    return [results[1:] for results in results_of]
 
 
 def time_episode(env: Environment, block: int) -> NDArray[np.float64]:
     """Seconds of each step of one episode; the reset is not counted."""
     env.reset(None, seeds_of(env.spec, block))
-    return _timed(env, actions_of(env.spec, block, env.spec.max_episode_steps))
+    return _time_actions(env, actions_of(env.spec, block, env.spec.max_episode_steps))
 
 
 def time_steps(env: Environment, steps: int) -> NDArray[np.float64]:
     env.reset(None, seeds_of(env.spec, 0))
-    return _timed(env, actions_of(env.spec, 0, steps))
+    return _time_actions(env, actions_of(env.spec, 0, steps))
 
 
-def _timed(env: Environment, actions: Iterator[FloatArray]) -> NDArray[np.float64]:
+def _time_actions(env: Environment, actions: Iterator[FloatArray]) -> NDArray[np.float64]:
     seconds = []
     for action in actions:
         start = time.perf_counter()

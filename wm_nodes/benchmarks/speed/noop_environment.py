@@ -7,7 +7,6 @@ from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
-from wm_nodes.environments.maniskill.tasks import instruction
 
 
 class NoopEnvironment:
@@ -53,4 +52,4 @@ class NoopEnvironment:
 
 def make_noop_environment(config: RunConfig, num_envs: int, seed: int) -> NoopEnvironment:
     """backend_factory of the second environment node."""
-    return NoopEnvironment(simulation_spec(config.task, instruction(config.task), config.simulation, num_envs))
+    return NoopEnvironment(simulation_spec(config.task, config.simulation, num_envs))

@@ -37,7 +37,7 @@ def measure_stages(config: RunConfig, effort: Effort, model: Path, starts: Path)
     policy = make_policy(config, model)
     pictures = itertools.pairwise(fresh_pictures(images))
 
-    def judged() -> RewardInput:
+    def next_reward_input() -> RewardInput:
         """The next step of one rollout: the picture before is known from the last step, the one after is new."""
         before, after = next(pictures)
         return RewardInput(before, after, zeros, np.ones(IMAGINED_ENVS, bool), zeros, images)
@@ -61,8 +61,8 @@ def measure_stages(config: RunConfig, effort: Effort, model: Path, starts: Path)
         "encode": lambda: tokenizer.encode(images),
         "transition": transition,
         "decode": lambda: tokenizer.decode(latents),
-        "reward, sparse": lambda: sparse_reward.evaluate(judged()),
-        "reward, dense": lambda: dense_reward.evaluate(judged()),
+        "reward, sparse": lambda: sparse_reward.evaluate(next_reward_input()),
+        "reward, dense": lambda: dense_reward.evaluate(next_reward_input()),
         "policy": lambda: policy.act(images, states),
     }
     console.print("stages", highlight=False)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from pydantic import TypeAdapter
 from rich.console import Console
 from tqdm import tqdm
 
@@ -44,7 +45,7 @@ from benchmarks.video_rl.tables import (
     training_table,
 )
 from benchmarks.video_rl.trials import Plan, SamplerTrial, ablation_trials, hacking_trials
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.files import file_sha256, write_atomic
@@ -53,7 +54,7 @@ from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_p
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_model.clips import load_clips
-from wm_nodes.video_model.flow_matching import FlowMatchingSettings, train_video_model
+from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.frame_features import (
     CentredPixels,
@@ -62,9 +63,7 @@ from wm_nodes.video_rl.frame_features import (
     TokenizerFeatures,
     load_backbone,
 )
-from wm_nodes.video_rl.grpo_settings import GrpoSettings
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.settings import load_video_config
 from wm_nodes.video_rl.toy_scene import BASE, NETWORK, load_base, training_batch
 from wm_nodes.world_model import load_model_folder
 
@@ -72,7 +71,7 @@ BASE_ITERATIONS, BASE_BATCH = 4000, 16
 EPISODES = Path("runs/clip_contexts")
 NEW_SEEDS = 250_000
 """First reset seed of contexts to train on that the shipped video model has not seen."""
-LEARNER = GrpoSettings(learning_rate=1e-4, micro_batch=64)
+LEARNER = load_video_config("base").grpo.with_values(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
 LOG_COLUMNS = 180
 """Width of tables that go to a file or a pipe."""
@@ -107,7 +106,8 @@ def _base(arguments: argparse.Namespace) -> None:
     model = VideoNetwork(NETWORK)
     train_video_model(
         model, lambda iteration: training_batch(BASE_BATCH, arguments.seed, iteration),
-        FlowMatchingSettings(arguments.iterations), seed=arguments.seed, run_dir=arguments.out,
+        load_video_config("base").model.training.with_values(num_iterations=arguments.iterations),
+        seed=arguments.seed, run_dir=arguments.out,
     )
     command = f"benchmark_dyndiff.py base --seed {arguments.seed} --iterations {arguments.iterations}"
     path = arguments.out / "video_model.safetensors"
@@ -309,7 +309,7 @@ def _write_trainings(
 
 
 def _settings(arms: list[SamplerSetup]) -> dict[str, Any]:
-    return {"arms": [asdict(arm) for arm in arms]}
+    return {"arms": TypeAdapter(list[SamplerSetup]).dump_python(arms)}
 
 
 def _base_of(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -326,7 +326,7 @@ def _cost(arguments: argparse.Namespace) -> None:
         *measure_anchors("moving disc", model, toy_buffer(model, arguments.seed), LEARNER, arguments.repeats),
         *measure_anchors("PushCube", *pushcube_buffer(arguments.seed), LEARNER, arguments.repeats),
     ]
-    of = {"seed": arguments.seed, "learner": asdict(LEARNER), **_base_of(arguments)}
+    of = {"seed": arguments.seed, "learner": LEARNER.model_dump(), **_base_of(arguments)}
     write_results(arguments, {**of, "rollouts": rollouts, "rows": rows})
     _draw(arguments, plot_cost, rows)
     console.print(rollout_table(rollouts, arguments.repeats), cost_table(rows, arguments.repeats))

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from benchmarks.video_rl.samplers import SamplerSetup
+from wm_nodes.config.video import RolloutConfig, VideoRlConfig
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
@@ -21,7 +22,6 @@ from wm_nodes.video_rl.diversity import rollout_diversity
 from wm_nodes.video_rl.frame_features import FrameFeatures
 from wm_nodes.video_rl.reference_reward import SEEN_MOTION, mixed, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest
-from wm_nodes.video_rl.settings import VideoRlConfig
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.validation.open_loop import OBJECT
 
@@ -41,7 +41,8 @@ def measure_clips(
     distance of the last frames' object positions from their mean. reward, reward_std: of config.rewards.
     """
     rollout = replace(arm.rollout, micro_batch=config.rollout.micro_batch)
-    generator = ClipGenerator(folder, contexts, replace(config, rollout=rollout))
+    sampled_so = config.with_values(rollout=RolloutConfig.model_validate(rollout, from_attributes=True))
+    generator = ClipGenerator(folder, contexts, sampled_so)
     found: dict[str, list[float]] = {}
     for index in range(len(contexts)):
         request = GroupRequest((index,), group_size, index, 0, arm.shared_noise)

@@ -1,7 +1,7 @@
 """Claim B on clips of recorded contexts: what each sampler makes of the same number of model calls.
 
-The setting is the one of docs/dyndiff.md in which the shipped video model was seen to learn: contexts it has not been
-trained on, clips of few steps, only the weights that carry the condition, no KL.
+The setting: contexts that the shipped video model was not trained on, clips of few steps, only the weights that carry
+the condition, no KL. Results: docs/results/video_rl.md.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,14 +10,14 @@ from typing import Any
 
 from benchmarks.video_rl.learning import follow_training
 from benchmarks.video_rl.samplers import SHIFT, SamplerSetup, dyndiff
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import RolloutConfig
 from wm_nodes.video_model import RolloutBuffer, RolloutSettings, SamplerSettings
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
 from wm_nodes.video_rl.reference_reward import mixed, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.settings import EvaluationSettings, GroupSettings, VideoRlConfig
 from wm_nodes.video_rl.training_run import rewarded
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -26,9 +26,11 @@ MEASURES = ("tracking_path", "tracking", "object_cm", "tool_cm", "psnr_db")
 TASK = "push_cube"
 NUM_STEPS = 4
 REWARDS = {"tracking": 1.0, "object_cm": -0.1}
-LEARNER = GrpoSettings(
-    AdvantageSettings(std_scope="global", best_of_n=4), KlSettings("none"), trains="condition", logprob_weight="cps",
-    updates_per_buffer=1, step_fraction=1.0, learning_rate=2e-4, weight_decay=0.0,
+BASE = load_video_config("base", {"task": TASK, "rewards": REWARDS})
+LEARNER = BASE.grpo.with_values(
+    advantage=BASE.grpo.advantage.with_values(std_scope="global", best_of_n=4),
+    kl=BASE.grpo.kl.with_values(mode="none"), trains="condition", logprob_weight="cps", updates_per_buffer=1,
+    step_fraction=1.0, learning_rate=2e-4, weight_decay=0.0,
 )
 
 
@@ -67,10 +69,11 @@ def train_on_clips(
     """Post-train folder.network in place; return follow_training's row, and the held-out scores of every context
     before and after.
     """
-    config = VideoRlConfig(
-        seed, TASK, rewards=REWARDS, groups=GroupSettings(plan.contexts, plan.group_size, arm.shared_noise),
-        window=arm.window, rollout=arm.rollout, grpo=arm.grpo,
-        evaluation=EvaluationSettings(plan.eval_contexts, NUM_STEPS),
+    groups = {"contexts": plan.contexts, "group_size": plan.group_size, "shared_noise": arm.shared_noise}
+    config = BASE.with_values(
+        seed=seed, groups=groups, window=arm.window, grpo=arm.grpo,
+        rollout=RolloutConfig.model_validate(arm.rollout, from_attributes=True),
+        evaluation=BASE.evaluation.with_values(contexts=plan.eval_contexts, num_steps=NUM_STEPS),
     )
     generator = ClipGenerator(folder, contexts, config)
     learner = GrpoLearner(folder.network, arm.grpo, arm.rollout, seed=seed)

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.reference_reward import score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.settings import VideoRlConfig
 from wm_nodes.world_model.position_probe import PositionProbe
 
 MODEL, CODEC, ENLARGED, COPY = "model", "codec alone", "the model's own size, enlarged", "first frame repeated"

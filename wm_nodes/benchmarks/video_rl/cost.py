@@ -15,7 +15,9 @@ import torch
 
 from benchmarks.video_rl.learning import sample_groups
 from benchmarks.video_rl.samplers import dyndiff, sampler_setup
+from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import Anchor, GrpoConfig
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model import (
     Condition,
@@ -31,8 +33,7 @@ from wm_nodes.video_model import (
 )
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.grpo_settings import Anchor, GrpoSettings
-from wm_nodes.video_rl.settings import load_video_config
+from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes
 
 ANCHORS: tuple[Anchor, ...] = ("buffer", "frozen", "dual")
@@ -44,7 +45,7 @@ CLIP_FRAMES = 9
 
 
 def measure_anchors(
-    name: str, model: VideoNetwork, sampled: tuple[RolloutBuffer, RolloutSettings], learner: GrpoSettings, repeats: int
+    name: str, model: VideoNetwork, sampled: tuple[RolloutBuffer, RolloutSettings], learner: GrpoConfig, repeats: int
 ) -> list[dict[str, Any]]:
     """One row per anchor: median seconds of each part of training on one buffer, turn by turn, and the bytes kept.
 
@@ -54,8 +55,8 @@ def measure_anchors(
     times: dict[str, dict[str, list[float]]] = {anchor: {part: [] for part in PARTS} for anchor in ANCHORS}
     for _ in range(repeats):
         for anchor in ANCHORS:
-            kl = replace(learner.kl, anchor=anchor, dual_every=1)
-            grpo = GrpoLearner(model, replace(learner, kl=kl, learning_rate=0.0), rollout, seed=0)
+            kl = learner.kl.with_values(anchor=anchor, dual_every=1)
+            grpo = GrpoLearner(model, learner.with_values(kl=kl, learning_rate=0.0), rollout, seed=0)
             updates = grpo.train(buffer).updates
             for part in PARTS:
                 times[anchor][part].append(sum(getattr(update, f"{part}_seconds") for update in updates))
@@ -173,4 +174,4 @@ def _pushcube(seed: int) -> tuple[VideoNetwork, Condition, tuple[int, ...], Roll
         draw(videos, frames - 1, settings.action_dim), draw(videos, 4, settings.text_dim),
     )
     shape = (settings.channels, frames, H, W)
-    return folder.network.eval(), condition, shape, config.rollout
+    return folder.network.eval(), condition, shape, rollout_settings(config.rollout)

@@ -2,7 +2,6 @@
 beside their JSON.
 """
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,8 @@ import numpy as np
 
 from benchmarks.video_rl.comparison import SamplerComparison, value
 from benchmarks.video_rl.learning import alarms
-from wm_nodes.core.files import write_atomic
 from wm_nodes.core.statistics import bootstrap_mean
-from wm_nodes.reports.curves import COLOURS
+from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figure, style_axes
 
 FAMILIES = {"CPS": "o", "DynDiff literal": "v", "DynDiff gated, rms": "s", "DynDiff sparse, rms": "D"}
 """Samplers that share a colour, with the marker of their points."""
@@ -31,7 +29,7 @@ SMOOTHED = 5
 
 def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> None:
     """Diversity (DD-19) with its 95 % interval against the noise an arm spends; the two regimes of initial noise."""
-    figure = figure_of(10.5, 4.2)
+    figure = make_figure(10.5, 4.2)
     for axes, shared in zip(figure.subplots(1, 2, sharey=True), (False, True), strict=True):
         whose = "shared" if shared else "own"
         style_axes(axes, f"{whose} initial noise", "noise spent, rms(std) / s", "diversity (DD-19)")
@@ -50,7 +48,7 @@ def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> Non
         ode = [np.mean(row["diversity"]) for row in rows if row["arm"] == "ODE" and row["shared_noise"] == shared]
         if ode:
             axes.axhline(ode[0], color="gray", linewidth=1, linestyle=":", label="ODE")
-        axes.legend(fontsize=8, frameon=False, loc="lower right")
+        add_legend(axes, "lower right")
     save_figure(figure, path)
 
 
@@ -59,7 +57,7 @@ def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
     over its training, by seed; and the diversity of its rollouts over the buffers, where the rows have it.
     """
     spread = [row for row in rows if "rollout_diversity" in row["buffers"]]
-    figure = figure_of(17.0 if spread else 12.0, 4.8)
+    figure = make_figure(17.0 if spread else 12.0, 4.8)
     left, right, *more = figure.subplots(1, 3 if spread else 2, width_ratios=(1.15, 1, 1)[: 3 if spread else 2])
     arms = sorted({row["arm"] for row in rows}, key=lambda arm: np.mean(_gains(rows, arm)))
     style_axes(left, f"arms with {CURVE_SEEDS} seeds or more", "buffers", "held-out reward above the base model's")
@@ -74,7 +72,7 @@ def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
         left.plot(x, mean, color=colour, linewidth=1.6, label=f"{arm} ({len(curves)})")
         left.fill_between(x, mean - error, mean + error, color=colour, alpha=0.12, linewidth=0)
     if shown:
-        left.legend(fontsize=7.5, frameon=False, loc="upper left")
+        add_legend(left, "upper left", fontsize=7.5)
     style_axes(right, "mean over a training; a dot per seed", "held-out reward above the base model's", "")
     for place, arm in enumerate(arms):
         values = _gains(rows, arm)
@@ -88,24 +86,24 @@ def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
             size = min(SMOOTHED, len(mean))
             smooth = np.convolve(mean, np.full(size, 1 / size), "valid")
             axes.plot(np.arange(size, len(mean) + 1), smooth, color=COLOURS[place % len(COLOURS)], label=arm)
-        axes.legend(fontsize=7.5, frameon=False)
+        add_legend(axes, fontsize=7.5)
     save_figure(figure, path)
 
 
 def plot_comparisons(comparisons: Sequence[SamplerComparison], path: Path) -> None:
     """Each pair's difference with its 95 % interval, a panel per measure."""
     measures = tuple(comparisons[0].differences)
-    figure = figure_of(3.0 * len(measures), 1.4 + 0.45 * len(comparisons))
+    figure = make_figure(3.0 * len(measures), 1.4 + 0.45 * len(comparisons))
     places = range(len(comparisons))
     for axes, measure in zip(figure.subplots(1, len(measures), sharey=True), measures, strict=True):
         style_axes(axes, SAID.get(measure, measure), "difference, 95 % t interval", "")
         axes.locator_params(axis="x", nbins=4)
         axes.axvline(0, color="gray", linewidth=1)
         for place, row in zip(places, comparisons, strict=True):
-            found = row.differences[measure]
-            colour = COLOURS[1] if found.separable else COLOURS[0]
-            axes.plot((found.low, found.high), (place, place), color=colour, linewidth=1.6)
-            axes.plot(found.mean, place, "o", color=colour, markersize=5)
+            difference = row.differences[measure]
+            colour = COLOURS[1] if difference.separable else COLOURS[0]
+            axes.plot((difference.low, difference.high), (place, place), color=colour, linewidth=1.6)
+            axes.plot(difference.mean, place, "o", color=colour, markersize=5)
         labels = [f"{row.arm}\n- {row.base} ({len(row.seeds)} seeds)" for row in comparisons]
         axes.set_yticks(places, labels, fontsize=8)
     axes.invert_yaxis()
@@ -115,7 +113,7 @@ def plot_comparisons(comparisons: Sequence[SamplerComparison], path: Path) -> No
 def plot_cost(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Seconds of forward, KL and backward on one buffer, stacked, and the bytes kept, per model and anchor."""
     models = list(dict.fromkeys(row["model"] for row in rows))
-    figure = figure_of(5.2 * len(models), 3.6)
+    figure = make_figure(5.2 * len(models), 3.6)
     for axes, model in zip(np.atleast_1d(figure.subplots(1, len(models))), models, strict=True):
         style_axes(axes, f"{model}: training on one buffer", "KL anchor, MiB kept beside the weights", "seconds")
         mine = [row for row in rows if row["model"] == model]
@@ -126,13 +124,13 @@ def plot_cost(rows: Sequence[dict[str, Any]], path: Path) -> None:
             bottom += seconds
         axes.set_xticks(range(len(mine)), [f"{row['anchor']}\n{row['bytes'] / 2**20:.2f} MiB" for row in mine])
         axes.set_ylim(top=1.2 * bottom.max())
-        axes.legend(fontsize=8, frameon=False, loc="upper center", ncols=3)
+        add_legend(axes, "upper center", ncols=3)
     save_figure(figure, path)
 
 
 def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """The reward that trains beside the truths held out of it, a panel per trial; mean over seeds, thin lines each."""
-    figure = figure_of(12.0, 4.0)
+    figure = make_figure(12.0, 4.0)
     arms = list(dict.fromkeys(row["arm"] for row in rows))
     truths = {"obeyed": COLOURS[0], "mass": COLOURS[1]}
     for axes, arm in zip(np.atleast_1d(figure.subplots(1, len(arms), sharey=True)), arms, strict=True):
@@ -147,7 +145,7 @@ def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
             label = f"{name} (trains)" if name == proxy else name
             axes.plot(x, mean, color=colour, linewidth=2, linestyle="-" if name == proxy else "--", label=label)
         axes.set_ylim(bottom=0)
-        axes.legend(fontsize=8, frameon=False, loc="lower left")
+        add_legend(axes, "lower left")
     save_figure(figure, path)
 
 
@@ -161,27 +159,3 @@ def family_of(arm: str) -> str:
 def _gains(rows: Sequence[dict[str, Any]], arm: str) -> list[float]:
     """Mean reward over each training of the arm, less that of its start."""
     return [value(row, "reward_path") - row["evaluations"][0]["reward"] for row in rows if row["arm"] == arm]
-
-
-def figure_of(width: float, height: float) -> Any:
-    """An empty figure, inches."""
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), dpi=80, layout="constrained", facecolor="white")
-
-
-def style_axes(axes: Any, title: str, x: str, y: str) -> None:
-    """Title, labels, a light grid."""
-    axes.set_title(title, fontsize=10, loc="left")
-    axes.set_xlabel(x, fontsize=8)
-    axes.set_ylabel(y, fontsize=8)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8)
-
-
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a PNG, whole or not at all."""
-    png = io.BytesIO()
-    figure.savefig(png, format="png")
-    write_atomic(path, png.getvalue())

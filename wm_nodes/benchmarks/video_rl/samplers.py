@@ -1,11 +1,13 @@
 """The competing samplers of the DynDiff benchmark, by name; everything else of a run is shared by all arms."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
-from wm_nodes.video_model import MaskSettings, RolloutSettings, SamplerSettings, WindowSettings
-from wm_nodes.video_rl.grpo_settings import GrpoSettings, KlSettings
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import GrpoConfig, WindowConfig
+from wm_nodes.video_model import MaskSettings, RolloutSettings, SamplerSettings
 
 NUM_STEPS, SHIFT = 10, 3.0
+_BASE = load_video_config("base")
 
 
 @dataclass(frozen=True)
@@ -16,14 +18,14 @@ class SamplerSetup:
 
     name: str
     rollout: RolloutSettings
-    grpo: GrpoSettings
+    grpo: GrpoConfig
     shared_noise: bool = False
-    window: WindowSettings = field(default_factory=WindowSettings)
+    window: WindowConfig = _BASE.window
 
 
-def sampler_setup(name: str, sampler: SamplerSettings, grpo: GrpoSettings | None = None) -> SamplerSetup:
+def sampler_setup(name: str, sampler: SamplerSettings, grpo: GrpoConfig | None = None) -> SamplerSetup:
     return SamplerSetup(
-        name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or GrpoSettings()
+        name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or _BASE.grpo
     )
 
 
@@ -45,12 +47,13 @@ def diversity_samplers() -> list[SamplerSetup]:
     return arms
 
 
-def learning_samplers(learner: GrpoSettings) -> list[SamplerSetup]:
+def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
     """Claim B: every arm on one learner; `learner` holds what they share.
 
     Mix-GRPO and the arms "window" train all four steps of a window that moves, as many as the others do of their nine.
     """
-    cps, frozen = replace(learner, logprob_weight="cps"), KlSettings(beta=learner.kl.beta, anchor="frozen")
+    cps = learner.with_values(logprob_weight="cps")
+    frozen = _BASE.grpo.kl.with_values(beta=learner.kl.beta, anchor="frozen")
     plain = sampler_setup("CPS 0.6", SamplerSettings("cps", 0.6), cps)
     matched = sampler_setup("DynDiff 0.4 sparse, rms, cps", dyndiff(0.4, "sparse", "rms"), cps)
     sparse = sampler_setup("DynDiff 0.6 sparse, cps", dyndiff(0.6, "sparse"), cps)
@@ -75,12 +78,12 @@ def learning_samplers(learner: GrpoSettings) -> list[SamplerSetup]:
         matched,
         sparse,
         gated,
-        *(replace(arm, name=f"{arm.name}, frozen", grpo=replace(arm.grpo, kl=frozen)) for arm in (plain, matched)),
+        *(replace(arm, name=f"{arm.name}, frozen", grpo=arm.grpo.with_values(kl=frozen)) for arm in (plain, matched)),
         *(replace(arm, name=f"{arm.name}, shared", shared_noise=True) for arm in shared),
         *(replace(_in_window(arm), name=f"{arm.name}, window") for arm in (plain, gated)),
     ]
 
 
 def _in_window(arm: SamplerSetup) -> SamplerSetup:
-    grpo = replace(arm.grpo, step_fraction=1.0)
-    return replace(arm, grpo=grpo, window=WindowSettings("progressive", size=4, period=7), shared_noise=True)
+    window = WindowConfig(strategy="progressive", size=4, period=7)
+    return replace(arm, grpo=arm.grpo.with_values(step_fraction=1.0), window=window, shared_noise=True)

@@ -9,6 +9,7 @@ from rich.table import Table
 from benchmarks.video_rl.comparison import Difference, SamplerComparison
 from benchmarks.video_rl.learning import alarms
 from wm_nodes.core.statistics import bootstrap_mean
+from wm_nodes.reports.console_table import estimate, make_table
 
 COURSE = ("noise_share", "rollout_diversity")
 SCORES = ("tracking", "object_cm", "tool_cm", "psnr_db")
@@ -16,46 +17,143 @@ LAST_UPDATE = ("clip_low_share_2", "clip_high_share_2", "kl_2")
 
 
 def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
-    table = _table(
-        "diversity (DD-19) and quality, mean over contexts with 95 % bootstrap interval",
-        ("arm", "initial noise"), ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"),
-    )
-    for row in rows:
-        mean, low, high = bootstrap_mean(row["diversity"], seed=seed)
-        shown = ("diversity_dynamic", "reward_std", "reward", "background", "mass")
-        values = [sum(row[name]) / len(row[name]) for name in shown]
-        table.add_row(
+    shown = ("diversity_dynamic", "reward_std", "reward", "background", "mass")
+    cells = (
+        (
             row["arm"], _regime(row), f"{row['noise_share']:.3f}",
-            f"{mean:.3f} ({low:.3f} to {high:.3f})", *(f"{value:.4f}" for value in values),
+            estimate(bootstrap_mean(row["diversity"], seed=seed), ".3f"), *(f"{_average(row, n):.4f}" for n in shown),
         )
-    return table
+        for row in rows
+    )
+    return _table(
+        "diversity (DD-19) and quality, mean over contexts with 95 % bootstrap interval", ("arm", "initial noise"),
+        ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"), cells,
+    )
 
 
 def clip_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
-    table = _table(
+    shown = ("diversity_dynamic", "object_spread_cm", "reward_std", "tracking", "scenery")
+    cells = (
+        (
+            row["arm"], _regime(row), f"{_average(row, 'noise_share'):.3f}",
+            estimate(bootstrap_mean(row["diversity"], seed=seed), ".4f"), *(f"{_average(row, n):.4f}" for n in shown),
+        )
+        for row in rows
+    )
+    return _table(
         f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("arm", "initial noise"),
         ("noise rms/s", "diversity (DD-19)", "moving part", "object spread, cm", "reward std", "tracking", "scenery"),
+        cells,
     )
-    for row in rows:
-        mean, low, high = bootstrap_mean(row["diversity"], seed=seed)
-        shown = ("diversity_dynamic", "object_spread_cm", "reward_std", "tracking", "scenery")
-        table.add_row(
-            row["arm"], _regime(row), f"{_average(row, 'noise_share'):.3f}", f"{mean:.4f} ({low:.4f} to {high:.4f})",
-            *(f"{_average(row, name):.4f}" for name in shown),
-        )
-    return table
 
 
 def clip_comparison_table(comparisons: Sequence[dict[str, Any]]) -> Table:
-    table = _table(
-        "DynDiff - CPS, paired over contexts, 95 % bootstrap interval", ("arm", "base", "initial noise"),
-        ("noise", "diversity (DD-19)", "moving part", "object spread, cm", "tracking"),
+    shown = ("diversity", "diversity_dynamic", "object_spread_cm", "tracking")
+    cells = (
+        (
+            row["arm"], row["base"], _regime(row), "{:.2f}, {:.2f}".format(*row["noise_share"]),
+            *(estimate(row[name]) for name in shown),
+        )
+        for row in comparisons
     )
-    for row in comparisons:
-        shown = ("diversity", "diversity_dynamic", "object_spread_cm", "tracking")
-        intervals = ("{:+.4f} ({:+.4f} to {:+.4f})".format(*row[name]) for name in shown)
-        table.add_row(row["arm"], row["base"], _regime(row), "{:.2f}, {:.2f}".format(*row["noise_share"]), *intervals)
-    return table
+    return _table(
+        "DynDiff - CPS, paired over contexts, 95 % bootstrap interval", ("arm", "base", "initial noise"),
+        ("noise", "diversity (DD-19)", "moving part", "object spread, cm", "tracking"), cells,
+    )
+
+
+def training_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """One line per arm, means over its seeds.
+
+    Held-out scenes before and after; noise and diversity of the arm's rollouts, means over the buffers; the last
+    buffer's second update.
+    """
+    cells = []
+    for arm in dict.fromkeys(row["arm"] for row in rows):
+        mine = [row for row in rows if row["arm"] == arm]
+        first, last = ([row["evaluations"][i] for row in mine] for i in (0, -1))
+        low, high, kl = (np.mean([row["buffers"][name][-1] for row in mine]) for name in LAST_UPDATE)
+        cells.append((
+            arm, len(mine), *(f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed")),
+            f"{_mean(last, 'background'):.4f}", f"{_mean(last, 'mass'):.3f}",
+            *(_over_buffers(mine, name) for name in COURSE), f"{low:.2f}/{high:.2f}", f"{kl:.1e}",
+            f"{np.mean([sum(row['seconds'].values()) for row in mine]):.0f}",
+        ))
+    return _table(
+        "held-out scenes, ODE, before and after; mean over seeds", ("arm",),
+        ("seeds", "reward", "obeyed", "bg", "mass", "noise", "diversity", "clip low/high @2", "KL @2", "seconds"),
+        cells,
+    )
+
+
+def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """One line per training: held-out contexts after - before, paired over them."""
+    cells = []
+    for row in rows:
+        changes = (np.subtract(row["after"][name], row["before"][name]) for name in SCORES)
+        cells.append((
+            row["arm"], row["seed"], _over_buffers([row], "noise_share"), f"{_average(row['before'], 'tracking'):.3f}",
+            *(estimate(bootstrap_mean(change, seed=row["seed"]), "+.3f") for change in changes),
+            f"{sum(row['seconds'].values()):.0f}",
+        ))
+    return _table(
+        "held-out contexts by ODE, after - before, 95 % bootstrap interval over the contexts", ("arm",),
+        ("seed", "noise rms/s", "tracking before", *SCORES, "seconds"), cells,
+    )
+
+
+def comparison_table(comparisons: Sequence[SamplerComparison]) -> Table:
+    measures = tuple(comparisons[0].differences) if comparisons else ()
+    cells = (
+        (row.arm, row.base, len(row.seeds), *(_difference_text(row.differences[name]) for name in measures))
+        for row in comparisons
+    )
+    return _table(
+        "arm - base on the same seeds: mean, 95 % t interval, * if beside 0; _path: mean over a training",
+        ("arm", "base"), ("seeds", *measures), cells,
+    )
+
+
+def resolution_table(rows: Sequence[dict[str, Any]]) -> Table:
+    cells = ((row["side_px"], row["shown"], *(f"{_average(row, name):.3f}" for name in SCORES)) for row in rows)
+    return _table("clips at other picture sizes, means over contexts", ("side, px", "shown"), SCORES, cells)
+
+
+def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Per training: the reward that trained it and the truths, before and after, and what the detector (DD-2) names."""
+    cells = []
+    for row in rows:
+        first, last, proxy = row["evaluations"][0], row["evaluations"][-1], row["plan"]["proxy"]
+        shown = (f"{first[name]:.4g} -> {last[name]:.4g}" for name in (proxy, "obeyed", "mass", "background"))
+        cells.append((row["arm"], row["seed"], *shown, ", ".join(alarms(row)) or "no alarm"))
+    return _table(
+        "reward hacking (DD-2), held-out scenes", ("trained on",),
+        ("seed", "that reward", "obeyed", "mass", "background", "falls while it rises"), cells,
+    )
+
+
+def cost_table(rows: Sequence[dict[str, Any]], repeats: int) -> Table:
+    parts = ("forward_s", "kl_s", "backward_s")
+    cells = (
+        (row["model"], row["anchor"], *(f"{row[name]:.3f}" for name in parts), f"{row['bytes'] / 2**20:.2f}")
+        for row in rows
+    )
+    numbers = ("forward, s", "KL, s", "backward, s", "kept beside the weights, MiB")
+    return _table(f"KL anchors, median of {repeats} turns on one buffer", ("model", "anchor"), numbers, cells)
+
+
+def rollout_table(rows: Sequence[dict[str, Any]], repeats: int) -> Table:
+    cells = []
+    for row in rows:
+        shares = row["mask_share"], row["cache_share"], row["mask_share"] + row["cache_share"]
+        seconds = (f"{row[name]:.3f}" for name in ("cps_s", "rollout_s", "over_cps"))
+        cells.append((row["model"], *seconds, *(f"{share:.2%}" for share in shares)))
+    title = f"What a rollout of 32 videos spends on mask and caching, median of {repeats}"
+    return _table(title, ("model",), ("by CPS, s", "by DynDiff, s", "ratio", "mask", "caching", "both"), cells)
+
+
+def _table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Any) -> Table:
+    return make_table(title, (*words, *numbers), rows, left=words)
 
 
 def _regime(row: dict[str, Any]) -> str:
@@ -66,115 +164,16 @@ def _average(row: dict[str, Any], name: str) -> float:
     return float(sum(row[name]) / len(row[name]))
 
 
-def training_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per arm, means over its seeds: held-out scenes before and after; noise and diversity of its rollouts,
-    means over the buffers; the last buffer's second update.
-    """
-    table = _table(
-        "held-out scenes, ODE, before and after; mean over seeds", ("arm",),
-        ("seeds", "reward", "obeyed", "bg", "mass", "noise", "diversity", "clip low/high @2", "KL @2", "seconds"),
-    )
-    for arm in dict.fromkeys(row["arm"] for row in rows):
-        mine = [row for row in rows if row["arm"] == arm]
-        first, last = ([row["evaluations"][i] for row in mine] for i in (0, -1))
-        update = {name: np.mean([row["buffers"][name][-1] for row in mine]) for name in LAST_UPDATE}
-        course = (f"{_mean(first, name):.3f} -> {_mean(last, name):.3f}" for name in ("reward", "obeyed"))
-        table.add_row(
-            arm, str(len(mine)), *course,
-            f"{_mean(last, 'background'):.4f}", f"{_mean(last, 'mass'):.3f}",
-            *(_over_buffers(mine, name) for name in COURSE),
-            f"{update['clip_low_share_2']:.2f}/{update['clip_high_share_2']:.2f}", f"{update['kl_2']:.1e}",
-            f"{np.mean([sum(row['seconds'].values()) for row in mine]):.0f}",
-        )
-    return table
-
-
-def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per training: held-out contexts after - before, paired over them."""
-    table = _table(
-        "held-out contexts by ODE, after - before, 95 % bootstrap interval over the contexts", ("arm",),
-        ("seed", "noise rms/s", "tracking before", *SCORES, "seconds"),
-    )
-    for row in rows:
-        changes = (np.subtract(row["after"][name], row["before"][name]) for name in SCORES)
-        intervals = ("{:+.3f} ({:+.3f} to {:+.3f})".format(*bootstrap_mean(one, seed=row["seed"])) for one in changes)
-        table.add_row(
-            row["arm"], str(row["seed"]), _over_buffers([row], "noise_share"),
-            f"{_average(row['before'], 'tracking'):.3f}", *intervals, f"{sum(row['seconds'].values()):.0f}",
-        )
-    return table
-
-
-def _over_buffers(rows: Sequence[dict[str, Any]], name: str) -> str:
-    """Mean over seeds and buffers; nothing where a file of an earlier version lacks it."""
-    found = [np.mean(row["buffers"][name]) for row in rows if name in row["buffers"]]
-    return f"{np.mean(found):.3f}" if len(found) == len(rows) else ""
-
-
-def comparison_table(comparisons: Sequence[SamplerComparison]) -> Table:
-    measures = tuple(comparisons[0].differences) if comparisons else ()
-    table = _table(
-        "arm - base on the same seeds: mean, 95 % t interval, * if beside 0; _path: mean over a training",
-        ("arm", "base"), ("seeds", *measures),
-    )
-    for row in comparisons:
-        table.add_row(row.arm, row.base, str(len(row.seeds)), *(_shown(row.differences[name]) for name in measures))
-    return table
-
-
-def _shown(difference: Difference) -> str:
-    star = "*" if difference.separable else ""
-    return f"{difference.mean:+.4f} ({difference.low:+.4f}, {difference.high:+.4f}){star}"
-
-
-def resolution_table(rows: Sequence[dict[str, Any]]) -> Table:
-    measures = ("tracking", "object_cm", "tool_cm", "psnr_db")
-    table = _table("clips at other picture sizes, means over contexts", ("side, px", "shown"), measures)
-    for row in rows:
-        table.add_row(str(row["side_px"]), row["shown"], *(f"{_average(row, name):.3f}" for name in measures))
-    return table
-
-
-def hacking_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Per training: the reward that trained it and the truths, before and after, and what the detector (DD-2) names."""
-    table = _table(
-        "reward hacking (DD-2), held-out scenes", ("trained on",),
-        ("seed", "that reward", "obeyed", "mass", "background", "falls while it rises"),
-    )
-    for row in rows:
-        first, last, proxy = row["evaluations"][0], row["evaluations"][-1], row["plan"]["proxy"]
-        shown = (f"{first[name]:.4g} -> {last[name]:.4g}" for name in (proxy, "obeyed", "mass", "background"))
-        table.add_row(row["arm"], str(row["seed"]), *shown, ", ".join(alarms(row)) or "no alarm")
-    return table
-
-
-def cost_table(rows: Sequence[dict[str, Any]], repeats: int) -> Table:
-    numbers = ("forward, s", "KL, s", "backward, s", "kept beside the weights, MiB")
-    table = _table(f"KL anchors, median of {repeats} turns on one buffer", ("model", "anchor"), numbers)
-    for row in rows:
-        seconds = (f"{row[name]:.3f}" for name in ("forward_s", "kl_s", "backward_s"))
-        table.add_row(row["model"], row["anchor"], *seconds, f"{row['bytes'] / 2**20:.2f}")
-    return table
-
-
-def rollout_table(rows: Sequence[dict[str, Any]], repeats: int) -> Table:
-    numbers = ("by CPS, s", "by DynDiff, s", "ratio", "mask", "caching", "both")
-    table = _table(f"What a rollout of 32 videos spends on mask and caching, median of {repeats}", ("model",), numbers)
-    for row in rows:
-        shares = row["mask_share"], row["cache_share"], row["mask_share"] + row["cache_share"]
-        seconds = f"{row['cps_s']:.3f}", f"{row['rollout_s']:.3f}", f"{row['over_cps']:.3f}"
-        table.add_row(row["model"], *seconds, *(f"{share:.2%}" for share in shares))
-    return table
-
-
 def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:
     return float(np.mean([row[name] for row in rows]))
 
 
-def _table(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
-    table = Table(title=title)
-    for name in words:
-        table.add_column(name)
-    for name in numbers:
-        table.add_column(name, justify="right")
-    return table
+def _over_buffers(rows: Sequence[dict[str, Any]], name: str) -> str:
+    """Mean over seeds and buffers; nothing where a file of an earlier version lacks it."""
+    means = [np.mean(row["buffers"][name]) for row in rows if name in row["buffers"]]
+    return f"{np.mean(means):.3f}" if len(means) == len(rows) else ""
+
+
+def _difference_text(difference: Difference) -> str:
+    star = "*" if difference.separable else ""
+    return f"{difference.mean:+.4f} ({difference.low:+.4f}, {difference.high:+.4f}){star}"

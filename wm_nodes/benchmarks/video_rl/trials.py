@@ -9,8 +9,9 @@ from typing import Generic, TypeVar
 from benchmarks.video_rl.clip_learning import ClipPlan
 from benchmarks.video_rl.learning import LearningPlan
 from benchmarks.video_rl.samplers import SamplerSetup, dyndiff, sampler_setup
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import GrpoConfig
 from wm_nodes.video_model import SamplerSettings
-from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings, KlSettings
 
 GUIDANCE = 2.0
 HIGH_SIDE = 20
@@ -32,21 +33,23 @@ class SamplerTrial(Generic[Plan]):
 
 
 def ablation_trials(
-    learner: GrpoSettings, plan: LearningPlan
+    learner: GrpoConfig, plan: LearningPlan
 ) -> tuple[list[SamplerTrial[LearningPlan]], list[tuple[str, str]]]:
     """Return the trainings, and which is compared with which: (name, name of its base)."""
-    cps = replace(learner, logprob_weight="cps", learning_rate=SHORT_RATE)
+    cps = learner.with_values(logprob_weight="cps", learning_rate=SHORT_RATE)
     base = replace(sampler_setup("base", dyndiff(0.6, "gated", "rms"), cps), shared_noise=True)
     groups = replace(plan, scenes=max(1, plan.scenes * plan.group_size // PAPER_GROUP), group_size=PAPER_GROUP)
     half = replace(plan, iterations=max(1, plan.iterations // 2), eval_every=max(1, plan.eval_every // 2))
     high = replace(plan, eval_side=HIGH_SIDE)
-    guided = replace(base.rollout, cfg=GUIDANCE)
+    guided, plain = replace(base.rollout, cfg=GUIDANCE), load_video_config("base").grpo
+    wide = plain.advantage.with_values(clip=5.0)
+    other_kl = plain.kl.with_values(mode="logk2", beta=learner.kl.beta)
     trials = [
         SamplerTrial(base, plan),
-        SamplerTrial(_learning(base, "KL of log-probabilities", kl=KlSettings("logk2", learner.kl.beta)), plan),
-        SamplerTrial(_learning(base, "no KL", kl=KlSettings("none")), plan),
+        SamplerTrial(_learning(base, "KL of log-probabilities", kl=other_kl), plan),
+        SamplerTrial(_learning(base, "no KL", kl=plain.kl.with_values(mode="none")), plan),
         SamplerTrial(_learning(base, "clip 2.5, groups of 16"), groups),
-        SamplerTrial(_learning(base, "clip 5, groups of 16", advantage=AdvantageSettings(clip=5.0)), groups),
+        SamplerTrial(_learning(base, "clip 5, groups of 16", advantage=wide), groups),
         SamplerTrial(replace(_learning(base, "guidance 2", cfg=GUIDANCE), rollout=guided), half),  # two calls per step
         SamplerTrial(replace(base, name="trained at 16, shown at 20"), high),
         SamplerTrial(replace(base, name="trained and shown at 20"), replace(high, side=HIGH_SIDE)),
@@ -58,13 +61,13 @@ def ablation_trials(
     return trials, pairs
 
 
-def hacking_trials(learner: GrpoSettings, plan: LearningPlan) -> list[SamplerTrial[LearningPlan]]:
+def hacking_trials(learner: GrpoConfig, plan: LearningPlan) -> list[SamplerTrial[LearningPlan]]:
     """The honest reward; temporal consistency alone, which a picture that stands still, or has no disc, satisfies best;
     the same with a frozen anchor, which holds it back.
     """
-    cps = replace(learner, logprob_weight="cps", learning_rate=SHORT_RATE)
+    cps = learner.with_values(logprob_weight="cps", learning_rate=SHORT_RATE)
     arm = replace(sampler_setup("honest reward", SamplerSettings("cps", 0.6), cps), shared_noise=True)
-    hackable, frozen = replace(plan, proxy="consistency"), replace(learner.kl, anchor="frozen")
+    hackable, frozen = replace(plan, proxy="consistency"), learner.kl.with_values(anchor="frozen")
     return [
         SamplerTrial(arm, plan),
         SamplerTrial(_learning(arm, "consistency alone"), hackable),
@@ -73,4 +76,4 @@ def hacking_trials(learner: GrpoSettings, plan: LearningPlan) -> list[SamplerTri
 
 
 def _learning(arm: SamplerSetup, name: str, **changes: object) -> SamplerSetup:
-    return replace(arm, name=name, grpo=replace(arm.grpo, **changes))  # type: ignore[arg-type]
+    return replace(arm, name=name, grpo=arm.grpo.with_values(**changes))

@@ -3,7 +3,6 @@
 import argparse
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,16 @@ import cv2
 import numpy as np
 import torch
 from rich.console import Console
-from rich.table import Table
 from torch import nn
 
-from wm_nodes.config.load import parse_override
+from wm_nodes.config.load import VIDEO, load_video_config, parse_override, preset_names
+from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.video_model import Condition
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.checks import examine
-from wm_nodes.video_rl.settings import VideoRlConfig, load_video_config, video_preset_names
+from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
 
 VIDEOS = 4
@@ -34,17 +34,21 @@ def main(argv: Sequence[str]) -> int:
         config = load_video_config(arguments.preset, dict(parse_override(text) for text in arguments.set))
         model, condition, shape, config = _patient(arguments, config)
         videos = config.groups.contexts * config.groups.group_size
-        findings = examine(model, condition, shape, config.rollout, config.grpo, seed=config.seed, buffer_videos=videos)
+        findings = examine(
+            model, condition, shape, rollout_settings(config.rollout), config.grpo, seed=config.seed,
+            buffer_videos=videos,
+        )
     except (ValueError, OSError, ImportError, FloatingPointError) as error:
         console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
         return 2
-    table = Table(title=f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)")
-    for name in ("check", "", "found", "where it failed"):
-        table.add_column(name)
-    for finding in findings:
-        verdict = "[green]passed" if finding.passed else "[red]FAILED"
-        table.add_row(finding.name, verdict, finding.value, "" if finding.passed else finding.remedy)
-    console.print(table)
+    title = f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)"
+    columns = ("check", "", "found", "where it failed")
+    rows = (
+        (finding.name, *(("[green]passed", finding.value, "") if finding.passed
+                         else ("[red]FAILED", finding.value, finding.remedy)))
+        for finding in findings
+    )
+    console.print(make_table(title, columns, rows, left=columns))
     return int(not all(finding.passed for finding in findings))
 
 
@@ -86,8 +90,8 @@ def _public(
     model: Any = public.velocity
     if arguments.lora_rank:
         add_lora(model, arguments.lora_rank, 2 * arguments.lora_rank)
-    return model, condition.to(arguments.device), (C, F, H, W), replace(
-        config, rollout=replace(config.rollout, shift=public.shift)
+    return model, condition.to(arguments.device), (C, F, H, W), config.with_values(
+        rollout=config.rollout.with_values(shift=public.shift)
     )
 
 
@@ -126,6 +130,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--offload", action="store_true", help="VAE and text encoder rest on the CPU")
     parser.add_argument("--lora-rank", type=int, default=0, help="check with a LoRA adapter of this rank")
-    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(video_preset_names())}, or a .yaml")
+    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(preset_names(VIDEO))}, or a .yaml")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
     return parser

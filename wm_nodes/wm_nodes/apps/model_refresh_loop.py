@@ -40,6 +40,7 @@ from wm_nodes.policy_rl.model_refresh import (
     refresh_model,
 )
 from wm_nodes.policy_rl.pretraining import load_arrays
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 from wm_nodes.training.metrics import join_metrics
 from wm_nodes.world_model import load_model_folder
@@ -86,7 +87,7 @@ def split_updates(updates: int, rounds: int) -> list[int]:
 
 def round_start(job: RunContext, number: int, model_dir: Path, policy: Path) -> TrainingStart:
     """What round `number`, counted from 1, begins with."""
-    shares = split_updates(job.config.ppo.updates, job.config.rounds.num_rounds)
+    shares = split_updates(job.config.ppo.updates, job.config.model_refresh.num_rounds)
     start = TrainingStart(_folder(job, number), model_dir, policy, job.config)
     if len(shares) == 1:
         return start
@@ -96,12 +97,12 @@ def round_start(job: RunContext, number: int, model_dir: Path, policy: Path) -> 
 def run_rounds(
     job: RunContext, model_dir: Path, policy: Path, judge: Judge, waiting: WaitingGraph | None = None
 ) -> ModelRefreshLoop:
-    """Train `policy` for config.rounds.num_rounds rounds, beginning in the world model `model_dir`; judge it first.
+    """Train `policy` in rounds, beginning in the world model `model_dir`; judge it first.
 
     waiting: the processes of round 1, where they run already.
     """
     config = job.config
-    shares = split_updates(config.ppo.updates, config.rounds.num_rounds)
+    shares = split_updates(config.ppo.updates, config.model_refresh.num_rounds)
     if len(shares) > 1:
         check_refreshable(model_dir)
     starts, trainings, table = list[TrainingStart](), list[TrainingResult](), list[dict[str, Any]]()
@@ -131,7 +132,7 @@ def run_rounds(
 
 
 def _folder(job: RunContext, number: int) -> Path:
-    return job.run_dir if job.config.rounds.num_rounds == 1 else job.run_dir / "rounds" / str(number)
+    return job.run_dir if job.config.model_refresh.num_rounds == 1 else job.run_dir / "rounds" / str(number)
 
 
 def round_config(config: RunConfig, number: int, updates: int) -> RunConfig:
@@ -171,15 +172,15 @@ def _finish(
 
 def _refresh(job: RunContext, start: TrainingStart, policy: Path, number: int) -> RefreshDecision:
     """Collect with the policy, go on training the model on all rounds' episodes and the replay, and compare."""
-    config = job.config
+    config, settings = job.config, job.config.model_refresh
     job.stage(
-        f"collecting {config.rounds.episodes_per_round} + {config.rounds.heldout_episodes} (held out) episodes of the "
-        "policy in the simulator"
+        f"collecting {settings.episodes_per_round} + {settings.heldout_episodes} (held out) episodes of the policy in "
+        "the simulator"
     )
     bags, heldout = collect_round(config, start.model_dir, policy, start.folder / "bags", number)
     replay, scripted = collect_replay(config, job.run_dir)
     earlier = [bag for k in range(1, number) for bag in sorted((_folder(job, k) / "bags" / "train").glob("shard_*"))]
-    job.stage(f"refreshing the world model: {config.rounds.refresh_iterations} iterations")
+    job.stage(f"refreshing the world model: {settings.refresh_iterations} iterations")
     folder = refresh_model(config, start.model_dir, [*replay, *earlier, *bags], start.folder / "model", number=number)
     verdict = compare_models(
         load_model_folder(start.model_dir), load_model_folder(folder),
@@ -192,10 +193,10 @@ def _refresh(job: RunContext, start: TrainingStart, policy: Path, number: int) -
 
 
 def _verdict_table(verdict: RefreshDecision, number: int) -> Table:
-    table = Table(title=f"round {number}: the old and the refreshed model on held-out real episodes")
-    for name in ("episodes of", "number", "old", "new", ""):
-        table.add_column(name, justify="right" if name in ("old", "new") else "left")
+    rows = []
     for row in verdict.rows:
         values = (f"{value:.3f}" if value == value else "undefined" for value in (row.old, row.new))
-        table.add_row(row.episodes, row.name, *values, "[red]worse" if row.worse else "[green]no worse")
-    return table
+        rows.append((row.episodes, row.name, *values, "[red]worse" if row.worse else "[green]no worse"))
+    title = f"round {number}: the old and the refreshed model on held-out real episodes"
+    columns = ("episodes of", "number", "old", "new", "")
+    return make_table(title, columns, rows, left=("episodes of", "number", ""))

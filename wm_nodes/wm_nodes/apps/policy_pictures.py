@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import get_task, success
 from wm_nodes.core.specs import SOURCE_SIMULATOR
 from wm_nodes.core.types import Environment, Episode, FloatArray, UInt8Array
-from wm_nodes.environments.maniskill.tasks import instruction, success
 from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
@@ -92,12 +92,12 @@ def play(environment: Environment, policy: ImagePolicy, seed: int) -> Episode:
 def side_by_side(models: WorldModels, episodes: list[Episode], config: RunConfig) -> list[SideBySide]:
     """Imagine the actions of real episodes, and the goal of each first frame."""
     task = models.task_index(config.task)
-    arrays: EpisodeArrays = stack_episodes(episodes, models.tasks, success)
+    arrays: EpisodeArrays = stack_episodes(episodes, models.tasks)
     imagined = imagine_episodes(models.tokenizer, models.action, arrays)
     goals = None
     if models.text is not None:
         goals = imagine_goals(
-            models.text, models.tokenizer, arrays.images[:, 0], instruction(config.task), task,
+            models.text, models.tokenizer, arrays.images[:, 0], get_task(config.task).instruction, task,
             horizon=config.simulation.max_episode_steps, threshold=config.reward.goal_threshold,
         ).goals
     pairs = []

@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 from tqdm import tqdm
 
-from wm_nodes.config.load import ConfigError, dump_config, judge_overrides
+from wm_nodes.config.load import ConfigError, dump_config, judge_overrides, with_current_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.statistics import wilson_interval
@@ -51,7 +51,7 @@ def open_run_dir(given: Path | None, name: str, config_text: str, *, begun_with:
     run_dir = (given or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}").expanduser().absolute()
     run_dir.mkdir(parents=True, exist_ok=True)
     saved = run_dir / "config.yaml"
-    if saved.exists() and saved.read_text() != config_text:
+    if saved.exists() and with_current_names(saved.read_text()) != config_text:
         raise ConfigError(
             f"{run_dir} was begun with another configuration ({saved}); repeat its options or use a new folder"
         )

@@ -13,15 +13,17 @@ from tqdm import tqdm
 
 from wm_nodes.apps.policy_run import Stages, console, judge_options, open_run_dir
 from wm_nodes.apps.video_results import Finished, conclude
-from wm_nodes.config.load import judge_or_embedded, parse_override
+from wm_nodes.config.load import dump_config, judge_or_embedded, load_video_config, parse_override, reward_overrides
 from wm_nodes.config.schema import AGENT
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent import Verdict
 from wm_nodes.judge.backends.factory import for_clips
 from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.service import READS, JudgeService, agent_scores, buffer_jobs, clip_fps
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
@@ -36,7 +38,6 @@ from wm_nodes.video_rl.recorded_buffers import (
     trained_clips,
 )
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.settings import VideoRlConfig, dump_video_config, load_video_config, reward_overrides
 from wm_nodes.video_rl.training_run import VideoRun, progress
 from wm_nodes.video_rl.validation import validation_scores
 
@@ -76,7 +77,7 @@ def retrain_run(arguments: argparse.Namespace, command: str) -> int:
     config = load_video_config(str(source / "config.yaml"), dict(parse_override(text) for text in arguments.set))
     if config.seed != live.seed:
         raise ValueError(f"the clips of {source} were drawn with seed {live.seed}, not {config.seed}; do not set it")
-    run_dir = open_run_dir(arguments.run_dir, "world_model_retrain", dump_video_config(config))
+    run_dir = open_run_dir(arguments.run_dir, "world_model_retrain", dump_config(config))
     if run_dir == source:
         raise ValueError(f"{run_dir} is the run to train again from; name a new folder with --run-dir")
     _, iterations = progress(source)
@@ -179,13 +180,13 @@ def verdict_row(verdict: Verdict) -> dict[str, object]:
 
 
 def _table(rows: Sequence[Rescored]) -> Table:
-    table = Table(title="recorded clips, scored again from their pictures")
-    for name in ("iteration", "version", "clips", "mean reward recorded", "again", "different"):
-        table.add_column(name, justify="left" if name == "different" else "right")
-    for row in rows:
-        theirs, ours = (f"{float(total.nanmean()):.6f}" for total in (row.recorded.total, row.total))
-        table.add_row(
-            str(row.recorded.iteration), str(row.recorded.policy_version), str(len(row.total)), theirs, ours,
+    columns = ("iteration", "version", "clips", "mean reward recorded", "again", "different")
+    cells = (
+        (
+            row.recorded.iteration, row.recorded.policy_version, len(row.total),
+            *(f"{float(total.nanmean()):.6f}" for total in (row.recorded.total, row.total)),
             ", ".join(row.different) or "-",
         )
-    return table
+        for row in rows
+    )
+    return make_table("recorded clips, scored again from their pictures", columns, cells, left=("different",))

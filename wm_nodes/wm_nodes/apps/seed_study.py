@@ -17,13 +17,14 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from wm_nodes.config.load import dump_config, load_config, parse_override, preset_names
+from wm_nodes.config.load import default_task, dump_config, load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.statistics import paired_difference, wilson_interval
 from wm_nodes.core.types import Environment
-from wm_nodes.environments.record import collect_plan, gate_plan
+from wm_nodes.environments.record import acceptance_plan, collect_plan
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment, models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
@@ -36,6 +37,8 @@ from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
+FORMER_NAMES = {"gate": "acceptance", "gate_passed": "accepted"}
+"""Of a row's values, in results written before they were renamed."""
 ARMS = ("world_model", "simulator")
 SIMULATOR_ENVS = 8
 IMAGINED_EPISODES = 256
@@ -63,19 +66,22 @@ def main(argv: Sequence[str]) -> int:
 
 def read_results(folder: Path) -> list[dict[str, Any]]:
     path = folder / "results.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
     """One line per run, and per task and arm the pooled paired difference."""
-    found = Table("task", "trained in", "seed", "real before", "real after", "difference (95 %)", "imagined", "gate")
+    found = Table(
+        "task", "trained in", "seed", "real before", "real after", "difference (95 %)", "imagined", "acceptance"
+    )
     for row in rows:
         before, after, pair = row["real_before"], row["real_after"], row["paired"]
         imagined = row["imagined_before"], row["imagined_after"]
         found.add_row(
             row["task"], row["arm"].replace("_", " "), str(row["seed"]), _percent(before), _percent(after),
             f"{100 * pair['difference']:+.1f} ({100 * pair['low']:+.1f} to {100 * pair['high']:+.1f})",
-            f"{_percent(imagined[0])} -> {_percent(imagined[1])}", "passed" if row["gate_passed"] else "failed",
+            f"{_percent(imagined[0])} -> {_percent(imagined[1])}", "passed" if row["accepted"] else "failed",
         )
     for task, arm in sorted({(row["task"], row["arm"]) for row in rows}):
         chosen = [row for row in rows if (row["task"], row["arm"]) == (task, arm)]
@@ -107,7 +113,7 @@ def gain_over_simulator(rows: Sequence[dict[str, Any]]) -> float | None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="study.py", description=__doc__.split("\n")[0])
-    parser.add_argument("--tasks", nargs="+", default=["reach", "push_cube"])
+    parser.add_argument("--tasks", nargs="+", default=model_tasks(default_task()))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--preset", default="cpu", help=f"one of {', '.join(preset_names())}, or a .yaml of overrides")
@@ -132,7 +138,7 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
     real = ManiSkillEnvironment(config.task, config.simulation, SIMULATOR_ENVS, seed=config.seed)
     imagined = make_imagined_environment(config, model_dir, starts, num_envs=config.ppo.num_envs, seed=config.seed)
     real_before, imagined_before = _measure(policy, real, config), _imagine(policy, imagined, config)
-    gate = accept_world_model(
+    acceptance = accept_world_model(
         models_of(model_dir), _heldout(config, folder), config,
         (imagined_before.successes, imagined_before.episodes), (real_before.successes, real_before.episodes),
     )
@@ -145,7 +151,8 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         "real_after": _rate(real_after), "imagined_before": _rate(imagined_before),
         "imagined_after": _rate(imagined_after),
         "paired": asdict(paired_difference(real_before.success.tolist(), real_after.success.tolist())),
-        "gate_passed": gate.passed, "gate": gate.to_dict(), "environment_steps": sum(c["steps"] for c in course),
+        "accepted": acceptance.passed, "acceptance": acceptance.to_dict(),
+        "environment_steps": sum(c["steps"] for c in course),
         "success_before": real_before.success.astype(int).tolist(),
         "success_after": real_after.success.astype(int).tolist(), "course": course,
         "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(), "config": dump_config(config),
@@ -177,7 +184,7 @@ def _train(
 
 
 def _heldout(config: RunConfig, folder: Path) -> Any:
-    return load_arrays(collect_plan(gate_plan(config), config, folder / "heldout"), config)
+    return load_arrays(collect_plan(acceptance_plan(config), config, folder / "heldout"), config)
 
 
 def _measure(policy: ImagePolicy, env: Environment, config: RunConfig) -> EvaluationResult:

@@ -24,7 +24,7 @@ from wm_nodes.judge.dataset.policy_camera import policy_models, policy_window
 from wm_nodes.judge.evidence.head import load_head, save_head
 from wm_nodes.judge.evidence.trees import TreeSettings
 from wm_nodes.judge.training.data import load_sets
-from wm_nodes.judge.training.heads import CONFORMAL, TARGETS, conformal_errors, measured
+from wm_nodes.judge.training.heads import CONFORMAL, TARGETS, conformal_errors, measure_target
 from wm_nodes.judge.training.train import JudgePlan, collect_evidence, make_judge
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.world_model import load_model_folder
@@ -85,7 +85,7 @@ def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
     examples = collect_evidence(arguments.out, load_sets(arguments.sets), part, head.segmenter, head.readers)
     if not len(examples.rows):
         raise ValueError(f"the sets have no {part} clips; build larger ones")
-    found: dict[str, Any] = {t: measured(head.questions, t, examples) for t in TARGETS}
+    found: dict[str, Any] = {t: measure_target(head.questions, t, examples) for t in TARGETS}
     known = head.familiarity
     foreign = known.distance(examples.evidence) > known.limit
     found["foreign"] = {

@@ -32,10 +32,11 @@ from wm_nodes.apps.policy_run import (
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, parse_override, preset_names
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import task_names
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
-from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, gate_plan
+from wm_nodes.environments.record import HELDOUT_SEEDS, acceptance_plan, collect_plan
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.launching.domain_lock import DomainInUseError
@@ -57,19 +58,21 @@ EXPECTED = (
 
 
 ENDOGENOUS = "endogenous"
+ACCEPTANCE, FORMER_ACCEPTANCE = "acceptance.json", "gate.json"
+"""Report of accept_world_model in the run folder, and its name in older ones."""
 
 
 class ModelNotAcceptedError(RuntimeError):
-    """The world model does not deserve to be trained in."""
+    """The world model does not pass acceptance."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Return the exit code: 0 done, 2 a clear error, 3 the gate refused the model, 130 Ctrl-C."""
+    """Return the exit code: 0 done, 2 a clear error, 3 the model does not pass acceptance, 130 Ctrl-C."""
     arguments = _parser().parse_args(argv)
     try:
         run(arguments)
     except ModelNotAcceptedError as refusal:
-        console.print(f"[bold red]gate:[/] {refusal}")
+        console.print(f"[bold red]acceptance:[/] {refusal}")
         return 3
     except KeyboardInterrupt:
         console.print("stopped; name the run folder with --run-dir to go on")
@@ -108,7 +111,7 @@ def run(arguments: argparse.Namespace) -> Summary:
         imagined_steps_per_s=found.samples_per_s, bag=found.bag,
         paired=asdict(paired_difference(found.real_before.tolist(), found.real_after.tolist())),
         imagined_paired=asdict(paired_difference(found.imagined_before.tolist(), found.imagined_after.tolist())),
-        gate=json.loads((run_dir / "gate.json").read_text()), samples=found.samples, minutes=stage.minutes,
+        acceptance=_read_acceptance(run_dir), samples=found.samples, minutes=stage.minutes,
         command=_command(), machine=machine_facts(), rounds=found.table, reward=arguments.reward,
         judge=judge_name(episode_judge(config)) if arguments.reward == AGENT else "",
     )
@@ -134,7 +137,7 @@ def _parser() -> argparse.ArgumentParser:
         "real simulator before and after.",
     )
     parser.add_argument("--preset", default="cpu", help=f"one of {', '.join(preset_names())}, or a .yaml of overrides")
-    parser.add_argument("--task", choices=("reach", "push_cube", "pull_cube"), help="default: the preset's")
+    parser.add_argument("--task", choices=task_names(), help="default: the preset's")
     parser.add_argument("--seed", type=int, help="root seed of every random number; default: the preset's")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
     parser.add_argument(
@@ -142,7 +145,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--model-dir", type=Path, help="world model to use instead of the shipped one")
     parser.add_argument("--from-scratch", action="store_true", help="collect data and train the world model too")
-    parser.add_argument("--force", action="store_true", help="train even in a model that fails the gate")
+    parser.add_argument("--force", action="store_true", help="train even in a model that does not pass acceptance")
     parser.add_argument(
         "--rounds", type=int, metavar="N",
         help="train, collect with the policy in the simulator, refresh the world model, N times; default: the preset's "
@@ -167,7 +170,7 @@ def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
     if arguments.seed is not None:
         overrides["seed"] = arguments.seed
     if arguments.rounds is not None:
-        overrides["rounds.num_rounds"] = arguments.rounds
+        overrides["model_refresh.num_rounds"] = arguments.rounds
     judge = judge_options(arguments)
     if judge and arguments.reward != AGENT:
         raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")
@@ -190,14 +193,14 @@ def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stag
 
 
 def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, real: BoolArray) -> None:
-    """Write gate.json and print it; raise ModelNotAcceptedError where the model failed and `force` is not set."""
+    """Write acceptance.json and print it; raise ModelNotAcceptedError where the model failed and `force` is not set."""
     config = job.config
-    bags = collect_plan(gate_plan(config), config, job.run_dir / "bags" / "heldout")
+    bags = collect_plan(acceptance_plan(config), config, job.run_dir / "bags" / "heldout")
     report = accept_world_model(
         load_model_folder(model_dir), load_arrays(bags, config), config,
         (int(imagined.sum()), len(imagined)), (int(real.sum()), len(real)),
     )
-    path = job.run_dir / "gate.json"
+    path = job.run_dir / ACCEPTANCE
     path.write_text(json.dumps(report.to_dict(), indent=1))
     console.print(report.table())
     if not report.passed and not force:
@@ -205,4 +208,10 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
             f"{', '.join(report.failed)} failed (numbers in {path}): the policy would learn to exploit the model. "
             "Train the model longer or on more data (--from-scratch --preset cpu_full), or go on with --force"
         )
-    job.stage("gate passed" if report.passed else "gate FAILED, going on because of --force")
+    job.stage("acceptance passed" if report.passed else "acceptance FAILED, going on because of --force")
+
+
+def _read_acceptance(run_dir: Path) -> dict[str, Any]:
+    path = run_dir / ACCEPTANCE
+    found: dict[str, Any] = json.loads((path if path.is_file() else run_dir / FORMER_ACCEPTANCE).read_text())
+    return found

@@ -8,7 +8,6 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,20 @@ from tqdm import tqdm
 from wm_nodes.apps.policy_run import READY_S, Stages, add_judge_options, console, open_run_dir
 from wm_nodes.apps.rescore import chosen_judge, recorded_bags, rescore_run, retrain_run
 from wm_nodes.apps.video_results import Finished, conclude
-from wm_nodes.config.load import ConfigError, judge_or_embedded, load_config, parse_override
+from wm_nodes.config.load import (
+    REWARDS,
+    VIDEO,
+    ConfigError,
+    dump_config,
+    judge_or_embedded,
+    load_config,
+    load_video_config,
+    parse_override,
+    preset_names,
+)
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
 from wm_nodes.judge.backends.factory import check_clips, check_judge
@@ -34,7 +44,6 @@ from wm_nodes.reports import ClipSummary
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_rl.pretraining import make_video_model, shipped_video_model
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.settings import REWARDS, VideoRlConfig, dump_video_config, load_video_config, video_preset_names
 from wm_nodes.video_rl.training_run import progress
 
 EXPECTED = (
@@ -166,15 +175,15 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
         overrides["seed"] = arguments.seed
     config = load_video_config(arguments.preset, {**overrides, **chosen_judge(arguments)})
     if config.rewards.get(AGENT):
-        config = replace(config, judge=judge_or_embedded(config.judge))
+        config = config.with_values(judge=judge_or_embedded(config.judge))
         check_judge(config.judge)
     if config.grpo.kl.anchor == "lora_off":
         raise ValueError(
-            "grpo.kl.anchor lora_off is for public models with a LoRA adapter, trained in Python (docs/dyndiff.md); "
-            "the graph's video model has none: take frozen"
+            "grpo.kl.anchor lora_off is for public models with a LoRA adapter, trained in Python "
+            "(docs/public_video_models.md); the graph's video model has none: take frozen"
         )
     run_dir = open_run_dir(
-        arguments.run_dir, "world_model_rl", dump_video_config(config),
+        arguments.run_dir, "world_model_rl", dump_config(config),
         begun_with=[
             *(["--from-scratch"] if arguments.from_scratch else []),
             *(f"--bags {bag.resolve()}" for bag in arguments.bags),
@@ -194,7 +203,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Post-train a flow-matching video world model by DynDiff-GRPO, as a ROS 2 graph, and measure it on "
         "held-out contexts before and after.",
     )
-    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(video_preset_names())}, or a .yaml")
+    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(preset_names(VIDEO))}, or a .yaml")
     parser.add_argument("--seed", type=int, help="root seed of every random number; default: the preset's")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
     parser.add_argument("--run-dir", type=Path, help="run folder; an existing one is resumed. Default: runs/<time>-...")

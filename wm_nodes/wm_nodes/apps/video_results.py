@@ -9,6 +9,8 @@ import numpy as np
 import torch
 
 from wm_nodes.apps.policy_run import console
+from wm_nodes.config.load import dump_config
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.reports import (
     ClipSummary,
@@ -30,7 +32,6 @@ from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.pretraining import BEFORE
 from wm_nodes.video_rl.reference_reward import more_is_better
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.settings import VideoRlConfig, dump_video_config
 from wm_nodes.video_rl.training_run import evaluated_uri
 from wm_nodes.video_rl.validation import SECTION, alarm_text, alarms_of, kept_scores
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -92,7 +93,7 @@ def conclude(run: Finished) -> ClipSummary:
     )
     if drawn is not None:
         strips.append(Picture("Training", "By buffer; held-out scores are of the weights that are evaluated.", drawn))
-    report = write_clip_report(run_dir, summary, strips, config_text=dump_video_config(config))
+    report = write_clip_report(run_dir, summary, strips, config_text=dump_config(config))
     console.print(scores_table(summary))
     for alarm in summary.hacked:
         console.print(f"[bold yellow]reward hacking[/] after {alarm['step']} buffers: {alarm['text']}", highlight=False)

@@ -1,24 +1,35 @@
-"""Presets: base.yaml holds every number; task, preset and command line override some of them, in this order.
+"""Presets: base.yaml holds every number of a loop; task, preset, command line override some of them, in this order.
 
-Reading presets and laying values over one another serve the settings of loop 2 too (video_rl/settings.py).
+presets/policy is of loop 1, presets/video of loop 2; the judge of both is in presets/judge.yaml.
 """
 
-from collections.abc import Collection
+import re
+from copy import deepcopy
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import ValidationError
 
-from wm_nodes.config.schema import JudgeConfig, RunConfig
+from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig, SettingsSection
+from wm_nodes.config.tasks import get_task, task_names
+from wm_nodes.config.video import VideoRlConfig
 
-PRESETS = "presets"
-TASK_PREFIX = "task_"
-"""presets/task_<name>.yaml holds what differs between tasks; it lies between base and the preset."""
-FREE = ("behaviours",)
+PRESETS = resources.files("wm_nodes.config") / "presets"
+POLICY, VIDEO = "policy", "video"
+"""Folders of presets, one for each loop."""
+FREE = ("behaviours", "rewards")
+"""Mappings without fixed keys, which are replaced as a whole."""
+FORMER_NAMES = {"gate": "acceptance", "rounds": "model_refresh"}
+"""Sections of configurations saved before they were renamed."""
 EMBEDDED = "embedded"
 """JudgeConfig.kind of the judge in this process."""
+REWARDS = ("reference", AGENT)
+"""What the video model can be paid for: its scores against the recording, or a judge's verdicts."""
+
+Config = TypeVar("Config", RunConfig, VideoRlConfig)
 
 
 class ConfigError(ValueError):
@@ -26,7 +37,7 @@ class ConfigError(ValueError):
 
 
 def load_config(preset: str = "cpu", overrides: dict[str, Any] | None = None) -> RunConfig:
-    """Return the resolved configuration.
+    """Return the resolved configuration of loop 1.
 
     Args:
         preset: a name from preset_names(), or a path of a YAML file of overrides on base.
@@ -35,23 +46,46 @@ def load_config(preset: str = "cpu", overrides: dict[str, Any] | None = None) ->
     Raises:
         ConfigError: names the value, what is allowed, and where to look.
     """
-    values = read_preset("base")
-    chosen = read_preset(preset)
-    task = (overrides or {}).get("task", chosen.get("task", values["task"]))
-    merge(values, _read_task(task), FREE)
+    return _load(RunConfig, POLICY, preset, overrides or {})
+
+
+def load_video_config(preset: str = "recommended", overrides: dict[str, Any] | None = None) -> VideoRlConfig:
+    """Return the resolved configuration of loop 2, as load_config does that of loop 1."""
+    return _load(VideoRlConfig, VIDEO, preset, overrides or {})
+
+
+def _load(schema: type[Config], loop: str, preset: str, overrides: dict[str, Any]) -> Config:
+    values = read_preset("base", loop) | _read(PRESETS / "judge.yaml")
+    chosen = read_preset(preset, loop)
+    task = overrides.get("task", chosen.get("task", values["task"]))
+    if loop == POLICY and task in task_names():
+        for dotted, value in get_task(task).settings.items():
+            _set_dotted(values, dotted, deepcopy(value))
     if preset != "base":
-        merge(values, chosen, FREE)
-    for dotted, value in (overrides or {}).items():
-        set_dotted(values, dotted, value, FREE)
+        _merge(values, chosen)
+    for dotted, value in overrides.items():
+        _set_dotted(values, dotted, value)
     try:
-        return RunConfig.model_validate(values)
+        return schema.model_validate(values)
     except ValidationError as error:
-        raise refusal(error, "wm_nodes/config/schema.py") from None
+        raise refusal(error, f"{schema.__module__.replace('.', '/')}.py") from None
+
+
+def default_task() -> str:
+    """The task of base.yaml."""
+    return str(read_preset("base")["task"])
 
 
 def default_judge() -> JudgeConfig:
-    """The judge's settings of base.yaml, which loop 2 has too (video_rl/settings.py)."""
-    return JudgeConfig.model_validate(read_preset("base")["judge"])
+    """The judge of both loops, as presets/judge.yaml sets it."""
+    return JudgeConfig.model_validate(_read(PRESETS / "judge.yaml")["judge"])
+
+
+def reward_overrides(reward: str | None) -> dict[str, Any]:
+    """The setting of loop 2 that one of REWARDS stands for: the weights of the rewards; None: none."""
+    if reward is None:
+        return {}
+    return {"rewards": {AGENT: 1.0} if reward == AGENT else read_preset("base", VIDEO)["rewards"]}
 
 
 def named_pack(rubric: str) -> str:
@@ -80,9 +114,14 @@ def judge_or_embedded(judge: JudgeConfig) -> JudgeConfig:
     return judge.model_copy(update={"kind": EMBEDDED}) if nobody else judge
 
 
-def dump_config(config: RunConfig) -> str:
-    """The resolved configuration as YAML, as saved with every run."""
+def dump_config(config: SettingsSection) -> str:
+    """The resolved configuration as YAML, as saved with every run; its loop's load function reads it back."""
     return str(yaml.safe_dump(config.model_dump(), sort_keys=False))
+
+
+def with_current_names(text: str) -> str:
+    """The YAML text of a configuration, with sections that were renamed since by their names of today."""
+    return re.sub(f"^({'|'.join(FORMER_NAMES)}):", lambda found: FORMER_NAMES[found[1]] + ":", text, flags=re.MULTILINE)
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -93,53 +132,38 @@ def parse_override(text: str) -> tuple[str, Any]:
     return name.strip(), yaml.safe_load(value)
 
 
-def preset_names(folder: str = PRESETS) -> list[str]:
-    """The presets in a folder of wm_nodes/config; what only differs by task is none."""
-    entries = (resources.files("wm_nodes.config") / folder).iterdir()
-    names = (Path(entry.name).stem for entry in entries if entry.name.endswith(".yaml"))
-    return sorted(name for name in names if not name.startswith(TASK_PREFIX))
+def preset_names(loop: str = POLICY) -> list[str]:
+    """The presets of a loop."""
+    return sorted(Path(entry.name).stem for entry in (PRESETS / loop).iterdir() if entry.name.endswith(".yaml"))
 
 
-def read_preset(name: str, folder: str = PRESETS) -> dict[str, Any]:
-    """The values of a preset: a name of `folder`, or a path of a YAML file.
+def read_preset(name: str, loop: str = POLICY) -> dict[str, Any]:
+    """The values of a preset: a name of the loop's, or a path of a YAML file.
 
     Raises:
         ConfigError: neither of them, or no mapping.
     """
-    if name in preset_names(folder):
-        text = (resources.files("wm_nodes.config") / folder / f"{name}.yaml").read_text()
-    elif Path(name).suffix in {".yaml", ".yml"} and Path(name).is_file():
-        text = Path(name).read_text()
-    else:
-        known = ", ".join(preset_names(folder))
+    if name in preset_names(loop):
+        return _read(PRESETS / loop / f"{name}.yaml")
+    if Path(name).suffix not in {".yaml", ".yml"} or not Path(name).is_file():
+        known = ", ".join(preset_names(loop))
         raise ConfigError(f"unknown preset {name!r}; choose one of {known} or give a .yaml file")
-    values = yaml.safe_load(text) or {}
-    if not isinstance(values, dict):
-        raise ConfigError(f"preset {name!r} must be a YAML mapping")
-    return values
+    return _read(Path(name))
 
 
-def merge(base: dict[str, Any], top: dict[str, Any], free: Collection[str] = (), path: str = "") -> None:
-    """Lay `top` over `base`, in place. free: names of mappings without fixed keys, which are replaced as a whole.
-
-    Raises:
-        ConfigError: a name that base does not have.
-    """
+def _merge(base: dict[str, Any], top: dict[str, Any], path: str = "") -> None:
+    """Lay `top` over `base`, in place. Raises ConfigError for a name that base does not have."""
     for key, value in top.items():
         if key not in base:
             raise _unknown(f"{path}{key}", base)
-        if isinstance(value, dict) and isinstance(base[key], dict) and key not in free:
-            merge(base[key], value, free, f"{path}{key}.")
+        if isinstance(value, dict) and isinstance(base[key], dict) and key not in FREE:
+            _merge(base[key], value, f"{path}{key}.")
         else:
             base[key] = value
 
 
-def set_dotted(values: dict[str, Any], dotted: str, value: Any, free: Collection[str] = ()) -> None:
-    """Set "section.key" in place; in a free mapping, one entry of it, which may be new.
-
-    Raises:
-        ConfigError: there is no such setting.
-    """
+def _set_dotted(values: dict[str, Any], dotted: str, value: Any) -> None:
+    """Set "section.key" in place; in a free mapping, one entry of it, which may be new. Raises as _merge."""
     *parents, last = dotted.split(".")
     section, path = values, ""
     for name in parents:
@@ -148,22 +172,29 @@ def set_dotted(values: dict[str, Any], dotted: str, value: Any, free: Collection
         section, path = section[name], f"{path}{name}."
         if not isinstance(section, dict):
             raise ConfigError(f"unknown setting {dotted!r}; {path[:-1]} is a single value")
-    if parents and parents[-1] in free:
+    if parents and parents[-1] in FREE:
         section[last] = value
     else:
-        merge(section, {last: value}, free, path)
+        _merge(section, {last: value}, path)
 
 
 def refusal(error: ValidationError, where: str) -> ConfigError:
     """One error that names every refused value. where: the file that explains the settings."""
-    lines = [f"  {'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
+    lines = []
+    for found in error.errors():
+        text = f"  {'.'.join(map(str, found['loc']))}: {found['msg'].removeprefix('Value error, ')}"
+        names_values = found["type"] == "value_error" and not isinstance(found["input"], (str, int, float))
+        lines.append(text if names_values else f"{text} (got {found['input']!r})")
     return ConfigError(f"settings refused; see {where}:\n" + "\n".join(lines))
 
 
 def _unknown(dotted: str, section: dict[str, Any]) -> ConfigError:
-    return ConfigError(f"unknown setting {dotted!r}; known there: {', '.join(map(str, section))}")
+    renamed = f", now called {FORMER_NAMES[dotted]!r}" if dotted in FORMER_NAMES else ""
+    return ConfigError(f"unknown setting {dotted!r}{renamed}; known there: {', '.join(map(str, section))}")
 
 
-def _read_task(task: Any) -> dict[str, Any]:
-    path = resources.files("wm_nodes.config") / PRESETS / f"{TASK_PREFIX}{task}.yaml"
-    return (yaml.safe_load(path.read_text()) or {}) if path.is_file() else {}
+def _read(path: Traversable) -> dict[str, Any]:
+    values = yaml.safe_load(with_current_names(path.read_text())) or {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"preset {str(path)!r} must be a YAML mapping")
+    return values

@@ -1,8 +1,13 @@
-"""What every setting means and which values are allowed. The numbers live in presets/*.yaml, not here."""
+"""What every setting of loop 1 means and which values are allowed. The numbers live in presets/, not here.
 
-from typing import Annotated, Literal
+Loop 2's are in video.py.
+"""
 
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from wm_nodes.config.tasks import check_task
 
 PositiveInt = Annotated[int, Field(ge=1)]
 NonNegativeInt = Annotated[int, Field(ge=0)]
@@ -13,13 +18,18 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
 
-TaskName = Literal["reach", "push_cube", "pull_cube"]
+TaskName = Annotated[str, AfterValidator(check_task)]
+"""Name of a task's file, see config/tasks.py."""
 
 
 class SettingsSection(BaseModel):
     """Frozen, and every unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def with_values(self, **values: Any) -> Self:
+        """A copy with other values, checked as those of a preset are."""
+        return self.model_validate({**dict(self), **values})
 
 
 class SimulationConfig(SettingsSection):
@@ -44,7 +54,7 @@ class DataConfig(SettingsSection):
     num_episodes: PositiveInt
     """Simulator episodes to collect for the world model."""
     num_heldout: PositiveInt
-    """Episodes kept apart for the gate; never trained on."""
+    """Episodes kept apart for the acceptance of the world model; never trained on."""
     behaviours: dict[str, NonNegativeFloat]
     """Relative share of each behaviour (expert, noisy, near_miss, biased, waypoint, random, reach, ...)."""
     num_workers: PositiveInt
@@ -142,7 +152,7 @@ class JudgeConfig(SettingsSection):
     """openai: name of the environment variable that holds the key; empty: the server wants none."""
     folder: str
     """embedded: folder of the trained judge; empty: the shipped one that reads such pictures."""
-    conformal: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    conformal: Annotated[float, Field(ge=0, lt=1)]
     """embedded: abstain where the answer is not sure at this coverage (0.8, 0.9, 0.95 or 0.98); 0: always decide."""
     rubric: str
     """Rubric pack: a name, or a .yaml file."""
@@ -169,10 +179,10 @@ class JudgeConfig(SettingsSection):
     """Images that the server takes in one call."""
     video: bool
     """Send the dense frames of a clip as one video instead of images; for vLLM."""
-    choice_grammar: bool = False
+    choice_grammar: bool
     """openai: a read of one token may only be a listed letter (vLLM); without it, a read that is mostly other words
     abstains."""
-    label_token_ids: list[int] = []
+    label_token_ids: list[int]
     """openai: token ids of A to E, for servers that give the probabilities of given ids (vLLM: logprob_token_ids)."""
     repeat_share: Annotated[float, Field(ge=0, le=1)]
     """Share of the calls to a server that are made twice: `flip_rate` says how often the second answer is another."""
@@ -243,7 +253,7 @@ class AcceptanceConfig(SettingsSection):
     """The SFT policy's imagined success must agree with its real success within the joint 95 % interval."""
 
 
-class RoundsConfig(SettingsSection):
+class ModelRefreshConfig(SettingsSection):
     """Online rounds: train in the model, collect with the policy in the simulator, refresh the model, go on."""
 
     num_rounds: Annotated[int, Field(ge=1, le=20)]
@@ -281,6 +291,6 @@ class RunConfig(SettingsSection):
     policy: PolicyConfig
     sft: SftConfig
     ppo: PpoConfig
-    gate: AcceptanceConfig
-    rounds: RoundsConfig
+    acceptance: AcceptanceConfig
+    model_refresh: ModelRefreshConfig
     evaluation: EvaluationConfig

@@ -12,8 +12,7 @@ OLD_GLIBC_LIMIT = 2**25
 def keep_freed_memory() -> bool:
     """Keep freed memory in the process; return whether the C library can (glibc; others are left as they are).
 
-    glibc gives large freed blocks back to the system, so that every step of a network touches new pages again: 4,300
-    page faults in an imagined step of 32 environments and 19,400 in one of 64, a quarter of its time (docs/speed.md).
+    glibc gives large freed blocks back to the system, so that every step of a network touches new pages again.
     The price: up to KEPT_BYTES that are free stay with the process. No number changes.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)

@@ -10,14 +10,9 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.tasks import get_task
 
 SOURCE_IMAGINED, SOURCE_SIMULATOR, SOURCE_REAL, SOURCE_REPLAY = 0, 1, 2, 3
-
-GROUND_TRUTH_NAMES = (
-    "cube_x", "cube_y", "cube_z", "cube_yaw", "tool_x", "tool_y", "tool_z", "goal_x", "goal_y",
-    "cube_start_x", "cube_start_y",
-)
-"""Simulator truth of the table-top scenes, in this order. Positions in m, yaw in rad, world frame."""
 
 POLICY_FIELDS = (
     "height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale", "state_names",
@@ -100,13 +95,13 @@ def _hash(fields: dict[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def simulation_spec(task: str, instruction: str, config: SimulationConfig, num_envs: int) -> EnvironmentSpec:
+def simulation_spec(task: str, config: SimulationConfig, num_envs: int) -> EnvironmentSpec:
     """The spec of `task` in ManiSkill; the imagined environment shares all but env_id, source and ground truth."""
     axes = ("x", "y", "z")
     return EnvironmentSpec(
         env_id=f"maniskill/{task}",
         task=task,
-        instruction=instruction,
+        instruction=get_task(task).instruction,
         source=SOURCE_SIMULATOR,
         num_envs=num_envs,
         height=config.image_size,
@@ -117,7 +112,7 @@ def simulation_spec(task: str, instruction: str, config: SimulationConfig, num_e
         action_scale=(config.max_action_m,) * 3,
         state_names=tuple(f"tool_target_{axis}" for axis in axes),
         state_units=("m",) * 3,
-        ground_truth_names=GROUND_TRUTH_NAMES,
+        ground_truth_names=get_task(task).ground_truth_names,
         control_period_s=1.0 / config.control_hz,
         max_episode_steps=config.max_episode_steps,
         state_low=config.workspace_low_m,

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import Episode
 from wm_nodes.environments.maniskill.collection import CollectionPlan, collect
-from wm_nodes.environments.maniskill.tasks import instruction
 from wm_nodes.recording import EpisodeBagWriter
 
 TRAINING_SEEDS, HELDOUT_SEEDS = 0, 500_000
@@ -19,19 +19,18 @@ def collect_training_data(config: RunConfig, folder: Path, *, progress: bool = T
 
 
 def collect_heldout_data(config: RunConfig, folder: Path, *, progress: bool = True) -> list[Path]:
-    """The same behaviours on seeds that are never trained on, for the gate."""
+    """The same behaviours on seeds that are never trained on, for the acceptance of a model."""
     return collect_plan(scripted_plan(config, config.data.num_heldout, HELDOUT_SEEDS), config, folder, progress)
 
 
-def gate_plan(config: RunConfig) -> CollectionPlan:
-    """The held-out episodes that the gate judges a model on."""
-    return scripted_plan(config, min(config.gate.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
+def acceptance_plan(config: RunConfig) -> CollectionPlan:
+    """The held-out episodes that decide about accepting a model."""
+    return scripted_plan(config, min(config.acceptance.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
 
 
 def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
-    scene_task = "push_cube" if config.task == "reach" else config.task  # one scene, one data set, two tasks
     return CollectionPlan(
-        task=scene_task,
+        task=model_tasks(config.task)[-1],  # one scene and one data set for all tasks of a model
         simulation=config.simulation,
         num_episodes=num_episodes,
         first_seed=first_seed,
@@ -63,7 +62,7 @@ def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path, progress
 
 def write_shard(path: Path, plan: CollectionPlan, episodes: list[Episode]) -> None:
     """Write one shard's episodes into a bag that is renamed to `path` when complete."""
-    spec = simulation_spec(plan.task, instruction(plan.task), plan.simulation, 1)
+    spec = simulation_spec(plan.task, plan.simulation, 1)
     custom = {"wm.seeds": f"{episodes[0].seed}..{episodes[-1].seed}"}
     with EpisodeBagWriter(
         path, spec, run_id=path.parent.name, custom=custom, start_ns=1, discard_partial=True

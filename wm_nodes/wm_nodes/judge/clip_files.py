@@ -1,4 +1,4 @@
-"""Clips of one's own in a folder: video files, and clips.jsonl, which says what each one should show."""
+"""A folder of clips to judge: video files, and clips.jsonl with the task of each."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,24 +18,24 @@ AT_ONCE = 64
 
 
 class ClipLine(BaseModel):
-    """One line of clips.jsonl. Paths are relative to its folder.
-
-    file: a video, or a .npy of uint8 (F, H, W, 3), RGB. fps: of a .npy. reference: the picture that the clip had to
-    start from; "": its first frame. goal: a picture of the end. sha256: of the clip's content, where it is to be
-    checked.
-    """
+    """One line of clips.jsonl. Paths are relative to its folder."""
 
     model_config = ConfigDict(extra="forbid")
 
     file: Annotated[str, Field(min_length=1)]
+    """A video, or a .npy of uint8 (F, H, W, 3), RGB."""
     instruction: str
     clip_id: str = ""
     task_id: str = ""
     robot: str = "panda"
     fps: Annotated[float, Field(gt=0)] = 5.0
+    """Of a .npy; a video has its own."""
     reference: str = ""
+    """The conditioning image; empty: the first frame."""
     goal: str = ""
+    """An image of the goal."""
     sha256: str = ""
+    """Of the clip's content; checked where given."""
 
 
 def read_list(folder: Path) -> list[ClipLine]:
@@ -64,16 +64,16 @@ def read_list(folder: Path) -> list[ClipLine]:
 
 
 def list_sha256(folder: Path, announced: str = "") -> str:
-    """Of the bytes of clips.jsonl.
+    """SHA-256 of clips.jsonl.
 
     Raises:
         ValueError: it is not the announced one. OSError: it cannot be read.
     """
     path = folder / LIST
-    found = file_sha256(path)
-    if announced and found != announced:
-        raise ValueError(f"{path} is not the announced list (sha256 {found[:12]}, not {announced[:12]}); copy it again")
-    return found
+    digest = file_sha256(path)
+    if announced and digest != announced:
+        raise ValueError(f"{path} is not the announced list ({digest[:12]}, not {announced[:12]}); copy it again")
+    return digest
 
 
 def read_job(folder: Path, line: ClipLine) -> ClipJob:
@@ -113,14 +113,14 @@ def read_video(path: Path) -> ClipRef:
 
 def read_picture(path: Path) -> UInt8Array:
     """uint8 (H, W, 3), RGB. Raises ValueError where it cannot be read."""
-    found = cv2.imread(str(path))
-    if found is None:
+    image = cv2.imread(str(path))
+    if image is None:
         raise ValueError(f"{path} is no readable picture")
-    return np.ascontiguousarray(found[..., ::-1], np.uint8)
+    return np.ascontiguousarray(image[..., ::-1], np.uint8)
 
 
 def _read_frames(path: Path, fps: float) -> ClipRef:
-    """What is wrong with the frames themselves is the agent's to say."""
+    """Load an array of frames; the agent checks their shape and type."""
     try:
         frames = np.load(path, allow_pickle=False)
     except (OSError, ValueError) as error:

@@ -1,8 +1,8 @@
-"""What a verdict decides, under the names of the paper's Table 2; labels of people and of recipes use the same names.
+"""Decisions of a verdict, by the row names of the paper's Table 2; labels of people and of recipes use the same names.
 
-A decision is True (passes), False, or a planning level; a row that a verdict leaves open is missing. Stages are decided
-as the agent's gates decide them, TC as completion (level 3 or more): its gate asks for visible progress only. Overall
-is what a trainer would accept: every gate passed and the task completed (RA-24). Our choice, the paper does not say it.
+A decision is True (passes), False, or a planning level; undecided rows are missing. A stage passes where its gate
+passes, except TC, which passes from level 3 on, because its gate asks for visible progress only. Overall passes where
+every gate passed and the task is completed (RA-24): our choice, the paper does not define it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wm_nodes.core.reward_statistics import balanced_accuracy, expected_calibration_error, kappa, wilson_of_share
+from wm_nodes.core.statistics import balanced_accuracy, expected_calibration_error, kappa, wilson_of_share
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING, Stage, Status, Verdict
 from wm_nodes.judge.dataset.edits import TC
@@ -31,32 +31,33 @@ FAIR_LEVEL = 2
 
 @dataclass(frozen=True)
 class Decision:
-    """What was decided, and how surely: p_pass in [0, 1] of a pass, or the probability of the planning level."""
+    """One decision. p_pass: probability of a pass, or of the planning level, in [0, 1]."""
 
     value: bool | int
     p_pass: float
 
 
 class Match(NamedTuple):
-    """How well decisions match labels. accuracy, low, high: share of equal ones with its 95 % Wilson interval.
-    prevalence: share of failing labels (planning: of levels below 2). balanced: balanced accuracy, of planning the mean
-    recall of its levels. calibration: expected calibration error of p_pass, of planning of the chosen level. NaN where
-    the labels are all alike.
-    """
+    """Agreement of decisions with labels; NaN where all labels are equal."""
 
     accuracy: float
+    """Share of equal decisions."""
     low: float
     high: float
+    """95 % Wilson interval of the accuracy."""
     prevalence: float
+    """Share of failing labels; of planning, of levels below 2."""
     balanced: float
+    """Balanced accuracy; of planning, the mean recall of its levels."""
     kappa: float
     calibration: float
+    """Expected calibration error of p_pass; of planning, of the chosen level."""
 
 
 def match(
     name: str, labels: Sequence[bool | int], decisions: Sequence[Decision], weights: ArrayLike | None = None
 ) -> Match:
-    """The numbers of the row `name`. weights: what each decision stands for; kappa and level recall count decisions."""
+    """Measure the agreement of the row `name`. weights: of each decision; kappa and level recall are unweighted."""
     values, p_pass = [decision.value for decision in decisions], [decision.p_pass for decision in decisions]
     right, planning = [label == value for label, value in zip(labels, values, strict=True)], name == PLANNING
     failing = [label < FAIR_LEVEL if planning else not label for label in labels]
@@ -81,34 +82,34 @@ def row_names(rubric: Rubric) -> list[str]:
 
 
 def decisions_of(verdict: Verdict) -> dict[str, Decision]:
-    """What a verdict decides.
+    """The decisions of a verdict by row.
 
-    p_pass of a stage is that of its likeliest failing component; of the whole, of its likeliest failing row.
+    p_pass of a stage is the least of its components; of overall, the least of its rows.
     """
-    found: dict[str, Decision] = {}
+    decisions: dict[str, Decision] = {}
     scores = {score.component: score for stage in verdict.stages for score in stage.components}
     for name, score in scores.items():
         if score.status is Status.OK:
-            found[name] = Decision(score.passed, 1 - score.p_fail)
+            decisions[name] = Decision(score.passed, 1 - score.p_fail)
     for stage in verdict.stages:
         if stage.status is Status.OK and stage.stage is not Stage.TC:
             least = min(1 - score.p_fail for score in stage.components)
-            found[str(stage.stage)] = Decision(stage.passed, 0.0 if stage.vetoed_by.startswith("hack ") else least)
+            decisions[str(stage.stage)] = Decision(stage.passed, 0.0 if stage.vetoed_by.startswith("hack ") else least)
     if verdict.plan is not None:
-        found[PLANNING] = Decision(verdict.level, verdict.plan.p_level[verdict.level])
+        decisions[PLANNING] = Decision(verdict.level, verdict.plan.p_level[verdict.level])
     elif verdict.level == 0:
-        found[PLANNING] = Decision(0, 1.0)
+        decisions[PLANNING] = Decision(0, 1.0)
     accepted = accepts(verdict)
     if accepted is not None:
-        parts = [decision.p_pass for name, decision in found.items() if name in (TC, *map(str, STAGES))]
-        found[OVERALL] = Decision(accepted, min(parts, default=0.0))
-    return found
+        parts = [decision.p_pass for name, decision in decisions.items() if name in (TC, *map(str, STAGES))]
+        decisions[OVERALL] = Decision(accepted, min(parts, default=0.0))
+    return decisions
 
 
 def accepts(verdict: Verdict) -> bool | None:
     """Whether a trainer would take the clip for a success; None where the verdict has no number.
 
-    A stage that failed its gate settles it, whatever abstained behind it.
+    A failed gate means False, even if later stages abstained.
     """
     if verdict.status is Status.ERROR:
         return None

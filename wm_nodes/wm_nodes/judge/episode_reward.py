@@ -1,9 +1,9 @@
-"""The reward agent as reward of a policy: an episode is judged as a clip at its end, and paid at its last step
+"""The reward agent as reward of a policy: an episode is judged as a clip at its end and rewarded at its last step
 (RA-15).
 
-Every rollout begins with a reset, so an episode that the rollout's end cuts short never goes on and is never judged.
-Its 0 at each step is exact, for what it is worth would come with its last step only; for the rest the critic stands,
-which learns from the episodes that ended: PPO bootstraps at the cut. One that ended has its verdict and nothing beyond.
+Every rollout begins with a reset, so an episode that is unfinished at the rollout's end is never continued and never
+judged. Its rewards are exactly 0, because the reward comes with the last step only, and PPO bootstraps from the value
+of its last state. An episode that ended has the verdict's reward and no bootstrap.
 
 Shapes: N environments, T steps of an episode, H W 3 image, A action.
 """
@@ -29,24 +29,29 @@ from wm_nodes.reward.base import version_of
 
 @dataclass(frozen=True, eq=False)
 class EpisodeStep:
-    """One lock-step. images, next_images: uint8 (N, H, W, 3), None where they are lost. actions: float32 (N, A).
-    episode_ids, episode_steps: (N,). ended: bool (N,), terminated or truncated. valid: bool (N,), a step was made.
-    goals: uint8 (H, W, 3) by environment, of those that have a goal image.
-    """
+    """One lock-step of N environments."""
 
     images: UInt8Array | None
+    """uint8 (N, H, W, 3) before the step; None where they were lost."""
     next_images: UInt8Array | None
+    """The same after the step."""
     actions: FloatArray
+    """float32 (N, A)."""
     episode_ids: UInt64Array
+    """(N,)."""
     episode_steps: NDArray[np.uint32]
+    """(N,), number of the step in its episode, from 0."""
     ended: BoolArray
+    """bool (N,), terminated or truncated by this step."""
     valid: BoolArray
+    """bool (N,), False where the message is a reset and no step."""
     goals: Mapping[int, UInt8Array] = field(default_factory=dict)
+    """Goal image, uint8 (H, W, 3), by environment, where there is one."""
 
 
 @dataclass
 class _Episode:
-    """What was seen of an episode. fault: why it cannot be judged as a whole."""
+    """The collected part of an episode. fault: why it cannot be judged."""
 
     episode_id: int
     frames: list[UInt8Array] = field(default_factory=list)
@@ -57,8 +62,9 @@ class _Episode:
 
 @dataclass(frozen=True)
 class PendingReward:
-    """The rewards of a lock-step, once the episodes that end with it are judged. waited: by environment, a verdict to
-    come, or why there will be none.
+    """The rewards of a lock-step, available once the episodes that end with it are judged.
+
+    waited: by environment, the future verdict, or why there will be none.
     """
 
     valid: BoolArray
@@ -66,25 +72,26 @@ class PendingReward:
 
     @property
     def done(self) -> bool:
-        return all(isinstance(found, str) or found.done() for found in self.waited.values())
+        return all(isinstance(outcome, str) or outcome.done() for outcome in self.waited.values())
 
     def cancel(self) -> None:
-        for found in self.waited.values():
-            if not isinstance(found, str):
-                found.cancel()
+        for outcome in self.waited.values():
+            if not isinstance(outcome, str):
+                outcome.cancel()
 
     def verdicts(self) -> dict[int, Verdict]:
-        """By environment; only when done."""
-        return {n: found.result() for n, found in self.waited.items() if not isinstance(found, str)}
+        """The verdicts by environment; call it only when done."""
+        return {n: outcome.result() for n, outcome in self.waited.items() if not isinstance(outcome, str)}
 
     def result(self) -> RewardResult:
-        """0 for steps within an episode, the verdict's reward for its last one, invalid without one; only when done."""
+        """The rewards: 0 within an episode, the verdict's at its last step, invalid without one; call it when done."""
         total, valid, reasons = np.zeros(len(self.valid), np.float32), self.valid.copy(), list[str]()
-        for n, found in self.waited.items():
-            verdict = None if isinstance(found, str) else found.result()
+        for n, outcome in self.waited.items():
+            verdict = None if isinstance(outcome, str) else outcome.result()
             if verdict is None or not verdict.valid:
                 valid[n] = False
-                reasons.append(f"environment {n}: {found if verdict is None else f'{verdict.status} {verdict.reason}'}")
+                reason = outcome if verdict is None else f"{verdict.status} {verdict.reason}"
+                reasons.append(f"environment {n}: {reason}")
             else:
                 total[n] = verdict.reward
         total = np.where(valid, total, np.float32(np.nan)).astype(np.float32)
@@ -111,19 +118,19 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
     spec = _scene(config)
     if trains:
         check_horizon(config.ppo.num_steps, spec.max_episode_steps)
-    check_clips(config.judge, _longest(spec))
+    check_clips(config.judge, _longest_clip(spec))
 
 
 def episode_judge(config: RunConfig) -> JudgeConfig:
     """The judge's settings for episodes of the configured scene, see judge_or_embedded and for_clips."""
-    return for_clips(judge_or_embedded(config.judge), _longest(_scene(config)))
+    return for_clips(judge_or_embedded(config.judge), _longest_clip(_scene(config)))
 
 
 def _scene(config: RunConfig) -> EnvironmentSpec:
-    return simulation_spec(config.task, "", config.simulation, 1)
+    return simulation_spec(config.task, config.simulation, 1)
 
 
-def _longest(spec: EnvironmentSpec) -> tuple[int, ...]:
+def _longest_clip(spec: EnvironmentSpec) -> tuple[int, ...]:
     """Shape of the longest episode as a clip."""
     return (spec.max_episode_steps + 1, spec.height, spec.width, spec.channels)
 
@@ -138,9 +145,9 @@ def _refuse_fallbacks(settings: JudgeConfig) -> None:
 
 
 def check_horizon(num_steps: int, max_episode_steps: int) -> None:
-    """Refuse rollouts in which an episode of full length does not end.
+    """Refuse rollouts that are shorter than an episode of full length.
 
-    None such would ever be judged: only episodes that end early would be paid, and no value beyond the cut be learned.
+    Such episodes would never be judged: only those that end early would get a reward.
 
     Args:
         num_steps: lock-steps of a rollout, the first of them after a reset. max_episode_steps: of the environment.
@@ -155,9 +162,10 @@ def check_horizon(num_steps: int, max_episode_steps: int) -> None:
         )
 
 
-def unjudged(rollout: Rollout) -> str:
-    """Why training must pause before a rollout that the agent judged: none of its episodes ended, or more than
-    MAX_INVALID_SHARE of them without a reward, so that nobody knows what their steps were worth; "" where it may go on.
+def unjudged_reason(rollout: Rollout) -> str:
+    """Why training must pause before it uses a rollout that the agent judged; "" where it may go on.
+
+    It pauses if no episode of the rollout ended, or if more than MAX_INVALID_SHARE of the ended ones have no reward.
     """
     ended = rollout.terminated_TN | rollout.truncated_TN
     without, count = int((ended & ~rollout.valid_TN).sum()), int(ended.sum())
@@ -198,33 +206,33 @@ class EpisodeReward:
         return version_of(self.name, self._judge.judge_id, self._judge.rubric.version, self._judge.settings.mode)
 
     def forget(self) -> None:
-        """The environment was (re)started: unfinished episodes belong to nobody."""
+        """Drop the unfinished episodes, because the environment was (re)started."""
         self.cut += len(self._open)
         self._open.clear()
 
     def add(self, step: EpisodeStep, spec: EnvironmentSpec, session: int) -> PendingReward:
-        """Take the next lock-step of a session of the environment."""
+        """Add the next lock-step of a session of the environment, and judge the episodes that end with it."""
         waited: dict[int, Future[Verdict] | str] = {}
         for n in map(int, np.flatnonzero(step.valid)):
-            episode = self._extended(n, step)
+            episode = self._extend(n, step)
             if step.ended[n]:
                 del self._open[n]
                 waited[n] = episode.fault or self._judge.submit(self._job(episode, spec, session))
         return PendingReward(step.valid, waited)
 
-    def _extended(self, n: int, step: EpisodeStep) -> _Episode:
-        """The episode of environment n with this step."""
+    def _extend(self, n: int, step: EpisodeStep) -> _Episode:
+        """Add the step to the episode of environment n and return the episode."""
         episode, episode_id = self._open.get(n), int(step.episode_ids[n])
         if episode is None or episode.episode_id != episode_id:
             self.cut += episode is not None
             episode = self._open[n] = _Episode(episode_id)
-        made = len(episode.actions)
-        if made != step.episode_steps[n]:
-            episode.fault = episode.fault or f"step {made} of episode {episode_id} was not seen"
+        num_steps = len(episode.actions)
+        if num_steps != step.episode_steps[n]:
+            episode.fault = episode.fault or f"step {num_steps} of episode {episode_id} was not seen"
         if step.images is None or step.next_images is None:
             episode.fault = episode.fault or f"no image of step {step.episode_steps[n]} of episode {episode_id}"
         else:
-            episode.frames += [images[n].copy() for images in (step.images, step.next_images)[int(made > 0) :]]
+            episode.frames += [images[n].copy() for images in (step.images, step.next_images)[int(num_steps > 0) :]]
         episode.actions.append(step.actions[n].copy())
         episode.goal = step.goals.get(n, episode.goal)
         return episode

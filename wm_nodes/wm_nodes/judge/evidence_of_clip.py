@@ -1,7 +1,7 @@
-"""Endogenous evidence of a clip, as far as a rubric's bands ask for it (RA-13, RA-17).
+"""Endogenous evidence of a clip, for the bands of a rubric (RA-13, RA-17).
 
-Pixels need nothing; what a world model says needs one that was trained in the clip's cameras, and the clip's actions.
-Evidence causes votes and second looks of the agent, and never adds reward.
+Pixel evidence needs the frames only; evidence of a world model needs one that was trained in the clip's cameras, and
+the clip's actions. Evidence makes the agent vote and reflect, and never adds reward.
 """
 
 import functools
@@ -19,10 +19,10 @@ from wm_nodes.world_model import WorldModels, load_model_folder
 
 
 class ClipEvidence:
-    """Measures clips.
+    """Measures the evidence of clips.
 
     Args:
-        model_dir: folder of the world model, loaded when a band first asks for it; None: there is none.
+        model_dir: folder of the world model, loaded when a band first needs it; None: there is none.
     """
 
     def __init__(self, model_dir: Path | None = None) -> None:
@@ -31,7 +31,7 @@ class ClipEvidence:
         self._one_at_a_time = threading.Lock()
 
     def check(self, rubric: Rubric) -> None:
-        """Refuse bands of evidence that is never measured: they would be silent.
+        """Refuse bands of evidence that is not measured here.
 
         Raises:
             ValueError: names the evidence and the remedy.
@@ -39,7 +39,7 @@ class ClipEvidence:
         """
         if unknown := sorted(set(rubric.evidence) - pixel_names() - set(MODEL_EVIDENCE)):
             raise ValueError(
-                f"rubric {rubric.version} has bands of {', '.join(unknown)}, which nobody measures here; known: "
+                f"rubric {rubric.version} has bands of {', '.join(unknown)}, which is not measured here; known: "
                 f"{', '.join(sorted({*pixel_names(), *MODEL_EVIDENCE}))}"
             )
         asked = sorted(set(rubric.evidence) & set(MODEL_EVIDENCE))
@@ -49,31 +49,31 @@ class ClipEvidence:
                 "folder in model_dir, or take another rubric"
             )
         if asked:
-            self._loaded()
+            self._load()
 
-    def of(self, rubric: Rubric, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
-        """What the rubric's bands name, of one clip; NaN, which lies in no band, where it cannot be measured."""
-        found = dict.fromkeys(rubric.evidence, math.nan)
+    def measure(self, rubric: Rubric, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
+        """Measure the evidence of one clip that the rubric's bands name; NaN, outside every band, where impossible."""
+        evidence = dict.fromkeys(rubric.evidence, math.nan)
         with self._one_at_a_time:
-            if found.keys() & pixel_names():
-                found |= self._pixels(clip, task)
-            if found.keys() & set(MODEL_EVIDENCE):
-                found |= self._model(clip, task)
-        return {name: found[name] for name in rubric.evidence}
+            if evidence.keys() & pixel_names():
+                evidence |= self._measure_pixels(clip, task)
+            if evidence.keys() & set(MODEL_EVIDENCE):
+                evidence |= self._measure_model(clip, task)
+        return {name: evidence[name] for name in rubric.evidence}
 
-    def _pixels(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
+    def _measure_pixels(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
         try:
             return pixel_evidence(pictures_of(clip.frames, task.reference_frame))
         except ValueError:  # of another shape than its reference frame, or no pictures: the agent says so
             return {}
 
-    def _model(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
+    def _measure_model(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
         try:
-            return model_evidence(self._loaded(), clip.frames, task)
+            return model_evidence(self._load(), clip.frames, task)
         except ValueError:  # of other cameras, another task, or without its actions
             return {}
 
-    def _loaded(self) -> WorldModels:
+    def _load(self) -> WorldModels:
         assert self._model_dir is not None  # check refuses such bands
         if self._models is None:
             self._models = load_model_folder(self._model_dir)

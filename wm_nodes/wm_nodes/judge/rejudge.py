@@ -1,6 +1,4 @@
-"""Have the reward agent judge the episodes of a recorded run, without a graph. Rewards that it gave live must come out
-again bit by bit.
-"""
+"""Judge the episodes of a recorded run again, without a graph, and compare with the recorded rewards bit by bit."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -19,18 +17,20 @@ from wm_nodes.reward import RewardResult
 
 @dataclass
 class JudgedBag:
-    """verdicts: of the episodes that were seen whole, in the order in which they ended. results: what the reward
-    evaluator would publish, by session and step. compared: lock-steps whose recorded rewards are of this judge, rubric
-    and mode; different: those of them that are not bit-equal. unanswered: rewards that the judge did not give then,
-    which are not compared. unseen: why ended episodes have no verdict.
-    """
+    """The rewards of a recording, judged again."""
 
     verdicts: list[Verdict] = field(default_factory=list)
+    """Of the completely recorded episodes, in the order in which they ended."""
     results: dict[tuple[int, int], RewardResult] = field(default_factory=dict)
+    """The rewards that the reward evaluator would publish, by (session, step)."""
     compared: int = 0
+    """Lock-steps whose recorded rewards are of this judge, rubric and mode."""
     different: list[tuple[int, int]] = field(default_factory=list)
+    """(session, step) of those that are not bit-equal."""
     unanswered: int = 0
+    """Rewards that were invalid in the recording; they are not compared."""
     unseen: list[str] = field(default_factory=list)
+    """Why ended episodes have no verdict."""
 
 
 def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) -> JudgedBag:
@@ -42,7 +42,7 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
     Raises:
         BagError: an unusable bag. ValueError: the judge has fallbacks.
     """
-    found, model = JudgedBag(), EpisodeReward(judge)
+    judged, model = JudgedBag(), EpisodeReward(judge)
     waiting = deque[tuple[RecordedStep, PendingReward]]()
     with Bag(path) as bag:
         steps = LockSteps(bag, namespace=namespace, reward_name=AGENT)
@@ -56,18 +56,18 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
     while waiting:
         step, pending = waiting.popleft()
         result = pending.result()
-        found.verdicts += pending.verdicts().values()
-        found.unseen += [reason for reason in pending.waited.values() if isinstance(reason, str)]
+        judged.verdicts += pending.verdicts().values()
+        judged.unseen += [reason for reason in pending.waited.values() if isinstance(reason, str)]
         place = step.session, step.step_id
-        found.results[place] = result
+        judged.results[place] = result
         if step.reward is not None and step.reward.reward_version == model.version:
             answered = step.reward.valid | ~step.valid
-            found.compared += 1
-            found.unanswered += int((~answered).sum())
+            judged.compared += 1
+            judged.unanswered += int((~answered).sum())
             same = step.reward.total[answered].tobytes() == result.total[answered].tobytes()
             if not same or not np.array_equal(step.reward.valid[answered], result.valid[answered]):
-                found.different.append(place)
-    return found
+                judged.different.append(place)
+    return judged
 
 
 def _episode_step(step: RecordedStep) -> EpisodeStep:

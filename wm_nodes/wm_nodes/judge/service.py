@@ -1,4 +1,4 @@
-"""The reward agent at work on many clips, for callers that do not await (RA-1, RA-15).
+"""A service that judges many clips with the reward agent, for callers that do not use asyncio (RA-1, RA-15).
 
 Shapes: N clips, F frames, H W 3 image, A action.
 """
@@ -22,7 +22,7 @@ from torch import Tensor
 from wm_nodes.config.schema import AGENT, JudgeConfig
 from wm_nodes.judge.agent import ClipRef, RewardAgent, Rubric, Status, TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
-from wm_nodes.judge.agent.scoring import skipped
+from wm_nodes.judge.agent.scoring import skipped_stage
 from wm_nodes.judge.agent.types import GATED, Cost, Health, Provenance, content_hash
 from wm_nodes.judge.audit import AuditedAgent, AuditLog, write_exchange
 from wm_nodes.judge.backends.factory import OpenedJudge, check_judge, judges_of, make_judge
@@ -31,18 +31,18 @@ from wm_nodes.recording.reader import read_spec
 from wm_nodes.video_model.clips import Clips
 
 READS = "judge_reads"
-"""Folder of a run that keeps the judge's answers."""
+"""Folder of a run with the cached answers of the judge."""
 POLL_S = 0.05
-"""How often a waiting caller looks whether it must stop."""
+"""How often a waiting caller checks whether it must stop, s."""
 HEALTH_S = 10.0
-"""Time between two questions to the servers whether they are there."""
+"""Time between two health requests to the servers, s."""
 CLOSE_S = 5.0
 
 T = TypeVar("T")
 
 
 class TrainingPaused(Exception):
-    """Too much of a round has no reward to train on: says why, and what to do."""
+    """Too many clips of a round have no reward; the text says why and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class ClipJob:
 
 @dataclass
 class VerdictCounts:
-    """What verdicts were given since the start, and what they took."""
+    """Number and cost of the verdicts since the start."""
 
     verdicts: int = 0
     by_status: dict[Status, int] = field(default_factory=dict)
@@ -78,7 +78,7 @@ class VerdictCounts:
 
 @dataclass
 class _JudgeSlot:
-    """One of the judges. failed_last_round: the last round that it was given was taken from it."""
+    """One judge with its agent. failed_last_round: it answered too few clips of its last round, see _FallbackBudget."""
 
     opened: OpenedJudge
     agent: RewardAgent | AuditedAgent
@@ -90,9 +90,10 @@ class _JudgeSlot:
 
 
 class _FallbackBudget:
-    """With a judge that others could stand in for: over when more than MAX_INVALID_SHARE of a round's clips have no
-    answer, or the clip that was sent ahead has none. It lasts when the round's time is up: nobody else could judge it.
+    """Counts the unanswered clips of a round and decides when the next judge takes the round over.
 
+    over: more than MAX_INVALID_SHARE of the clips have no answer, or the single clip that was sent as a test has none.
+    Clips that end after the round's deadline do not count, because no other judge could answer them in time.
     reason: of the newest clip without an answer.
     """
 
@@ -110,10 +111,10 @@ class _FallbackBudget:
 
 
 class JudgeService:
-    """A reward agent with its judge on an event loop in a thread of its own; at most `concurrency` clips at a time.
+    """Runs a reward agent on an event loop in a thread of its own; at most `concurrency` clips at a time.
 
-    settings.fallbacks are further judges for whole rounds, see judge. fallen_back: why the last round did not stay with
-    the first judge, and to whom it went; "" where it stayed.
+    settings.fallbacks are further judges for whole rounds, see judge. fallen_back: why another judge than the first
+    judged the last round, and which; "" where the first did.
 
     Args:
         reads: folder that keeps the judge's answers; None: none are kept.
@@ -133,33 +134,33 @@ class JudgeService:
         self._evidence = evidence or ClipEvidence()
         self._log = None if audit is None else AuditLog(audit)
         self.pack, self.tally, self.health = settings.rubric, VerdictCounts(), Health(True, "not asked yet")
-        self._seats = self._made(load_rubric(settings.rubric))
-        self.fallen_back, self._used = "", self._seats[0]
-        self._places = asyncio.Semaphore(settings.concurrency)
-        self._asked_s = -math.inf
-        self._asking: Future[None] | None = None
+        self._slots = self._make_slots(load_rubric(settings.rubric))
+        self.fallen_back, self._used = "", self._slots[0]
+        self._semaphore = asyncio.Semaphore(settings.concurrency)
+        self._health_asked_s = -math.inf
+        self._health_request: Future[None] | None = None
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="reward agent", daemon=True)
         self._thread.start()
 
     @property
     def rubric(self) -> Rubric:
-        return self._seats[0].agent.rubric
+        return self._slots[0].agent.rubric
 
     @property
     def judge_id(self) -> str:
-        """Of the judge of the last round; before one, of the first judge, of whom `health` is too."""
+        """Identity of the judge of the last round; before the first round, of the first judge."""
         return self._used.judge_id
 
     @property
     def judge_ids(self) -> list[str]:
-        """Of all judges, in the order in which they are tried."""
-        return [seat.judge_id for seat in self._seats]
+        """Identities of all judges, in the order in which they are tried."""
+        return [slot.judge_id for slot in self._slots]
 
     @property
     def cards(self) -> list[str]:
-        """What the judges were measured to see, in words; those of whom nobody knows say nothing."""
-        return [card for seat in self._seats if (card := seat.agent.judge.capabilities.card)]
+        """The measured abilities of each judge, as text; judges without a measurement are left out."""
+        return [card for slot in self._slots if (card := slot.agent.judge.capabilities.card)]
 
     def set_rubric(self, pack: str, base: Path) -> None:
         """Judge by another rubric from now on; call it while nothing is being judged.
@@ -174,14 +175,14 @@ class JudgeService:
         """
         path = base / pack
         rubric = load_rubric(str(path) if path.is_file() else pack)
-        old, self._seats = self._seats, self._made(rubric)
-        self.pack, self.fallen_back, self._used = pack, "", self._seats[0]
-        for seat in old:
-            self._run(seat.opened.close())
+        old, self._slots = self._slots, self._make_slots(rubric)
+        self.pack, self.fallen_back, self._used = pack, "", self._slots[0]
+        for slot in old:
+            self._run(slot.opened.close())
 
     def submit(self, job: ClipJob, deadline: float | None = None) -> "Future[Verdict]":
-        """Have the first judge judge a clip as soon as there is a place. deadline: on the time.monotonic clock, s."""
-        return self._run(self._judged(self._seats[0].agent, job, deadline))
+        """Have the first judge judge one clip, concurrency permitting. deadline: on the time.monotonic clock, s."""
+        return self._run(self._judge_clip(self._slots[0].agent, job, deadline))
 
     def judge(
         self, jobs: Sequence[ClipJob], *, check: Callable[[], None] = lambda: None,
@@ -190,55 +191,55 @@ class JudgeService:
     ) -> list[Verdict]:
         """Judge a round of clips by one judge and one rubric; the verdicts are in the order of the jobs.
 
-        A judge that leaves more than MAX_INVALID_SHARE of the clips without an answer (status ERROR) loses the round to
-        the next one, as long as there is one and time: all its verdicts are dropped, the answers it gave included.
+        If a judge leaves more than MAX_INVALID_SHARE of the clips without an answer (status ERROR), all its verdicts
+        are dropped and the next judge judges the whole round, while time is left.
 
         Args:
-            check: called at least every POLL_S; what it raises ends the judging, and calls under way are dropped.
-            done: called in this thread with the index and verdict of every clip: as it is judged by the last judge
-                there is, or when a round that could still be taken from its judge is over.
-            within_s: clips without a verdict by then get one that says so, without a reward; None: no limit.
-            round_number: what the audit log calls these clips' round.
+            check: called at least every POLL_S; an exception from it ends the judging and cancels open calls.
+            done: called in this thread with the index and verdict of every clip; immediately for the last judge, at
+                the end of the round for judges that have a fallback.
+            within_s: clips without a verdict after this time get one with status ERROR; None: no limit.
+            round_number: of these clips in the audit log.
             by: the id of the only judge to ask; empty: all, in their order.
 
         Raises:
             ValueError: there is no judge of this id.
         """
-        seats = [seat for seat in self._seats if by in ("", seat.judge_id)]
-        if not seats:
+        slots = [slot for slot in self._slots if by in ("", slot.judge_id)]
+        if not slots:
             raise ValueError(f"there is no judge {by!r} to ask, only {', '.join(self.judge_ids)}")
         deadline = None if within_s is None else time.monotonic() + within_s
         lost = list[str]()
-        for seat in seats:
-            if isinstance(seat.agent, AuditedAgent):
-                seat.agent.round_number = round_number
-            held = dict[int, Verdict]()
-            patience = _FallbackBudget(len(jobs), deadline) if seat is not seats[-1] else None
-            told = done if patience is None else held.__setitem__
+        for slot in slots:
+            if isinstance(slot.agent, AuditedAgent):
+                slot.agent.round_number = round_number
+            verdicts_by_index = dict[int, Verdict]()
+            budget = _FallbackBudget(len(jobs), deadline) if slot is not slots[-1] else None
+            on_verdict = done if budget is None else verdicts_by_index.__setitem__
             ahead = (
-                1 if seat.failed_last_round and patience is not None else 0
-            )  # is it back? One clip, so that a breaker can close
-            verdicts = self._round(seat, jobs[:ahead], 0, deadline, check, told, patience)
-            verdicts += self._round(seat, jobs[ahead:], ahead, deadline, check, told, patience)
-            seat.failed_last_round = patience is not None and patience.over
-            if patience is None or not patience.over:
+                1 if slot.failed_last_round and budget is not None else 0
+            )  # one clip tests whether the judge answers again and lets its circuit breaker close
+            verdicts = self._round(slot, jobs[:ahead], 0, deadline, check, on_verdict, budget)
+            verdicts += self._round(slot, jobs[ahead:], ahead, deadline, check, on_verdict, budget)
+            slot.failed_last_round = budget is not None and budget.over
+            if budget is None or not budget.over:
                 break
-            lost.append(f"{seat.judge_id} did not answer: {patience.reason}")
-        for index, verdict in held.items():
+            lost.append(f"{slot.judge_id} did not answer: {budget.reason}")
+        for index, verdict in verdicts_by_index.items():
             done(index, verdict)
-        self._used = seat
-        self.fallen_back = f"{'; '.join(lost)}; the round went to {seat.judge_id}" if lost else ""
+        self._used = slot
+        self.fallen_back = f"{'; '.join(lost)}; the round went to {slot.judge_id}" if lost else ""
         return verdicts
 
     def refresh_health(self) -> None:
-        """Ask the judge how it is, at most every HEALTH_S and without waiting: `health` is the newest answer."""
-        idle = self._asking is None or self._asking.done()
-        if idle and not self._loop.is_closed() and time.monotonic() - self._asked_s >= HEALTH_S:
-            self._asked_s = time.monotonic()
-            self._asking = self._run(self._ask_health(self._seats[0]))
+        """Request the judge's health, at most every HEALTH_S and without waiting; `health` is the newest answer."""
+        idle = self._health_request is None or self._health_request.done()
+        if idle and not self._loop.is_closed() and time.monotonic() - self._health_asked_s >= HEALTH_S:
+            self._health_asked_s = time.monotonic()
+            self._health_request = self._run(self._ask_health(self._slots[0]))
 
     def close(self) -> None:
-        """Drop what is under way and end the thread."""
+        """Cancel open calls and end the thread."""
         with suppress(TimeoutError):
             self._run(self._end()).result(CLOSE_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
@@ -249,12 +250,12 @@ class JudgeService:
 
     # internals
 
-    def _made(self, rubric: Rubric) -> list[_JudgeSlot]:
+    def _make_slots(self, rubric: Rubric) -> list[_JudgeSlot]:
         check_judge(self.settings)
         self._evidence.check(rubric)
-        return [self._seat(settings, rubric) for settings in judges_of(self.settings)]
+        return [self._make_slot(settings, rubric) for settings in judges_of(self.settings)]
 
-    def _seat(self, settings: JudgeConfig, rubric: Rubric) -> _JudgeSlot:
+    def _make_slot(self, settings: JudgeConfig, rubric: Rubric) -> _JudgeSlot:
         log = self._log
         limits: dict[str, Any] = {
             "mode": settings.mode, "seed": self._seed, "max_reads": settings.max_reads,
@@ -267,22 +268,23 @@ class JudgeService:
         return _JudgeSlot(opened, AuditedAgent(opened.judge, rubric, log, **limits))
 
     def _round(
-        self, seat: _JudgeSlot, jobs: Sequence[ClipJob], first: int, deadline: float | None, check: Callable[[], None],
-        done: Callable[[int, Verdict], None], patience: "_FallbackBudget | None",
+        self, slot: _JudgeSlot, jobs: Sequence[ClipJob], first: int, deadline: float | None, check: Callable[[], None],
+        done: Callable[[int, Verdict], None], budget: "_FallbackBudget | None",
     ) -> list[Verdict]:
-        """The verdicts of one judge; fewer where patience with it is over. first: index of the first job."""
-        if patience is not None and patience.over:
+        """The verdicts of one judge, incomplete when its budget is over. first: index of the first job."""
+        if budget is not None and budget.over:
             return []
-        futures = {self._run(self._judged(seat.agent, job, deadline)): first + index for index, job in enumerate(jobs)}
+        work = (self._judge_clip(slot.agent, job, deadline) for job in jobs)
+        futures = {self._run(each): index for index, each in enumerate(work, first)}
         open_ = set(futures)
         try:
-            while open_ and not (patience is not None and patience.over):
+            while open_ and not (budget is not None and budget.over):
                 check()
                 finished, open_ = wait(open_, POLL_S, FIRST_COMPLETED)
                 for future in finished:
                     done(futures[future], future.result())
-                    if patience is not None:
-                        patience.record(future.result(), alone=len(jobs) == 1)
+                    if budget is not None:
+                        budget.record(future.result(), alone=len(jobs) == 1)
         finally:
             for future in open_:
                 future.cancel()
@@ -291,36 +293,37 @@ class JudgeService:
     def _run(self, work: Coroutine[Any, Any, T]) -> "Future[T]":
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
-    async def _judged(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
+    async def _judge_clip(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
         left_s = None if deadline is None else deadline - time.monotonic()
         try:
-            async with asyncio.timeout(left_s), self._places:
+            async with asyncio.timeout(left_s), self._semaphore:
                 bands = agent.rubric.evidence
-                evidence = await asyncio.to_thread(self._evidence.of, agent.rubric, job.clip, job.task) if bands else {}
+                measure = partial(self._evidence.measure, agent.rubric, job.clip, job.task)
+                evidence = await asyncio.to_thread(measure) if bands else {}
                 verdict = await agent.evaluate(job.clip, job.task, evidence)
         except TimeoutError:
-            verdict = _late(agent, job, self._seed)
+            verdict = _late_verdict(agent, job, self._seed)
         self.tally.add(verdict)
         return verdict
 
-    async def _ask_health(self, seat: _JudgeSlot) -> None:
-        self.health = await seat.opened.judge.health()
+    async def _ask_health(self, slot: _JudgeSlot) -> None:
+        self.health = await slot.opened.judge.health()
 
     async def _end(self) -> None:
         others = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
         for task in others:
             task.cancel()
         await asyncio.gather(*others, return_exceptions=True)
-        for seat in self._seats:
-            await seat.opened.close()
+        for slot in self._slots:
+            await slot.opened.close()
 
 
-def _late(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict:
-    """The verdict on a clip that the round did not wait for."""
+def _late_verdict(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict:
+    """The verdict on a clip that was not judged by the round's deadline."""
     able, now = agent.judge.capabilities, time.time()
     verdict = Verdict(
         clip_id=job.clip.clip_id, status=Status.ERROR, reward=math.nan, level=-1,
-        stages=tuple(map(skipped, GATED)), plan=None, reflections=(), hack_flags=(), cost=Cost(),
+        stages=tuple(map(skipped_stage, GATED)), plan=None, reflections=(), hack_flags=(), cost=Cost(),
         provenance=Provenance(
             able.judge_id, able.transport, able.model, able.server_version, agent.rubric.version, "", job.clip.sha256,
             seed, now, now,
@@ -333,8 +336,9 @@ def _late(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict
 def buffer_jobs(
     frames: Tensor, references: Clips, sha256: str, *, given: int, fps: float, task: str, robot: str
 ) -> list[ClipJob]:
-    """One job per clip of a buffer. Frames that the model was given are shown as they were recorded: what its codec
-    makes of them is no work of the model's.
+    """One job per clip of a buffer.
+
+    The conditioning frames are shown as they were recorded, not as the video model's codec decodes them.
 
     Args:
         frames: decoded clips, uint8 (N, F, H, W, 3). references: the recordings of their contexts, a row per clip.

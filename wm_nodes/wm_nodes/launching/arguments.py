@@ -6,13 +6,19 @@
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.config.load import dump_config, judge_or_embedded, judge_overrides, load_config
-from wm_nodes.config.schema import JudgeConfig, RunConfig
+from wm_nodes.config.load import (
+    dump_config,
+    judge_or_embedded,
+    judge_overrides,
+    load_config,
+    load_video_config,
+    reward_overrides,
+)
+from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.launching.graph import Graph, GraphError, compose
 from wm_nodes.launching.scenarios import build_graph, parse_arguments
@@ -56,7 +62,7 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     if values.get("starts_file") == "":
         values["starts_file"] = str(Path(values["model_dir"]) / "starts.safetensors")
     if values["params_file"]:
-        values["params_file"] = _existing(values["params_file"], "params_file")
+        values["params_file"] = _check_file(values["params_file"], "params_file")
     if "bag_uri" in values:
         values["bag_uri"] = _bag_uri(values["bag_uri"], scenario, run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
@@ -67,10 +73,10 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
 
 def _judge_settings(values: Mapping[str, str]) -> dict[str, Any]:
     """The settings that the judge's arguments stand for. Raises GraphError where nobody would be asked by them."""
-    found = judge_overrides(*(values.get(name, "") for name in ("judge", "judge_model", "judge_key_env", "rubric")))
-    if found and values["reward"] != "agent":
-        raise GraphError(f"{', '.join(found)} would change nothing without reward:=agent")
-    return found
+    settings = judge_overrides(*(values.get(name, "") for name in ("judge", "judge_model", "judge_key_env", "rubric")))
+    if settings and values["reward"] != "agent":
+        raise GraphError(f"{', '.join(settings)} would change nothing without reward:=agent")
+    return settings
 
 
 def _check_agent(config: RunConfig, values: Mapping[str, str]) -> None:
@@ -96,22 +102,20 @@ def _check_judge(settings: JudgeConfig) -> None:
 
 
 def _resolve_video(values: dict[str, str], run_dir: Path, judge: dict[str, Any]) -> dict[str, str]:
-    """Loop 2 has settings of its own (video_rl/settings.py); the world model gives the judge's position probe."""
-    from wm_nodes.config.schema import AGENT
-    from wm_nodes.video_rl.settings import dump_video_config, load_video_config, reward_overrides
+    """Loop 2 has settings of its own (config/video.py); the world model gives the judge's position probe."""
 
     if values["reward"] not in ("", "agent"):
         raise GraphError(f"reward {values['reward']!r} is of policies; for the video model give agent or nothing")
     weights = reward_overrides(values["reward"] or None)
     config = load_video_config(values["config_file"] or values["video_preset"], {**weights, **judge})
     if config.rewards.get(AGENT):
-        config = replace(config, judge=judge_or_embedded(config.judge))
+        config = config.with_values(judge=judge_or_embedded(config.judge))
         _check_judge(config.judge)
     values["model_dir"] = _model_dir(values["model_dir"], config.task)
     values["bag_uri"] = _bag_uri(values["bag_uri"], "world_model_rl", run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
     values["config_file"] = str(run_dir / "video_config.yaml")
-    Path(values["config_file"]).write_text(dump_video_config(config))
+    Path(values["config_file"]).write_text(dump_config(config))
     return values
 
 
@@ -142,7 +146,7 @@ def _model_dir(given: str, task: str) -> str:
         raise GraphError(str(error)) from None
 
 
-def _existing(given: str, name: str) -> str:
+def _check_file(given: str, name: str) -> str:
     path = Path(given).expanduser().absolute()
     if not path.is_file():
         raise GraphError(f"{name} {given!r} does not exist")

@@ -94,7 +94,7 @@ class ForkServer:
         self._socket.close()
 
     def _read(self) -> None:
-        while message := self._received():
+        while message := self._receive():
             answer = json.loads(message)
             pid = answer["pid"]
             if "code" in answer:
@@ -108,7 +108,7 @@ class ForkServer:
         if not self._started.done():
             self._started.set_exception(OSError("it has ended"))
 
-    def _received(self) -> bytes:
+    def _receive(self) -> bytes:
         try:
             return self._socket.recv(MESSAGE_BYTES)
         except OSError:

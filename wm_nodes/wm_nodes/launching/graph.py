@@ -97,13 +97,13 @@ class Graph:
 
     def node(self, name: str) -> NodeSpec:
         """The process of a node: by label or, where only one has it, by name; a composed process carries several."""
-        found = [node for node in self.nodes if name.lstrip("/") in [one.label for one in (node, *node.inside)]]
-        found = found or [node for node in self.nodes if name in [one.name for one in (node, *node.inside)]]
-        if len(found) != 1:
+        matches = [node for node in self.nodes if name.lstrip("/") in [part.label for part in (node, *node.inside)]]
+        matches = matches or [node for node in self.nodes if name in [part.name for part in (node, *node.inside)]]
+        if len(matches) != 1:
             raise GraphError(
                 f"no single node {name!r} in graph {self.name!r}: {', '.join(n.label for n in self.nodes)}"
             )
-        return found[0]
+        return matches[0]
 
     def to_json(self) -> str:
         return json.dumps(dataclasses.asdict(self), indent=1)
@@ -131,9 +131,9 @@ def compose(graph: Graph, parameter_file: str) -> Graph:
     ]
     if len(inside) < 2:
         return graph
-    one = NodeSpec(
+    composed = NodeSpec(
         "wm_nodes.nodes.compose", "composed", namespace, log_level=inside[0].log_level,
         arguments=tuple(node.name for node in inside), inside=tuple(inside), parameter_file=parameter_file,
         extra_parameters=inside[0].extra_parameters,
     )
-    return dataclasses.replace(graph, nodes=(one, *(node for node in graph.nodes if node not in inside)))
+    return dataclasses.replace(graph, nodes=(composed, *(node for node in graph.nodes if node not in inside)))

@@ -1,7 +1,7 @@
-"""The face of a scenario for `ros2 launch`: needs the ROS 2 packages launch and launch_ros (apt), nothing of rclpy.
+"""The launch description of a scenario for `ros2 launch`; needs the ROS 2 packages launch and launch_ros (apt).
 
-ros2 runs under the system's Python, which has neither our pydantic nor torch: the graph is made by the nodes'
-interpreter (ros.arguments, in a process of its own), and this module imports only the standard library.
+ros2 runs under the system's Python, which has neither pydantic nor torch: the graph is made by the nodes' interpreter
+(launching.arguments, in a process of its own), and this module imports only the standard library.
 
 PyPI's `launch` 0.1.3 is an unrelated project of the same name.
 """
@@ -16,7 +16,7 @@ from wm_nodes.launching.environment import graph_environment, interpreter
 from wm_nodes.launching.graph import Graph, NodeSpec
 from wm_nodes.launching.scenarios import argument_table
 
-HELD: list[DomainLock] = []
+LOCKS: list[DomainLock] = []
 """Of the graphs that this process launched, until it ends: ros2 launch runs nothing of ours at its own end."""
 
 
@@ -55,16 +55,16 @@ def _start(scenario: str, context: Any) -> list[Any]:
         argument.name: LaunchConfiguration(argument.name).perform(context) for argument in argument_table(scenario)
     }
     python = interpreter(given)
-    graph = prepared(scenario, given, python)
+    graph = prepare_graph(scenario, given, python)
     domain = int(graph_environment(graph.environment, python=python)["ROS_DOMAIN_ID"])
     lock = DomainLock(domain, f"graph {graph.name!r}")
     lock.acquire()
-    HELD.append(lock)
+    LOCKS.append(lock)
     return node_actions(graph, python)
 
 
-def prepared(scenario: str, given: Mapping[str, str], python: str) -> Graph:
-    """ros.arguments.prepare in the nodes' interpreter.
+def prepare_graph(scenario: str, given: Mapping[str, str], python: str) -> Graph:
+    """Run launching.arguments.prepare in the nodes' interpreter and return its graph.
 
     Raises:
         RuntimeError: its last line of error, and what to set where a module is missing.

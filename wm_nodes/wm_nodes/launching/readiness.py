@@ -47,11 +47,11 @@ def wait_ready(
                 for full_name, node in list(waiting.items()):
                     if full_name in names:
                         states[full_name] = _state(observer, node, asked)
-                    if states[full_name] in _wanted(node):
+                    if states[full_name] in _ready_states(node):
                         del waiting[full_name]
                 if waiting and time.monotonic() > deadline:
-                    found = ", ".join(f"{name} ({states[name]})" for name in waiting)
-                    raise NotReadyError(f"not ready after {timeout_s:g} s: {found}", list(waiting))
+                    pending = ", ".join(f"{name} ({states[name]})" for name in waiting)
+                    raise NotReadyError(f"not ready after {timeout_s:g} s: {pending}", list(waiting))
                 spin_once(POLL_S)
 
 
@@ -92,7 +92,7 @@ def activate(
                     raise NotReadyError(f"{name} refused to {transition}", [name])
 
 
-def _wanted(node: NodeSpec) -> tuple[str, ...]:
+def _ready_states(node: NodeSpec) -> tuple[str, ...]:
     if not node.lifecycle:
         return ("seen",)
     return ("active",) if node.parameters.get("autostart", True) else ("unconfigured", "inactive", "active")

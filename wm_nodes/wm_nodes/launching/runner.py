@@ -27,7 +27,7 @@ from wm_nodes.launching.scenarios import describe_arguments
 from wm_nodes.ros.middleware import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-LAST_WORDS_S = 0.2
+LAST_OUTPUT_S = 0.2
 """Until what a node wrote before its answer has come through its pipe."""
 GRACE_S = 5.0
 """Time for an orderly end after SIGINT, and again after SIGTERM."""
@@ -109,7 +109,7 @@ class Runner:
         try:
             wait_ready(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
         except NotReadyError as error:
-            raise self._with_last_words(error) from None
+            raise self._add_last_output(error) from None
 
     def activate(self, timeout_s: float = 60.0) -> None:
         """Configure and activate the nodes of a graph that was started with autostart false.
@@ -121,10 +121,10 @@ class Runner:
         try:
             activate(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
         except NotReadyError as error:
-            raise self._with_last_words(error) from None
+            raise self._add_last_output(error) from None
 
-    def _with_last_words(self, error: NotReadyError) -> NotReadyError:
-        time.sleep(LAST_WORDS_S)
+    def _add_last_output(self, error: NotReadyError) -> NotReadyError:
+        time.sleep(LAST_OUTPUT_S)
         words = [
             process.last_output_line() for process in self._processes.values()
             if {node.full_name for node in process.spec.carried()} & {*error.nodes}

@@ -1,7 +1,7 @@
 """Which nodes a scenario has: one table of arguments and one function per scenario.
 
-They serve both `ros2 launch` (ros.launch_face) and the plain Python starter (ros.runner); no rclpy, no launch, no files
-read.
+They serve both `ros2 launch` (launch_description.py) and the plain Python starter (runner.py); no rclpy, no launch, no
+files read.
 """
 
 import dataclasses
@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from wm_nodes.config.tasks import task_names
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
 
 TRUTHS = ("true", "false")
@@ -36,7 +37,7 @@ class LaunchArgument:
 
 ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("preset", "cpu", "Settings to start from, when config_file is empty: a name or a .yaml file"),
-    LaunchArgument("task", "push_cube", "Task, when config_file is empty", ("reach", "push_cube", "pull_cube")),
+    LaunchArgument("task", "push_cube", "Task, when config_file is empty", task_names()),
     LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
     LaunchArgument("run_dir", "", "Folder for weights, bags and logs; empty: runs/<time>-<scenario>"),
     LaunchArgument("namespace", "wm", "ROS namespace of the graph; several graphs on one host need several domains"),
@@ -113,7 +114,7 @@ def parse_arguments(scenario: str, given: Mapping[str, str]) -> dict[str, str]:
 
 
 def build_graph(scenario: str, arguments: Mapping[str, str]) -> Graph:
-    """Return the graph for resolved arguments (ros.arguments.resolve fills run_dir, config_file and the like)."""
+    """Return the graph for resolved arguments (arguments.resolve fills run_dir, config_file and others)."""
     graph = scenario_of(scenario).build(arguments)
     environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": arguments["discovery_range"]}
     if arguments["domain_id"]:

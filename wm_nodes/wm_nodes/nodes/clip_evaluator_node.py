@@ -13,7 +13,7 @@ import torch
 
 from wm_msgs.action import EvaluateClips
 from wm_msgs.msg import ClipScores, ClipVerdict
-from wm_nodes.config.load import judge_or_embedded
+from wm_nodes.config.load import judge_or_embedded, load_video_config
 from wm_nodes.config.schema import AGENT
 from wm_nodes.judge.agent import Verdict, check_one_judge
 from wm_nodes.judge.agent.types import GATED
@@ -32,7 +32,6 @@ from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.reference_reward import mixed, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.settings import load_video_config
 from wm_nodes.world_model import load_model_folder
 
 PARAMS = (

@@ -264,15 +264,15 @@ class EnvironmentNode(ManagedNode):
         if not self.active:
             raise self._not_active()
         next_seq = self._transitions.next_seq
-        holding = self._ledger.holding(next_seq)
-        if not holding:
+        blocking = self._ledger.blocking_consumers(next_seq)
+        if not blocking:
             return
         for name in self._ledger.drop_silent(next_seq):
             self.diagnostics.count("dropped_consumers", text=f"{name} gave no credit for 5 s; not waited for")
-            holding.remove(name)
-        if holding:
+            blocking.remove(name)
+        if blocking:
             self.diagnostics.count("waits_for_credit", level=diagnostics.OK)
-            raise WireError(ErrorCode.BUSY, f"waiting for {', '.join(holding)} to take in seq {next_seq - 1}; retry")
+            raise WireError(ErrorCode.BUSY, f"waiting for {', '.join(blocking)} to take in seq {next_seq - 1}; retry")
 
     def _make_clock(self) -> Any:
         """The publisher of /clock, or None where nobody wants it."""

@@ -97,7 +97,7 @@ def expected_spec(config: RunConfig, model_dir: str, policy_factory: str) -> Env
     """The robot and cameras that the policy of make_policy was made for; None for a factory's, which tells nothing."""
     if policy_factory or not model_dir:
         return None
-    return simulation_spec(config.task, "", config.simulation, 1)
+    return simulation_spec(config.task, config.simulation, 1)
 
 
 def refuse_other(found: EnvironmentSpec, expected: EnvironmentSpec, whose: str) -> None:

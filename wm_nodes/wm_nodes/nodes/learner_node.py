@@ -20,7 +20,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import AGENT
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Rollout
-from wm_nodes.judge.episode_reward import check_horizon, unjudged
+from wm_nodes.judge.episode_reward import check_horizon, unjudged_reason
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.factories import existing, expected_spec, make_learner, make_policy, refuse_other
 from wm_nodes.nodes.learner.replay_assembler import ReplayAssembler
@@ -152,7 +152,7 @@ class LearnerNode(TrainingNode):
         """
         while (following := source.next()) is not None and self._reward_name == AGENT:
             check_horizon(self._config.ppo.num_steps, self._max_episode_steps)
-            if not (reason := unjudged(following[0])):
+            if not (reason := unjudged_reason(following[0])):
                 break
             if live:
                 raise TrainingPaused(reason)

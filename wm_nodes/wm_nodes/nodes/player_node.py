@@ -205,7 +205,7 @@ class PlayerNode(ManagedNode):
         """Hold a transition back until every consumer has granted it, as the environment does."""
         session, seq = session_and_seq(data)
         ledger = self._ledgers.setdefault(session, ProducerCredits(CREDITED, session))
-        while ledger.holding(seq):
+        while ledger.blocking_consumers(seq):
             for name in ledger.drop_silent(seq):
                 self.diagnostics.count("silent_consumers", text=f"{name} granted nothing for 5 s and is not waited for")
             check()

@@ -89,7 +89,7 @@ class RecorderNode(ManagedNode):
     def cleanup(self) -> None:
         self._stop()
 
-    def settled(self, stop_s: float) -> bool:
+    def is_settled(self, stop_s: float) -> bool:
         return self._bag is None or time.monotonic() - max(stop_s, self._last_message_s) > QUIET_S
 
     def update_diagnostics(self) -> None:
@@ -113,7 +113,7 @@ class RecorderNode(ManagedNode):
         if not self._paused:
             self._write(name, data)
         if grantor is not None and tracker is not None:
-            grantor.consumed(tracker)
+            grantor.record_consumed(tracker)
 
     def _write(self, name: str, data: bytes) -> None:
         if self._bag is None:

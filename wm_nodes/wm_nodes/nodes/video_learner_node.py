@@ -14,6 +14,7 @@ from rclpy.action import ActionClient
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
 from wm_msgs.msg import ClipScores
+from wm_nodes.config.load import load_video_config
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
@@ -27,7 +28,6 @@ from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
-from wm_nodes.video_rl.settings import load_video_config
 from wm_nodes.video_rl.training_run import VideoRun, rewarded
 from wm_nodes.video_rl.validation import alarm_text, validation_scores
 

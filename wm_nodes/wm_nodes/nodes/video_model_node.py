@@ -10,6 +10,7 @@ import torch
 
 from wm_msgs.action import GenerateClips
 from wm_msgs.msg import ClipBatch, PolicyVersion
+from wm_nodes.config.load import load_video_config
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.nodes.policy.weights import read_weights
@@ -26,7 +27,6 @@ from wm_nodes.training.weights import WeightsError, load_weights
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.settings import load_video_config
 
 PARAMS = (
     Param("video_model_dir", "", "Folder of the trained video model", read_only=True),

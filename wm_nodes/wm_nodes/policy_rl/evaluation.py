@@ -68,7 +68,7 @@ def evaluate(
         ValueError: episodes < 1.
     """
     if episodes < 1:
-        raise ValueError(f"episodes must be >= 1, got {episodes}; see evaluation.episodes in presets/base.yaml")
+        raise ValueError(f"episodes must be >= 1, got {episodes}; see evaluation.episodes in presets/policy/base.yaml")
     num_envs = env.spec.num_envs
     playing = np.where(np.arange(num_envs) < episodes, np.arange(num_envs), -1)
     next_episode = min(num_envs, episodes)

@@ -12,7 +12,6 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import FloatArray, Observation, UInt8Array
-from wm_nodes.environments.maniskill.tasks import instruction
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.reward import EncoderDistance, EndogenousReward
 from wm_nodes.training.weights import load_weights
@@ -105,7 +104,7 @@ def make_imagined_environment(
                 f"{model_dir} was trained with simulation.{name} = {found}, the configuration says {wanted}; change "
                 "the configuration or train another model"
             )
-    spec = simulation_spec(config.task, instruction(config.task), config.simulation, num_envs)
+    spec = simulation_spec(config.task, config.simulation, num_envs)
     return ImaginedEnvironment(
         models, spec, load_starts(Path(starts_file)), config.reward, num_envs=num_envs, seed=seed,
         with_goals=config.reward.dense_weight > 0,

@@ -13,22 +13,21 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
+from wm_nodes.config.tasks import get_task, model_tasks
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.environments.maniskill.collection import CollectionPlan
-from wm_nodes.environments.maniskill.tasks import success
-from wm_nodes.environments.record import TRAINING_SEEDS, collect_plan, gate_plan, scripted_plan
+from wm_nodes.environments.record import TRAINING_SEEDS, acceptance_plan, collect_plan, scripted_plan
 from wm_nodes.policy_rl.factories import policy_actor
-from wm_nodes.policy_rl.pretraining import MODEL_TASKS
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import ActionModel, WorldModels, load_model_folder, save_refreshed_folder
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.training.dynamics import train_action_model
-from wm_nodes.world_model.validation.acceptance import CONTACT_FREE, model_metrics
+from wm_nodes.world_model.validation.acceptance import model_metrics
 
 ROUND_SEEDS, ROUND_HELDOUT_SEEDS = 800_000, 900_000
 SEEDS_PER_ROUND = 5_000
-"""Reset seeds of round k start at (k - 1) * SEEDS_PER_ROUND from these; rounds.num_rounds is at most 20."""
+"""Reset seeds of round k start at (k - 1) * SEEDS_PER_ROUND from these; model_refresh.num_rounds is at most 20."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +91,11 @@ def collect_round(
     """
     bags = []
     for name, first_seed, episodes in (
-        ("train", ROUND_SEEDS, config.rounds.episodes_per_round),
-        ("heldout", ROUND_HELDOUT_SEEDS, config.rounds.heldout_episodes),
+        ("train", ROUND_SEEDS, config.model_refresh.episodes_per_round),
+        ("heldout", ROUND_HELDOUT_SEEDS, config.model_refresh.heldout_episodes),
     ):
         plan = CollectionPlan(
-            MODEL_TASKS[config.task][-1], config.simulation, episodes, first_seed + SEEDS_PER_ROUND * (number - 1), {},
+            model_tasks(config.task)[-1], config.simulation, episodes, first_seed + SEEDS_PER_ROUND * (number - 1), {},
             make_policy=partial(policy_actor, config, model_dir, weights, None), policy_version=number,
         )
         bags.append(collect_plan(plan, config, folder / name, progress))
@@ -104,11 +103,11 @@ def collect_round(
 
 
 def collect_replay(config: RunConfig, run_dir: Path, *, progress: bool = True) -> tuple[list[Path], list[Path]]:
-    """Scripted simulator episodes of a run, collected once: (replay for every refresh, held out as for the gate)."""
-    replay = scripted_plan(config, config.rounds.replay_episodes, TRAINING_SEEDS)
+    """Scripted simulator episodes of a run, collected once: (replay for every refresh, held out as for acceptance)."""
+    replay = scripted_plan(config, config.model_refresh.replay_episodes, TRAINING_SEEDS)
     return (
         collect_plan(replay, config, run_dir / "bags" / "replay", progress),
-        collect_plan(gate_plan(config), config, run_dir / "bags" / "heldout", progress),
+        collect_plan(acceptance_plan(config), config, run_dir / "bags" / "heldout", progress),
     )
 
 
@@ -130,7 +129,8 @@ def refresh_model(
     manifest = models.manifest
     settings = WorldModelConfig.model_validate(manifest["world_model"]).model_copy(
         update={
-            "num_iterations": config.rounds.refresh_iterations, "learning_rate": config.rounds.learning_rate,
+            "num_iterations": config.model_refresh.refresh_iterations,
+            "learning_rate": config.model_refresh.learning_rate,
             "rollout_steps": [config.simulation.max_episode_steps],
         }
     )
@@ -143,14 +143,14 @@ def refresh_model(
     action = copy.deepcopy(models.action)
     assert isinstance(action, ActionModel)
     recorded = (episode for bag in bags for episode in read_episodes(bag))
-    episodes = stack_episodes(recorded, models.tasks, success, num_steps=config.simulation.max_episode_steps)
+    episodes = stack_episodes(recorded, models.tasks, num_steps=config.simulation.max_episode_steps)
     action, metrics = train_action_model(
         models.tokenizer, episodes, training, config.seed + number, folder.with_name(f"{folder.name}_training"),
         model=action.requires_grad_(True), progress=progress,
     )
     refreshed = {
         "source_sha256": models.sha256, "round": number, "episodes": len(episodes), "metrics": metrics,
-        "rounds": config.rounds.model_dump(),
+        "model_refresh": config.model_refresh.model_dump(),
     }
     earlier = list(manifest.get("refreshed", []))
     save_refreshed_folder(
@@ -164,7 +164,7 @@ def refresh_model(
 def compare_models(
     old: WorldModels, new: WorldModels, heldout: Mapping[str, EpisodeArrays], config: RunConfig
 ) -> RefreshDecision:
-    """Judge both models on the same held-out real episodes with the numbers of the gate.
+    """Judge both models on the same held-out real episodes with the numbers of its acceptance.
 
     Args:
         heldout: e.g. {"policy": ..., "scripted": ...}, episodes neither model was trained on.
@@ -175,10 +175,8 @@ def compare_models(
                    for models in (old, new)]
         for key, before in numbers[0].items():
             after = numbers[1][key]
-            grows = key.endswith("copying")
-            rows.append(
-                ModelComparison(name, key, before, after, is_worse(before, after, config.rounds.tolerance, grows))
-            )
+            worse = is_worse(before, after, config.model_refresh.tolerance, key.endswith("copying"))
+            rows.append(ModelComparison(name, key, before, after, worse))
     return RefreshDecision(tuple(rows))
 
 
@@ -195,7 +193,7 @@ def is_worse(old: float, new: float, tolerance: float, error: bool) -> bool:
 def _numbers(metrics: Mapping[str, float], config: RunConfig, num_steps: int) -> dict[str, float]:
     label = f"h{num_steps:02d}"
     errors = {"tool error / copying": f"tool_ratio_{label}"}
-    if config.task not in CONTACT_FREE:
+    if get_task(config.task).moves_object:
         errors["object error / copying"] = f"object_moved_ratio_{label}"
     rates = {f"done {kind}": f"done_{config.task}_{kind}" for kind in ("precision", "recall")}
     return {name: float(metrics.get(key, math.nan)) for name, key in (errors | rates).items()}

@@ -6,11 +6,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import get_task, model_tasks
 from wm_nodes.environments.maniskill.collection import CollectionPlan
-from wm_nodes.environments.maniskill.tasks import instruction, success
 from wm_nodes.environments.record import (
     HELDOUT_SEEDS,
     TRAINING_SEEDS,
@@ -28,28 +29,18 @@ from wm_nodes.world_model.folder import action_model_class
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.position_probe import train_position_probe
-from wm_nodes.world_model.training.text import DEMONSTRATORS, train_text_model
+from wm_nodes.world_model.training.text import demonstrators, train_text_model
 from wm_nodes.world_model.training.token_dynamics import train_token_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.acceptance import model_metrics
 
-MODEL_TASKS = {"reach": ("reach", "push_cube"), "push_cube": ("reach", "push_cube"), "pull_cube": ("pull_cube",)}
-"""Tasks that one world model serves, because they share a scene: one done output each."""
-WEAK_POLICIES = (
-    ("push_cube", 3, 0.25),
-    ("reach", 8, 0.25),
-    ("push_cube", 4, 0.4),
-    ("reach", 4, 0.4),
-    ("pull_cube", 4, 0.3),
-)
-"""(task, demonstrations cloned, exploration noise) of the policies whose episodes the action model learns from too."""
 POLICY_SEEDS = 300_000
 
 
 def load_arrays(bags: list[Path], config: RunConfig) -> EpisodeArrays:
     """Stack every episode of the bags, labelled for all tasks of the scene."""
     episodes = (episode for bag in bags for episode in read_episodes(bag))
-    return stack_episodes(episodes, MODEL_TASKS[config.task], success, num_steps=config.simulation.max_episode_steps)
+    return stack_episodes(episodes, model_tasks(config.task), num_steps=config.simulation.max_episode_steps)
 
 
 def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, command: str = "") -> Path:
@@ -75,8 +66,8 @@ def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, comma
         action, action_metrics = train_token_model(tokenizer, data, config, config.seed, run_dir, progress=progress)
     else:
         first, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir, progress=progress)
-        golden = episodes.select([i for i, behaviour in enumerate(episodes.behaviours) if behaviour in DEMONSTRATORS])
-        texts = tuple(instruction(task) for task in MODEL_TASKS[config.task])
+        golden = episodes.select(np.flatnonzero(np.isin(episodes.behaviours, demonstrators())))
+        texts = tuple(get_task(task).instruction for task in model_tasks(config.task))
         text, text_metrics = train_text_model(
             tokenizer, first, golden, tokenise_episodes(tokenizer, golden), texts, config, config.seed, run_dir,
             progress=progress,
@@ -99,9 +90,9 @@ def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, comma
     }
     arguments: dict[str, Any] = {
         "tokenizer_config": config.tokenizer, "world_model_config": config.world_model, "simulation": config.simulation,
-        "tasks": MODEL_TASKS[config.task],
+        "tasks": model_tasks(config.task),
     }
-    models = WorldModels(tokenizer, action, text, MODEL_TASKS[config.task], config.simulation, {}, probe)
+    models = WorldModels(tokenizer, action, text, model_tasks(config.task), config.simulation, {}, probe)
     story["heldout"] = model_metrics(models, load_arrays(heldout_bags, config), config)
     write_starts(bags, folder / STARTS, MODEL_STARTS)
     save_model_folder(folder, tokenizer, action, text, story=story, probe=probe, **arguments)
@@ -115,20 +106,19 @@ def _policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer, progres
     They need the tokenizer only, so they are collected before the action model is trained and belong to its data.
     """
     bags = list[Path]()
-    for number, (task, demonstrations, noise) in enumerate(WEAK_POLICIES):
-        if task not in MODEL_TASKS[config.task]:
-            continue
-        chosen = config.model_copy(
-            update={"task": task, "sft": config.sft.model_copy(update={"num_demonstrations": demonstrations})}
-        )
+    weak = [(policy, task) for task in model_tasks(config.task) for policy in get_task(task).weak_policies]
+    for policy, task in sorted(weak, key=lambda pair: pair[0].number):
+        number, sft = policy.number, config.sft.model_copy(update={"num_demonstrations": policy.demonstrations})
+        chosen = config.model_copy(update={"task": task, "sft": sft})
         folder = _tokenizer_folder(config, run_dir, tokenizer)
         weights = run_dir / "policies" / f"weak_{number}.safetensors"
         if not weights.exists():
-            plan = demonstration_plan(chosen, demonstrations + 3, POLICY_SEEDS + 1000 * number)
+            plan = demonstration_plan(chosen, policy.demonstrations + 3, POLICY_SEEDS + 1000 * number)
             train_weak_policy(chosen, folder, collect_plan(plan, config, run_dir / "data" / "demos", progress), weights)
         plan = CollectionPlan(
-            MODEL_TASKS[config.task][-1], config.simulation, config.data.policy_episodes,
-            POLICY_SEEDS + 10_000 * (number + 1), {}, make_policy=partial(policy_actor, chosen, folder, weights, noise),
+            model_tasks(config.task)[-1], config.simulation, config.data.policy_episodes,
+            POLICY_SEEDS + 10_000 * (number + 1), {},
+            make_policy=partial(policy_actor, chosen, folder, weights, policy.noise),
         )
         bags += collect_plan(plan, config, run_dir / "data" / "policy", progress)
     return bags
@@ -138,7 +128,7 @@ def _tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenizer) ->
     """A model folder for policies, which read the tokenizer alone: its action model is untrained."""
     folder = run_dir / "tokenizer_only"
     if not (folder / "manifest.json").exists():
-        tasks = MODEL_TASKS[config.task]
+        tasks = model_tasks(config.task)
         untrained = action_model_class(config.tokenizer.kind)(
             config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
             action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),

@@ -81,7 +81,7 @@ def collect_rollout(
         ValueError: steps < 1.
     """
     if steps < 1:
-        raise ValueError(f"steps must be >= 1, got {steps}; see ppo.num_steps in presets/base.yaml")
+        raise ValueError(f"steps must be >= 1, got {steps}; see ppo.num_steps in presets/policy/base.yaml")
     num_envs, action_dim = env.spec.num_envs, env.spec.action_dim
     observation = env.reset(None, reset_seeds(seed, policy_version, 0, num_envs))
     ended = np.zeros(num_envs, np.bool_)

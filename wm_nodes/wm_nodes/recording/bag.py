@@ -77,12 +77,12 @@ class Bag:
         """The namespace of the environment to read: `wanted`, or the only one; among several the one that the others
         lie below (/wm before /wm/sim), else /wm."""
         suffix = f"/{topics.TRANSITION.name}"
-        found = sorted({c.topic.removesuffix(suffix) for c in self.connections if c.topic.endswith(suffix)})
-        is_root = bool(found) and all(name.startswith(f"{found[0]}/") for name in found[1:])
-        choice = wanted if wanted is not None else found[0] if is_root else topics.DEFAULT_NAMESPACE
-        if choice not in found:
+        names = sorted({c.topic.removesuffix(suffix) for c in self.connections if c.topic.endswith(suffix)})
+        is_root = bool(names) and all(name.startswith(f"{names[0]}/") for name in names[1:])
+        choice = wanted if wanted is not None else names[0] if is_root else topics.DEFAULT_NAMESPACE
+        if choice not in names:
             raise BagError(
-                f"bag {self.path} has no {choice}{suffix}; environments recorded: {found or 'none'}; "
+                f"bag {self.path} has no {choice}{suffix}; environments recorded: {names or 'none'}; "
                 f"topics: {sorted({c.topic for c in self.connections})}"
             )
         return choice

@@ -126,10 +126,10 @@ def dataset_of(episodes: Iterable[Episode], spec: EnvironmentSpec, *, frames_hin
     return EpisodeDataset(
         spec=spec,
         images=images[:total],
-        states=_joined([e.states for e in waiting], (0, spec.state_dim), np.float32),
+        states=_concatenate([e.states for e in waiting], (0, spec.state_dim), np.float32),
         actions=actions,
-        ground_truth=_joined([e.ground_truth for e in waiting], (0, spec.ground_truth_dim), np.float32),
-        success=_joined([e.success for e in waiting], (0,), np.bool_),
+        ground_truth=_concatenate([e.ground_truth for e in waiting], (0, spec.ground_truth_dim), np.float32),
+        success=_concatenate([e.success for e in waiting], (0,), np.bool_),
         rewards=rewards,
         first_frame=np.array(first_frame, np.int64),
         terminated=np.array([e.terminated for e in waiting], bool),
@@ -171,10 +171,10 @@ def load_dataset(
     for path in bags:
         with Bag(path) as bag:
             namespace = bag.namespace(None)
-            found, _ = bag.spec(namespace)
-            frames += bag.count(topics.absolute(namespace, topics.IMAGES)) * found.num_envs
-        spec = spec if spec is not None else single(found)
-        check_spec(found, spec, where=str(path))
+            recorded, _ = bag.spec(namespace)
+            frames += bag.count(topics.absolute(namespace, topics.IMAGES)) * recorded.num_envs
+        spec = spec if spec is not None else single(recorded)
+        check_spec(recorded, spec, where=str(path))
     assert spec is not None
 
     def episodes() -> Iterable[Episode]:
@@ -193,5 +193,5 @@ def load_dataset(
     return dataset
 
 
-def _joined(parts: Sequence[NDArray[Any]], empty: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+def _concatenate(parts: Sequence[NDArray[Any]], empty: tuple[int, ...], dtype: Any) -> NDArray[Any]:
     return np.concatenate([np.zeros(empty, dtype), *parts])

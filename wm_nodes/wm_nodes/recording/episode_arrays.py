@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.config.tasks import success
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
 
 TaskLabels = Callable[[str, FloatArray], BoolArray]
-"""(task name, ground truth (..., P)) -> success (...,), e.g. simulation.tasks.success."""
+"""(task name, ground truth (..., P)) -> success (...,)."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class EpisodeArrays:
 
 
 def stack_episodes(
-    episodes: Iterable[Episode], tasks: Sequence[str], labels: TaskLabels, *, num_steps: int | None = None
+    episodes: Iterable[Episode], tasks: Sequence[str], labels: TaskLabels = success, *, num_steps: int | None = None
 ) -> EpisodeArrays:
     """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides).
 

@@ -120,7 +120,7 @@ class LockSteps:
             if topic is topics.TRANSITION:
                 if self._last_seq is not None and self._last_seq[0] != message.session:
                     while pending:
-                        yield self._joined(pending.popleft())
+                        yield self._join_step(pending.popleft())
                     self._forget_images(time_ns)
                 self._check_transition(message)
                 self._last_transition_ns = time_ns
@@ -135,9 +135,9 @@ class LockSteps:
             else:
                 self._keep_event(message)
             while pending and (len(pending) > MAX_LAG or self._is_complete(pending[0])):
-                yield self._joined(pending.popleft())
+                yield self._join_step(pending.popleft())
         while pending:
-            yield self._joined(pending.popleft())
+            yield self._join_step(pending.popleft())
 
     def _untile(self, message: Any) -> UInt8Array:
         mosaic = mosaic_of(message, self.spec, self.tiles, where=str(self.bag.path))
@@ -149,10 +149,10 @@ class LockSteps:
             raise BagError(f"{where} has {message.num_envs} environments, env/spec says {spec.num_envs}")
         sizes = {"action": spec.action_dim, "state": spec.state_dim, "next_state": spec.state_dim, "valid": 1}
         for name, size in sizes.items():
-            found = len(getattr(message, name))
-            if found != size * spec.num_envs:
+            length = len(getattr(message, name))
+            if length != size * spec.num_envs:
                 raise BagError(
-                    f"{where} has {found} values in {name} instead of {spec.num_envs} x {size}; the bag's env/spec "
+                    f"{where} has {length} values in {name} instead of {spec.num_envs} x {size}; the bag's env/spec "
                     "describes another robot"
                 )
         if self._last_seq is not None and self._last_seq[0] == message.session:
@@ -180,10 +180,10 @@ class LockSteps:
     def _keep_goals(self, message: Any) -> None:
         if not len(message.goal_image.data):
             return
-        for goal, found, episode in zip(
+        for goal, is_found, episode in zip(
             self._untile(message.goal_image), message.goal_found, message.episode_id, strict=False
         ):
-            self._goals[int(episode)] = goal, bool(found)
+            self._goals[int(episode)] = goal, bool(is_found)
 
     def _keep_event(self, message: Any) -> None:
         key = int(message.session), int(message.env_index), int(message.episode_id)
@@ -197,7 +197,7 @@ class LockSteps:
         expects_reward = self._counts[topics.REWARD] > 0 and message.valid.any()
         return not expects_reward or _reward_key(message) in self._rewards
 
-    def _joined(self, message: Any) -> RecordedStep:
+    def _join_step(self, message: Any) -> RecordedStep:
         spec = self.spec
         num_envs = spec.num_envs
         now_ns, next_ns = stamp_ns(message.header.stamp), stamp_ns(message.next_stamp)
@@ -246,7 +246,7 @@ class LockSteps:
     def _stack_goals(self, goals: list[tuple[UInt8Array, bool] | None]) -> tuple[UInt8Array, BoolArray]:
         blank = np.zeros((self.spec.height, self.spec.width, self.spec.channels), np.uint8), False
         pairs = [goal if goal is not None else blank for goal in goals]
-        return np.stack([image for image, _ in pairs]), np.array([found for _, found in pairs])
+        return np.stack([image for image, _ in pairs]), np.array([is_found for _, is_found in pairs])
 
 
 def _reward_key(message: Any) -> tuple[int, int, int]:

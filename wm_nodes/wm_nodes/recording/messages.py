@@ -65,9 +65,9 @@ def mosaic_of(message: Any, spec: EnvironmentSpec, tiles: Tiles, *, where: str) 
     """uint8 (H, W, 3) view of a sensor_msgs/Image after checking its encoding, size and step against the spec."""
     height, width = tiles.mosaic_shape
     expected = {"encoding": spec.encoding, "height": height, "width": width, "step": width * spec.channels}
-    found = {name: getattr(message, name) for name in expected}
-    if found != expected:
-        wrong = ", ".join(f"{k} {found[k]!r} instead of {expected[k]!r}" for k in expected if found[k] != expected[k])
+    given = {name: getattr(message, name) for name in expected}
+    if given != expected:
+        wrong = ", ".join(f"{k} {given[k]!r} instead of {expected[k]!r}" for k in expected if given[k] != expected[k])
         raise BagError(
             f"image at stamp {stamp_ns(message.header.stamp)} in {where} has {wrong}; the bag's env/spec describes "
             "another camera or layout, so record spec and images from the same environment"

@@ -43,8 +43,8 @@ class Playback:
             self.start_ns, self.end_ns = bag.start_ns, bag.end_ns
             missing = sorted(set(names) - {c.topic for c in bag.connections})
             if missing:
-                held = ", ".join(sorted(c.topic for c in bag.connections))
-                raise BagError(f"bag {path} has no topic {', '.join(missing)}; it holds {held}")
+                recorded = ", ".join(sorted(c.topic for c in bag.connections))
+                raise BagError(f"bag {path} has no topic {', '.join(missing)}; it holds {recorded}")
         self._condition = threading.Condition()
         self._paused, self._steps, self._stopped = paused, 0, False
         self._seek_ns: int | None = None

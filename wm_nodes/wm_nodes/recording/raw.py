@@ -107,7 +107,7 @@ class RawBagWriter:
                 time_ns if publish_ns is None else publish_ns,  # type: ignore[arg-type]
             )
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._abort_with(error) from error
         self._unflushed += 1
         self._topics[topic].messages += 1
         self.files[-1].count(topic, time_ns)
@@ -128,7 +128,7 @@ class RawBagWriter:
             try:
                 self._open_writer().flush()
             except OSError as error:
-                raise self._failed(error) from error
+                raise self._abort_with(error) from error
             self._unflushed = 0
 
     def split(self) -> None:
@@ -153,7 +153,7 @@ class RawBagWriter:
             self.partial_path.rename(self.path)
             _sync_folder(self.path.parent)
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._abort_with(error) from error
         return self.path
 
     def abort(self, *, remove: bool = False) -> None:
@@ -228,11 +228,11 @@ class RawBagWriter:
             os.fsync(stream.fileno())
             stream.close()
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._abort_with(error) from error
         self._writer = self._stream = None
         self._unflushed = 0
 
-    def _failed(self, error: OSError) -> RecordingError:
+    def _abort_with(self, error: OSError) -> RecordingError:
         self.abort()
         return RecordingError(
             error.errno,

@@ -94,10 +94,10 @@ def read_episodes(
 
 
 def check_spec(
-    found: EnvironmentSpec, expected: EnvironmentSpec, *, where: str, names: Sequence[str] = EPISODE_FIELDS
+    recorded: EnvironmentSpec, expected: EnvironmentSpec, *, where: str, names: Sequence[str] = EPISODE_FIELDS
 ) -> None:
     """Raise BagError unless both agree on the named fields."""
-    wrong = [f"{name} {is_!r} instead of {should!r}" for name, is_, should in differences(found, expected, names)]
+    wrong = [f"{name} {is_!r} instead of {should!r}" for name, is_, should in differences(recorded, expected, names)]
     if wrong:
         raise BagError(
             f"{where} was recorded with {'; '.join(wrong)}; collect again with this configuration, or run with the "
@@ -122,13 +122,13 @@ class _EpisodeJoiner:
         for step in self._steps:
             self._clock += 1
             for index in range(self._steps.spec.num_envs):
-                self._take(step, index)
-            yield from self._ready(final=False)
-        yield from self._ready(final=True)
+                self._add_step(step, index)
+            yield from self._finished_episodes(final=False)
+        yield from self._finished_episodes(final=True)
         self._notes.unfinished += sum(builder is not None for builder in self._open)
         self._notes.lost_steps += self._steps.lost
 
-    def _take(self, step: RecordedStep, index: int) -> None:
+    def _add_step(self, step: RecordedStep, index: int) -> None:
         builder = self._open[index]
         key = step.session, int(step.episode_id[index])
         if builder is not None and key != (builder.session, builder.episode_id):
@@ -182,7 +182,7 @@ class _EpisodeJoiner:
             builder.finished_at = self._clock
             self._waiting.append((index, builder))
 
-    def _ready(self, *, final: bool) -> Iterator[Episode]:
+    def _finished_episodes(self, *, final: bool) -> Iterator[Episode]:
         """Episodes whose end event has come too, in order; without one after MAX_LAG lock-steps."""
         while self._waiting:
             index, builder = self._waiting[0]
@@ -194,11 +194,11 @@ class _EpisodeJoiner:
             self._waiting.pop(0)
             self._steps.events.pop(key, None)
             if builder.problem:
-                self._complain(index, builder)
+                self._report_problem(index, builder)
             else:
-                yield self._episode(index, builder, event)
+                yield self._make_episode(index, builder, event)
 
-    def _complain(self, index: int, builder: _Builder) -> None:
+    def _report_problem(self, index: int, builder: _Builder) -> None:
         text = f"episode {builder.episode_id} of environment {index}: {builder.problem}"
         if self._strict:
             raise BagError(
@@ -207,7 +207,7 @@ class _EpisodeJoiner:
             )
         self._notes.incomplete.append(text)
 
-    def _episode(self, index: int, builder: _Builder, event: Any) -> Episode:
+    def _make_episode(self, index: int, builder: _Builder, event: Any) -> Episode:
         spec, last = self._steps.spec, builder.last
         assert last is not None
         rewards = np.array(builder.rewards, np.float32)

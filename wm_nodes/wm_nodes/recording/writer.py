@@ -251,9 +251,9 @@ class EpisodeBagWriter:
             "rewards": (frames - 1,),
         }
         for array, expected in shapes.items():
-            found = getattr(episode, array).shape
-            if found != expected:
-                raise ValueError(f"{name}: {array} has shape {found}, but the spec {spec.env_id} asks for {expected}")
+            shape = getattr(episode, array).shape
+            if shape != expected:
+                raise ValueError(f"{name}: {array} has shape {shape}, but the spec {spec.env_id} asks for {expected}")
         if not np.isfinite(episode.actions).all() or np.abs(episode.actions).max() > 1 + 1e-6:
             raise ValueError(f"{name}: actions must be finite and in [-1, 1]; store them as executed, after clipping")
         if episode.episode_id in self._seen:

@@ -1,4 +1,4 @@
-"""What a run of loop 2 leaves for people: summary.json, the table of held-out scores, report.html."""
+"""The report of a run of loop 2: summary.json, the table of held-out scores, report.html."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,8 +10,9 @@ from typing import Any
 from rich.table import Table
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.reports.console_table import estimate, make_table
 from wm_nodes.reports.curves import Panel
-from wm_nodes.reports.html import Picture, figures, made_on, number_cell, write_page
+from wm_nodes.reports.html import Picture, figures, html_table, made_on, write_page
 from wm_nodes.reports.summary import FILE_NAME, plain
 
 TITLES = {
@@ -37,7 +38,7 @@ class ScoreChange:
 
 @dataclass(frozen=True)
 class ClipSummary:
-    """What a run of loop 2 found out.
+    """The results of a run of loop 2.
 
     scores: by name. contexts: held-out ones behind each. iterations: buffers trained on. version: optimizer steps.
     weights: which ones were measured after, "averaged" or "last". evaluations: held-out ones made while training.
@@ -76,20 +77,17 @@ def clip_verdict(summary: ClipSummary) -> str:
         names = [TITLES[name] for name in TITLES if summary.scores[name].verdict == verdict]
         if names:
             parts.append(f"{verdict.capitalize()}: {'; '.join(names)}")
-    found = ". ".join(parts) or "No difference that chance does not explain"
-    return f"{found} (n = {summary.contexts} held-out contexts)."
+    sentence = ". ".join(parts) or "No difference that chance does not explain"
+    return f"{sentence} (n = {summary.contexts} held-out contexts)."
 
 
 def scores_table(summary: ClipSummary) -> Table:
     """The table for the terminal."""
     title = f"held-out contexts (n = {summary.contexts}), one ODE clip each, {summary.weights} weights"
-    table = Table(title=title, caption=clip_verdict(summary))
-    for name in ("score", "before", "after", "difference, 95 % bootstrap interval", ""):
-        table.add_column(name, justify="left" if name in ("score", "") else "right")
-    for title, change, cells in _rows(summary):
-        style = {"better": "green", "worse": "red"}.get(change.verdict, "")
-        table.add_row(title, *cells, f"[{style}]{change.verdict}[/]" if style else "")
-    return table
+    columns = ("score", "before", "after", "difference, 95 % bootstrap interval", "")
+    marks = {"better": "[green]better[/]", "worse": "[red]worse[/]"}
+    rows = ((name, *cells, marks.get(change.verdict, "")) for name, change, cells in _rows(summary))
+    return make_table(title, columns, rows, left=("score", ""), caption=clip_verdict(summary))
 
 
 def clip_panels(updates: int) -> tuple[Panel, ...]:
@@ -136,24 +134,22 @@ def write_clip_report(
 def _rows(summary: ClipSummary) -> Iterable[tuple[str, ScoreChange, tuple[str, str, str]]]:
     for name, title in TITLES.items():
         change = summary.scores[name]
-        interval = f"{change.difference:+.4f} ({change.low:+.4f} to {change.high:+.4f})"
+        interval = estimate((change.difference, change.low, change.high))
         yield title, change, (f"{change.before:.4f}", f"{change.after:.4f}", interval)
 
 
 def _scores(summary: ClipSummary) -> str:
-    lines = []
-    for title, change, cells in _rows(summary):
-        mark = {"better": "good", "worse": "bad"}.get(change.verdict, "")
-        lines.append(
-            f"<tr><td>{escape(title)}</td>{''.join(map(number_cell, cells))}"
-            f'<td><span class="{mark}">{change.verdict}</span></td></tr>'
-        )
+    marks = {"better": "good", "worse": "bad"}
+    rows = (
+        (escape(title), *cells, f'<span class="{marks.get(change.verdict, "")}">{change.verdict}</span>')
+        for title, change, cells in _rows(summary)
+    )
+    columns = ("score", "before", "after", "difference, 95 % interval", "")
     return (
-        '<div class="wide"><table><tr><th>score</th><th class="number">before</th><th class="number">after</th>'
-        f'<th class="number">difference, 95 % interval</th><th></th></tr>{"".join(lines)}</table></div>'
-        f'<p class="faint">Means over {summary.contexts} contexts that nothing was trained on, one ODE clip each from '
-        f"the same noise; after: the {escape(summary.weights)} weights. Intervals: paired bootstrap over the contexts. "
-        "Positions are read off the pictures by a probe that shares nothing with the video model.</p>"
+        html_table(columns, rows, numbers=(1, 2, 3))
+        + f'<p class="faint">Means over {summary.contexts} contexts that nothing was trained on, one ODE clip each '
+        f"from the same noise; after: the {escape(summary.weights)} weights. Intervals: paired bootstrap over the "
+        "contexts. Positions are read off the pictures by a probe that shares nothing with the video model.</p>"
     )
 
 
@@ -167,11 +163,9 @@ def _hacking(summary: ClipSummary) -> Iterable[str]:
             "rose.</p>"
         )
         return
-    lines = "".join(f"<tr>{number_cell(str(a['step']))}<td>{escape(str(a['text']))}</td></tr>" for a in summary.hacked)
-    yield (
-        '<p class="bad">The training reward rose while held-out scores got worse.</p><div class="wide"><table>'
-        f'<tr><th class="number">buffers</th><th>alarm</th></tr>{lines}</table></div>'
-    )
+    yield '<p class="bad">The training reward rose while held-out scores got worse.</p>'
+    rows = ((str(alarm["step"]), escape(str(alarm["text"]))) for alarm in summary.hacked)
+    yield html_table(("buffers", "alarm"), rows, numbers=(0,))
 
 
 def _again(run_dir: Path, summary: ClipSummary) -> Iterable[str]:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figure, style_axes
+
 
 @dataclass(frozen=True)
 class Panel:
@@ -25,7 +27,6 @@ POLICY_PANELS = (
     Panel("KL to the SFT policy (nats per step)", {"kl_reference": ""}),
     Panel("value loss (Huber)", {"loss_value": ""}),
 )
-COLOURS = ("#2a7f5f", "#3567a8", "#b5562b", "#7a4fa0")
 
 
 def curves(
@@ -40,21 +41,16 @@ def curves(
         step: what a step is; under every panel.
     """
     series = [{name: read_series(metrics_file, name) for name in panel.lines} for panel in panels]
-    if not any(points for found in series for points in found.values()):
+    if not any(points for lines in series for points in lines.values()):
         return None
-    from matplotlib.figure import Figure
-
     rows = -(-len(panels) // 2)
-    figure = Figure(figsize=(10.5, 2.7 * rows), dpi=110, layout="constrained", facecolor="white")
+    figure = make_figure(10.5, 2.7 * rows, dpi=110)
     diagrams = list(figure.subplots(rows, 2, squeeze=False).flat)
     for unused in diagrams[len(panels) :]:
         unused.set_axis_off()
-    for index, (axes, panel, found) in enumerate(zip(diagrams, panels, series, strict=False)):
-        _panel(axes, panel, found, step, index)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp.png")
-    figure.savefig(temporary)
-    temporary.replace(path)
+    for index, (axes, panel, lines) in enumerate(zip(diagrams, panels, series, strict=False)):
+        _panel(axes, panel, lines, step, index)
+    save_figure(figure, path)
     return path
 
 
@@ -77,11 +73,7 @@ def read_series(metrics_file: Path, name: str) -> list[tuple[int, float]]:
 
 
 def _panel(axes: Any, panel: Panel, series: Mapping[str, Sequence[tuple[int, float]]], step: str, index: int) -> None:
-    axes.set_title(panel.title, fontsize=10, loc="left")
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel(step, fontsize=8)
-    axes.tick_params(labelsize=8)
+    style_axes(axes, panel.title, step)
     drawn = {name for name, points in series.items() if any(math.isfinite(value) for _, value in points)}
     if not drawn:
         axes.text(0.5, 0.5, "not recorded", ha="center", va="center", transform=axes.transAxes, color="gray")
@@ -93,7 +85,7 @@ def _panel(axes: Any, panel: Panel, series: Mapping[str, Sequence[tuple[int, flo
         steps, values = zip(*points, strict=True)
         axes.plot(steps, values, color=colour, linewidth=1.6, marker="o", markersize=2.5, label=panel.lines[name])
     if any(panel.lines[name] for name in drawn):
-        axes.legend(fontsize=8, frameon=False)
+        add_legend(axes)
     axes.xaxis.get_major_locator().set_params(integer=True)
     if panel.limits is not None:
         low, high = panel.limits

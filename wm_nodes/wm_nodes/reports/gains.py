@@ -1,4 +1,4 @@
-"""What one way of training gains over another, over a table of success rates: RoboScape-R's headline number."""
+"""Mean gain of one way of training over another, from a table of success rates, as RoboScape-R reports it."""
 
 from collections.abc import Mapping
 
@@ -13,7 +13,7 @@ def mean_gain(rates: Mapping[Cell, float], training: str, baseline: str) -> floa
         rates: a success rate for each cell. What only one of the two trainings has been measured on is an error.
 
     Raises:
-        ValueError: a cell of one training without its fellow, or none at all.
+        ValueError: a cell that only one of the two trainings has, or none at all.
     """
     names = {name: {(policy, task) for policy, other, task in rates if other == name} for name in (training, baseline)}
     alone = names[training] ^ names[baseline]

@@ -1,7 +1,7 @@
 """report.html: everything about one run in one file without outside parts, readable on light and dark screens."""
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -60,7 +60,7 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
         f"{summary.minutes:.1f} minutes in all</p>",
         "<h2>Success</h2>", _results(summary),
         *_rounds(summary),
-        "<h2>Gate: did the world model deserve it?</h2>", _gate(summary.gate),
+        "<h2>Acceptance of the world model</h2>", _acceptance(summary.acceptance),
         *figures(pictures),
         "<h2>Look closer, do it again</h2>", _again(run_dir, summary),
         *made_on(summary.machine, config_text),
@@ -102,7 +102,7 @@ def figures(pictures: Sequence[Picture]) -> Iterable[str]:
 
 def made_on(machine: Mapping[str, str], config_text: str) -> Iterable[str]:
     """The machine and, folded, the settings."""
-    yield f"<h2>Made on</h2>{_table(('', ''), machine.items())}"
+    yield f"<h2>Made on</h2>{html_table(('', ''), (tuple(map(escape, fact)) for fact in machine.items()))}"
     if config_text:
         yield (
             f"<h2>Settings</h2><details><summary>resolved configuration</summary><pre>{escape(config_text)}</pre>"
@@ -110,24 +110,38 @@ def made_on(machine: Mapping[str, str], config_text: str) -> Iterable[str]:
         )
 
 
-def number_cell(text: str) -> str:
-    return f'<td class="number">{escape(text)}</td>'
+def html_table(
+    columns: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Collection[int] = (),
+    emphasise_last: bool = False,
+) -> str:
+    """A table as HTML.
+
+    Args:
+        columns: headings; without any text there is no heading line.
+        rows: cells, which are HTML already.
+        numbers: indices of the columns that are aligned right.
+    """
+
+    def line(tag: str, cells: Sequence[str], kind: str = "") -> str:
+        classes = (' class="number"' if index in numbers else "" for index in range(len(cells)))
+        return f"<tr{kind}>" + "".join(f"<{tag}{c}>{cell}</{tag}>" for c, cell in zip(classes, cells)) + "</tr>"
+
+    body = list(rows)
+    last = ' class="last"' if emphasise_last else ""
+    lines = [line("td", cells, last if index == len(body) - 1 else "") for index, cells in enumerate(body)]
+    head = line("th", columns) if any(columns) else ""
+    return f'<div class="wide"><table>{head}{"".join(lines)}</table></div>'
 
 
 def _results(summary: Summary) -> str:
-    head = "".join(
-        f'<th class="number">{side}</th><th class="number"></th><th class="number">95 % interval</th>'
-        for side in ("real simulator", "imagined")
+    rows = (
+        [row.label, *(text for c in (row.real, row.imagined)
+                      for text in (c.count, c.percent, c.interval.removeprefix("95 %: ")))]
+        for row in result_rows(summary)
     )
-    rows = result_rows(summary)
-    lines = []
-    for row in rows:
-        sides = (row.real, row.imagined)
-        cells = (text for c in sides for text in (c.count, c.percent, c.interval.removeprefix("95 %: ")))
-        kind = ' class="last"' if row is rows[-1] else ""
-        lines.append(f"<tr{kind}><td>{escape(row.label)}</td>{''.join(map(number_cell, cells))}</tr>")
-    return (
-        f'<div class="wide"><table><tr><th></th>{head}</tr>{"".join(lines)}</table></div>'
+    columns = ("", *(text for side in ("real simulator", "imagined") for text in (side, "", "95 % interval")))
+    table = html_table(columns, (tuple(map(escape, row)) for row in rows), numbers=range(1, 7), emphasise_last=True)
+    return table + (
         '<p class="faint">Intervals of rates: Wilson. Interval of the real difference: the same seeds before and after '
         "(Tango's score interval). Imagined success is what the world model claims; only real success counts.</p>"
     )
@@ -136,42 +150,38 @@ def _results(summary: Summary) -> str:
 def _rounds(summary: Summary) -> Iterable[str]:
     if not summary.rounds:
         return
-    head = "".join(f"<th>{escape(name)}</th>" for name in ROUND_COLUMNS)
-    lines = ("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in round_rows(summary))
-    yield (
-        f'<h2>Online rounds</h2><div class="wide"><table><tr>{head}</tr>{"".join(lines)}</table></div>'
+    table = html_table(ROUND_COLUMNS, (tuple(map(escape, row)) for row in round_rows(summary)))
+    yield f"<h2>Online rounds</h2>{table}" + (
         '<p class="faint">After each round but the last, the policy acted in the simulator and the world model went on '
         "training on what it saw there. The refreshed model is taken only where it is no worse on held-out episodes. "
         "Imagined rates are those of the model that the round trained in.</p>"
     )
 
 
-def _gate(gate: Mapping[str, Any]) -> str:
-    if not gate:
-        return "<p>The gate was not asked.</p>"
+def _acceptance(report: Mapping[str, Any]) -> str:
+    if not report:
+        return "<p>Not measured.</p>"
     rows = []
-    for criterion in gate["criteria"]:
+    for criterion in report["criteria"]:
         passed = criterion["passed"]
         mark = '<span class="good">passed</span>'
         if not passed:
             mark = f'<span class="bad">failed</span>: {escape(str(criterion["remedy"]))}'
-        rows.append(
-            f"<tr><td>{escape(str(criterion['name']))}</td>{number_cell(_value(criterion['value']))}"
-            f"<td>{escape(str(criterion['rule']))} {escape(_threshold(criterion))}</td><td>{mark}</td></tr>"
-        )
-    notes = "".join(f'<p class="faint">{escape(str(note))}</p>' for note in gate.get("notes", ()))
-    words = "Passed" if gate["passed"] else "Failed: trained in it all the same"
+        rule = escape(f"{criterion['rule']} {_threshold(criterion)}")
+        rows.append((escape(str(criterion["name"])), _value(criterion["value"]), rule, mark))
+    notes = "".join(f'<p class="faint">{escape(str(note))}</p>' for note in report.get("notes", ()))
+    words = "Passed" if report["passed"] else "Failed: trained in it all the same"
     return (
-        f"<p>{words}. Judged on {gate['episodes']} held-out real episodes.</p>"
-        '<div class="wide"><table><tr><th>criterion</th><th class="number">value</th><th>must be</th><th></th></tr>'
-        f"{''.join(rows)}</table></div>{notes}{_metrics(gate.get('metrics', {}))}"
+        f"<p>{words}. Judged on {report['episodes']} held-out real episodes.</p>"
+        f"{html_table(('criterion', 'value', 'must be', ''), rows, numbers=(1,))}"
+        f"{notes}{_metrics(report.get('metrics', {}))}"
     )
 
 
 def _metrics(metrics: Mapping[str, Any]) -> str:
     if not metrics:
         return ""
-    table = _table(("metric", "value"), [(name, _value(value)) for name, value in metrics.items()])
+    table = html_table(("metric", "value"), ((escape(name), _value(value)) for name, value in metrics.items()))
     return f"<details><summary>all numbers of the held-out rollouts</summary>{table}</details>"
 
 
@@ -193,12 +203,6 @@ def _again(run_dir: Path, summary: Summary) -> str:
             f"its own):</p><pre>{escape(replay)}</pre>"
         )
     return "".join(parts)
-
-
-def _table(head: tuple[str, str], rows: Iterable[tuple[str, str]]) -> str:
-    lines = "".join(f"<tr><td>{escape(str(name))}</td><td>{escape(str(value))}</td></tr>" for name, value in rows)
-    title = f"<tr><th>{escape(head[0])}</th><th>{escape(head[1])}</th></tr>" if any(head) else ""
-    return f'<div class="wide"><table>{title}{lines}</table></div>'
 
 
 def _value(value: Any) -> str:

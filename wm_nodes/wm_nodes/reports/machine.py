@@ -38,5 +38,5 @@ def _field(path: str, name: str, separator: str = ":") -> str:
         lines = Path(path).read_text(errors="replace").splitlines()
     except OSError:
         return ""
-    found = (line.split(separator, 1)[1].strip() for line in lines if line.split(separator)[0].strip() == name)
-    return next(found, "")
+    values = (line.split(separator, 1)[1].strip() for line in lines if line.split(separator)[0].strip() == name)
+    return next(values, "")

@@ -32,13 +32,13 @@ class SuccessRate:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run found out.
+    """The results of a run.
 
     real_, imagined_: success before and after training, in the simulator and in the world model.
     imagined_steps_per_s: environment steps of the training in the world model, per second of training.
     bag: path of the recorded training. paired, imagined_paired: after minus before on the same seeds, with the keys
         difference, low and high (and more); empty where not measured.
-    gate: GateReport.to_dict(). samples: environment steps trained on. minutes: of the whole run.
+    acceptance: AcceptanceReport.to_dict(). samples: environment steps trained on. minutes: of the whole run.
     command: as typed. machine: facts by name.
     reward: that the policy was trained for. judge: who gave it, where it is the agent's; else empty.
     rounds: of a run in online rounds, one mapping for each: number, updates, samples, imagined_before, imagined, real
@@ -57,7 +57,7 @@ class Summary:
     bag: str
     paired: Mapping[str, Any] = field(default_factory=dict)
     imagined_paired: Mapping[str, Any] = field(default_factory=dict)
-    gate: Mapping[str, Any] = field(default_factory=dict)
+    acceptance: Mapping[str, Any] = field(default_factory=dict)
     samples: int = 0
     minutes: float = float("nan")
     command: str = ""
@@ -82,7 +82,7 @@ def write_summary(run_dir: Path, summary: Summary) -> Path:
 
 
 def read_summary(run_dir: Path) -> dict[str, Any]:
-    """The values of <run_dir>/summary.json.
+    """The values of <run_dir>/summary.json; `acceptance` is called gate in older ones.
 
     Raises:
         FileNotFoundError: the run has not ended; names the file.
@@ -91,7 +91,7 @@ def read_summary(run_dir: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: the run has not come to its end")
     values: dict[str, Any] = json.loads(path.read_text())
-    return values
+    return {"acceptance" if name == "gate" else name: value for name, value in values.items()}
 
 
 def plain(value: Any) -> Any:

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import SuccessRate, Summary
 
 
@@ -45,20 +46,18 @@ def verdict(summary: Summary) -> str:
         return "The real difference was not measured on paired seeds."
     points = 100 * float(summary.paired["difference"])
     low, high = 100 * float(summary.paired["low"]), 100 * float(summary.paired["high"])
-    found = f"{points:+.1f} points in the real simulator (95 % interval {low:+.1f} to {high:+.1f})"
+    effect = f"{points:+.1f} points in the real simulator (95 % interval {low:+.1f} to {high:+.1f})"
     if low > 0:
-        return f"The policy got better: {found}."
+        return f"The policy got better: {effect}."
     if high < 0:
-        return f"The policy got worse: {found}."
-    return f"No difference that chance does not explain: {found}."
+        return f"The policy got worse: {effect}."
+    return f"No difference that chance does not explain: {effect}."
 
 
 def results_table(summary: Summary) -> Table:
     """The table for the terminal."""
     title = f"{summary.task}, preset {summary.preset}, seed {summary.seed}, reward {summary.reward}"
-    table = Table(title=title, caption=verdict(summary))
-    for name in ("success", "real simulator", "imagined"):
-        table.add_column(name, justify="left" if name == "success" else "right")
+    table = make_table(title, ("success", "real simulator", "imagined"), caption=verdict(summary))
     for row in result_rows(summary):
         style = "bold" if row.label == "difference" else ""
         table.add_row(row.label, *(f"{c.percent}   {c.count}\n[dim]{c.interval}" for c in (row.real, row.imagined)),
@@ -72,22 +71,18 @@ ROUND_COLUMNS = ("round", "updates", "imagined before", "imagined after", "real 
 def round_rows(summary: Summary) -> list[tuple[str, ...]]:
     """One row of texts for each online round, under ROUND_COLUMNS."""
     rows = []
-    for found in summary.rounds:
-        verdict = found["verdict"]
+    for entry in summary.rounds:
+        verdict = entry["verdict"]
         words = "" if not verdict else f"{'taken' if verdict['accepted'] else 'old one kept'}: {verdict['reason']}"
-        rates = (_share(found[name]) for name in ("imagined_before", "imagined", "real"))
-        rows.append((str(found["number"]), str(found["updates"]), *rates, words))
+        rates = (_share(entry[name]) for name in ("imagined_before", "imagined", "real"))
+        rows.append((str(entry["number"]), str(entry["updates"]), *rates, words))
     return rows
 
 
 def rounds_table(summary: Summary) -> Table:
     """The online rounds for the terminal."""
-    table = Table(title="online rounds: success in the model of the round, and in the simulator")
-    for name in ROUND_COLUMNS:
-        table.add_column(name, justify="left" if name == ROUND_COLUMNS[-1] else "right")
-    for row in round_rows(summary):
-        table.add_row(*row)
-    return table
+    title = "online rounds: success in the model of the round, and in the simulator"
+    return make_table(title, ROUND_COLUMNS, round_rows(summary), left=ROUND_COLUMNS[-1:])
 
 
 def _share(rate: Mapping[str, Any]) -> str:

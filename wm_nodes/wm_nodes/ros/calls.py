@@ -16,8 +16,8 @@ from wm_nodes.ros.convert import (
     from_field,
     images_of,
     mosaic_msg,
+    reshape_field,
     set_optional,
-    shaped,
     time_msg,
     time_ns,
     to_field,
@@ -112,7 +112,7 @@ def step_reply(response: StepBatch.Response, spec: EnvironmentSpec, session: int
         states=floats(response.state, (count, spec.state_dim), "state"),
         terminated=flags(response.terminated, count, "terminated"),
         truncated=flags(response.truncated, count, "truncated"),
-        episode_ids=shaped(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
+        episode_ids=reshape_field(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
         success_probability=floats(response.success_probability, (count,), "success_probability"),
         uncertainty=floats(response.model_uncertainty, (count,), "model_uncertainty"),
         step_s=response.step_ms / 1e3,
@@ -132,7 +132,7 @@ def reset_reply(response: ResetBatch.Response, spec: EnvironmentSpec) -> Reply:
         states=floats(response.state, (count, spec.state_dim), "state"),
         terminated=zeros != 0,
         truncated=zeros != 0,
-        episode_ids=shaped(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
+        episode_ids=reshape_field(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
         success_probability=zeros,
         uncertainty=zeros,
     )
@@ -144,4 +144,4 @@ def _raise_for(response: Any) -> None:
 
 
 def _seeds(field: Any, count: int, name: str) -> UInt64Array | None:
-    return shaped(from_field(field, np.uint64), (count,), name) if len(field) else None
+    return reshape_field(from_field(field, np.uint64), (count,), name) if len(field) else None

@@ -144,7 +144,7 @@ class RosEnvironmentClient:
         return self._spec
 
     def reset(self, command: ResetCommand, check: Check) -> Reply:
-        spec = self._known_spec()
+        spec = self._require_spec()
         request = calls.reset_request(command)
 
         def attempt(left_s: float) -> Reply:
@@ -153,7 +153,7 @@ class RosEnvironmentClient:
             try:
                 response = self._call(self._reset, request, min(left_s, self._timeout_s / 2), check)
             except PeerLost:
-                if left_s <= self._timeout_s / 2 or self._silent:
+                if left_s <= self._timeout_s / 2 or self._is_silent:
                     raise
                 raise WireError(ErrorCode.BUSY, "sent again") from None
             return calls.reset_reply(response, spec)
@@ -164,14 +164,14 @@ class RosEnvironmentClient:
         return reply
 
     def step(self, command: StepCommand, check: Check) -> Reply:
-        spec = self._known_spec()
+        spec = self._require_spec()
         request = calls.step_request(command)
 
         def attempt(left_s: float) -> Reply:
             try:
                 response = self._call(self._step, request, min(left_s, ATTEMPT_S), check)
             except PeerLost:
-                if left_s <= ATTEMPT_S or self._silent:
+                if left_s <= ATTEMPT_S or self._is_silent:
                     raise
                 self._node.diagnostics.count("step_retries", level=0)
                 raise WireError(ErrorCode.BUSY, "sent again") from None
@@ -184,7 +184,7 @@ class RosEnvironmentClient:
                 raise PeerLost(f"the environment was restarted: {error}") from None
             raise
 
-    def _known_spec(self) -> EnvironmentSpec:
+    def _require_spec(self) -> EnvironmentSpec:
         if self._spec is None:
             raise PeerLost("no handshake with the environment yet")
         return self._spec
@@ -205,13 +205,13 @@ class RosEnvironmentClient:
     def _call(self, client: Client, request: Any, timeout_s: float, check: Check) -> Any:
         def alive() -> None:
             check()
-            if self._silent:
+            if self._is_silent:
                 raise PeerLost(f"{self._peer} is silent")
 
         return call(client, request, timeout_s, alive)
 
     @property
-    def _silent(self) -> bool:
+    def _is_silent(self) -> bool:
         """Whether the environment is lost, and was silent for so long that no answer will come, however often it is
         asked."""
         peers = self._node.peers
@@ -226,25 +226,25 @@ class LocalEnvironmentClient:
     """
 
     def __init__(self, served: Callable[[], Any], timeout_s: float = 10.0) -> None:
-        self._served, self._timeout_s = served, timeout_s
+        self._get_served, self._timeout_s = served, timeout_s
 
     @property
     def session(self) -> int:
-        return int(self._present().session)
+        return int(self._get_environment().session)
 
     def handshake(self, timeout_s: float, check: Check) -> EnvironmentSpec:
-        wait_until(lambda: self._served() is not None, timeout_s, check, "the local environment")
-        spec: EnvironmentSpec = self._present().spec
+        wait_until(lambda: self._get_served() is not None, timeout_s, check, "the local environment")
+        spec: EnvironmentSpec = self._get_environment().spec
         return spec
 
     def reset(self, command: ResetCommand, check: Check) -> Reply:
-        return self._retry(lambda: self._present().reset(command), check)
+        return self._retry(lambda: self._get_environment().reset(command), check)
 
     def step(self, command: StepCommand, check: Check) -> Reply:
-        return self._retry(lambda: self._present().step(command), check)
+        return self._retry(lambda: self._get_environment().step(command), check)
 
-    def _present(self) -> Any:
-        served = self._served()
+    def _get_environment(self) -> Any:
+        served = self._get_served()
         if served is None:
             raise PeerLost("the local environment was cleaned up")
         return served
@@ -261,14 +261,14 @@ class LocalEnvironmentClient:
             time.sleep(BUSY_WAIT_S)
 
 
-def from_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Any:
+def call_in_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Any:
     """Call `send` in the executor's thread and wait for the future it returns."""
     deadline = time.monotonic() + timeout_s
-    future = sent_by_executor(node, send, timeout_s, check)
+    future = send_in_executor(node, send, timeout_s, check)
     return wait_for(future, max(0.0, deadline - time.monotonic()), check)
 
 
-def sent_by_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Future:
+def send_in_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Future:
     """Call `send` in the executor's thread and return the future it returns.
 
     rclpy's ActionClient notes a request only after sending it: sent from another thread, the answer may come before the
@@ -306,7 +306,7 @@ def goal_result(handle: Any, timeout_s: float, check: Check) -> Any:
     asked: list[Future] = []
 
     def ask() -> None:
-        asked.append(sent_by_executor(node, handle.get_result_async, deadline - time.monotonic(), check))
+        asked.append(send_in_executor(node, handle.get_result_async, deadline - time.monotonic(), check))
         asked[-1].add_done_callback(lambda _: done.set())
 
     ask()
@@ -359,7 +359,7 @@ def run_goal(
 
     while True:
         try:
-            handle = from_executor(node, send, accept_s, both)
+            handle = call_in_executor(node, send, accept_s, both)
         except BaseException as error:
             node.executor.create_task(lambda: [future.add_done_callback(_cancel_accepted) for future in sent[-1:]])
             if isinstance(error, PeerLost):

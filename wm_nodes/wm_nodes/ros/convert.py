@@ -59,16 +59,16 @@ def from_field(field: Any, dtype: DTypeLike) -> NDArray[Any]:
 
 def floats(field: Any, shape: Sequence[int], name: str) -> FloatArray:
     """Return a float32 view of the given shape; raise WireError(BAD_SHAPE) where the length differs."""
-    return shaped(from_field(field, np.float32), shape, name)
+    return reshape_field(from_field(field, np.float32), shape, name)
 
 
 def flags(field: Any, count: int, name: str) -> BoolArray:
     """Return bool (count,) from uint8 flags."""
-    values: UInt8Array = shaped(from_field(field, np.uint8), (count,), name)
+    values: UInt8Array = reshape_field(from_field(field, np.uint8), (count,), name)
     return np.not_equal(values, 0)
 
 
-def shaped(values: NDArray[Any], shape: Sequence[int], name: str) -> NDArray[Any]:
+def reshape_field(values: NDArray[Any], shape: Sequence[int], name: str) -> NDArray[Any]:
     """Return values in a shape; raise WireError(BAD_SHAPE) where the length differs."""
     if values.size != int(np.prod(shape)):
         raise WireError(
@@ -229,9 +229,9 @@ def transition_of(message: TransitionBatch, spec: EnvironmentSpec) -> Transition
         terminated=flags(message.terminated, count, "terminated"),
         truncated=flags(message.truncated, count, "truncated"),
         valid=flags(message.valid, count, "valid"),
-        episode_ids=shaped(from_field(message.episode_id, np.uint64), (count,), "episode_id"),
-        episode_steps=shaped(from_field(message.episode_step, np.uint32), (count,), "episode_step"),
-        policy_versions=shaped(from_field(message.policy_version, np.uint64), (count,), "policy_version"),
+        episode_ids=reshape_field(from_field(message.episode_id, np.uint64), (count,), "episode_id"),
+        episode_steps=reshape_field(from_field(message.episode_step, np.uint32), (count,), "episode_step"),
+        policy_versions=reshape_field(from_field(message.policy_version, np.uint64), (count,), "policy_version"),
         success_probability=floats(message.success_probability, (count,), "success_probability"),
         uncertainty=floats(message.model_uncertainty, (count,), "model_uncertainty"),
         ground_truth=from_field(message.ground_truth, np.float32).reshape(count, -1),
@@ -267,7 +267,7 @@ def goals_of(message: TaskGoal, spec: EnvironmentSpec) -> Goals:
         stamp_ns=time_ns(message.header.stamp),
         images=images_of(message.goal_image, spec) if len(message.goal_image.data) else None,
         found=flags(message.goal_found, spec.num_envs, "goal_found"),
-        episode_ids=shaped(from_field(message.episode_id, np.uint64), (spec.num_envs,), "episode_id"),
+        episode_ids=reshape_field(from_field(message.episode_id, np.uint64), (spec.num_envs,), "episode_id"),
     )
 
 
@@ -306,6 +306,6 @@ def rewards_of(message: RewardBatch) -> Rewards:
         step_id=message.step_id,
         total=floats(message.total, (count,), "total"),
         valid=flags(message.valid, count, "valid"),
-        success=shaped(from_field(message.success, np.uint8), (count,), "success"),
+        success=reshape_field(from_field(message.success, np.uint8), (count,), "success"),
         invalid_reason=message.invalid_reason,
     )

@@ -1,9 +1,9 @@
-"""Who is connected to whom: every node says on run/links which of its topics are matched, so that a data flow can wait
-until nobody misses its first message.
+"""Endpoint matching: every node publishes on run/links which of its topics are matched, so that a data flow starts only
+when every subscriber gets its first message.
 
-A publisher does not know a subscription that DDS discovery has not brought yet, and what it sends before is lost to it.
-Both ends of a pair must see each other, and only the two nodes can tell; so each tells all, at once and then once a
-second, so that a node that comes late or was busy has the whole book within that time.
+A publisher does not know a subscription that DDS has not discovered yet, and what it sends before is lost to that
+subscription. Both ends of a pair must have discovered each other, which only the two nodes know; so each node publishes
+its links at every change and once a second.
 """
 
 import threading

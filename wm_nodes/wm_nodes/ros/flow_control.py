@@ -46,14 +46,14 @@ class ProducerCredits:
     def remove(self, consumer: str) -> None:
         self._consumers.pop(consumer, None)
 
-    def holding(self, next_seq: int, now: float | None = None) -> list[str]:
+    def blocking_consumers(self, next_seq: int, now: float | None = None) -> list[str]:
         """Return the consumers that have not granted `next_seq` yet; empty: publish."""
         return [name for name, consumer in self._consumers.items() if consumer.granted_seq < next_seq]
 
     def drop_silent(self, next_seq: int, now: float | None = None) -> list[str]:
         """Drop and return the consumers that hold the producer up and were silent for SILENT_S."""
         now = time.monotonic() if now is None else now
-        gone = [name for name in self.holding(next_seq) if now - self._consumers[name].heard > SILENT_S]
+        gone = [name for name in self.blocking_consumers(next_seq) if now - self._consumers[name].heard > SILENT_S]
         for name in gone:
             del self._consumers[name]
         return gone
@@ -83,7 +83,7 @@ class ConsumerCredits:
         self._granted: tuple[int, int] | None = None
         self.withheld = False
 
-    def consumed(self, tracker: GapTracker) -> None:
+    def record_consumed(self, tracker: GapTracker) -> None:
         """Note that one message of the stream was dealt with; `tracker` has already observed it."""
         first = self._tracker is None or tracker.sessions == 0 or tracker.received <= 1
         self._tracker = tracker

@@ -149,8 +149,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     ) -> ConsumerCredits | None:
         """Subscribe to a row of the QoS table until cleanup. Messages with (session, seq) are checked for gaps.
 
-        credit: grant the producer messages as they are consumed (see ros.credit); for keep-all streams. The grantor is
-            returned.
+        credit: grant the producer messages as they are consumed (see flow_control.py), for keep-all streams; the
+            ConsumerCredits are returned.
         while_inactive: latched topics, whose message must not be missed before activation.
         """
         row = topic(name)
@@ -163,7 +163,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             if self._active or while_inactive:
                 callback(message)
             if grantor is not None:
-                grantor.consumed(tracker)
+                grantor.record_consumed(tracker)
 
         subscription = self.create_subscription(row.type, row.name, observe, row.reader_qos)
         self._entities.append(lambda: self.destroy_subscription(subscription))
@@ -197,7 +197,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.failed = True
         return not self.failed
 
-    def settled(self, stop_s: float) -> bool:
+    def is_settled(self, stop_s: float) -> bool:
         """Whether all that was sent to this node before the stop, at time.monotonic() `stop_s`, has been taken."""
         return True
 
@@ -300,7 +300,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         """
         if message.state not in (RunState.IDLE, RunState.RUNNING) or message.detail == self._identity or self.failed:
             return
-        if _since(message.detail) < _since(self._identity):
+        if _start_time(message.detail) < _start_time(self._identity):
             self.failed = True
             self.get_logger().error(
                 f"another {message.node} is there already ({message.detail}): stop it, or give this one another "
@@ -347,10 +347,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             return
 
 
-def _since(identity: str) -> float:
+def _start_time(identity: str) -> float:
     """When a process of this name began, in s since 1970; never, where another program wrote the heartbeat."""
-    _, found, text = identity.rpartition(" since ")
+    _, separator, text = identity.rpartition(" since ")
     try:
-        return float(text) if found else math.inf
+        return float(text) if separator else math.inf
     except ValueError:
         return math.inf

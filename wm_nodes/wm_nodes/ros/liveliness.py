@@ -1,4 +1,4 @@
-"""Who else is in the graph: every node says on run/state twice a second that it is there; silence is a lost peer."""
+"""Liveliness of the nodes of a graph: each publishes a heartbeat on run/state twice a second; a silent one is lost."""
 
 import time
 

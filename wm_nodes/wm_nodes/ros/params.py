@@ -109,7 +109,7 @@ def refusal(node: Node, params: Mapping[str, Param], changes: Sequence[Parameter
     """Why a change at run time is refused, or ''. params: those of declare(), by name."""
     for change in changes:
         if not node.has_parameter(change.name):
-            return _unknown(node, change.name)
+            return _unknown_text(node, change.name)
         param = params.get(change.name)
         if param is None:
             continue
@@ -147,10 +147,10 @@ def _refuse_unknown(node: Node) -> None:
                 "change the topic's row in wm_nodes/recording/topics.py"
             )
         if not node.has_parameter(name):
-            raise ParameterError(f"{node.get_name()}: {_unknown(node, name)}")
+            raise ParameterError(f"{node.get_name()}: {_unknown_text(node, name)}")
 
 
-def _unknown(node: Node, name: str) -> str:
+def _unknown_text(node: Node, name: str) -> str:
     known = sorted(declared for declared in node._parameters if "." not in declared)
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"

@@ -69,7 +69,7 @@ def profile_of(qos: Qos) -> QoSProfile:
     return profile
 
 
-def _recorded(topic: recorded.RecordedTopic, message: type[Any]) -> GraphTopic:
+def _graph_topic(topic: recorded.RecordedTopic, message: type[Any]) -> GraphTopic:
     return GraphTopic(topic.name, message, profile_of(topic.qos))
 
 
@@ -94,22 +94,22 @@ LIVE_ACTION = QoSProfile(
 TOPICS: dict[str, GraphTopic] = {
     topic.name: topic
     for topic in (
-        _recorded(recorded.IMAGES, Image),
-        _recorded(recorded.TRANSITION, TransitionBatch),
-        _recorded(recorded.SPEC, EnvSpec),
-        _recorded(recorded.GOAL, TaskGoal),
-        _recorded(recorded.REWARD, RewardBatch),
-        _recorded(recorded.REWARD_SUMMARY, RewardSummary),
-        _recorded(recorded.EPISODE, EpisodeEvent),
-        _recorded(recorded.ACTION, ActionBatch),
-        _recorded(recorded.POLICY_VERSION, PolicyVersion),
-        _recorded(recorded.LEARNER_METRICS, LearnerMetrics),
-        _recorded(recorded.RUN_STATE, RunState),
-        _recorded(recorded.CLIPS, ClipBatch),
-        _recorded(recorded.CLIP_IMAGES, Image),
-        _recorded(recorded.CLIP_SCORES, ClipScores),
-        _recorded(recorded.VIDEO_VERSION, PolicyVersion),
-        _recorded(recorded.VERDICT, ClipVerdict),
+        _graph_topic(recorded.IMAGES, Image),
+        _graph_topic(recorded.TRANSITION, TransitionBatch),
+        _graph_topic(recorded.SPEC, EnvSpec),
+        _graph_topic(recorded.GOAL, TaskGoal),
+        _graph_topic(recorded.REWARD, RewardBatch),
+        _graph_topic(recorded.REWARD_SUMMARY, RewardSummary),
+        _graph_topic(recorded.EPISODE, EpisodeEvent),
+        _graph_topic(recorded.ACTION, ActionBatch),
+        _graph_topic(recorded.POLICY_VERSION, PolicyVersion),
+        _graph_topic(recorded.LEARNER_METRICS, LearnerMetrics),
+        _graph_topic(recorded.RUN_STATE, RunState),
+        _graph_topic(recorded.CLIPS, ClipBatch),
+        _graph_topic(recorded.CLIP_IMAGES, Image),
+        _graph_topic(recorded.CLIP_SCORES, ClipScores),
+        _graph_topic(recorded.VIDEO_VERSION, PolicyVersion),
+        _graph_topic(recorded.VERDICT, ClipVerdict),
         GraphTopic("env/image/compressed", CompressedImage, COMPRESSED),
         GraphTopic("flow/credit", Credit, CREDIT),
         GraphTopic("run/links", NodeLinks, LATCHED),

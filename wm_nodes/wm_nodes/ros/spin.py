@@ -79,7 +79,7 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
 
 
 @contextmanager
-def _marking_failed(nodes: list[Any]) -> Iterator[None]:
+def _mark_failed(nodes: list[Any]) -> Iterator[None]:
     """Log an exception that nobody expected, with its trace, and mark the nodes as failed, so that they still stop."""
     try:
         yield
@@ -94,7 +94,7 @@ def _settle(executor: Executor, nodes: list[Any]) -> None:
     spin(
         executor,
         until=lambda: (
-            time.monotonic() - began_s > SETTLE_S or all(node.failed or node.settled(began_s) for node in nodes)
+            time.monotonic() - began_s > SETTLE_S or all(node.failed or node.is_settled(began_s) for node in nodes)
         ),
     )
 
@@ -119,12 +119,12 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
             executor = make_executor(executor_kind(nodes[0]))
             for node in nodes:
                 executor.add_node(node)
-            with _marking_failed(nodes):
+            with _mark_failed(nodes):
                 if all(node.start() for node in nodes):
                     spin(executor, until=lambda: stopped() or any(node.failed for node in nodes))
                     _settle(executor, nodes)
             for node in reversed(nodes):
-                with _marking_failed([node]):
+                with _mark_failed([node]):
                     node.stop()
             code = int(any(node.failed for node in nodes))
             for node in nodes:

@@ -7,7 +7,7 @@ from wm_nodes.video_model.mask import MaskSettings, dynamic_mask
 from wm_nodes.video_model.network import NetworkSettings, VelocityModel, VideoNetwork, guided_velocity
 from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout, initial_noise, sample_videos, step_noise
 from wm_nodes.video_model.schedule import flow_times
-from wm_nodes.video_model.step_window import WindowSettings, select_steps, stochastic_steps
+from wm_nodes.video_model.step_window import select_steps, stochastic_steps
 from wm_nodes.video_model.transitions import GaussianTransition, transition
 
 __all__ = [
@@ -24,7 +24,6 @@ __all__ = [
     "VelocityModel",
     "VideoNetwork",
     "VideoRollout",
-    "WindowSettings",
     "config_hash",
     "dynamic_mask",
     "estimates",

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from wm_nodes.core.types import FloatArray
-from wm_nodes.environments.maniskill.tasks import success
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.video_model import Condition
@@ -23,13 +22,14 @@ from wm_nodes.video_model.tokenizer_codec import Codec
 @dataclass(frozen=True)
 class Clips:
     """frames: uint8 (E, F, H, W, 3). actions: (E, F - 1, stride A), the recorded actions between two frames, one after
-    the other. ground_truth: (E, F, P) simulator state. instructions: one each.
+    the other. ground_truth: (E, F, P) simulator state of `task`. instructions: one each.
     """
 
     frames: Tensor
     actions: Tensor
     ground_truth: FloatArray
     instructions: tuple[str, ...]
+    task: str
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -37,7 +37,7 @@ class Clips:
     def select(self, index: Tensor) -> "Clips":
         return Clips(
             self.frames[index], self.actions[index], self.ground_truth[index.numpy()],
-            tuple(self.instructions[int(i)] for i in index),
+            tuple(self.instructions[int(i)] for i in index), self.task,
         )
 
     def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:
@@ -52,8 +52,8 @@ def load_clips(bags: Sequence[Path], stride: int) -> Clips:
     Raises:
         BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, or of different sizes.
     """
-    episodes = (episode for bag in bags for episode in read_episodes(bag))
-    return cut_clips(stack_episodes(episodes, ("push_cube",), success), stride)
+    episodes = [episode for bag in bags for episode in read_episodes(bag)]
+    return cut_clips(stack_episodes(episodes, [episode.task for episode in episodes[:1]]), stride)
 
 
 def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
@@ -71,4 +71,5 @@ def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
         actions=torch.from_numpy(np.ascontiguousarray(actions)),
         ground_truth=episodes.ground_truth[:, ::stride],
         instructions=episodes.instructions,
+        task=episodes.tasks[0],
     )

@@ -6,12 +6,12 @@ x_t = (1 - t) x_0 + t eps on generated frames, clean on given ones; loss = mean 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from wm_nodes.config.video import FlowMatchingConfig
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.training.loop import LoopSettings, TrainingLoop
 from wm_nodes.video_model import Condition, VideoNetwork
@@ -23,17 +23,8 @@ Batches = Callable[[int], tuple[Tensor, Condition]]
 """iteration -> clean latents (B, C, F, H, W) and their condition."""
 
 
-@dataclass(frozen=True)
-class FlowMatchingSettings:
-    """drop: share of videos whose actions and instruction are hidden, for classifier-free guidance."""
-
-    num_iterations: int
-    learning_rate: float = 1e-3
-    drop: float = 0.1
-
-
 def train_video_model(
-    model: VideoNetwork, batches: Batches, settings: FlowMatchingSettings, *, seed: int, run_dir: Path | None,
+    model: VideoNetwork, batches: Batches, settings: FlowMatchingConfig, *, seed: int, run_dir: Path | None,
     progress: bool = True,
 ) -> dict[str, float]:
     """Train in place to the last iteration (resuming run_dir's checkpoint), ending with the averaged weights."""

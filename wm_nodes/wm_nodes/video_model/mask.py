@@ -19,21 +19,7 @@ _LEAST_NORMAL = torch.finfo(torch.float32).tiny
 
 @dataclass(frozen=True)
 class MaskSettings:
-    """Knobs of the mask.
-
-    m_min: exploration left where nothing moves, in (0, 1]; a cell without any has no density.
-    quantile: q of DD-8; cells whose intensity reaches it count as dynamic.
-    combine: how intensity I and sparse prior P become the mask (DD-9). gated: m_min + (1 - m_min) I P, the paper's
-        reading; sparse: m_min + (1 - m_min) P; convex: m_min + (1 - m_min)(a I + (1 - a) P); max: max(m_min, I P).
-    convex_share: a of `convex`.
-    channel_norm: how a residual's channels become one intensity (DD-7).
-    norm: what an intensity is divided by; q99 is the 0.99 quantile, less sensitive to one hot cell.
-    norm_scope: over the whole sample, or per frame (gives still frames full exploration).
-    diff: temporal difference of DD-6.
-    budget: DD-9b; literal: as is; rms: the mask's mean square over generated cells becomes 1; peak: that over dynamic
-        cells does.
-    time_limit: above this t the mask is 1 everywhere (x0 says little about motion near pure noise).
-    """
+    """Of the mask; config/video.py explains them one by one. m_min is in (0, 1]."""
 
     m_min: float = 0.2
     quantile: float = 0.8

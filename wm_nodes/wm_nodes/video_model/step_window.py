@@ -4,12 +4,12 @@ Steps are numbered 0 to T - 1; the last one (s = 0) is never stochastic, so T - 
 """
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from wm_nodes.config.video import WindowConfig
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 
 DECAY_FROM = 13
@@ -18,24 +18,7 @@ LEAST_STAY = 4
 """With strategy decay the stay of a window falls towards this part of the period."""
 
 
-@dataclass(frozen=True)
-class WindowSettings:
-    """strategy: all steps stochastic; a window of `size` steps that moves on by one every `period` iterations
-    (progressive), is drawn anew each iteration (random), moves on after fewer iterations the further it is, down to a
-    quarter of the period (decay) or exponentially from step 13 on (exp_decay), or is drawn in the first half (fast,
-    Flow-GRPO-Fast).
-    """
-
-    strategy: Literal["all", "progressive", "random", "decay", "exp_decay", "fast"] = "all"
-    size: int = 4
-    period: int = 25
-
-    def __post_init__(self) -> None:
-        if self.size < 1 or self.period < 1:
-            raise ValueError(f"window size and period must be >= 1, got {self.size} and {self.period}")
-
-
-def stochastic_steps(num_steps: int, settings: WindowSettings, iteration: int, seed: int) -> list[int]:
+def stochastic_steps(num_steps: int, settings: WindowConfig, iteration: int, seed: int) -> list[int]:
     """Return the stochastic steps of one iteration; never empty unless T = 1, where no step can be.
 
     The window's start is kept at or below T - 1 - size, so it never shrinks or runs empty near the end; a window of
@@ -94,7 +77,7 @@ def select_steps(
     return chosen
 
 
-def _decayed_start(iteration: int, settings: WindowSettings, last_start: int, num_steps: int) -> int:
+def _decayed_start(iteration: int, settings: WindowConfig, last_start: int, num_steps: int) -> int:
     """Where a window stands that stays ever shorter, by Mix-GRPO's formulas; it starts anew after its last place."""
     period, least = settings.period, max(1, settings.period // LEAST_STAY)
 

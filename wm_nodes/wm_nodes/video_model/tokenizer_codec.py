@@ -21,7 +21,7 @@ class TokenizerCodec(nn.Module):
     """uint8 frames (B, F, H, W, 3) <-> latents float32 (B, C, F, h, w), of about unit variance.
 
     Pictures of another size than the tokenizer was trained on, of the same cameras, go through the same convolutions
-    with the background stretched to them; what that costs is in docs/dyndiff.md.
+    with the background stretched to them; what that costs is in docs/results/video_rl.md.
 
     Raises:
         ValueError: a tokenizer of discrete tokens, which flow matching cannot move through.

@@ -9,6 +9,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import GrpoConfig
 from wm_nodes.video_model import (
     Condition,
     RolloutBuffer,
@@ -23,7 +25,6 @@ from wm_nodes.video_model import (
 )
 from wm_nodes.video_model.kernels import with_conditioning
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.grpo_settings import AdvantageSettings, GrpoSettings
 
 RATIO_LIMIT, ODE_LIMIT, KL_LIMIT = 1e-5, 1e-4, 1e-10
 ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT = 1e-4, 3e-6
@@ -45,7 +46,7 @@ class CheckResult:
 
 def examine(
     model: nn.Module, condition: Condition, shape: tuple[int, int, int, int], rollout: RolloutSettings,
-    grpo: GrpoSettings, *, seed: int = 0, buffer_videos: int = 0,
+    grpo: GrpoConfig, *, seed: int = 0, buffer_videos: int = 0,
 ) -> list[CheckResult]:
     """Sample a few videos of shape (C, F, H, W) and check them; the model's weights are as before afterwards.
 
@@ -153,12 +154,13 @@ def _limits(rollout: RolloutSettings) -> tuple[float, float]:
     return RATIO_LIMIT, KL_LIMIT
 
 
-def _still(grpo: GrpoSettings, rollout: RolloutSettings) -> GrpoSettings:
+def _still(grpo: GrpoConfig, rollout: RolloutSettings) -> GrpoConfig:
     """Of one update that moves nothing, whose clipped transitions are those off the limit of the ratio."""
     limit, _ = _limits(rollout)
-    return replace(
-        grpo, updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0, ratio_norm=False,
-        kl=replace(grpo.kl, mode="mean", beta=1.0), clip_low=limit, clip_high=limit, advantage=AdvantageSettings(),
+    return grpo.with_values(
+        updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0, ratio_norm=False,
+        kl=grpo.kl.with_values(mode="mean", beta=1.0), clip_low=limit, clip_high=limit,
+        advantage=load_video_config("base").grpo.advantage,
     )
 
 

@@ -21,6 +21,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
+from wm_nodes.config.video import GrpoConfig
 from wm_nodes.training.checkpoint import (
     optimizer_tensors,
     read_checkpoint,
@@ -43,7 +44,6 @@ from wm_nodes.video_rl.group_advantages import (
     win_rates,
 )
 from wm_nodes.video_rl.grpo_math import clip_tails, clipped_objective
-from wm_nodes.video_rl.grpo_settings import GrpoSettings
 from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
 
 
@@ -99,7 +99,7 @@ class GrpoLearner:
     def __init__(
         self,
         model: nn.Module,
-        settings: GrpoSettings,
+        settings: GrpoConfig,
         rollout: RolloutSettings,
         *,
         seed: int,

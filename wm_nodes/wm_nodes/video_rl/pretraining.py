@@ -1,7 +1,6 @@
 """From clips to a video model: codec, flow matching, held-out scores. Resumable; what is finished is kept."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
@@ -19,7 +19,6 @@ from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
 from wm_nodes.video_model.tokenizer_codec import Codec, codec_of_world_model
 from wm_nodes.video_rl.reference_reward import score_clips
-from wm_nodes.video_rl.settings import VideoRlConfig
 from wm_nodes.video_rl.validation import kept_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -55,7 +54,8 @@ def make_video_model(
             "episodes": len(clips), "training": losses,
         }
     scores = kept_scores(run_dir / BEFORE, made, heldout, probe, config)
-    story |= {"model": asdict(config.model), "heldout": {**_means(scores), **_baselines(made, heldout, probe, config)}}
+    story["model"] = config.model.model_dump()
+    story["heldout"] = {**_means(scores), **_baselines(made, heldout, probe, config)}
     save_video_folder(folder, made.codec, made.network, made.clip, story)
     return load_video_folder(folder)
 
@@ -69,7 +69,7 @@ def shipped_video_model(config: VideoRlConfig) -> VideoFolder | None:
     if not (folder / MANIFEST).is_file():
         return None
     found = load_video_folder(folder)
-    return found if found.manifest["model"] == asdict(config.model) else None
+    return found if found.manifest["model"] == config.model.model_dump() else None
 
 
 def _trained(

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from wm_nodes.config.video import GrpoConfig
 from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_model.kernels import masked_deviation
 from wm_nodes.video_model.sampling import RolloutSettings, step_noise
@@ -25,7 +26,6 @@ from wm_nodes.video_rl.grpo_math import (
     step_equaliser,
     velocity_kl,
 )
-from wm_nodes.video_rl.grpo_settings import GrpoSettings
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class GrpoTerms:
         ValueError: the anchor is a model without its adapter, and there is none.
     """
 
-    def __init__(self, model: nn.Module, settings: GrpoSettings, rollout: RolloutSettings) -> None:
+    def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutSettings) -> None:
         if settings.kl.anchor == "lora_off" and not hasattr(model, "disable_adapter"):
             raise ValueError(
                 "kl.anchor lora_off needs a model with a LoRA adapter; add one (video_model.adapters.add_lora), or "

@@ -59,7 +59,7 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
         raise ValueError(f"clips are {tuple(frames.shape)}, their recordings {tuple(references.frames.shape)}")
     generated = slice(num_conditioning, None)
     found = probe.read(frames[:, generated])
-    truth = probe_targets(references.ground_truth[:, generated])
+    truth = probe_targets(references.ground_truth[:, generated], references.task)
     object_m = np.linalg.norm(found[..., OBJECT] - truth[..., OBJECT], axis=-1)
     tool_m = np.linalg.norm(found[..., TOOL] - truth[..., TOOL], axis=-1)
     tracking = (np.exp(-object_m / TRACKING_SCALE_M) + np.exp(-tool_m / TRACKING_SCALE_M)) / 2

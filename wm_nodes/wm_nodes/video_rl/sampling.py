@@ -4,8 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from pydantic import TypeAdapter
 from torch import Tensor
 
+from wm_nodes.config.video import RolloutConfig, VideoRlConfig
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.video_model import (
     Condition,
@@ -18,7 +20,13 @@ from wm_nodes.video_model import (
 )
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.settings import VideoRlConfig
+
+_ROLLOUT = TypeAdapter(RolloutSettings)
+
+
+def rollout_settings(config: RolloutConfig) -> RolloutSettings:
+    """The settings that the sampler is called with."""
+    return _ROLLOUT.validate_python(config.model_dump())
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,7 @@ class ClipGenerator:
         group = torch.arange(len(request.contexts)).repeat_interleave(request.group_size)
         sample = torch.arange(request.group_size).repeat(len(request.contexts))
         rows = torch.tensor(request.contexts)[group]
-        settings, seed = self.config.rollout, self.config.seed
+        settings, seed = rollout_settings(self.config.rollout), self.config.seed
         seeds = _seeds(seed, "clip_steps", request.iteration, group, sample)
         noises = torch.zeros_like(sample) if request.shared_noise else sample
         drawn = _seeds(seed, "clip_noise", request.iteration, group, noises)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import torch
 
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.training.checkpoint import read_metadata
 from wm_nodes.training.metrics import MetricsWriter, read_metrics
 from wm_nodes.training.ranks import Ranks, broadcast_bytes
@@ -25,7 +26,7 @@ from wm_nodes.training.weights import PackedWeights, save_weights
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
 from wm_nodes.video_rl.reward_hacking import HackedMetric
-from wm_nodes.video_rl.settings import VideoRlConfig
+from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.validation import SECTION, HeldoutScores, alarm_scalars, hacked_now
 
 CHECKPOINT = "checkpoints/video_learner.safetensors"
@@ -65,7 +66,8 @@ class VideoRun(TrainingRun):
         self.network, self.config, self._heldout = network, config, heldout
         self._training = threading.Lock()
         self.learner = GrpoLearner(
-            network, config.grpo, config.rollout, seed=config.seed, ranks=ranks, reward_weights=config.rewards
+            network, config.grpo, rollout_settings(config.rollout), seed=config.seed, ranks=ranks,
+            reward_weights=config.rewards,
         )
         self.iterations = 0
         """Buffers trained on in the run folder."""

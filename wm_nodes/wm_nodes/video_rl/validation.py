@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.files import write_atomic
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips, load_clips
@@ -17,7 +18,6 @@ from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.reference_reward import ClipScores, load_probe, mixed, more_is_better, score_clips
 from wm_nodes.video_rl.reward_hacking import HackedMetric, hacked_metrics
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.settings import VideoRlConfig
 from wm_nodes.world_model.position_probe import PositionProbe
 
 SECTION = "heldout"

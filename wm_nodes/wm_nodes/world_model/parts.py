@@ -1,8 +1,7 @@
 """Inference on a batch in parts, a thread per core.
 
-torch's own threads meet after every operation: one that another program holds up holds up all, and a step took twelve
-times as long (docs/speed.md). Parts meet once. They depend on the batch alone, so the numbers are those of any number
-of cores.
+torch's own threads meet after every operation: one that another program holds up holds up all. Parts meet once. They
+depend on the batch alone, so the numbers are those of any number of cores.
 """
 
 import functools

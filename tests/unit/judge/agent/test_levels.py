@@ -17,7 +17,7 @@ from wm_nodes.judge.agent.levels import (
     p_fail_of,
     pool,
     score_of,
-    settled,
+    settle,
     tally,
 )
 from wm_nodes.judge.agent.profiles import cited_media, contact_window, dense_indices, profile_media, static_indices
@@ -56,7 +56,7 @@ def test_the_order_of_votes_changes_nothing(answers: list[tuple[float, ...]], ra
     reads = votes(*answers)
     shuffled = list(reads)
     random.shuffle(shuffled)  # type: ignore[attr-defined]
-    before, after = settled(reads, 0.5), settled(shuffled, 0.5)
+    before, after = settle(reads, 0.5), settle(shuffled, 0.5)
     assert (before.status, before.passed) == (after.status, after.passed)
     assert (before.s, before.p_fail) == (after.s, after.p_fail) or (math.isnan(before.s) and math.isnan(after.s))
 

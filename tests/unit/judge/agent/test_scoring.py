@@ -13,7 +13,7 @@ from scripted_judge import BORDERLINE, CLEAN, COOKING, FAIR, GOOD, INVALID, UNUS
 from wm_nodes.config.load import ConfigError
 from wm_nodes.judge.agent.levels import first_vote, score
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
-from wm_nodes.judge.agent.scoring import capped, gate, plan_weights, reward, skipped, stage_score
+from wm_nodes.judge.agent.scoring import apply_caps, gate, plan_weights, reward, skipped_stage, stage_score
 from wm_nodes.judge.agent.types import GATED, ComponentScore, Read, Stage, StageScore, Status
 
 RUBRICS = {kind: load_rubric(overrides={"reward": {"gate": kind}}) for kind in ("hard", "soft", "lexicographic")}
@@ -128,7 +128,8 @@ def test_behind_a_failed_gate_no_score_counts(
     behind = [name for stage in GATED[GATED.index(failed) + 1 :] for name in rubric.stages[stage].components]
     changed = table | {name: other[name] for name in behind}
     assert reward_of(changed, p_level, rubric) == reward_of(table, p_level, rubric)
-    unread = [s if GATED.index(s.stage) <= GATED.index(failed) else skipped(s.stage) for s in stages_of(table, rubric)]
+    read = GATED[: GATED.index(failed) + 1]
+    unread = [s if s.stage in read else skipped_stage(s.stage) for s in stages_of(table, rubric)]
     assert reward(plan_weights(p_level, rubric.planning), unread, rubric) == reward_of(table, p_level, rubric)
 
 
@@ -148,9 +149,9 @@ def test_a_confirmed_pattern_never_raises_a_reward(
 ) -> None:
     rubric, before = RUBRICS[kind], stages_of(table, RUBRICS[kind])
     weights = plan_weights(p_level, rubric.planning)
-    after = capped(before, sorted(patterns), rubric)
+    after = apply_caps(before, sorted(patterns), rubric)
     assert reward(weights, after, rubric) <= reward(weights, before, rubric) + 1e-12
-    assert after == capped(before, sorted(patterns, reverse=True), rubric)
+    assert after == apply_caps(before, sorted(patterns, reverse=True), rubric)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +159,7 @@ def test_a_confirmed_pattern_never_raises_a_reward(
     [("occlusion", VQ, 0.53125), ("motion", TC, 0.25), ("background", IF, 0.53125), ("physics", PC, 0.0)],
 )
 def test_a_confirmed_pattern_fails_the_stage_it_hides_in(pattern: str, failed: Stage, s: float) -> None:
-    after = {stage.stage: stage for stage in capped(stages_of(everywhere(CLEAN)), [pattern], ROBOT)}
+    after = {stage.stage: stage for stage in apply_caps(stages_of(everywhere(CLEAN)), [pattern], ROBOT)}
     assert after[failed].s == pytest.approx(s) and not after[failed].passed
     assert all(stage.passed for name, stage in after.items() if name is not failed)
 
@@ -176,7 +177,7 @@ def test_stages_out_of_order_and_skipped_ones_behind_an_open_gate_are_refused() 
     with pytest.raises(ValueError, match="got PC, TC, IF, VQ"):
         reward(weights, stages[::-1], ROBOT)
     with pytest.raises(ValueError, match="TC was skipped"):
-        reward(weights, [*stages[:2], skipped(TC), skipped(PC)], ROBOT)
+        reward(weights, [*stages[:2], skipped_stage(TC), skipped_stage(PC)], ROBOT)
 
 
 def test_another_domain_adds_components_and_patterns_with_a_file_alone(tmp_path: Path) -> None:
@@ -188,9 +189,10 @@ def test_another_domain_adds_components_and_patterns_with_a_file_alone(tmp_path:
     stage = stages_of(everywhere(CLEAN, cooking, liquid=BORDERLINE), cooking)[3]
     assert stage.s == pytest.approx(0.5 * 4 / 5 + 0.5 * 0.5)
     clean = stages_of(everywhere(CLEAN, cooking), cooking)
-    assert not capped(clean, ["spill"], cooking)[3].passed
-    both = capped(clean, ["physics", "spill"], cooking)[3]
-    assert both.s == 0 and both == replace(capped(clean, ["spill", "physics"], cooking)[3], vetoed_by="hack physics")
+    assert not apply_caps(clean, ["spill"], cooking)[3].passed
+    both = apply_caps(clean, ["physics", "spill"], cooking)[3]
+    other_order = apply_caps(clean, ["spill", "physics"], cooking)[3]
+    assert both.s == 0 and both == replace(other_order, vetoed_by="hack physics")
 
 
 def test_the_version_differs_with_every_word() -> None:

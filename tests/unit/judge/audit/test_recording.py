@@ -33,7 +33,7 @@ from wm_nodes.judge.audit.entries import plain
 from wm_nodes.judge.audit.log import FILE_NAME, AuditError, AuditLog, read_lines
 from wm_nodes.judge.audit.reading import read_record, verify
 from wm_nodes.judge.audit.recording import AuditedAgent, write_exchange
-from wm_nodes.judge.audit.replay import replayed
+from wm_nodes.judge.audit.replay import replay_evaluation
 from wm_nodes.judge.backends import ChatTransport, Endpoint, OpenAIJudge, RetryPolicy, VerdictCache
 
 RUBRIC = load_rubric("robot")
@@ -54,7 +54,7 @@ def test_a_verdict_comes_out_of_the_log_bit_equal(tmp_path: Path, case: str, mod
     record = read_record(tmp_path)
     for verdict, evaluation in zip(verdicts, record.judged()):
         assert plain(evaluation.verdict) == plain(verdict)  # NaN itself equals nothing
-        again = asyncio.run(replayed(record, evaluation))
+        again = asyncio.run(replay_evaluation(record, evaluation))
         assert again.equal
         assert again.after is not None and again.after.audit_id == verdict.audit_id
     assert verify(tmp_path).problems == []
@@ -80,7 +80,7 @@ def test_a_failing_judge_fails_in_the_replay_with_the_same_words(tmp_path: Path,
     assert math.isnan(verdict.reward)
     record = read_record(tmp_path)
     (evaluation,) = record.judged()
-    assert asyncio.run(replayed(record, evaluation)).equal
+    assert asyncio.run(replay_evaluation(record, evaluation)).equal
     assert verify(tmp_path).problems == []
 
 
@@ -94,7 +94,7 @@ def test_a_clip_that_ran_out_of_time_is_recorded_and_not_replayed(tmp_path: Path
     record = read_record(tmp_path)
     (evaluation,) = record.judged()
     assert verdict.status is Status.ERROR
-    assert asyncio.run(replayed(record, evaluation)).after is None
+    assert asyncio.run(replay_evaluation(record, evaluation)).after is None
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_a_malformed_clip_is_recorded_as_it_is(tmp_path: Path, frames: np.ndarra
     record = read_record(tmp_path)
     (evaluation,) = record.judged()
     np.testing.assert_array_equal(record.clip(evaluation).frames, frames)
-    assert asyncio.run(replayed(record, evaluation)).equal
+    assert asyncio.run(replay_evaluation(record, evaluation)).equal
     assert verify(tmp_path).problems == []
 
 
@@ -144,14 +144,14 @@ def test_other_numbers_need_no_judge_and_other_words_do(tmp_path: Path) -> None:
     record = read_record(tmp_path)
     (evaluation,) = record.judged()
     stricter = load_rubric("robot", {"revision": 2, "stages": {"PC": {"threshold": 0.95}}})
-    after = asyncio.run(replayed(record, evaluation, stricter)).after
+    after = asyncio.run(replay_evaluation(record, evaluation, stricter)).after
     assert after is not None and after.provenance.rubric_version == stricter.version
     assert verdict.stages[3].passed and not after.stages[3].passed
     direct = asyncio.run(RewardAgent(ScriptedJudge(table), stricter, mode="benchmark").evaluate(*clips(1)[0]))
     assert after.audit_id == direct.audit_id
     words = load_rubric("robot", {"stages": {"PC": {"components": {"interaction": {"question": "Does it touch?"}}}}})
     with pytest.raises(AuditError, match="asks about interaction in other words"):
-        asyncio.run(replayed(record, evaluation, words))
+        asyncio.run(replay_evaluation(record, evaluation, words))
 
 
 def test_a_question_that_nobody_asked_is_an_error_that_names_it(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_a_question_that_nobody_asked_is_an_error_that_names_it(tmp_path: Path) 
     record = read_record(tmp_path)
     (evaluation,) = record.judged()
     lenient = load_rubric("robot", {"stages": {"VQ": {"threshold": 0.1}}, "voting": {"veto": 1.0}})
-    after = asyncio.run(replayed(record, evaluation, lenient)).after
+    after = asyncio.run(replay_evaluation(record, evaluation, lenient)).after
     assert after is not None and after.status is Status.ERROR and math.isnan(after.reward)
     assert "the log has no answer on background, vote 0" in after.reason
 
@@ -208,7 +208,7 @@ def test_prompts_and_raw_replies_of_a_server_are_kept_and_its_key_is_not(
     assert "Your last answer was refused" in second["prompt"][-1]
     assert second["settings"]["temperature"] == 0
     assert all("base64" not in "".join(exchange["prompt"]) for exchange in evaluation.exchanges)
-    assert asyncio.run(replayed(record, evaluation)).equal
+    assert asyncio.run(replay_evaluation(record, evaluation)).equal
     assert verify(tmp_path / "a").problems == []
     again = asyncio.run(run(ChatServer(), tmp_path / "b", VerdictCache(tmp_path / "cache")))
     assert again.audit_id == verdict.audit_id
@@ -226,7 +226,7 @@ def test_a_secret_in_a_reason_is_replaced_and_the_verdict_still_replayed(
     (evaluation,) = record.judged()
     assert evaluation.redacted and evaluation.verdict is not None
     assert evaluation.verdict.audit_id == verdict.audit_id
-    assert asyncio.run(replayed(record, evaluation)).equal
+    assert asyncio.run(replay_evaluation(record, evaluation)).equal
     assert verify(tmp_path).problems == []
     monkeypatch.delenv("JUDGE_API_KEY")
     judge_all(tmp_path, ScriptedJudge(clean_table(RUBRIC)), clips(1))

@@ -12,19 +12,19 @@ import pytest
 from audit_logs import Job, JudgeByClip, clips, judge_all
 from scripted_judge import CLEAN, FLAWED, WRONG, ScriptedJudge, clean_table
 
-from wm_nodes.core.reward_statistics import wilson_interval
+from wm_nodes.core.statistics import wilson_interval
 from wm_nodes.judge.agent import RewardAgent
 from wm_nodes.judge.agent.levels import next_vote
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Profile, Read, ReadRequest, Stage, Status
 from wm_nodes.judge.audit.adoption import Registry, RubricComparison, compare, decide
-from wm_nodes.judge.audit.agreement import AgreementRow, joined, report
+from wm_nodes.judge.audit.agreement import AgreementRow, join_labels, report
 from wm_nodes.judge.audit.commands import main
 from wm_nodes.judge.audit.labels import FORMAT, read_labels
 from wm_nodes.judge.audit.log import AuditError
 from wm_nodes.judge.audit.people import HumanJudge
 from wm_nodes.judge.audit.reading import RecordedEvaluation, read_record
-from wm_nodes.judge.audit.sampling import SHARES, draw, read_sample, sample_size, stratified, stratum_of
+from wm_nodes.judge.audit.sampling import SHARES, draw, draw_stratified, read_sample, sample_size, stratum_of
 
 EVIDENCE = {"surprise": {"component": "temporal", "high": 2.0}}
 RUBRIC = load_rubric("robot", {"evidence": EVIDENCE})
@@ -76,7 +76,7 @@ def test_weights_are_the_inverse_of_how_often_a_clip_is_drawn() -> None:
     rng = np.random.default_rng(0)
     times, totals = np.zeros(100), []
     for _ in range(3000):
-        drawn, weights, sizes = stratified(strata, 40, rng)
+        drawn, weights, sizes = draw_stratified(strata, 40, rng)
         assert len(set(drawn)) == 40
         times[drawn] += 1
         totals.append(sum(weights.values()))
@@ -180,7 +180,7 @@ def test_the_command_names_the_clips_that_are_paid_more_than_people_would(
 
 # --- agreement --------------------------------------------------------------------------------------------------
 def rows_of(folder: Path, *paths: Path, weights: Mapping[int, float] | None = None) -> dict[str, AgreementRow]:
-    found = joined(read_record(folder), [read_labels(path) for path in paths])
+    found = join_labels(read_record(folder), [read_labels(path) for path in paths])
     return {row.name: row for row in report(found).rows}
 
 
@@ -244,7 +244,7 @@ def test_labels_of_a_sample_are_weighted_to_the_round(tmp_path: Path) -> None:
     chosen = [e for e in evaluations if e.number in weight]
     said: list[Mapping[str, Any]] = [{"clarity": i > 3} for i, _ in enumerate(chosen)]
     files = [read_labels(write_labels(tmp_path / "a.json", chosen, said))]
-    row = next(r for r in report(joined(read_record(log), files, [sample])).rows if r.name == "clarity")
+    row = next(r for r in report(join_labels(read_record(log), files, [sample])).rows if r.name == "clarity")
     passed = [e.verdict is not None and e.verdict.stages[0].components[0].passed for e in chosen]
     right = [ok == (i > 3) for i, ok in enumerate(passed)]
     weights = [weight[e.number] for e in chosen]
@@ -390,7 +390,7 @@ def test_the_round_of_the_document_runs_as_it_is_written(tmp_path: Path, monkeyp
     Path("labels-Bob.json").write_text(bob)
     Path("next.yaml").write_text("extends: robot\nrevision: 2\nstages: {VQ: {threshold: 0.8}}\n")
     block = DOCUMENT.read_text().split("```bash\n")[1].split("```")[0]
-    commands = [line.removeprefix("python -m wm_nodes.judge.audit ").split() for line in block.splitlines()]
+    commands = [line.removeprefix("wm audit ").split() for line in block.splitlines()]
     assert [command[0] for command in commands] == [
         "verify", "sample", "view", "agree", "people", "replay", "replay", "replay", "adopt",
     ]

@@ -492,10 +492,10 @@ def test_threshold_counts_followers_only_and_is_checked_again_after_500_calls() 
     for _ in range(500):
         assert plan.plan == "pack"
         plan.observe(usage(0), follows=True)
-    assert plan.measuring and plan.plan == "fanout"
+    assert plan.is_measuring and plan.plan == "fanout"
     for _ in range(3):
         plan.observe(usage(60), follows=True)
-    assert plan.plan == "fanout" and not plan.measuring and plan.cached_ratio == 0.6
+    assert plan.plan == "fanout" and not plan.is_measuring and plan.cached_ratio == 0.6
 
 
 # The judge as a whole

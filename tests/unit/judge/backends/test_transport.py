@@ -160,12 +160,12 @@ def test_fifty_good_answers_raise_the_limit_by_one_up_to_its_maximum() -> None:
     async def run() -> None:
         limit = AdaptiveLimit(4)
         ticket = await limit.acquire()
-        limit.overloaded(ticket)
-        limit.overloaded(ticket)
+        limit.record_overload(ticket)
+        limit.record_overload(ticket)
         assert limit.limit == 2
         seen = []
         for _ in range(200):
-            limit.good()
+            limit.record_success()
             seen.append(limit.limit)
         assert (seen[48], seen[49], seen[99], seen[199]) == (2, 3, 4, 4)
 

@@ -32,7 +32,7 @@ from wm_nodes.judge.dataset.domain_randomization import (
     RESERVED_TABLE,
     TABLE_GAP,
     RandomizedScene,
-    drawn_variation,
+    draw_scene,
     hue_degrees,
 )
 from wm_nodes.judge.dataset.edits import OBJECT, Origin, failed_physics
@@ -46,11 +46,11 @@ PLAN = SetPlan(num_episodes=60, seed=20_000, development=True, diverse=True)
 
 
 def drawn(task: str = "push_cube", part: Part = "train") -> list[RandomizedScene]:
-    return [drawn_variation(task, seed, part) for seed in SEEDS]
+    return [draw_scene(task, seed, part) for seed in SEEDS]
 
 
 def of_set(seed: int) -> RandomizedScene:
-    return drawn_variation("push_cube", seed, PLAN.part("push_cube", seed))
+    return draw_scene("push_cube", seed, PLAN.part("push_cube", seed))
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_validation_has_each_reserved_factor_in_half_of_its_draws_and_training_h
 def test_a_diverse_set_has_no_test_part_and_its_origins_hold_all_numbers() -> None:
     parts = Counter(HELD_OUT.part(Origin("push_cube", "", "", "", seed)) for seed in PLAN.seeds("push_cube"))
     assert parts.keys() == {"train", "validation"} and parts.total() == 60
-    variation = drawn_variation("push_cube", 20_000, "train")
+    variation = draw_scene("push_cube", 20_000, "train")
     origin, look, layout = variation.origin("push_cube", 20_000, "expert"), variation.look, variation.look.layout
     assert layout is not None and look.lamp is not None
     for text, numbers in (

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.tasks import clip_rules, get_task
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.tasks import get_task
 from wm_nodes.judge.agent import RewardAgent, TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_heads
 from wm_nodes.judge.dataset.build import SIDE_PX, ClipSource, SetPlan
-from wm_nodes.judge.dataset.edits import OBJECT, TASK_RULES, tc_level
+from wm_nodes.judge.dataset.edits import OBJECT, tc_level
 from wm_nodes.judge.dataset.policy_camera import (
     DECODED,
     DRAWN,
@@ -128,7 +128,7 @@ def test_an_imagined_clip_is_the_models_own_where_it_stays_with_the_simulator_an
 
 @pytest.mark.rendering
 def test_successes_are_cut_at_their_end_or_go_on_and_failures_are_whole(source: ClipSource, view: PolicyCamera) -> None:
-    rule, cut = TASK_RULES["push_cube"], 0
+    rule, cut = clip_rules("push_cube").label, 0
     for seed in [s for s in range(40) if view.origin("push_cube", s).behaviour in ("expert", "short")][:6]:
         states = source.clip(seed).clip.states
         levels = [tc_level(states.at(np.arange(end)), rule) for end in range(1, len(states) + 1)]
@@ -152,7 +152,7 @@ def test_the_shipped_judge_of_these_pictures_pays_a_success_more_than_what_only_
 ) -> None:
     clips = (source.clip(seed) for seed in seeds_of(view, DRAWN))
     states = next(clip.clip.states for clip in clips if clip.labels.overall and len(clip.clip) > 8)
-    _, pictures = view.pictures(source.stage, states)
+    _, pictures = view.render(source.stage, states)
     task = TaskSpec(get_task("push_cube").instruction, "push_cube", "panda", pictures[0])
     cut = np.concatenate([pictures[:1].repeat(len(pictures) - 1, 0), pictures[-1:]])  # the end, and nothing before it
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pushed_box import FRAMES, draw, push_clip, pushing_states, redrawn
 
+from wm_nodes.config.tasks import clip_rules
 from wm_nodes.judge.agent.levels import one_hot, p_fail_of
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.dataset.edits import (
@@ -20,7 +21,6 @@ from wm_nodes.judge.dataset.edits import (
     PHYSICS,
     RECIPES,
     ROBOT,
-    TASK_RULES,
     TC,
     ClipTruth,
     LabelledClip,
@@ -37,11 +37,11 @@ from wm_nodes.judge.dataset.edits import (
     tc_level,
 )
 from wm_nodes.judge.dataset.edits.clips import TC_PASS_LEVEL
-from wm_nodes.judge.dataset.edits.generator import edited
+from wm_nodes.judge.dataset.edits.generator import apply_edit
 from wm_nodes.judge.dataset.edits.recipes import get_recipe
 from wm_nodes.judge.dataset.edits.truth import overlap_m, touched_nearby
 
-PUSH = TASK_RULES["push_cube"]
+PUSH = clip_rules("push_cube").label
 TOUCHING = slice(7, 12)
 seeds = st.integers(0, 2**32)
 names = st.sampled_from(sorted(RECIPES))
@@ -56,7 +56,7 @@ def parent(recipe: str = "", severity: str = "mild") -> LabelledClip:
 
 
 def child(name: str, severity: str, seed: int = 0) -> LabelledClip:
-    return edited(parent(name, severity), name, severity, seed, redrawn)
+    return apply_edit(parent(name, severity), name, severity, seed, redrawn)
 
 
 def change(before: LabelledClip, after: LabelledClip) -> float:
@@ -322,7 +322,7 @@ def test_task_completion_levels_worked_by_hand() -> None:
     def tool_at(height_m: float) -> int:
         tool = states.thing + np.array([0, 0, 0.3], np.float32)
         tool[-1, 2] = 0.02 + height_m
-        return tc_level(replace(states, tool=tool, contact=np.zeros(FRAMES, bool)), TASK_RULES["reach"])
+        return tc_level(replace(states, tool=tool, contact=np.zeros(FRAMES, bool)), clip_rules("reach").label)
 
     assert tool_at(0.099) == 4 and tool_at(0.101) == 3 and tool_at(0.18) == 2 and tool_at(0.25) == 1
 
@@ -380,7 +380,7 @@ def test_what_is_hit_may_go_twice_as_far_as_the_tool() -> None:
 def test_what_the_simulator_did_is_no_fault_of_a_recording_nor_of_an_edit() -> None:
     root = recorded(draw(knocked(0.2), push_clip().clip.origin))  # more than the rule allows an edit
     assert failed_physics(root.clip.states) == {"interaction"} and all(root.labels.components.values())
-    sunk = {kind: edited(root, "sunk", kind, 0, redrawn).labels for kind in ("mild", "fail")}
+    sunk = {kind: apply_edit(root, "sunk", kind, 0, redrawn).labels for kind in ("mild", "fail")}
     assert sunk["mild"] == root.labels and failures(sunk["fail"]) - failures(root.labels) == {"geometry"}
 
 
@@ -427,7 +427,7 @@ def test_wrong_calls_name_the_value_and_the_remedy() -> None:
         edit_states(child("blur", "mild"), "sunk", "fail", 0)
     with pytest.raises(ValueError, match="severity must be mild or fail, got 'clean'"):
         apply(parent(), "blur", "clean", 0)
-    with pytest.raises(ValueError, match="no rule for task 'juggle'"):
+    with pytest.raises(ValueError, match="unknown task 'juggle'; choose one of pull_cube, push_cube"):
         push_clip(task="juggle")
     with pytest.raises(ValueError, match="temporal unknown and nothing fails"):
         ClipTruth({name: True for name in COMPONENTS if name != "temporal"}, 4)

@@ -8,27 +8,15 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.tasks import clip_rules, success, task_names
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.tasks import success
 from wm_nodes.judge.dataset import rendering
-from wm_nodes.judge.dataset.build import (
-    HELD_OUT,
-    ClipSource,
-    SetPlan,
-    build,
-    check_set,
-    clip_path,
-    load_frames,
-    load_set,
-    main,
-    scene_states,
-)
+from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, SetPlan, build, main, scene_states
 from wm_nodes.judge.dataset.edits import (
     BACKGROUND,
     DISTRACTOR,
     OBJECT,
     ROBOT,
-    TASK_RULES,
     ManifestError,
     edit_states,
     failed_physics,
@@ -36,6 +24,7 @@ from wm_nodes.judge.dataset.edits import (
     tc_level,
 )
 from wm_nodes.judge.dataset.rendering import CAMERAS, SceneAppearance, record_states
+from wm_nodes.judge.dataset.set_files import check_set, clip_path, load_frames, load_set
 
 pytestmark = pytest.mark.rendering
 CONFIG = load_config("cpu").simulation
@@ -115,7 +104,7 @@ def test_hovering_above_the_cube_is_success_of_reach_and_of_no_push() -> None:
     env = ManiSkillEnvironment("reach", CONFIG.model_copy(update={"image_size": 16}), end_on_success=False)
     states = scene_states(record_states(env, "hover", 1))
     env.close()
-    levels = {task: tc_level(states, rule) for task, rule in TASK_RULES.items()}
+    levels = {task: tc_level(states, clip_rules(task).label) for task in task_names()}
     assert levels["reach"] == 4 and levels["push_cube"] <= 1
     assert success("reach", env.ground_truth)[0]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
-from wm_nodes.judge.dataset.build import BENCHMARK, HELD_OUT, STEADY, ClipSource, SetPlan, drawn_origin, instruction_of
+from wm_nodes.judge.dataset.build import BENCHMARK, HELD_OUT, STEADY, ClipSource, SetPlan, draw_origin, instruction_of
 from wm_nodes.judge.dataset.edits import OBJECT
 
 pytestmark = pytest.mark.rendering
@@ -25,7 +25,7 @@ def source() -> Iterator[ClipSource]:
 def test_shapes_are_rare_held_out_and_change_nothing_else(source: ClipSource) -> None:
     shapes: Counter[str] = Counter()
     for seed in range(600):
-        origin, without = source.origin(seed), drawn_origin("push_cube", seed)
+        origin, without = source.origin(seed), draw_origin("push_cube", seed)
         shape, _, colour = origin.object_id.partition("/")
         assert replace(origin, object_id=f"cube/{colour}") == without
         if origin.behaviour in STEADY:

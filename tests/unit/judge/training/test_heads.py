@@ -37,7 +37,7 @@ from wm_nodes.judge.training.heads import (
     fit_all,
     fit_familiarity,
     fit_questions,
-    measured,
+    measure_target,
     true_levels,
 )
 
@@ -157,10 +157,10 @@ def test_truth_of_every_target() -> None:
 def test_every_head_finds_its_number_on_clips_it_has_not_seen_and_is_calibrated(head: JudgeHead) -> None:
     test = examples(300, 3)
     for target in TARGETS:
-        found = measured(head.questions, target, test)
+        found = measure_target(head.questions, target, test)
         assert found["balanced_accuracy"] > 0.9, (target, found)
         assert target.startswith(HACK) or found["ece"] < 0.08, (target, found)
-    assert measured(head.questions, TC, test)["level_accuracy"] > 0.85
+    assert measure_target(head.questions, TC, test)["level_accuracy"] > 0.85
     text = head.evidence_text("clarity", np.eye(len(NAMES), dtype=np.float32)[:1] * 3)
     assert text.startswith("clarity 3 (clean ") and "idle" not in text
 

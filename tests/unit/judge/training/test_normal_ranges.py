@@ -22,7 +22,7 @@ from wm_nodes.judge.audit import read_record
 from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.judge.training import normal_ranges
-from wm_nodes.judge.training.normal_ranges import SIGNALS, bands_of, main, outside
+from wm_nodes.judge.training.normal_ranges import SIGNALS, bands_of, count_outside, main
 from wm_nodes.recording import EpisodeBagWriter
 
 MODEL_DIR = shipped_model("push_cube")
@@ -83,7 +83,7 @@ def test_what_cannot_be_measured_lies_in_no_band(server: PickyServer, tmp_path: 
 
 def test_bands_of_evidence_that_nobody_measures_are_refused_by_name(server: PickyServer, tmp_path: Path) -> None:
     unknown = pack(tmp_path, sharpnes={"component": "clarity", "low": 0.5})
-    with pytest.raises(ValueError, match=r"bands of sharpnes, which nobody measures here; known: .*sharpness_min"):
+    with pytest.raises(ValueError, match=r"bands of sharpnes, which is not measured here; known: .*sharpness_min"):
         JudgeService(settings(server, unknown), seed=0)
     needs_model = pack(tmp_path, **BANDS)
     with pytest.raises(ValueError, match=r"bands of still_energy, which a world model measures; name its folder"):
@@ -100,7 +100,7 @@ def test_the_shipped_bands_are_measured_by_the_shipped_model_and_tell_a_frozen_c
     assert set(rubric.evidence) == set(SIGNALS) and rubric.stages == load_rubric().stages
     evidence.check(rubric)
     frozen = job("frozen", imagined()[0][:1].repeat(STEPS + 1, 0))
-    found = conflicting_evidence(rubric, evidence.of(rubric, frozen.clip, frozen.task))
+    found = conflicting_evidence(rubric, evidence.measure(rubric, frozen.clip, frozen.task))
     assert {"still_energy", "surprise_over_still"} <= set(found)
 
 
@@ -115,7 +115,7 @@ def test_a_band_ends_where_so_many_clean_clips_lie_outside() -> None:
     assert bands["action_gain"] == {"component": "interaction", "low": 2.0}
     assert bands["done_max"] == {"component": "task_completion", "low": 2.0}  # of 0, 2, .. 100
     rubric = load_rubric(overrides={"evidence": bands})
-    counts = outside(rows(101), rubric)
+    counts = count_outside(rows(101), rubric)
     assert (counts["flicker_max"], counts["action_gain"], counts["done_max"], counts["any"]) == (2, 2, 1, 4)
     with pytest.raises(ValueError, match="done_max needs 50 clips whose task is done, the bags hold 30"):
         bands_of(rows(60), 0.02)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from pushed_box import push_clip, redrawn
 
-from wm_nodes.core.reward_statistics import auroc
+from wm_nodes.core.statistics import auroc
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.dataset.edits import LabelledClip, edit_states
 from wm_nodes.judge.evidence.motion import outline_of

@@ -14,7 +14,7 @@ Criteria, scales and answer forms are the public ones, the wording is ours: no p
 the authors' by that; quote them as "VideoAlign-style". Every failure is a reason, never a number.
 """
 
-from benchmarks.judge.comparisons.chat import ChatComparison, ComparisonReward, Scored
+from benchmarks.judge.comparisons.chat import ChatComparison, ComparisonReward, ScoredClip
 from benchmarks.judge.comparisons.protocols import PAIRWISE, POINTWISE, PairwiseProtocol, PointwiseProtocol
 
 __all__ = [
@@ -24,5 +24,5 @@ __all__ = [
     "ComparisonReward",
     "PairwiseProtocol",
     "PointwiseProtocol",
-    "Scored",
+    "ScoredClip",
 ]

@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredClip:
     """value in [0, 1], NaN unless valid; parts in the protocol's own units. reason: why there is no number."""
 
     value: float
@@ -54,14 +54,14 @@ class ChatComparison:
     ) -> None:
         self._transport, self._timeout_s, self._max_tokens, self._seed = transport, timeout_s, max_tokens, seed
 
-    async def score(self, protocol: PointwiseProtocol, clip: ClipRef, task: TaskSpec) -> Scored:
+    async def score(self, protocol: PointwiseProtocol, clip: ClipRef, task: TaskSpec) -> ScoredClip:
         """Score one clip by a pointwise protocol."""
         count = protocol.frames or max(2, math.ceil(clip.duration_s * protocol.fps))
         content = [*_images(clip, count), _text(protocol.question(task.instruction))]
         parts, reason, cost = await self.ask(content, protocol.read, count)
         if parts is None:
-            return Scored(math.nan, {}, False, reason, cost)
-        return Scored(protocol.value(parts), parts, cost=cost)
+            return ScoredClip(math.nan, {}, False, reason, cost)
+        return ScoredClip(protocol.value(parts), parts, cost=cost)
 
     async def compare(
         self, protocol: PairwiseProtocol, first: ClipRef, second: ClipRef, task: TaskSpec, *, both_orders: bool = True
@@ -71,16 +71,16 @@ class ChatComparison:
         Args:
             both_orders: ask twice, with the clips exchanged: models prefer a place. The published protocol asks once.
         """
-        one = await self._one_order(protocol, first, second, task)
-        if not both_orders or not one.valid:
-            return one
-        other = await self._one_order(protocol, second, first, task)
-        cost = one.cost + other.cost
+        forward = await self._compare_once(protocol, first, second, task)
+        if not both_orders or not forward.valid:
+            return forward
+        other = await self._compare_once(protocol, second, first, task)
+        cost = forward.cost + other.cost
         if not other.valid:
             return ComparisonReward(math.nan, {}, False, other.reason, cost=cost)
         turned = 1 - other.preference
-        same = (one.preference - 0.5) * (turned - 0.5) > 0
-        return ComparisonReward((one.preference + turned) / 2, one.parts, consistent=same, cost=cost)
+        same = (forward.preference - 0.5) * (turned - 0.5) > 0
+        return ComparisonReward((forward.preference + turned) / 2, forward.parts, consistent=same, cost=cost)
 
     async def ask(
         self, content: Sequence[Part], read: Callable[[str], T], num_images: int, system: str = ""
@@ -113,15 +113,15 @@ class ChatComparison:
         waited = time.monotonic() - began
         return None, f"{TRIES} answers were refused in {waited:.1f} s, the last one: {reason}", cost
 
-    async def _one_order(
+    async def _compare_once(
         self, protocol: PairwiseProtocol, first: ClipRef, second: ClipRef, task: TaskSpec
     ) -> ComparisonReward:
         images = [*_images(first, protocol.frames, "video 1, "), *_images(second, protocol.frames, "video 2, ")]
         content = [*images, _text(protocol.question(task.instruction))]
-        found, reason, cost = await self.ask(content, protocol.read, len(images) // 2)
-        if found is None:
+        answer, reason, cost = await self.ask(content, protocol.read, len(images) // 2)
+        if answer is None:
             return ComparisonReward(math.nan, {}, False, reason, cost=cost)
-        preference, parts = found
+        preference, parts = answer
         return ComparisonReward(preference, parts, cost=cost)
 
 

@@ -54,7 +54,7 @@ class BenchQuestion:
 
 
 @dataclass(frozen=True)
-class Answered:
+class AnsweredQuestion:
     """said: None where the judge gave no usable answer, says `reason`; such a question is counted as not answered."""
 
     question: BenchQuestion
@@ -81,8 +81,8 @@ def load_questions(folder: Path, category: str = CATEGORY) -> list[BenchQuestion
 
 def _questions(path: Path) -> list[BenchQuestion]:
     try:
-        found = json.loads(path.read_text())
-        return [_question(path.stem, entry) for entry in found]
+        entries = json.loads(path.read_text())
+        return [_question(path.stem, entry) for entry in entries]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is no list of yes-or-no questions: {type(error).__name__}: {error}") from None
 
@@ -95,7 +95,7 @@ def _question(video_id: str, entry: Mapping[str, Any]) -> BenchQuestion:
     return BenchQuestion(str(entry["uid"]), video_id, str(entry["question"]), answer, str(entry["task"]))
 
 
-async def answer(judge: ChatComparison, question: BenchQuestion, clip: ClipRef) -> Answered:
+async def answer(judge: ChatComparison, question: BenchQuestion, clip: ClipRef) -> AnsweredQuestion:
     """Ask one question about one video."""
     shown = uniform(len(clip.frames), max(2, math.ceil(clip.duration_s * VIDEO_FPS)))
     content: list[dict[str, Any]] = []
@@ -104,7 +104,7 @@ async def answer(judge: ChatComparison, question: BenchQuestion, clip: ClipRef) 
         content.append({"type": "image_url", "image_url": {"url": data_uri(clip.frames[index])}})
     content.append({"type": "text", "text": f"{question.text}\nAnswer with yes or no."})
     said, reason, cost = await judge.ask(content, yes_or_no, len(shown), SYSTEM)
-    return Answered(question, said, reason, cost)
+    return AnsweredQuestion(question, said, reason, cost)
 
 
 def yes_or_no(text: str) -> Literal["yes", "no"]:
@@ -119,17 +119,17 @@ def yes_or_no(text: str) -> Literal["yes", "no"]:
     return "yes" if "yes" in words else "no"
 
 
-def domain_score(answers: Sequence[Answered]) -> tuple[float, int]:
+def domain_score(answers: Sequence[AnsweredQuestion]) -> tuple[float, int]:
     """Accuracy in percent over the questions that were answered, and how many were not.
 
     Raises:
         ValueError: not one was answered.
     """
-    said = [one for one in answers if one.said is not None]
+    said = [answer for answer in answers if answer.said is not None]
     if not said:
         reason = answers[0].reason if answers else "there are no questions"
         raise ValueError(f"no question was answered: {reason}")
-    return 100 * sum(one.right for one in said) / len(said), len(answers) - len(said)
+    return 100 * sum(answer.right for answer in said) / len(said), len(answers) - len(said)
 
 
 def consistency(features_TD: FloatArray) -> float:
@@ -139,7 +139,7 @@ def consistency(features_TD: FloatArray) -> float:
     Raises:
         ValueError: fewer than two frames, or features that are zero or not finite.
     """
-    unit = _unit(features_TD)
+    unit = _normalise(features_TD)
     if len(unit) < 2:
         raise ValueError(f"consistency needs at least 2 frames, got {len(unit)}")
     return float(((unit[1:] @ unit[0]) + (unit[1:] * unit[:-1]).sum(1)).mean() / 2)
@@ -163,7 +163,7 @@ def summary(domain: float, quality: Mapping[str, float]) -> dict[str, float]:
     return {"domain": domain, "quality": mean, "overall": (domain + mean) / 2}
 
 
-def _unit(features_TD: FloatArray) -> FloatArray:
+def _normalise(features_TD: FloatArray) -> FloatArray:
     norms = np.linalg.norm(features_TD, axis=1, keepdims=True)
     if features_TD.ndim != 2 or not np.isfinite(norms).all() or not (norms > 0).all():
         raise ValueError(f"features must be (T, D), finite and not zero, got shape {features_TD.shape}")

@@ -128,13 +128,13 @@ def read_unified(text: str) -> Parts:
     """
     parts = {}
     for name in (*UNIFIED_DIMENSIONS, "Final Score"):
-        found = re.findall(rf"^\W*{re.escape(name)}\W*:\W*([\d.]+)\W*$", text, re.IGNORECASE | re.MULTILINE)
+        numbers = re.findall(rf"^\W*{re.escape(name)}\W*:\W*([\d.]+)\W*$", text, re.IGNORECASE | re.MULTILINE)
         high = 10 if name == "Final Score" else 4
-        if len(found) != 1:
-            raise AnswerError(f"{name!r} is there {len(found)} times instead of once")
-        value = _number(found[0])
+        if len(numbers) != 1:
+            raise AnswerError(f"{name!r} is there {len(numbers)} times instead of once")
+        value = _number(numbers[0])
         if not 1 <= value <= high:
-            raise AnswerError(f"{name} must be 1 to {high}, got {found[0]}")
+            raise AnswerError(f"{name} must be 1 to {high}, got {numbers[0]}")
         parts[name] = value
     return parts
 
@@ -145,7 +145,7 @@ def read_flex(text: str) -> tuple[float, Parts]:
     Raises:
         AnswerError: not that JSON, points that do not sum to 10, or a winner whom the points contradict.
     """
-    answer = _parsed(_Flex, text)
+    answer = _parse(_Flex, text)
     shares: dict[str, float] = {}
     points: list[float] = []
     for category in answer.categories:
@@ -162,10 +162,10 @@ def read_flex(text: str) -> tuple[float, Parts]:
 
 
 def _reader(model: type[BaseModel]) -> Callable[[str], Parts]:
-    return lambda text: _parsed(model, text).model_dump()
+    return lambda text: _parse(model, text).model_dump()
 
 
-def _parsed(model: type[Any], text: str) -> Any:
+def _parse(model: type[Any], text: str) -> Any:
     try:
         return model.model_validate(json.loads(strip_reasoning(text)))
     except ValidationError as error:

@@ -70,11 +70,11 @@ class VideoReward:
         patches, grid = to_patches(frames, self._pictures)
         ids = self._token_ids(task.instruction, int(grid.prod()) // self._pictures.merge**2)
         types = torch.where(ids == self._id(VIDEO_TOKEN), VIDEO_TYPE, 0)
-        found = self._model(
+        output = self._model(
             input_ids=ids, attention_mask=torch.ones_like(ids), pixel_values_videos=patches, video_grid_thw=grid[None],
             mm_token_type_ids=types,
         )
-        raw = F.linear(found.last_hidden_state[0].float(), self._head)
+        raw = F.linear(output.last_hidden_state[0].float(), self._head)
         scores = {}
         for column, (name, token) in enumerate(zip(DIMENSIONS, REWARD_TOKENS)):
             (place,) = (ids[0] == self._id(token)).nonzero()[:, 0].tolist()
@@ -137,7 +137,7 @@ def to_patches(frames: Tensor, pictures: VideoPatches) -> tuple[Tensor, Tensor]:
     The last frame is repeated until the number of frames is a multiple of `temporal`.
     """
     patch, merge, pair = pictures.patch_px, pictures.merge, pictures.temporal
-    height, width = fitted(frames.shape[1], frames.shape[2], pictures)
+    height, width = fit_size(frames.shape[1], frames.shape[2], pictures)
     pixels = frames.permute(0, 3, 1, 2).float()
     pixels = F.interpolate(pixels, (height, width), mode="bicubic", antialias=True).round().clamp(0, 255) / 255
     mean, std = (torch.tensor(values).view(1, 3, 1, 1) for values in (pictures.mean, pictures.std))
@@ -149,7 +149,7 @@ def to_patches(frames: Tensor, pictures: VideoPatches) -> tuple[Tensor, Tensor]:
     return parts.reshape(times * rows * columns, 3 * pair * patch * patch), torch.tensor([times, rows, columns])
 
 
-def fitted(height: int, width: int, pictures: VideoPatches) -> tuple[int, int]:
+def fit_size(height: int, width: int, pictures: VideoPatches) -> tuple[int, int]:
     """The size in px: multiples of patch x merge, nearest to the frame's, within the limits at its proportions."""
     unit = pictures.patch_px * pictures.merge
     rows, columns = (max(unit, round(side / unit) * unit) for side in (height, width))
@@ -163,13 +163,13 @@ def fitted(height: int, width: int, pictures: VideoPatches) -> tuple[int, int]:
 
 
 def _pictures(folder: Path) -> VideoPatches:
-    found = json.loads((folder / "preprocessor_config.json").read_text())
-    size = found.get("size") or {}
+    settings = json.loads((folder / "preprocessor_config.json").read_text())
+    size = settings.get("size") or {}
     return VideoPatches(
-        found.get("patch_size", 14), found.get("merge_size", 2), found.get("temporal_patch_size", 2),
-        found.get("min_pixels", size.get("shortest_edge", MIN_PIXELS)),
-        found.get("max_pixels", size.get("longest_edge", MAX_PIXELS)),
-        tuple(found["image_mean"]), tuple(found["image_std"]),
+        settings.get("patch_size", 14), settings.get("merge_size", 2), settings.get("temporal_patch_size", 2),
+        settings.get("min_pixels", size.get("shortest_edge", MIN_PIXELS)),
+        settings.get("max_pixels", size.get("longest_edge", MAX_PIXELS)),
+        tuple(settings["image_mean"]), tuple(settings["image_std"]),
     )
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wm_nodes.core.types import FloatArray
-from wm_nodes.environments.maniskill.tasks import CUBE, CUBE_HALF_SIZE_M, GOAL, TOOL, reach_target
+from wm_nodes.environments.maniskill.table_top import CUBE, CUBE_HALF_SIZE_M, GOAL, TOOL, above_cube
 
 ROBOT_BASE = np.array([-0.615, 0.0, 0.0], np.float32)
 CLEARANCE_M = 0.045
@@ -35,12 +35,15 @@ class Style:
     speed: float = 1.0
 
 
+EXPERT = Style()
+
+
 def sample_style(behaviour: str, rng: np.random.Generator) -> Style:
     """Draw a style of `behaviour`; raises ValueError for an unknown name."""
     sign = rng.choice([-1.0, 1.0])
     match behaviour:
         case "expert" | "hover":
-            return Style()
+            return EXPERT
         case "noisy" | "hover_noisy":
             return Style(noise=rng.uniform(0.1, 0.8), lateral_m=rng.normal(0, 0.008), speed=rng.uniform(0.5, 1.0))
         case "near_miss":
@@ -73,7 +76,7 @@ def script(
         tool = state + ROBOT_BASE
         while reached < len(waypoints) - 1 and np.linalg.norm(waypoints[reached] - tool) < 0.012:
             reached += 1
-        target = reach_target(truth_now) if behaviour.startswith("hover") and not style.noise else waypoints[reached]
+        target = above_cube(truth_now) if behaviour.startswith("hover") and not style.noise else waypoints[reached]
         step = (target - tool) / max_action_m
         largest = np.abs(step).max()
         if largest > style.speed:
@@ -117,30 +120,25 @@ def _waypoints(behaviour: str, style: Style, truth: FloatArray, rng: np.random.G
     for _ in range(style.detours):
         yield _near(cube, rng)
     if behaviour.startswith("hover"):
-        yield reach_target(truth) + rng.normal(0, 0.02 if style.noise else 0.0, 3).astype(np.float32)
+        yield above_cube(truth) + rng.normal(0, 0.02 if style.noise else 0.0, 3).astype(np.float32)
         for _ in range(6 if style.noise else 0):
             yield _near(cube, rng)
         return
-    yield from _push_waypoints(style, truth)
+    yield from push_waypoints(truth, style)
 
 
-def task_waypoints(task: str, truth: FloatArray) -> list[FloatArray]:
-    """World tool positions (3,) that solve `task` from ground truth (P,) without detours."""
-    return [reach_target(truth)] if task == "reach" else list(_push_waypoints(Style(), truth))
-
-
-def _push_waypoints(style: Style, truth: FloatArray) -> Iterator[FloatArray]:
+def push_waypoints(truth: FloatArray, style: Style = EXPERT) -> list[FloatArray]:
     """Above the start of the push, down, and along to the goal; pulling is pushing from the other side."""
     cube, goal = truth[CUBE], truth[GOAL]
     direction = np.sign(goal[0] - cube[0])
     push_z = PUSH_HEIGHT_M + style.height_m
     side = cube[1] + style.lateral_m
     start_x = cube[0] - direction * (CLEARANCE_M + 0.02)
-    yield np.array([start_x, side, max(TRAVEL_HEIGHT_M, push_z)], np.float32)
-    yield np.array([start_x, side, push_z], np.float32)
     distance = abs(goal[0] - cube[0]) - 0.06 - style.stop_short_m
     touch = CUBE_HALF_SIZE_M + 0.01
-    yield np.array([cube[0] + direction * (distance - touch), side, push_z], np.float32)
+    end_x = cube[0] + direction * (distance - touch)
+    places = [(start_x, max(TRAVEL_HEIGHT_M, push_z)), (start_x, push_z), (end_x, push_z)]
+    return [np.array([x, side, z], np.float32) for x, z in places]
 
 
 def _near(cube: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -9,15 +9,15 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from transforms3d.euler import euler2quat, quat2euler
+from transforms3d.euler import euler2quat
 
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.tasks import get_task
 from wm_nodes.core.seeding import stream_seed
-from wm_nodes.core.specs import GROUND_TRUTH_NAMES, simulation_spec
+from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.environments.maniskill.scenes import make_scene, render
-from wm_nodes.environments.maniskill.tasks import get_task
 
 CONTROLLER_RANGE_M = 0.1
 """A full-scale action of ManiSkill's stock Panda controller."""
@@ -33,7 +33,7 @@ class ManiSkillEnvironment:
     def __init__(
         self, task: str, config: SimulationConfig, num_envs: int = 1, seed: int = 0, *, end_on_success: bool = True
     ) -> None:
-        self.spec = simulation_spec(task, get_task(task).instruction, config, num_envs)
+        self.spec = simulation_spec(task, config, num_envs)
         self._task = get_task(task)
         self._config = config
         self._seed = seed
@@ -42,8 +42,8 @@ class ManiSkillEnvironment:
         self._num_resets = 0
         self._images = np.zeros((num_envs, self.spec.height, self.spec.width, 3), np.uint8)
         self._states = np.zeros((num_envs, 3), np.float32)
-        self._truth = np.full((num_envs, len(GROUND_TRUTH_NAMES)), np.nan, np.float32)
-        self._cube_start = np.zeros((num_envs, 2), np.float32)
+        self._truth = np.full((num_envs, self.spec.ground_truth_dim), np.nan, np.float32)
+        self._first_truth = self._truth.copy()
         self._steps = np.zeros(num_envs, np.uint32)
         self._episode_ids = np.zeros(num_envs, np.uint64)
         self._ended = np.ones(num_envs, bool)
@@ -64,11 +64,10 @@ class ManiSkillEnvironment:
             self._num_resets += 1
             seed = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else int(seeds[i])
             self._scenes[i].reset(seed=seed % 2**32)
-            self._cube_start[i] = self._scenes[i].obj.pose.p[0, :2].numpy()
             self._steps[i] = 0
             self._episode_ids[i] = self._num_resets
             self._ended[i] = False
-            self._observe(i)
+            self._start(i)
         return self.current()
 
     def lay_out(self, cube_m: Sequence[float], heading_rad: float) -> None:
@@ -81,8 +80,7 @@ class ManiSkillEnvironment:
         ahead = np.array([np.cos(heading_rad), np.sin(heading_rad)])
         scene.obj.set_pose(sapien.Pose([*cube_m, cube[2]], euler2quat(0, 0, heading_rad)))
         scene.goal_region.set_pose(sapien.Pose([*(np.array(cube_m) + away * ahead), goal[2]], goal[3:]))
-        self._cube_start[0] = cube_m
-        self._observe(0)
+        self._start(0)
 
     def step(self, actions: FloatArray) -> StepResult:
         check_actions(actions, self.spec)
@@ -115,14 +113,14 @@ class ManiSkillEnvironment:
         for scene in self._scenes:
             scene.close()
 
+    def _start(self, i: int) -> None:
+        self._first_truth[i] = self._task.measure(self._scenes[i], None)
+        self._observe(i)
+
     def _observe(self, i: int) -> None:
         scene = self._scenes[i]
         self._images[i] = render(scene, self._config.cameras)
-        cube = scene.obj.pose.raw_pose[0].numpy()
-        tool = scene.agent.tcp.pose.p[0].numpy()
-        goal = scene.goal_region.pose.p[0, :2].numpy()
-        yaw = quat2euler(cube[3:])[2]
-        self._truth[i] = np.concatenate([cube[:3], [yaw], tool, goal, self._cube_start[i]])
+        self._truth[i] = self._task.measure(scene, self._first_truth[i])
         arm = scene.agent.controller.controllers["arm"]
         self._states[i] = arm._target_pose.p[0].numpy()
 

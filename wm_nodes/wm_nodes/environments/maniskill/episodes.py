@@ -4,12 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from wm_nodes.config.tasks import get_task, success
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode, FloatArray, Observation
-from wm_nodes.environments.maniskill.behaviours import script
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner, follow
-from wm_nodes.environments.maniskill.tasks import success
 
 Act = Callable[[Observation, FloatArray], FloatArray]
 """(observation of one slot, ground truth (P,)) -> action (A,); a policy ignores the ground truth."""
@@ -19,6 +18,7 @@ def scripted_episode(env: ManiSkillEnvironment, behaviour: str, seed: int, episo
     """One episode of a scripted behaviour; everything random follows from `seed`."""
     env.reset(seeds=np.array([seed], np.uint64))
     truth = env.ground_truth[0]
+    script = get_task(env.spec.task).script
     scripted = script(behaviour, truth, numpy_stream(seed, "behaviour"), env.spec.action_scale[0])
 
     def act(observation: Observation, truth_now: FloatArray) -> FloatArray:

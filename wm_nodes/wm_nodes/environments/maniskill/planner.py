@@ -10,8 +10,9 @@ from collections.abc import Callable
 import mplib
 import numpy as np
 
+from wm_nodes.config.tasks import get_task
 from wm_nodes.core.types import FloatArray
-from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE, task_waypoints
+from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
 PLANNER_TIME_STEP_S = 0.02
@@ -48,7 +49,7 @@ class DemonstrationPlanner:
         joints = agent.robot.get_qpos()[0].numpy().astype(np.float64)
         rotation = agent.tcp.pose.q[0].numpy()
         tools = [agent.tcp.pose.p[0].numpy()]
-        for waypoint in task_waypoints(self._env.spec.task, self._env.ground_truth[0]):
+        for waypoint in get_task(self._env.spec.task).waypoints(self._env.ground_truth[0]):
             pose = np.concatenate([waypoint, rotation])
             result = self._planner.plan_screw(pose, joints, time_step=PLANNER_TIME_STEP_S)
             if result["status"] != "Success":

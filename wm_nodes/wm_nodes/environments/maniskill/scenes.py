@@ -1,11 +1,12 @@
-"""ManiSkill's PushCube-v1 and PullCube-v1 with our two cameras and a plain table top; physics unchanged.
+"""ManiSkill's table-top environments with our two cameras and a plain table top; physics unchanged.
 
 What differs from the stock picture: two near cameras (the stock one shows the cube 2 px wide), a thin plain sheet in
 place of the wooden table and the ground (visual only), arm links 0 to 6 not drawn (they are outside or at the edge of
 both views and cost two thirds of the rendering), and fingers closed from the start.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -13,8 +14,6 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.envs.tasks.tabletop.pull_cube import PullCubeEnv
-from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import register_env
@@ -63,22 +62,21 @@ class TableTopScene(BaseEnv):  # type: ignore[misc]
         self.agent.reset(joint_positions)
 
 
-class WmPushCube(TableTopScene, PushCubeEnv):  # type: ignore[misc]
-    pass
+def make_scene(scene: Callable[[], type[BaseEnv]], config: SimulationConfig, *mixins: type[BaseEnv]) -> BaseEnv:
+    """Build the scene of a task (Task.scene) on the CPU physics, rendered by config.render_device.
 
-
-class WmPullCube(TableTopScene, PullCubeEnv):  # type: ignore[misc]
-    pass
-
-
-register_env("WmPushCube-v1", max_episode_steps=10_000)(WmPushCube)
-register_env("WmPullCube-v1", max_episode_steps=10_000)(WmPullCube)
-
-
-def make_scene(scene: str, config: SimulationConfig) -> BaseEnv:
-    """Build one of our scenes on the CPU physics, rendered by config.render_device."""
+    mixins: classes before TableTopScene.
+    """
     TableTopScene.image_size = config.image_size
-    return make(scene, config).unwrapped
+    return make(_registered(scene, mixins), config).unwrapped
+
+
+@functools.cache
+def _registered(scene: Callable[[], type[BaseEnv]], mixins: tuple[type[BaseEnv], ...]) -> str:
+    """The name under which gymnasium makes the scene, built and registered once in a process."""
+    name = ".".join([*(mixin.__qualname__ for mixin in mixins), scene.__module__, scene.__qualname__]) + "-v1"
+    register_env(name, max_episode_steps=10_000)(type(name, (*mixins, TableTopScene, scene()), {}))
+    return name
 
 
 def make(scene: str, config: SimulationConfig, **options: Any) -> gym.Env[Any, Any]:

@@ -104,26 +104,26 @@ def score(reads: Sequence[Read], decided_by: str) -> ComponentScore:
     )
 
 
-def unscored(reads: Sequence[Read], status: Status, reason: str) -> ComponentScore:
+def unscored_component(reads: Sequence[Read], status: Status, reason: str) -> ComponentScore:
     """A component without a number, and why."""
     nan = math.nan
     return ComponentScore(reads[0].component, status, nan, nan, nan, tuple(reads), "nothing", reason)
 
 
-def settled(reads: Sequence[Read], min_label_mass: float) -> ComponentScore:
+def settle(reads: Sequence[Read], min_label_mass: float) -> ComponentScore:
     """Decide from these reads alone; ABSTAIN where their majority on pass is not that of the pooled levels."""
     states = [state_of(read, min_label_mass) for read in reads]
     for status in (Status.ERROR, Status.ABSTAIN):
-        for found, reason in states:
-            if found is status:
-                return unscored(reads, status, reason)
+        for state, reason in states:
+            if state is status:
+                return unscored_component(reads, status, reason)
     passes = sum(p_fail_of(read.levels) < 0.5 for read in reads)
     fails = len(reads) - passes
     pooled = score(reads, "first read" if len(reads) == 1 else f"{max(passes, fails)} of {len(reads)} votes")
     if passes != fails and pooled.passed == (passes > fails):
         return pooled
     reason = f"{reads[0].component}: {passes} votes pass, {fails} fail; the pooled p_fail is {pooled.p_fail:.3f}"
-    return unscored(reads, Status.ABSTAIN, reason)
+    return unscored_component(reads, Status.ABSTAIN, reason)
 
 
 def tally(reads: Sequence[Read], *, k: int, k_max: int, min_label_mass: float) -> ComponentScore | None:
@@ -132,7 +132,7 @@ def tally(reads: Sequence[Read], *, k: int, k_max: int, min_label_mass: float) -
     Stops once the votes still to come of k cannot change the majority, which must be that of the pooled levels; else
     one more vote, up to k_max, then ABSTAIN. A read that does not count (state_of) ends it at once.
     """
-    result = settled(reads, min_label_mass)
+    result = settle(reads, min_label_mass)
     if len(reads) >= k_max or any(state_of(read, min_label_mass)[0] is not Status.OK for read in reads):
         return result
     passes = sum(p_fail_of(read.levels) < 0.5 for read in reads)

@@ -1,8 +1,8 @@
-"""The state machine over a judge (RA-1).
+"""The state machine of the reward agent (RA-1).
 
 PRECHECK -> PLAN -> VQ -> IF -> TC -> PC -> REFLECT -> HACK -> AGGREGATE. In reward mode a failed gate ends the reading;
-in benchmark mode every component is read. A second look that opens a closed gate goes on with the stages behind it,
-once. Whatever the judge does, the result is a Verdict: a judge that fails or cannot say leaves reward NaN.
+in benchmark mode every component is read. If reflection opens a closed gate, the stages after it are read, too, once.
+The result is always a Verdict; its reward is NaN where the judge fails or abstains.
 """
 
 import asyncio
@@ -97,7 +97,7 @@ class RewardAgent:
         run = _Run(self, clip, task, evidence or {})
         try:
             async with asyncio.timeout(self.budget_s):
-                status, value, reason = await run.judged()
+                status, value, reason = await run.judge_clip()
         except _Stop as stop:
             status, value, reason = stop.status, math.nan, str(stop)
         except TimeoutError:
@@ -124,7 +124,7 @@ class RewardAgent:
 
 
 class _Stop(Exception):
-    """Nothing more is asked: the verdict has no number."""
+    """Ends the evaluation of a clip with a verdict without a reward."""
 
     def __init__(self, status: Status, reason: str) -> None:
         super().__init__(reason)
@@ -132,43 +132,43 @@ class _Stop(Exception):
 
 
 class _Run:
-    """One clip on its way through the states."""
+    """The evaluation of one clip."""
 
     def __init__(self, agent: RewardAgent, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> None:
         self.agent, self.rubric, self.clip, self.task, self.evidence = agent, agent.rubric, clip, task, evidence
-        self.stages: dict[Stage, StageScore] = {stage: scoring.skipped(stage) for stage in GATED}
+        self.stages: dict[Stage, StageScore] = {stage: scoring.skipped_stage(stage) for stage in GATED}
         self.plan: PlanResult | None = None
         self.level = -1
         self.reflections: list[Reflection] = []
         self.flags: list[HackFlag] = []
         self.cost, self.num_reads, self.prompts = Cost(), 0, list[str]()
         self._media: dict[Profile, tuple[MediaItem, ...]] = {}
-        self._audited = self._drawn("audit")
+        self._audited = self._is_drawn("audit")
 
-    async def judged(self) -> tuple[Status, float, str]:
+    async def judge_clip(self) -> tuple[Status, float, str]:
         """Go through every state. Raises _Stop where the judge fails or, in reward mode, cannot say."""
-        found = precheck(self.clip, self.task)
-        if found.kind == "malformed":
-            return Status.ERROR, math.nan, found.reason
-        if found.kind == "no video":
+        check = precheck(self.clip, self.task)
+        if check.kind == "malformed":
+            return Status.ERROR, math.nan, check.reason
+        if check.kind == "no video":
             self.level = 0
-            return Status.OK, 0.0, found.reason
-        self.plan = plan = await self._planned()
+            return Status.OK, 0.0, check.reason
+        self.plan = plan = await self._read_plan()
         self.level = plan.level
         await self._read_stages(plan)
         if self.rubric.reflection.enabled:
             await self._reflect(plan)
             await self._read_stages(plan)
-        if self.rubric.hack.enabled and all(stage.status is not Status.SKIPPED for stage in self._ordered()):
+        if self.rubric.hack.enabled and all(stage.status is not Status.SKIPPED for stage in self._stages_in_order()):
             await self._read_patterns()
             confirmed = [flag.pattern for flag in self.flags if flag.confirmed]
-            self.stages = {s.stage: s for s in scoring.capped(self._ordered(), confirmed, self.rubric)}
-        silent = [c.reason for s in self._ordered() for c in s.components if c.status is Status.ABSTAIN]
+            self.stages = {s.stage: s for s in scoring.apply_caps(self._stages_in_order(), confirmed, self.rubric)}
+        silent = [c.reason for s in self._stages_in_order() for c in s.components if c.status is Status.ABSTAIN]
         if silent:
             return Status.ABSTAIN, math.nan, "; ".join(silent)
-        return Status.OK, scoring.reward(plan.weights, self._ordered(), self.rubric), ""
+        return Status.OK, scoring.reward(plan.weights, self._stages_in_order(), self.rubric), ""
 
-    async def _planned(self) -> PlanResult:
+    async def _read_plan(self) -> PlanResult:
         (read,) = await self._ask(Stage.PLAN, (PLANNING,), levels.first_vote(self.agent.seed), Profile.S)
         status, reason = levels.state_of(read, self.rubric.voting.min_label_mass, NUM_PLAN_LEVELS)
         if status is not Status.OK:
@@ -192,16 +192,16 @@ class _Run:
         names = tuple(dict.fromkeys([*focus, *described.components]))
         first = await self._ask(stage, names, levels.first_vote(self.agent.seed), described.profile)
         reads = {read.component: [read] for read in first}
-        voted = self._voted_on(reads, plan)
+        voted = self._select_voted(reads, plan)
         scores: dict[Component, ComponentScore] = {}
         for name in names:
-            score = self._tally(reads[name]) if name in voted else self._look(reads[name][0])
+            score = self._tally(reads[name]) if name in voted else self._score_read(reads[name][0])
             if score is not None:
                 scores[name] = score
         while unclear := [name for name in names if name not in scores]:
-            granted = tuple(unclear[: self._spare(stage)])
+            granted = tuple(unclear[: self._spare_reads(stage)])
             for name in unclear[len(granted) :]:
-                scores[name] = levels.settled(reads[name], min_label_mass)
+                scores[name] = levels.settle(reads[name], min_label_mass)
             if granted:
                 vote = levels.next_vote(len(reads[granted[0]]), self.agent.seed)
                 for read in await self._ask(stage, granted, vote, described.profile):
@@ -211,50 +211,50 @@ class _Run:
                     scores[name] = score
         return scoring.stage_score(stage, [scores[name] for name in described.components], self.rubric)
 
-    def _voted_on(self, reads: Mapping[Component, list[Read]], plan: PlanResult) -> set[Component]:
+    def _select_voted(self, reads: Mapping[Component, list[Read]], plan: PlanResult) -> set[Component]:
         """Activation: the unclear ones and those against evidence; all at a middling planning level or for audit."""
         rules = self.rubric.voting
         if self._audited or plan.level in rules.levels:
             return set(reads)
-        suspected = {self.rubric.evidence[name].component for name in self._conflicting()}
-        looks = {name: self._look(first) for name, (first,) in reads.items()}
+        suspected = {self.rubric.evidence[name].component for name in self._conflicts()}
+        looks = {name: self._score_read(first) for name, (first,) in reads.items()}
         return {name for name, look in looks.items() if look.margin < rules.clear_margin or name in suspected}
 
     def _tally(self, reads: Sequence[Read]) -> ComponentScore | None:
         rules = self.rubric.voting
         return levels.tally(reads, k=rules.k, k_max=rules.k_max, min_label_mass=rules.min_label_mass)
 
-    def _look(self, read: Read) -> ComponentScore:
+    def _score_read(self, read: Read) -> ComponentScore:
         """The score of a single read, or why it has none."""
-        return levels.settled([read], self.rubric.voting.min_label_mass)
+        return levels.settle([read], self.rubric.voting.min_label_mass)
 
     async def _reflect(self, plan: PlanResult) -> None:
-        stages = self._ordered()
-        found = reflection.triggers(plan, stages, self.rubric, self.evidence, drawn=self._drawn("reflect"))
-        names = reflection.suspects(found, stages, self.rubric.reflection.max_changes)
+        stages = self._stages_in_order()
+        reasons = reflection.triggers(plan, stages, self.rubric, self.evidence, drawn=self._is_drawn("reflect"))
+        names = reflection.suspects(reasons, stages, self.rubric.reflection.max_changes)
         last_read = [stage.stage for stage in stages if stage.status is not Status.SKIPPED][-1]
-        if not found or 2 * len(names) > self._spare(last_read) or not names:
+        if not reasons or 2 * len(names) > self._spare_reads(last_read) or not names:
             return
         before = {score.component: score for stage in stages for score in stage.components}
         vote = levels.first_vote(self.agent.seed)
         second = await self._ask(Stage.REFLECT, names, vote, Profile.D, prior=tuple(before.values()))
-        changes = [change for read in second if (change := await self._changed(before[read.component], read))]
-        self.reflections.append(Reflection(tuple(trigger.reason for trigger in found), tuple(changes)))
+        changes = [change for read in second if (change := await self._check_change(before[read.component], read))]
+        self.reflections.append(Reflection(tuple(trigger.reason for trigger in reasons), tuple(changes)))
 
-    async def _changed(self, before: ComponentScore, second: Read) -> Change | None:
+    async def _check_change(self, before: ComponentScore, second: Read) -> Change | None:
         """Check one proposal with a fresh label read on the frames it cites, and take it over if that agrees."""
-        look = self._look(second)
+        look = self._score_read(second)
         if look.status is Status.ERROR:
             raise _Stop(Status.ERROR, look.reason)
-        if look.status is not Status.OK or not reflection.proposes(before, second, len(self.clip.frames)):
+        if look.status is not Status.OK or not reflection.proposes_change(before, second, len(self.clip.frames)):
             return None
         stage, media = self.rubric.stage_of(before.component), cited_media(second.frames_cited, self.clip)
         vote = levels.next_vote(len(before.votes), self.agent.seed)
         (fresh,) = await self._ask(stage, (before.component,), vote, Profile.D, media=media)
-        checked = self._look(fresh)
+        checked = self._score_read(fresh)
         if checked.status is Status.ERROR:
             raise _Stop(Status.ERROR, checked.reason)
-        accepted = checked.status is Status.OK and reflection.agreed(before, second, fresh)
+        accepted = checked.status is Status.OK and reflection.is_confirmed(before, second, fresh)
         after = levels.score([second, fresh], "reflection") if accepted else look
         if accepted:
             taken = replace(after, votes=(*before.votes, second, fresh))
@@ -279,7 +279,7 @@ class _Run:
 
     def _p_present(self, read: Read) -> float:
         """Probability of a pattern; NaN, which confirms nothing, where the judge cannot say."""
-        look = self._look(read)
+        look = self._score_read(read)
         if look.status is Status.ERROR:
             raise _Stop(Status.ERROR, look.reason)
         return look.p_fail
@@ -304,7 +304,7 @@ class _Run:
         except JudgeError as error:
             self.cost += error.cost
             raise _Stop(Status.ERROR, f"{stage}: {error}") from error
-        except Exception as error:  # a judge is somebody else's code: whatever it raises, this clip has no number
+        except Exception as error:  # a judge is external code: whatever it raises, this clip has no reward
             raise _Stop(Status.ERROR, f"{stage}: judge raised {type(error).__name__}: {error}") from error
         self.cost = sum((read.cost for read in reads), self.cost)
         self.prompts += [read.prompt_sha for read in reads]
@@ -324,20 +324,20 @@ class _Run:
             self._media[profile] = media
         return self._media[profile]
 
-    def _spare(self, stage: Stage) -> int:
+    def _spare_reads(self, stage: Stage) -> int:
         """Reads that may be spent on votes now: what is left after one read of everything behind `stage`."""
         behind = GATED[GATED.index(stage) + 1 :]
         reserved = sum(len(self.rubric.stages[later].components) for later in behind)
         reserved += 2 * len(self.rubric.hack.patterns) if self.rubric.hack.enabled else 0
         return max(0, self.agent.max_reads - self.num_reads - reserved)
 
-    def _ordered(self) -> tuple[StageScore, ...]:
+    def _stages_in_order(self) -> tuple[StageScore, ...]:
         return tuple(self.stages[stage] for stage in GATED)
 
-    def _conflicting(self) -> list[str]:
+    def _conflicts(self) -> list[str]:
         return reflection.conflicting_evidence(self.rubric, self.evidence)
 
-    def _drawn(self, name: str) -> bool:
+    def _is_drawn(self, name: str) -> bool:
         """A seeded draw of the audit share, by clip content."""
         stream = numpy_stream(self.agent.seed, f"{name}/{self.clip.sha256}")
         return bool(stream.random() < self.rubric.voting.audit_share)

@@ -1,8 +1,8 @@
-"""What needs no model (RA-2): is this a clip at all? Shapes: T frames, H W 3 image.
+"""Checks of a clip that need no model (RA-2). Shapes: T frames, H W 3 image.
 
-Two kinds of refusal. `malformed`: whoever asked made a mistake (one frame, NaN pixels, wrong encoding, no
-instruction); the verdict is an ERROR without a number. `no video`: a proper clip that shows nothing; the verdict is
-level 0 with reward 0.
+Two kinds of refusal. `malformed`: a mistake of the caller (one frame, NaN pixels, wrong encoding, no instruction); the
+verdict is an ERROR without a reward. `no video`: a well-formed clip that is black or still; the verdict is level 0 with
+reward 0.
 """
 
 from dataclasses import dataclass
@@ -27,18 +27,18 @@ class Precheck:
 
 
 def precheck(clip: ClipRef, task: TaskSpec) -> Precheck:
-    """Refuse what no judge should be asked about."""
-    if fault := _malformed(clip, task):
+    """Check a clip and its task."""
+    if fault := _format_problem(clip, task):
         return Precheck("malformed", fault)
     if clip.frames.max() <= BLACK_MAX:
         return Precheck("no video", f"all black: no pixel above {BLACK_MAX} of 255")
     moved = task.actions is not None and bool((np.abs(task.actions) > MIN_ACTION).any())
-    if moved and all(_equal(frame, clip.frames[0]) for frame in clip.frames[1:]):
+    if moved and all(_is_equal(frame, clip.frames[0]) for frame in clip.frames[1:]):
         return Precheck("no video", f"all {len(clip.frames)} frames are equal while the actions are not zero")
     return Precheck("ok")
 
 
-def _malformed(clip: ClipRef, task: TaskSpec) -> str:
+def _format_problem(clip: ClipRef, task: TaskSpec) -> str:
     frames, reference, goal = clip.frames, task.reference_frame, task.goal_image
     if frames.ndim != 4 or frames.shape[3] != 3 or 0 in frames.shape:
         return f"frames must have shape (T, H, W, 3), got {frames.shape}"
@@ -63,5 +63,5 @@ def _malformed(clip: ClipRef, task: TaskSpec) -> str:
     return ""
 
 
-def _equal(frame: UInt8Array, first: UInt8Array) -> bool:
+def _is_equal(frame: UInt8Array, first: UInt8Array) -> bool:
     return bool(np.abs(frame.astype(np.int16) - first).max() <= STILL_MAX)

@@ -1,4 +1,4 @@
-"""Which frames a read sees, chosen here and not by the server (RA-3). Shapes: T frames.
+"""Choose the frames that a read sees (RA-3). Shapes: T frames.
 
 Two media trunks: S, then I, then E only append images to one another, so that a server's prefix cache still holds what
 came before; D is a trunk of its own. No image is in a trunk twice.
@@ -37,21 +37,21 @@ def profile_media(
     if energy.shape != (num_frames - 1,):
         raise ValueError(f"motion must have shape ({num_frames - 1},), got {energy.shape}")
     if profile is Profile.D:
-        return _items(dense_indices(energy, clip.fps, max_frames), clip)
+        return _clip_items(dense_indices(energy, clip.fps, max_frames), clip)
     shown = static_indices(energy)
-    media = [MediaItem("reference"), *_items(shown, clip)]
+    media = [MediaItem("reference"), *_clip_items(shown, clip)]
     if profile in (Profile.I, Profile.E):
-        media += _items(more := _without(uniform(num_frames, INSTRUCTION_UNIFORM), shown), clip)
+        media += _clip_items(more := _exclude(uniform(num_frames, INSTRUCTION_UNIFORM), shown), clip)
         shown = shown + more
     if profile is Profile.E:
-        media += _items(_without(list(range(max(0, num_frames - END_FRAMES), num_frames)), shown), clip)
+        media += _clip_items(_exclude(list(range(max(0, num_frames - END_FRAMES), num_frames)), shown), clip)
         media += [MediaItem("goal")] if task.goal_image is not None else []
     return tuple(media)
 
 
 def cited_media(frames: tuple[int, ...], clip: ClipRef) -> tuple[MediaItem, ...]:
     """The cited frames, each once, in time order."""
-    return _items(sorted(set(frames)), clip)
+    return _clip_items(sorted(set(frames)), clip)
 
 
 def frame_energy(frames: UInt8Array) -> Energy:
@@ -84,7 +84,7 @@ def dense_indices(energy: Energy, fps: float, max_frames: int = DENSE_MAX) -> li
         raise ValueError(f"max_frames must be >= 2, got {max_frames}")
     wanted = int(np.ceil((num_frames - 1) / fps * DENSE_FPS)) + 1
     base = uniform(num_frames, wanted if wanted + len(contact_window(energy)) <= max_frames else max_frames // 2)
-    window = _without(contact_window(energy), base)
+    window = _exclude(contact_window(energy), base)
     peak = int(energy.argmax())
     nearest = sorted(window, key=lambda index: abs(2 * index - 2 * peak - 1))[: max_frames - len(base)]
     return sorted(base + nearest)
@@ -100,9 +100,9 @@ def contact_window(energy: Energy) -> list[int]:
     return list(range(first, last + 2))
 
 
-def _without(indices: list[int], shown: list[int]) -> list[int]:
+def _exclude(indices: list[int], shown: list[int]) -> list[int]:
     return [index for index in indices if index not in shown]
 
 
-def _items(indices: list[int], clip: ClipRef) -> tuple[MediaItem, ...]:
+def _clip_items(indices: list[int], clip: ClipRef) -> tuple[MediaItem, ...]:
     return tuple(MediaItem("clip", index, index / clip.fps) for index in indices)

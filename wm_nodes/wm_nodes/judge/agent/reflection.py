@@ -1,7 +1,7 @@
-"""When a verdict is looked at again, and what the second look may change (RA-13, RA-14). Pure functions.
+"""When the agent reflects on a verdict, and which of the proposed changes count (RA-13, RA-14). Pure functions.
 
-The second look sees new pixels (profile D), must cite frames, and counts only if a fresh label read on those frames
-agrees.
+The second read sees new frames (profile D) and must cite frames; its change counts only if a fresh label read on those
+frames agrees.
 """
 
 from collections.abc import Sequence
@@ -41,32 +41,32 @@ def triggers(
     rules = rubric.reflection
     known = [stage for stage in stages if stage.status is Status.OK]
     scores = {score.component: score for stage in known for score in stage.components}
-    found: list[Trigger] = []
+    result: list[Trigger] = []
     for rule in rules.conflicts:
         failed = tuple(name for name in rule.needs if name in scores and not scores[name].passed)
         if failed and rule.done in scores and scores[rule.done].passed:
-            found.append(Trigger(f"{rule.done} passed while {', '.join(failed)} failed", (rule.done, *failed)))
+            result.append(Trigger(f"{rule.done} passed while {', '.join(failed)} failed", (rule.done, *failed)))
     if known:
         mean = float(np.mean([stage.s for stage in known]))
         if abs(plan.level - (NUM_PLAN_LEVELS - 1) * mean) >= rules.level_gap:
-            found.append(Trigger(f"planning level {plan.level} against a mean stage score of {mean:.2f}"))
+            result.append(Trigger(f"planning level {plan.level} against a mean stage score of {mean:.2f}"))
     quality, physics = stages[0], stages[-1]
     both = quality.status is physics.status is Status.OK
     confident = all(score.margin >= rubric.voting.clear_margin for score in physics.components)
     if both and not quality.passed and physics.passed and confident:
-        found.append(Trigger("VQ failed but PC is confident", tuple(s.component for s in quality.components)))
+        result.append(Trigger("VQ failed but PC is confident", tuple(s.component for s in quality.components)))
     for stage in known:
         lowest = min(stage.components, key=lambda score: score.s)
         if lowest.margin < rules.margin:
             reason = f"{lowest.component} decided {stage.stage} with margin {lowest.margin:.2f}"
-            found.append(Trigger(reason, (lowest.component,)))
+            result.append(Trigger(reason, (lowest.component,)))
     for name in conflicting_evidence(rubric, evidence):
         component = rubric.evidence[name].component
         if component in scores and scores[component].passed:
-            found.append(Trigger(f"{component} passed against evidence {name} {evidence[name]:.3g}", (component,)))
+            result.append(Trigger(f"{component} passed against evidence {name} {evidence[name]:.3g}", (component,)))
     if drawn:
-        found.append(Trigger("drawn at random"))
-    return found
+        result.append(Trigger("drawn at random"))
+    return result
 
 
 def conflicting_evidence(rubric: Rubric, evidence: Evidence) -> list[str]:
@@ -77,21 +77,21 @@ def conflicting_evidence(rubric: Rubric, evidence: Evidence) -> list[str]:
     ]
 
 
-def suspects(found: Sequence[Trigger], stages: Sequence[StageScore], limit: int) -> tuple[Component, ...]:
+def suspects(reasons: Sequence[Trigger], stages: Sequence[StageScore], limit: int) -> tuple[Component, ...]:
     """At most `limit` components to look at again: those named, then those with the smallest margins."""
     scores = [score for stage in stages if stage.status is Status.OK for score in stage.components]
-    named = [name for trigger in found for name in trigger.components]
+    named = [name for trigger in reasons for name in trigger.components]
     doubtful = sorted(scores, key=lambda score: score.margin)
     return tuple(dict.fromkeys([*named, *(score.component for score in doubtful)]))[:limit]
 
 
-def proposes(before: ComponentScore, second: Read, num_frames: int) -> bool:
-    """The second look changes something by half a level or more, and cites frames that exist."""
+def proposes_change(before: ComponentScore, second: Read, num_frames: int) -> bool:
+    """Whether the second read changes the score by half a level or more, and cites frames that exist."""
     cites = bool(second.frames_cited) and all(0 <= index < num_frames for index in second.frames_cited)
     return cites and abs(score([second], "").s - before.s) >= MIN_CHANGE
 
 
-def agreed(before: ComponentScore, second: Read, fresh: Read) -> bool:
-    """The fresh read is on the second look's side of pass, and nearer to it than to what was before."""
+def is_confirmed(before: ComponentScore, second: Read, fresh: Read) -> bool:
+    """Whether the fresh read passes or fails as the second one does, and is nearer to it than to the score before."""
     proposed, checked = score([second], ""), score([fresh], "")
     return checked.passed == proposed.passed and abs(checked.s - proposed.s) < abs(checked.s - before.s)

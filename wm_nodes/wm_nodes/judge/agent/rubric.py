@@ -56,7 +56,7 @@ class PlanningRubric(RubricSection):
     """Components that planning may ask to be voted first."""
 
     @model_validator(mode="after")
-    def _rows_sum_to_one(self) -> "PlanningRubric":
+    def _check_weights(self) -> "PlanningRubric":
         for level, row in enumerate(self.weights):
             if abs(sum(row) - 1) > 1e-9:
                 raise ValueError(f"weights of L{level} sum to {sum(row)}, not 1")
@@ -80,7 +80,7 @@ class VotingRubric(RubricSection):
     """A component with at least this p_fail fails its stage."""
 
     @model_validator(mode="after")
-    def _k_fits(self) -> "VotingRubric":
+    def _check_votes(self) -> "VotingRubric":
         if self.k % 2 == 0 or self.k_max < self.k:
             raise ValueError(f"k must be odd and at most k_max, got k {self.k}, k_max {self.k_max}")
         return self
@@ -94,7 +94,7 @@ class Cap(RubricSection):
     stage: Stage | None = None
 
     @model_validator(mode="after")
-    def _one_target(self) -> "Cap":
+    def _check_target(self) -> "Cap":
         if (self.component is None) == (self.stage is None) or (self.stage is not None and self.stage not in GATED):
             raise ValueError("a cap needs either a component or one of the stages VQ, IF, TC, PC")
         return self
@@ -160,7 +160,7 @@ class Rubric(RubricSection):
     reward: RewardRubric
 
     @model_validator(mode="after")
-    def _names_agree(self) -> "Rubric":
+    def _check_names(self) -> "Rubric":
         if set(self.stages) != set(GATED):
             raise ValueError(f"stages must be VQ, IF, TC, PC, got {', '.join(self.stages)}")
         known = self.component_names
@@ -198,16 +198,16 @@ def load_rubric(pack: str = "robot", overrides: Mapping[str, Any] | None = None)
         ConfigError: no such pack, or values refused; names each of them.
     """
     try:
-        return Rubric.model_validate(_laid_over(_resolve(pack, ()), overrides or {}))
+        return Rubric.model_validate(_merge(_resolve(pack, ()), overrides or {}))
     except ValidationError as error:
         raise refusal(error, f"wm_nodes/judge/agent/rubric.py, pack {pack}") from None
 
 
 def pack_names() -> list[str]:
-    return sorted(Path(entry.name).stem for entry in _packs().iterdir() if entry.name.endswith(".yaml"))
+    return sorted(Path(entry.name).stem for entry in _pack_folder().iterdir() if entry.name.endswith(".yaml"))
 
 
-def _packs() -> Any:
+def _pack_folder() -> Any:
     return resources.files("wm_nodes.judge.agent") / "rubrics"
 
 
@@ -215,7 +215,7 @@ def _resolve(pack: str, seen: tuple[str, ...]) -> dict[str, Any]:
     if pack in seen:
         raise ConfigError(f"rubric packs extend each other in a circle: {' -> '.join((*seen, pack))}")
     if pack in pack_names():
-        text = (_packs() / f"{pack}.yaml").read_text()
+        text = (_pack_folder() / f"{pack}.yaml").read_text()
     elif Path(pack).suffix in {".yaml", ".yml"} and Path(pack).is_file():
         text = Path(pack).read_text()
     else:
@@ -224,12 +224,12 @@ def _resolve(pack: str, seen: tuple[str, ...]) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ConfigError(f"rubric pack {pack!r} must be a YAML mapping")
     base = values.pop("extends", None)
-    return values if base is None else _laid_over(_resolve(str(base), (*seen, pack)), values)
+    return values if base is None else _merge(_resolve(str(base), (*seen, pack)), values)
 
 
-def _laid_over(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for name, value in top.items():
         both = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
-        merged[name] = _laid_over(merged[name], value) if both else value
+        merged[name] = _merge(merged[name], value) if both else value
     return merged

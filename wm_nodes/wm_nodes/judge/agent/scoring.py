@@ -23,7 +23,7 @@ OPEN_SOFT_GATE = 0.01
 """A soft gate below this counts as closed: what comes after could add no more than this."""
 
 
-def skipped(stage: Stage) -> StageScore:
+def skipped_stage(stage: Stage) -> StageScore:
     return StageScore(stage, Status.SKIPPED, math.nan, False)
 
 
@@ -99,7 +99,7 @@ def reward(weights: Mapping[Stage, float], stages: Sequence[StageScore], rubric:
     return min(1.0, total)
 
 
-def capped(stages: Sequence[StageScore], patterns: Sequence[str], rubric: Rubric) -> tuple[StageScore, ...]:
+def apply_caps(stages: Sequence[StageScore], patterns: Sequence[str], rubric: Rubric) -> tuple[StageScore, ...]:
     """Apply the caps of confirmed hacking patterns. They lower scores and close gates, and never raise anything."""
     result = {score.stage: score for score in stages}
     for name in patterns:
@@ -111,14 +111,14 @@ def capped(stages: Sequence[StageScore], patterns: Sequence[str], rubric: Rubric
         if cap.stage is not None:
             result[target] = replace(before, s=0.0, passed=False, vetoed_by=f"hack {name}")
             continue
-        scores = [_limited(c, cap.ceiling, name) if c.component == cap.component else c for c in before.components]
+        scores = [_limit(c, cap.ceiling, name) if c.component == cap.component else c for c in before.components]
         after = stage_score(target, scores, rubric)
         closed = before.vetoed_by.startswith("hack ")
         result[target] = replace(after, s=0.0, passed=False, vetoed_by=before.vetoed_by) if closed else after
     return tuple(result.values())
 
 
-def _limited(score: ComponentScore, ceiling: float, pattern: str) -> ComponentScore:
+def _limit(score: ComponentScore, ceiling: float, pattern: str) -> ComponentScore:
     """At most `ceiling`; a score of s fails with probability 1 - s at least, up to level 1."""
     if score.s <= ceiling:
         return score

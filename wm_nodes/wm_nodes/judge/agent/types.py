@@ -1,4 +1,4 @@
-"""What the reward agent and its judges say to each other.
+"""Requests, answers, scores and verdicts of the reward agent and its judges.
 
 Shapes: T frames, H W 3 image, A action. A component (clarity, robot, ...) is a name that the rubric pack defines, so
 that another domain adds its own without code. Levels of a component: 0 unusable, 1 clearly wrong, 2 borderline,
@@ -43,7 +43,7 @@ GATED = (Stage.VQ, Stage.IF, Stage.TC, Stage.PC)
 
 
 class Status(StrEnum):
-    """OK: there is a number. SKIPPED: not looked at. ABSTAIN: looked, cannot say. ERROR: no answer came."""
+    """OK: there is a number. SKIPPED: not read. ABSTAIN: read, but undecided. ERROR: no answer."""
 
     OK = "OK"
     SKIPPED = "SKIPPED"
@@ -112,7 +112,7 @@ Evidence = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Cost:
-    """What some reads took. images: sent. cached_tokens: of prompt_tokens. usd: None where no price is known."""
+    """Cost of some reads. images: sent. cached_tokens: part of prompt_tokens. usd: None where no price is known."""
 
     calls: int = 0
     prompt_tokens: int = 0
@@ -124,7 +124,7 @@ class Cost:
     usd: float | None = None
 
     def __add__(self, other: "Cost") -> "Cost":
-        """Sums, field by field; the usd of both where either is known."""
+        """Sum field by field; the usd of both where either is known."""
         known = [cost.usd for cost in (self, other) if cost.usd is not None]
         numbers = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self) if f.name != "usd"}
         return Cost(**numbers, usd=sum(known) if known else None)
@@ -264,7 +264,7 @@ class HackFlag:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Who judged, on what, when. prompt_sha: over the prompts of all reads. started, ended: Unix time, s."""
+    """Origin of a verdict. prompt_sha: over the prompts of all reads. started, ended: Unix time, s."""
 
     judge_id: str
     transport: str
@@ -280,9 +280,9 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the agent says of one clip. reward: in [0, 1], NaN unless status is OK. level: planning level; 0 where
-    PRECHECK found no video, -1 where planning gave none. stages: VQ, IF, TC, PC. reason: of anything but a plain OK.
-    audit_id: content hash without times, equal for equal seeds and equal judges' answers.
+    """The agent's result for one clip. reward: in [0, 1], NaN unless status is OK. level: planning level; 0 where
+    PRECHECK found no video, -1 without planning. stages: VQ, IF, TC, PC. reason: of any status but OK. audit_id:
+    content hash without times, equal for equal seeds and equal answers of the judge.
     """
 
     clip_id: str
@@ -357,9 +357,9 @@ class ReadRequest:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a judge can do. components: those it reads, None for whatever the rubric describes. max_frames: images in
-    one call. probabilities: label votes carry more than one-hot. reasons: gives evidence texts. deterministic: equal
-    requests get equal answers. card: what it was measured to see and not to see, in words; "" where nobody measured it.
+    """What a judge can do. components: those it reads, None for all of the rubric. max_frames: images per call.
+    probabilities: label votes are not one-hot. reasons: it gives evidence texts. deterministic: equal requests get
+    equal answers. card: its measured abilities as text; "" without a measurement.
     """
 
     judge_id: str
@@ -385,7 +385,7 @@ class Health:
 
 
 class JudgeError(Exception):
-    """No read of a request could be had, after the judge's own retries. cost: what was spent on it."""
+    """No read of a request was answered, after the judge's own retries. cost: of the attempts."""
 
     def __init__(self, reason: str, cost: Cost | None = None) -> None:
         super().__init__(reason)
@@ -393,7 +393,7 @@ class JudgeError(Exception):
 
 
 class Judge(Protocol):
-    """Whoever reads clips: a server, an embedded model, an audit log, a person."""
+    """Reads clips: a server, an embedded model, an audit log or people."""
 
     @property
     def capabilities(self) -> Capabilities: ...

@@ -11,7 +11,7 @@ from wm_nodes.judge.audit.log import AuditError, AuditLog
 from wm_nodes.judge.audit.people import HumanJudge
 from wm_nodes.judge.audit.reading import Record, read_record, verify
 from wm_nodes.judge.audit.recording import AuditedAgent, RecordingJudge, write_exchange
-from wm_nodes.judge.audit.replay import ReplayJudge, replayed
+from wm_nodes.judge.audit.replay import ReplayJudge, replay_evaluation
 
 __all__ = [
     "AuditError",
@@ -22,7 +22,7 @@ __all__ = [
     "RecordingJudge",
     "ReplayJudge",
     "read_record",
-    "replayed",
+    "replay_evaluation",
     "verify",
     "write_exchange",
 ]

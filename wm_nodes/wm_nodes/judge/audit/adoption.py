@@ -1,4 +1,4 @@
-"""Whether a new version of a rubric takes over (RA-25).
+"""Decide whether a new version of a rubric is adopted (RA-25).
 
 Both versions judged the clips of two labelled sets. The frozen set guards what was reached, the newest round shows what
 was gained. Measured by the balanced accuracy, averaged over the components and "overall", because a judge that
@@ -23,7 +23,7 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.audit.entries import plain
-from wm_nodes.judge.audit.labels import HumanLabels, known_of
+from wm_nodes.judge.audit.labels import HumanLabels, known_answers
 from wm_nodes.judge.audit.log import AuditError, AuditLog, read_lines
 from wm_nodes.judge.audit.reading import Record, RecordedEvaluation
 from wm_nodes.judge.decisions import OVERALL, decisions_of
@@ -53,7 +53,7 @@ class RubricComparison:
 
 
 @dataclass(frozen=True)
-class Decided:
+class AdoptionDecision:
     """adopted, and why, in a sentence."""
 
     adopted: bool
@@ -73,7 +73,7 @@ def compare(
         AuditError: a clip that both judged has no label, no clip is left, or no component has labels of both kinds.
     """
     first, second = _by_clip(old), _by_clip(new)
-    known = _known(files, _only_rubric(old))
+    known = _known_labels(files, _only_rubric(old))
     shared = sorted(first.keys() & second.keys() & known.keys())
     if not shared:
         raise AuditError(
@@ -82,15 +82,15 @@ def compare(
         )
     names = [name for name in (*_only_rubric(old).component_names, OVERALL) if any(name in known[s] for s in shared)]
     truth = np.array([[_as_number(known[sha].get(name)) for name in names] for sha in shared])
-    right = [_right(found, shared, names, truth) for found in (first, second)]
+    right = [_is_right(verdicts, shared, names, truth) for verdicts in (first, second)]
     ones = np.ones((1, len(shared)))
-    before, after = (_balanced(ones, truth, hits)[0] for hits in right)
+    before, after = (_balanced_accuracies(ones, truth, hits)[0] for hits in right)
     usable = ~np.isnan(before)
     if not usable.any():
         raise AuditError("no component has labels that pass and labels that fail; label more clips")
     rng = numpy_stream(seed, "audit_adoption", len(shared))
     counts = rng.multinomial(len(shared), np.full(len(shared), 1 / len(shared)), size=draws).astype(np.float64)
-    drawn = [_balanced(counts, truth[:, usable], hits[:, usable]) for hits in right]
+    drawn = [_balanced_accuracies(counts, truth[:, usable], hits[:, usable]) for hits in right]
     low, high = np.nanquantile(_row_means(drawn[1]) - _row_means(drawn[0]), (0.025, 0.975))
     rows = {name: (float(b), float(a)) for name, b, a in zip(names, before, after) if not math.isnan(b)}
     return RubricComparison(
@@ -100,16 +100,16 @@ def compare(
 
 def decide(
     frozen: RubricComparison, newest: RubricComparison, old: str, new: str, *, margin: float = MARGIN
-) -> Decided:
+) -> AdoptionDecision:
     """Apply the rule."""
     reasons = []
     if frozen.low < -margin:
         rule = f"the low end must be >= {-100 * margin:g}"
-        reasons.append(f"not shown to be no worse on the frozen set ({_words(frozen)}; {rule})")
+        reasons.append(f"not shown to be no worse on the frozen set ({_describe(frozen)}; {rule})")
     if newest.low <= 0:
-        reasons.append(f"not shown to be better on the newest round ({_words(newest)}; the low end must be > 0)")
-    good = f"no worse on the frozen set ({_words(frozen)}), better on the newest round ({_words(newest)})"
-    return Decided(not reasons, "; ".join(reasons) or good, old, new, frozen, newest)
+        reasons.append(f"not shown to be better on the newest round ({_describe(newest)}; the low end must be > 0)")
+    good = f"no worse on the frozen set ({_describe(frozen)}), better on the newest round ({_describe(newest)})"
+    return AdoptionDecision(not reasons, "; ".join(reasons) or good, old, new, frozen, newest)
 
 
 class Registry:
@@ -131,7 +131,7 @@ class Registry:
         return str(shas[-1]) if shas else ""
 
     def record(
-        self, decided: Decided, rubrics: Mapping[str, Rubric], frozen_set: str, facts: Mapping[str, Any]
+        self, decided: AdoptionDecision, rubrics: Mapping[str, Rubric], frozen_set: str, facts: Mapping[str, Any]
     ) -> None:
         """Note a decision and put the rubric that is in force now into current.yaml.
 
@@ -166,12 +166,12 @@ def _by_clip(record: Record) -> dict[str, RecordedEvaluation]:
     return {evaluation.sha256: evaluation for evaluation in record.judged()}
 
 
-def _known(files: Sequence[HumanLabels], rubric: Rubric) -> dict[str, dict[str, Any]]:
+def _known_labels(files: Sequence[HumanLabels], rubric: Rubric) -> dict[str, dict[str, Any]]:
     """Sure labels by clip; the first file that has one counts."""
     known: dict[str, dict[str, Any]] = {}
     for file in files:
         for label in file.labels:
-            sure = {name: answer for name, answer in known_of(label, rubric).items() if answer is not None}
+            sure = {name: answer for name, answer in known_answers(label, rubric).items() if answer is not None}
             known[label.sha256] = {**sure, **known.get(label.sha256, {})}
     return known
 
@@ -180,18 +180,18 @@ def _as_number(answer: bool | None) -> float:
     return math.nan if answer is None else float(answer)
 
 
-def _right(
-    found: Mapping[str, RecordedEvaluation], shared: Sequence[str], names: Sequence[str], truth: NDArray[np.float64]
+def _is_right(
+    verdicts: Mapping[str, RecordedEvaluation], shared: Sequence[str], names: Sequence[str], truth: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """bool (clips, names): the version's decision is the label."""
-    decisions = [decisions_of(verdict) if (verdict := found[sha].verdict) else {} for sha in shared]
+    decisions = [decisions_of(verdict) if (verdict := verdicts[sha].verdict) else {} for sha in shared]
     said = np.array(
         [[_as_number(bool(row[name].value)) if name in row else math.nan for name in names] for row in decisions]
     )
     return np.asarray(said == truth)
 
 
-def _balanced(counts: NDArray[Any], truth: NDArray[Any], right: NDArray[Any]) -> NDArray[np.float64]:
+def _balanced_accuracies(counts: NDArray[Any], truth: NDArray[Any], right: NDArray[Any]) -> NDArray[np.float64]:
     """Balanced accuracy by draw and name. counts: (draws, clips), how often a clip was drawn."""
     shares = []
     for value in (1.0, 0.0):
@@ -207,5 +207,6 @@ def _row_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.where(known, values, 0).sum(1) / known.sum(1))
 
 
-def _words(found: RubricComparison) -> str:
-    return f"{100 * found.difference:+.1f} points, {100 * found.low:+.1f} to {100 * found.high:+.1f}, n = {found.clips}"
+def _describe(comparison: RubricComparison) -> str:
+    difference, low, high = (100 * share for share in (comparison.difference, comparison.low, comparison.high))
+    return f"{difference:+.1f} points, {low:+.1f} to {high:+.1f}, n = {comparison.clips}"

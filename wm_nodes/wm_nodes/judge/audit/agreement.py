@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from wm_nodes.core.reward_statistics import kappa
-from wm_nodes.judge.agent.levels import settled
+from wm_nodes.core.statistics import kappa
+from wm_nodes.judge.agent.levels import settle
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import Status
-from wm_nodes.judge.audit.labels import HACK, ClipLabel, HumanLabels, annotators, known_of, of_evaluation
+from wm_nodes.judge.audit.labels import HACK, ClipLabel, HumanLabels, annotators, find_evaluation, known_answers
 from wm_nodes.judge.audit.reading import Record, RecordedEvaluation
 from wm_nodes.judge.audit.sampling import Sample
 from wm_nodes.judge.decisions import PAPER, Decision, decisions_of, match, row_names
+from wm_nodes.reports.console_table import decimal, make_table, percent, percent_interval
 
 
 @dataclass(frozen=True)
-class Judged:
+class LabelledEvaluation:
     """One evaluation with its labels. weight: clips of the round it stands for. by: a label per person who gave one."""
 
     evaluation: RecordedEvaluation
@@ -41,7 +42,7 @@ class Judged:
 
     def answers(self, name: str) -> dict[str, bool | int]:
         """What each person who was sure said of a row, in the order of the files."""
-        known = {who: known_of(label, self.rubric).get(name) for who, label in self.by.items()}
+        known = {who: known_answers(label, self.rubric).get(name) for who, label in self.by.items()}
         return {who: answer for who, answer in known.items() if answer is not None}
 
 
@@ -76,7 +77,7 @@ class AgreementRow:
 
 
 @dataclass(frozen=True)
-class Reflected:
+class ReflectionEffect:
     """What second looks did to labelled components: changed, helpful ones among them, accuracy before and after."""
 
     changed: int
@@ -94,12 +95,14 @@ class Report:
     clips: int
     annotators: Sequence[str]
     rows: Sequence[AgreementRow]
-    reflected: Reflected
+    reflected: ReflectionEffect
     cost: Mapping[str, float]
     weighted: bool
 
 
-def joined(record: Record, files: Sequence[HumanLabels], samples: Sequence[Sample] = ()) -> list[Judged]:
+def join_labels(
+    record: Record, files: Sequence[HumanLabels], samples: Sequence[Sample] = ()
+) -> list[LabelledEvaluation]:
     """Every labelled evaluation with all its labels, in the order of the log. Without its sample a clip has weight 1.
 
     Raises:
@@ -108,60 +111,60 @@ def joined(record: Record, files: Sequence[HumanLabels], samples: Sequence[Sampl
     annotators(files)
     weights: dict[int, float] = {}
     for chosen in (chosen for sample in samples for chosen in sample.chosen):
-        of_evaluation(chosen.evaluation, chosen.audit_id, record.evaluations, "sample")
+        find_evaluation(chosen.evaluation, chosen.audit_id, record.evaluations, "sample")
         weights[chosen.evaluation] = chosen.weight
     by: dict[int, dict[str, ClipLabel]] = {}
     for file in files:
         for label in file.labels:
             who = f"labels of {file.annotator}"
-            evaluation = of_evaluation(label.evaluation, label.audit_id, record.evaluations, who)
+            evaluation = find_evaluation(label.evaluation, label.audit_id, record.evaluations, who)
             by.setdefault(evaluation.number, {})[file.annotator] = label
-    found = [record.evaluations[number] for number in sorted(by)]
-    return [Judged(e, record.rubric(e), weights.get(e.number, 1.0), by[e.number]) for e in found]
+    evaluations = [record.evaluations[number] for number in sorted(by)]
+    return [LabelledEvaluation(e, record.rubric(e), weights.get(e.number, 1.0), by[e.number]) for e in evaluations]
 
 
-def report(judged: Sequence[Judged], round_number: int | None = None, *, weighted: bool = False) -> Report:
+def report(judged: Sequence[LabelledEvaluation], round_number: int | None = None, *, weighted: bool = False) -> Report:
     """The numbers of one round, or of all."""
     chosen = [clip for clip in judged if round_number in (None, clip.evaluation.round_number)]
-    names = list(dict.fromkeys(name for clip in chosen for name in _rows_of(clip.rubric)))
+    names = list(dict.fromkeys(name for clip in chosen for name in _row_names(clip.rubric)))
     people = list(dict.fromkeys(who for clip in chosen for who in clip.by))
-    rows = [row for name in names if (row := _row(name, chosen)) is not None]
-    return Report(round_number, len(chosen), people, rows, _reflected(chosen), _cost(chosen), weighted)
+    rows = [row for name in names if (row := _agreement_row(name, chosen)) is not None]
+    return Report(round_number, len(chosen), people, rows, _measure_reflection(chosen), _cost(chosen), weighted)
 
 
-def table(found: Report) -> Table:
+def table(numbers: Report) -> Table:
     """For the terminal."""
-    which = "all rounds" if found.round_number is None else f"round {found.round_number}"
-    weights = "weighted to the whole round" if found.weighted else "unweighted"
-    second = found.reflected
+    which = "all rounds" if numbers.round_number is None else f"round {numbers.round_number}"
+    weights = "weighted to the whole round" if numbers.weighted else "unweighted"
+    second = numbers.reflected
     caption = (
-        f"{weights}; people: {', '.join(found.annotators)}; reflection changed {second.changed} labelled components, "
-        f"{second.helpful} for the better ({_percent(second.before)} right before, {_percent(second.after)} after, "
-        f"n = {second.n}); per clip " + ", ".join(f"{name} {value:.4g}" for name, value in found.cost.items())
+        f"{weights}; people: {', '.join(numbers.annotators)}; reflection changed {second.changed} labelled components, "
+        f"{second.helpful} for the better ({percent(second.before)} right before, {percent(second.after)} after, "
+        f"n = {second.n}); per clip " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.cost.items())
     )
-    result = Table(title=f"agreement with people, {which}, {found.clips} clips", caption=caption)
-    result.add_column("row", no_wrap=True)
-    for name in ("paper", "n", "silent", "unsure", "accuracy", "95 % Wilson", "fails", "balanced", "kappa", "ECE",
-                 "people: n, kappa", "reasons: n, right"):
-        result.add_column(name, justify="right")
-    for row in found.rows:
-        result.add_row(
-            row.name, "-" if row.paper is None else f"{row.paper:.0f}", str(row.n), str(row.silent), str(row.unsure),
-            _percent(row.accuracy), f"{100 * row.low:.1f} to {100 * row.high:.1f}", _percent(row.prevalence),
-            _percent(row.balanced), _number(row.kappa), _number(row.calibration),
-            f"{row.people}, {_number(row.kappa_people)}", f"{row.reasons}, {_percent(row.reasons_right)}",
+    columns = ("row", "paper", "n", "silent", "unsure", "accuracy", "95 % Wilson", "fails", "balanced", "kappa", "ECE",
+               "people: n, kappa", "reasons: n, right")
+    cells = (
+        (
+            row.name, "-" if row.paper is None else f"{row.paper:.0f}", row.n, row.silent, row.unsure,
+            percent(row.accuracy), percent_interval(row.low, row.high), percent(row.prevalence),
+            percent(row.balanced), decimal(row.kappa), decimal(row.calibration),
+            f"{row.people}, {decimal(row.kappa_people)}", f"{row.reasons}, {percent(row.reasons_right)}",
         )
-    return result
+        for row in numbers.rows
+    )
+    title = f"agreement with people, {which}, {numbers.clips} clips"
+    return make_table(title, columns, cells, caption=caption, no_wrap=("row",))
 
 
-def _rows_of(rubric: Rubric) -> list[str]:
+def _row_names(rubric: Rubric) -> list[str]:
     return [*row_names(rubric), *(HACK + name for name in rubric.hack.patterns)]
 
 
-def _row(name: str, clips: Sequence[Judged]) -> AgreementRow | None:
+def _agreement_row(name: str, clips: Sequence[LabelledEvaluation]) -> AgreementRow | None:
     """None where nobody labelled the row."""
     given = [(clip, clip.answers(name)) for clip in clips]
-    asked = [clip for clip in clips if any(name in known_of(label, clip.rubric) for label in clip.by.values())]
+    asked = [clip for clip in clips if any(name in known_answers(label, clip.rubric) for label in clip.by.values())]
     if not asked:
         return None
     sure = [(clip, next(iter(answers.values())), clip.decisions().get(name)) for clip, answers in given if answers]
@@ -172,18 +175,18 @@ def _row(name: str, clips: Sequence[Judged]) -> AgreementRow | None:
     reasons = [ok for clip in clips if (ok := _reason(clip, name)) is not None]
     return AgreementRow(
         name, len(said), len(sure) - len(said), len(asked) - len(sure), *match(name, labels, decisions, weights),
-        len(pairs), kappa([one for one, _ in pairs], [other for _, other in pairs]),
+        len(pairs), kappa([first for first, _ in pairs], [other for _, other in pairs]),
         len(reasons), float(np.mean(reasons)) if reasons else math.nan, PAPER.get(name),
     )
 
 
-def _reason(clip: Judged, name: str) -> bool | None:
+def _reason(clip: LabelledEvaluation, name: str) -> bool | None:
     """Whether the judge's explanation of a row is right, by the first who said so."""
     rows = (label.rows.get(name) for label in clip.by.values())
     return next((row.explanation for row in rows if row is not None and row.explanation is not None), None)
 
 
-def _reflected(clips: Sequence[Judged]) -> Reflected:
+def _measure_reflection(clips: Sequence[LabelledEvaluation]) -> ReflectionEffect:
     """Compare each component that a second look changed with what its votes had said before."""
     before, after = [], []
     for clip in clips:
@@ -193,25 +196,17 @@ def _reflected(clips: Sequence[Judged]) -> Reflected:
             answers = clip.answers(score.component)
             if answers and score.status is Status.OK and score.decided_by == "reflection":
                 label = next(iter(answers.values()))
-                old = settled(score.votes[:-2], clip.rubric.voting.min_label_mass)
+                old = settle(score.votes[:-2], clip.rubric.voting.min_label_mass)
                 before.append(old.passed == label)
                 after.append(score.passed == label)
     helpful = sum(now and not then for then, now in zip(before, after))
     means = [float(np.mean(values)) if values else math.nan for values in (before, after)]
     flips = sum(now != then for then, now in zip(before, after))
-    return Reflected(flips, helpful, len(before), *means)
+    return ReflectionEffect(flips, helpful, len(before), *means)
 
 
-def _cost(clips: Sequence[Judged]) -> dict[str, float]:
+def _cost(clips: Sequence[LabelledEvaluation]) -> dict[str, float]:
     costs = [clip.evaluation.verdict.cost for clip in clips if clip.evaluation.verdict]
     names: tuple[str, ...] = ("calls", "prompt_tokens", "cached_tokens", "completion_tokens", "images", "wall_s", "usd")
     known: dict[str, list[Any]] = {name: [getattr(cost, name) for cost in costs] for name in names}
     return {n: float(np.mean(v)) for n, v in known.items() if v and None not in v}
-
-
-def _percent(share: float) -> str:
-    return "-" if math.isnan(share) else f"{100 * share:.1f}"
-
-
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.3f}"

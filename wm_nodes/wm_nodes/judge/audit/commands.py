@@ -17,13 +17,13 @@ from tqdm import tqdm
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.audit.adoption import MARGIN, Registry, compare, decide
-from wm_nodes.judge.audit.agreement import joined, report, table
+from wm_nodes.judge.audit.agreement import join_labels, report, table
 from wm_nodes.judge.audit.entries import plain
 from wm_nodes.judge.audit.labels import load_all
 from wm_nodes.judge.audit.log import AuditError, AuditLog, recover
 from wm_nodes.judge.audit.people import HumanJudge
 from wm_nodes.judge.audit.reading import read_record, verify
-from wm_nodes.judge.audit.replay import judged_again, reaggregated, replayed
+from wm_nodes.judge.audit.replay import judge_again, reaggregate, replay_evaluation
 from wm_nodes.judge.audit.sampling import draw, read_sample, write_sample
 from wm_nodes.judge.audit.viewer import FILE_NAME, write_view
 
@@ -65,10 +65,10 @@ def _sample(arguments: argparse.Namespace) -> int:
     sample = draw(read_record(arguments.log), arguments.round, seed=arguments.seed, size=arguments.size)
     path = arguments.output or arguments.log / f"sample-{arguments.round}.json"
     write_sample(path, sample)
-    drawn = Counter(one.stratum for one in sample.chosen)
+    drawn = Counter(clip.stratum for clip in sample.chosen)
     by = ", ".join(f"{drawn[name]} of {count} {name}" for name, count in sample.sizes.items())
     print(f"{len(sample.chosen)} of {sample.population} clips of round {sample.round_number}, mean reward "
-          f"{sample.mean_reward:.3f}: {by}; {sum(one.second for one in sample.chosen)} for two people")
+          f"{sample.mean_reward:.3f}: {by}; {sum(clip.second for clip in sample.chosen)} for two people")
     print(f"wrote {path}")
     return OK
 
@@ -76,7 +76,7 @@ def _sample(arguments: argparse.Namespace) -> int:
 def _view(arguments: argparse.Namespace) -> int:
     record = read_record(arguments.log)
     sample = read_sample(arguments.sample) if arguments.sample else None
-    wanted = {one.evaluation for one in sample.chosen if one.second or not arguments.second} if sample else None
+    wanted = {clip.evaluation for clip in sample.chosen if clip.second or not arguments.second} if sample else None
     chosen = [e for e in record.judged(arguments.round) if wanted is None or e.number in wanted]
     path = write_view(arguments.output or arguments.log / FILE_NAME, record, chosen, sample)
     print(f"wrote {path} with {len(chosen)} clips; open it in a browser, press ? for its keys")
@@ -85,15 +85,15 @@ def _view(arguments: argparse.Namespace) -> int:
 
 def _agree(arguments: argparse.Namespace) -> int:
     samples = [read_sample(path) for path in arguments.sample]
-    judged = joined(read_record(arguments.log), load_all(arguments.labels), samples)
+    judged = join_labels(read_record(arguments.log), load_all(arguments.labels), samples)
     rounds = sorted({clip.evaluation.round_number for clip in judged})
     parts = [*rounds, None] if len(rounds) > 1 else rounds
     reports = [report(judged, number, weighted=bool(samples)) for number in parts]
     console = Console(width=None if sys.stdout.isatty() else 180)
-    for found in reports:
-        console.print(table(found))
+    for numbers in reports:
+        console.print(table(numbers))
     if arguments.json:
-        text = json.dumps([plain(asdict(found)) for found in reports], indent=1, allow_nan=False)
+        text = json.dumps([plain(asdict(numbers)) for numbers in reports], indent=1, allow_nan=False)
         write_atomic(arguments.json, (text + "\n").encode())
         print(f"wrote {arguments.json}")
     return OK
@@ -101,10 +101,10 @@ def _agree(arguments: argparse.Namespace) -> int:
 
 def _people(arguments: argparse.Namespace) -> int:
     record, labels = read_record(arguments.log), load_all(arguments.labels)
-    chosen = [clip.evaluation for clip in joined(record, labels)]
+    chosen = [clip.evaluation for clip in join_labels(record, labels)]
     judge, progress = HumanJudge(labels), tqdm(chosen, desc="people", disable=None)
     with AuditLog(arguments.output) as log:
-        by_people = asyncio.run(judged_again(record, progress, lambda e: (judge, record.rubric(e)), log))
+        by_people = asyncio.run(judge_again(record, progress, lambda e: (judge, record.rubric(e)), log))
     pairs = [(e.verdict, new) for e, new in zip(chosen, by_people) if e.verdict is not None]
     both = [(old.clip_id, (old.reward, new.reward)) for old, new in pairs if old.valid and new.valid]
     rewards = [pair for _, pair in both]
@@ -129,11 +129,11 @@ def _replay(arguments: argparse.Namespace) -> int:
             raise AuditError("a replay under another rubric needs --output, the folder of its own log")
         rubric = load_rubric(arguments.rubric)
         with AuditLog(arguments.output) as log:
-            verdicts = asyncio.run(reaggregated(record, progress, rubric, log))
+            verdicts = asyncio.run(reaggregate(record, progress, rubric, log))
         open_ones = sum(not verdict.valid for verdict in verdicts)
         print(f"{len(verdicts)} verdicts under {rubric.version} in {arguments.output}, {open_ones} without a number")
         return OK
-    results = [asyncio.run(replayed(record, evaluation)) for evaluation in progress]
+    results = [asyncio.run(replay_evaluation(record, evaluation)) for evaluation in progress]
     for result in results:
         if result.after is not None and not result.equal:
             print(f"evaluation {result.evaluation.number} of {result.evaluation.clip_id}: another verdict now")
@@ -177,47 +177,47 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def command(name: str, run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
-        one = commands.add_parser(name, help=about, description=about)
-        one.set_defaults(run=run)
-        return one
+        sub = commands.add_parser(name, help=about, description=about)
+        sub.set_defaults(run=run)
+        return sub
 
     def of_log(name: str, run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
-        one = command(name, run, about)
-        one.add_argument("log", type=Path, help="folder of the audit log")
-        return one
+        sub = command(name, run, about)
+        sub.add_argument("log", type=Path, help="folder of the audit log")
+        return sub
 
-    one = of_log("verify", _verify, "check every line, verdict and picture; name what was changed")
-    one.add_argument("--no-pictures", action="store_true", help="check the lines and verdicts only")
-    one.add_argument("--head", default="", help="a head noted earlier: fail where the log has lost it")
+    sub = of_log("verify", _verify, "check every line, verdict and picture; name what was changed")
+    sub.add_argument("--no-pictures", action="store_true", help="check the lines and verdicts only")
+    sub.add_argument("--head", default="", help="a head noted earlier: fail where the log has lost it")
     of_log("recover", _recover, "cut off a last line that a crash has torn, and keep it beside the log")
-    one = of_log("sample", _sample, "choose the clips of a round that a person should look at")
-    one.add_argument("--round", type=int, default=0)
-    one.add_argument("--seed", type=int, default=0)
-    one.add_argument("--size", type=int, help="another number of clips than 200 + 400 (1 - mean reward)")
-    one.add_argument("--output", type=Path, help="default: sample-ROUND.json in the log's folder")
-    one = of_log("view", _view, "write the page on which people look at clips and label them")
-    one.add_argument("--round", type=int, help="only this round")
-    one.add_argument("--sample", type=Path, help="only the clips that `sample` chose")
-    one.add_argument("--second", action="store_true", help="only those for a second annotator")
-    one.add_argument("--output", type=Path, help=f"default: {FILE_NAME} in the log's folder; pictures stay there")
-    one = of_log("agree", _agree, "compare the verdicts with exported labels, row by row of the paper's Table 2")
-    one.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
-    one.add_argument("--sample", type=Path, nargs="*", default=[], help="weight labels to the rounds drawn from")
-    one.add_argument("--json", type=Path, help="also write the numbers to this file")
-    one = of_log("people", _people, "what labelled clips earn with people as the judge, and which ones are overpaid")
-    one.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
-    one.add_argument("--output", type=Path, required=True, help="folder of the new log")
-    one = of_log("replay", _replay, "work verdicts out again, equal bit for bit or under a rubric with other numbers")
-    one.add_argument("--round", type=int, help="only this round")
-    one.add_argument("--rubric", help="pack or .yaml file with the same questions and other numbers")
-    one.add_argument("--output", type=Path, help="with --rubric: folder of the new log")
-    one = command("adopt", _adopt, "put a new rubric in force if it is no worse on the frozen set and better now")
+    sub = of_log("sample", _sample, "choose the clips of a round that a person should look at")
+    sub.add_argument("--round", type=int, default=0)
+    sub.add_argument("--seed", type=int, default=0)
+    sub.add_argument("--size", type=int, help="another number of clips than 200 + 400 (1 - mean reward)")
+    sub.add_argument("--output", type=Path, help="default: sample-ROUND.json in the log's folder")
+    sub = of_log("view", _view, "write the page on which people look at clips and label them")
+    sub.add_argument("--round", type=int, help="only this round")
+    sub.add_argument("--sample", type=Path, help="only the clips that `sample` chose")
+    sub.add_argument("--second", action="store_true", help="only those for a second annotator")
+    sub.add_argument("--output", type=Path, help=f"default: {FILE_NAME} in the log's folder; pictures stay there")
+    sub = of_log("agree", _agree, "compare the verdicts with exported labels, row by row of the paper's Table 2")
+    sub.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
+    sub.add_argument("--sample", type=Path, nargs="*", default=[], help="weight labels to the rounds drawn from")
+    sub.add_argument("--json", type=Path, help="also write the numbers to this file")
+    sub = of_log("people", _people, "what labelled clips earn with people as the judge, and which ones are overpaid")
+    sub.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
+    sub.add_argument("--output", type=Path, required=True, help="folder of the new log")
+    sub = of_log("replay", _replay, "work verdicts out again, equal bit for bit or under a rubric with other numbers")
+    sub.add_argument("--round", type=int, help="only this round")
+    sub.add_argument("--rubric", help="pack or .yaml file with the same questions and other numbers")
+    sub.add_argument("--output", type=Path, help="with --rubric: folder of the new log")
+    sub = command("adopt", _adopt, "put a new rubric in force if it is no worse on the frozen set and better now")
     pair = ("OLD_LOG", "NEW_LOG")
-    one.add_argument("registry", type=Path, help="folder of the rubric in force and of the decisions")
-    one.add_argument("--frozen", nargs=2, type=Path, required=True, metavar=pair, help="both on the frozen set")
-    one.add_argument("--frozen-labels", type=Path, nargs="+", required=True)
-    one.add_argument("--newest", nargs=2, type=Path, required=True, metavar=pair, help="the same on the newest round")
-    one.add_argument("--newest-labels", type=Path, nargs="+", required=True)
-    one.add_argument("--margin", type=float, default=MARGIN, help="loss on the frozen set that may be chance")
-    one.add_argument("--seed", type=int, default=0)
+    sub.add_argument("registry", type=Path, help="folder of the rubric in force and of the decisions")
+    sub.add_argument("--frozen", nargs=2, type=Path, required=True, metavar=pair, help="both on the frozen set")
+    sub.add_argument("--frozen-labels", type=Path, nargs="+", required=True)
+    sub.add_argument("--newest", nargs=2, type=Path, required=True, metavar=pair, help="the same on the newest round")
+    sub.add_argument("--newest-labels", type=Path, nargs="+", required=True)
+    sub.add_argument("--margin", type=float, default=MARGIN, help="loss on the frozen set that may be chance")
+    sub.add_argument("--seed", type=int, default=0)
     return parser

@@ -20,11 +20,11 @@ Answer = bool | int | None
 """True: passes. False: fails. Of planning: the level. None: unsure."""
 
 
-class _Part(BaseModel):
+class _FrozenModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class RowLabel(_Part):
+class RowLabel(_FrozenModel):
     """answer: of one row. level: where a person gave one. explanation: whether the judge's reason is right."""
 
     answer: Literal["pass", "fail", "unsure"]
@@ -32,7 +32,7 @@ class RowLabel(_Part):
     explanation: bool | None = None
 
 
-class ClipLabel(_Part):
+class ClipLabel(_FrozenModel):
     """rows: by component, "planning", "overall" or "hack: PATTERN". evaluation: line of the log."""
 
     evaluation: int
@@ -41,7 +41,7 @@ class ClipLabel(_Part):
     rows: dict[str, RowLabel]
 
 
-class HumanLabels(_Part):
+class HumanLabels(_FrozenModel):
     """What one person said of the clips of one page. head: hash of the log's last line when the page was written."""
 
     format: Literal["audit-labels-1"]
@@ -65,7 +65,7 @@ def read_labels(path: Path) -> HumanLabels:
         raise AuditError(f"{path} is no exported file of labels: {where}: {first['msg']}; export it again") from None
 
 
-def known_of(label: ClipLabel, rubric: Rubric) -> dict[str, Answer]:
+def known_answers(label: ClipLabel, rubric: Rubric) -> dict[str, Answer]:
     """What one person decided, by row of the table; stages pass where all their components do. None: unsure.
 
     Raises:
@@ -88,7 +88,7 @@ def known_of(label: ClipLabel, rubric: Rubric) -> dict[str, Answer]:
     return known
 
 
-def of_evaluation(
+def find_evaluation(
     number: int, audit_id: str, evaluations: Mapping[int, RecordedEvaluation], source: str
 ) -> RecordedEvaluation:
     """The evaluation that a label or a sample means.

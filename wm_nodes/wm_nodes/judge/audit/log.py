@@ -69,11 +69,11 @@ class AuditLog:
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         self._guard = threading.Lock()
-        self._lock = locked(self.folder)
+        self._lock = lock_folder(self.folder)
         try:
             self._file = open(self.folder / FILE_NAME, "ab", buffering=0)  # noqa: SIM115
             self._size = self._file.tell()
-            self.num_lines, self.head = _tail(self.folder / FILE_NAME) if self._size else (0, NO_LINE)
+            self.num_lines, self.head = _read_tail(self.folder / FILE_NAME) if self._size else (0, NO_LINE)
             if not self._size:
                 self.append("log", {"format": FORMAT, "created": datetime.now(UTC).isoformat(timespec="seconds")})
         except BaseException:
@@ -98,14 +98,14 @@ class AuditLog:
         Raises:
             OSError: e.g. a full disk; the file is as it was before. AuditError: the log is closed.
         """
-        data = canonical(body)
+        data = canonical_json(body)
         if may_hold_secrets(data):
-            clean, names = without_secrets(body)
-            data = canonical({**clean, "redacted": names} if names else clean)
+            clean, names = redact(body)
+            data = canonical_json({**clean, "redacted": names} if names else clean)
         with self._guard:
             if self._file.closed:
                 raise AuditError(f"{self.folder} is closed; open it again to write a {kind}")
-            data, digest = _line(self.num_lines + 1, self.head, kind, data)
+            data, digest = _make_line(self.num_lines + 1, self.head, kind, data)
             try:
                 _write_all(self._file, data)
             except OSError as error:
@@ -132,11 +132,11 @@ def read_lines(folder: Path) -> Iterator[Entry]:
     Raises:
         AuditError: the first fault, with the command to look closer; another format.
     """
-    for found in _checked(Path(folder) / FILE_NAME):
-        if isinstance(found, Fault):
-            remedy = "run `recover`" if found.torn else "run `verify` for all faults, and take a copy from before"
-            raise AuditError(f"{Path(folder) / FILE_NAME}, {found}; {remedy}")
-        yield found
+    for entry in _check_lines(Path(folder) / FILE_NAME):
+        if isinstance(entry, Fault):
+            remedy = "run `recover`" if entry.torn else "run `verify` for all faults, and take a copy from before"
+            raise AuditError(f"{Path(folder) / FILE_NAME}, {entry}; {remedy}")
+        yield entry
 
 
 def faults(folder: Path) -> list[Fault]:
@@ -145,7 +145,7 @@ def faults(folder: Path) -> list[Fault]:
     Raises:
         AuditError: there is no log.
     """
-    return [found for found in _checked(Path(folder) / FILE_NAME) if isinstance(found, Fault)]
+    return [entry for entry in _check_lines(Path(folder) / FILE_NAME) if isinstance(entry, Fault)]
 
 
 def recover(folder: Path) -> str:
@@ -155,31 +155,31 @@ def recover(folder: Path) -> str:
         AuditError: the log is in use, or faulty anywhere but at its end: nothing is touched then.
     """
     path = Path(folder) / FILE_NAME
-    with locked(Path(folder)):
-        found = faults(folder)
-        if not found:
+    with lock_folder(Path(folder)):
+        problems = faults(folder)
+        if not problems:
             return "nothing to recover: every line is whole"
-        if solid := [fault for fault in found if not fault.torn]:
+        if solid := [fault for fault in problems if not fault.torn]:
             raise AuditError(f"{path} was not torn by a crash but changed: " + "; ".join(map(str, solid)))
-        data, start = path.read_bytes(), found[0].start
+        data, start = path.read_bytes(), problems[0].start
         rest = data[start:]
         digest = hashlib.sha256(rest).hexdigest()
-        kept = path.with_name(f"torn-{found[0].number}-{digest[:8]}.bin")
-        kept.write_bytes(rest)
+        saved = path.with_name(f"torn-{problems[0].number}-{digest[:8]}.bin")
+        saved.write_bytes(rest)
         with open(path, "r+b") as file:
             file.truncate(start)
             os.fsync(file.fileno())
     with AuditLog(folder) as log:
-        number = log.append("recovered", {"bytes": len(rest), "sha256": digest, "file": kept.name}, sync=True)
-    return f"cut {len(rest)} bytes of line {found[0].number} off, kept them in {kept.name}, noted in line {number}"
+        number = log.append("recovered", {"bytes": len(rest), "sha256": digest, "file": saved.name}, sync=True)
+    return f"cut {len(rest)} bytes of line {problems[0].number} off, kept them in {saved.name}, noted in line {number}"
 
 
 def may_hold_secrets(text: bytes) -> bool:
     """Quick look at canonical JSON: False only where without_secrets would find nothing."""
-    return bool(_MAY_BE_SECRET.search(text)) or any(canonical(secret)[1:-1] in text for secret in _known_secrets())
+    return bool(_MAY_BE_SECRET.search(text)) or any(canonical_json(secret)[1:-1] in text for secret in _known_secrets())
 
 
-def without_secrets(value: Any) -> tuple[Any, list[str]]:
+def redact(value: Any) -> tuple[Any, list[str]]:
     """The value with every secret in its texts replaced, and the names of those found.
 
     A secret is the value of an environment variable that is named like one (..._KEY, TOKEN, PASSWORD) and has 8
@@ -205,7 +205,7 @@ def without_secrets(value: Any) -> tuple[Any, list[str]]:
     return clean(value), sorted(names)
 
 
-def locked(folder: Path) -> IO[str]:
+def lock_folder(folder: Path) -> IO[str]:
     """Hold the folder's lock until the returned file is closed.
 
     Raises:
@@ -225,15 +225,15 @@ def locked(folder: Path) -> IO[str]:
     return file
 
 
-def canonical(value: Any) -> bytes:
+def canonical_json(value: Any) -> bytes:
     """JSON with sorted keys and nothing that can be written in two ways."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _line(number: int, previous: str, kind: str, body: bytes) -> tuple[bytes, str]:
+def _make_line(number: int, previous: str, kind: str, body: bytes) -> tuple[bytes, str]:
     """A line in canonical JSON, and its hash. body: canonical JSON."""
     before = b'{"body":' + body
-    after = b"," + canonical({"kind": kind, "line": number, "previous": previous})[1:]
+    after = b"," + canonical_json({"kind": kind, "line": number, "previous": previous})[1:]
     digest = hashlib.sha256(before + after).hexdigest()
     return before + b',"hash":"' + digest.encode() + b'"' + after + b"\n", digest
 
@@ -255,19 +255,19 @@ def _write_all(file: IO[bytes], data: bytes) -> None:
         left = left[file.write(left) :]
 
 
-def _checked(path: Path) -> Iterator[Entry | Fault]:
+def _check_lines(path: Path) -> Iterator[Entry | Fault]:
     """Every line as an Entry or, where something is wrong, a Fault."""
-    held: list[Fault] = []
+    torn: list[Fault] = []
     expected, previous = 1, str(NO_LINE)
     for number, start, raw in _raw_lines(path):
-        found, expected, previous = _parse(raw, number, start, expected, previous)
-        if isinstance(found, Fault) and found.torn:
-            held.append(found)
+        entry, expected, previous = _parse(raw, number, start, expected, previous)
+        if isinstance(entry, Fault) and entry.torn:
+            torn.append(entry)
             continue
-        yield from (replace(fault, torn=False) for fault in held)  # a whole line behind it: no crash did that
-        held = []
-        yield found
-    yield from held
+        yield from (replace(fault, torn=False) for fault in torn)  # a whole line behind it: no crash did that
+        torn = []
+        yield entry
+    yield from torn
 
 
 def _raw_lines(path: Path) -> Iterator[tuple[int, int, bytes]]:
@@ -289,18 +289,18 @@ def _parse(raw: bytes, number: int, start: int, expected: int, previous: str) ->
     except (ValueError, KeyError, TypeError):
         what = f"{len(raw)} bytes that are no line of an audit log"
         return Fault(number, what, start, torn=True), expected + 1, ""
-    about, found = f"a {kind} line", stated + 1
+    about, after = f"a {kind} line", stated + 1
     if not raw.endswith(b"\n"):
-        return Fault(number, f"{about} without its line end", start, torn=True), found, digest
-    if raw != canonical(line) + b"\n" or not _is_whole(raw):
-        return Fault(number, f"{about}: its text was changed after it was written", start), found, digest
+        return Fault(number, f"{about} without its line end", start, torn=True), after, digest
+    if raw != canonical_json(line) + b"\n" or not _is_whole(raw):
+        return Fault(number, f"{about}: its text was changed after it was written", start), after, digest
     if stated != expected or (previous and follows != previous):
         other = f"it follows another line than line {number - 1}"
         gap = f"it says it is line {stated}" if stated != expected else other
-        return Fault(number, f"{about}: {gap}; lines were removed, added, swapped or replaced", start), found, digest
+        return Fault(number, f"{about}: {gap}; lines were removed, added, swapped or replaced", start), after, digest
     if number == 1 and (kind != "log" or body.get("format") != FORMAT):
-        return Fault(number, f"{about}: this is no {FORMAT} log but {body.get('format')!r}", start), found, digest
-    return Entry(stated, kind, body, digest), found, digest
+        return Fault(number, f"{about}: this is no {FORMAT} log but {body.get('format')!r}", start), after, digest
+    return Entry(stated, kind, body, digest), after, digest
 
 
 def _is_whole(raw: bytes) -> bool:
@@ -308,12 +308,12 @@ def _is_whole(raw: bytes) -> bool:
     try:
         line = json.loads(raw)
         digest = line.pop("hash")
-        return raw.endswith(b"\n") and hashlib.sha256(canonical(line)).hexdigest() == digest
+        return raw.endswith(b"\n") and hashlib.sha256(canonical_json(line)).hexdigest() == digest
     except (ValueError, KeyError, TypeError, AttributeError):
         return False
 
 
-def _tail(path: Path) -> tuple[int, str]:
+def _read_tail(path: Path) -> tuple[int, str]:
     """Number and hash of the last line."""
     with open(path, "rb") as file:
         file.seek(0, os.SEEK_END)

@@ -28,7 +28,7 @@ class MediaStore:
         Raises:
             AuditError: it holds Python objects. OSError: e.g. a full disk.
         """
-        data, suffix = _encoded(np.asarray(array))
+        data, suffix = _encode(np.asarray(array))
         name = f"{hashlib.sha256(data).hexdigest()}.{suffix}"
         path = self.path(name)
         if path.is_file() and path.stat().st_size == len(data):
@@ -45,7 +45,7 @@ class MediaStore:
         Raises:
             AuditError: missing, or not what was stored.
         """
-        data = self._checked(name)
+        data = self._read_checked(name)
         if name.endswith(".npy"):
             array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
             return array
@@ -62,7 +62,7 @@ class MediaStore:
             raise AuditError(f"{name!r} is no name of a stored picture")
         return self._folder / stem[:2] / name
 
-    def _checked(self, name: str) -> bytes:
+    def _read_checked(self, name: str) -> bytes:
         path = self.path(name)
         try:
             data = path.read_bytes()
@@ -73,7 +73,7 @@ class MediaStore:
         return data
 
 
-def _encoded(array: NDArray[Any]) -> tuple[bytes, str]:
+def _encode(array: NDArray[Any]) -> tuple[bytes, str]:
     if array.dtype == np.uint8 and array.ndim == 3 and array.shape[2] == 3 and array.size:
         return cv2.imencode(".png", np.ascontiguousarray(array[..., ::-1]))[1].tobytes(), "png"
     if array.dtype.hasobject:

@@ -1,4 +1,4 @@
-"""People as a judge: what they said of clips, through the same states, gates and weights.
+"""A judge that answers with people's labels, so that they go through the same states, gates and weights.
 
 A vote is one person's answer: where people differ, components are voted on, pooled or left undecided as the reads of a
 server are.

@@ -120,7 +120,7 @@ def read_record(folder: Path) -> Record:
     for line in read_lines(folder):
         record.head, record.num_lines = line.hash, line.number
         try:
-            _take(record, agents, asks, line)
+            _add_line(record, agents, asks, line)
         except AuditError as error:
             raise AuditError(f"{Path(folder)}, line {line.number} ({line.kind}): {error}") from None
         except (KeyError, TypeError, IndexError) as error:
@@ -128,7 +128,7 @@ def read_record(folder: Path) -> Record:
     return record
 
 
-def _take(record: Record, agents: dict[int, AgentLine], asks: dict[int, Ask], line: Entry) -> None:
+def _add_line(record: Record, agents: dict[int, AgentLine], asks: dict[int, Ask], line: Entry) -> None:
     body = line.body
     if line.kind == "rubric":
         record.rubrics[body["version"]] = rubric_from(body)
@@ -160,7 +160,7 @@ def _take(record: Record, agents: dict[int, AgentLine], asks: dict[int, Ask], li
 
 
 @dataclass(frozen=True)
-class Checked:
+class VerifyReport:
     """What `verify` found. problems: none for a sound log. verdicts: the hash of all audit ids, in whatever order the
     clips were judged: equal for equal seeds and equal answers.
     """
@@ -173,7 +173,7 @@ class Checked:
     verdicts: str = ""
 
 
-def verify(folder: Path, *, pictures: bool = True, expected_head: str = "") -> Checked:
+def verify(folder: Path, *, pictures: bool = True, expected_head: str = "") -> VerifyReport:
     """Check the chain, the content hash of every verdict and, unless told otherwise, every picture and clip.
 
     Args:
@@ -182,17 +182,17 @@ def verify(folder: Path, *, pictures: bool = True, expected_head: str = "") -> C
     Raises:
         AuditError: there is no log.
     """
-    if found := faults(folder):
-        return Checked([str(fault) + (" (torn: run `recover`)" if fault.torn else "") for fault in found])
+    if broken := faults(folder):
+        return VerifyReport([str(fault) + (" (torn: run `recover`)" if fault.torn else "") for fault in broken])
     try:
         record = read_record(folder)
     except AuditError as error:
-        return Checked([str(error)])
-    problems = list(_wrong(record, pictures))
+        return VerifyReport([str(error)])
+    problems = list(_find_problems(record, pictures))
     if expected_head and all(line.hash != expected_head for line in read_lines(folder)):
         problems.append(f"no line has the hash {expected_head}: lines at the end were cut off, or it is another log")
     ids = sorted(e.verdict.audit_id for e in record.judged() if e.verdict)
-    return Checked(
+    return VerifyReport(
         problems, record.num_lines, len(record.evaluations), len(record.evaluations) - len(ids), record.head,
         content_hash_of(ids),
     )
@@ -203,7 +203,7 @@ def content_hash_of(ids: Sequence[str]) -> str:
     return hashlib.sha256("".join(ids).encode()).hexdigest()
 
 
-def _wrong(record: Record, pictures: bool) -> Iterator[str]:
+def _find_problems(record: Record, pictures: bool) -> Iterator[str]:
     for evaluation in record.evaluations.values():
         verdict = evaluation.verdict
         about = f"evaluation {evaluation.number} of clip {evaluation.clip_id!r}"

@@ -1,4 +1,4 @@
-"""A reward agent whose every question, answer and verdict is written down."""
+"""A reward agent that writes every question, answer and verdict into an audit log."""
 
 import asyncio
 from collections.abc import Mapping
@@ -40,10 +40,10 @@ class AuditedAgent:
         self._agent = agent = RewardAgent(RecordingJudge(judge, log), rubric, **settings)
         self._written: set[str] = set()
         log.append("rubric", rubric_body(rubric))
-        kept = {name: getattr(agent, name) for name in ("mode", "seed", "max_reads", "budget_s", "call_plan")}
+        limits = {name: getattr(agent, name) for name in ("mode", "seed", "max_reads", "budget_s", "call_plan")}
         self._line = log.append(
             "agent",
-            {"capabilities": plain(judge.capabilities), "rubric_version": rubric.version, "settings": plain(kept)},
+            {"capabilities": plain(judge.capabilities), "rubric_version": rubric.version, "settings": plain(limits)},
         )
 
     @property
@@ -60,7 +60,7 @@ class AuditedAgent:
         Raises:
             OSError: it cannot be written down; then there is no verdict.
         """
-        evaluation = self._begun(clip, task, evidence or {})
+        evaluation = self._begin(clip, task, evidence or {})
         token = _EVALUATION.set(evaluation)
         try:
             verdict = await self._agent.evaluate(clip, task, evidence)
@@ -69,7 +69,7 @@ class AuditedAgent:
         self._log.append("verdict", {"evaluation": evaluation, "verdict": plain(verdict)}, sync=True)
         return verdict
 
-    def _begun(self, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> int:
+    def _begin(self, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> int:
         if clip.sha256 not in self._written:
             self._log.append("clip", clip_body(clip, self._store))
             self._written.add(clip.sha256)

@@ -1,8 +1,8 @@
-"""A log as a judge: verdicts worked out again offline, equal bit for bit; and anew under a rubric with other numbers.
+"""A judge that answers from an audit log: it recomputes verdicts bit for bit, or under a rubric with other numbers.
 
-The answers are those that were given. A rubric with other weights, thresholds, votes or caps may lead to a question
-that nobody was asked then, e.g. of a stage behind a gate that is now open: such a clip gets an ERROR that names the
-question, never a guess. Logs of benchmark mode hold a read of everything.
+The answers are the recorded ones. A rubric with other weights, thresholds, votes or caps may need a read that was not
+recorded, e.g. of a stage behind a gate that is now open: such a clip gets an ERROR that names the question. Logs of
+benchmark mode hold a read of every component.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -30,8 +30,8 @@ from wm_nodes.judge.audit.log import AuditError, AuditLog
 from wm_nodes.judge.audit.reading import Ask, Failure, Record, RecordedEvaluation
 from wm_nodes.judge.audit.recording import AuditedAgent
 
-Asked = tuple[str, str, tuple[Component, ...], tuple[Vote, ...], tuple[MediaItem, ...]]
-Answered = tuple[str, str, Component, Vote, tuple[MediaItem, ...]]
+QuestionKey = tuple[str, str, tuple[Component, ...], tuple[Vote, ...], tuple[MediaItem, ...]]
+ReadKey = tuple[str, str, Component, Vote, tuple[MediaItem, ...]]
 
 
 class ReplayJudge:
@@ -46,8 +46,8 @@ class ReplayJudge:
         if len(judges) != 1:
             raise ValueError(f"a replay needs evaluations of one judge, got {', '.join(sorted(judges)) or 'none'}")
         self._capabilities = evaluations[0].agent.capabilities
-        self._asks: dict[Asked, Ask] = {}
-        self._reads: dict[Answered, Read] = {}
+        self._asks: dict[QuestionKey, Ask] = {}
+        self._reads: dict[ReadKey, Read] = {}
         for evaluation in evaluations:
             for ask in evaluation.asks:
                 self._asks.setdefault((evaluation.sha256, ask.stage, ask.components, ask.votes, ask.media), ask)
@@ -73,7 +73,7 @@ class ReplayJudge:
         ask = self._asks.get((sha, stage, request.components, request.votes, media))
         if ask is not None:
             if ask.failure is not None:
-                raise _raised(ask.failure)
+                raise _rebuild_error(ask.failure)
             return list(ask.reads)
         wanted = [(sha, stage, name, vote, media) for name in request.components for vote in request.votes]
         if missing := [key for key in wanted if key not in self._reads]:
@@ -82,7 +82,7 @@ class ReplayJudge:
         return [self._reads[key] for key in wanted]
 
 
-def _raised(failure: Failure) -> Exception:
+def _rebuild_error(failure: Failure) -> Exception:
     """An exception that reads like the one that was recorded."""
     if failure.error == JudgeError.__name__:
         return JudgeError(failure.reason, typed(Cost, failure.cost))
@@ -91,7 +91,7 @@ def _raised(failure: Failure) -> Exception:
 
 
 @dataclass(frozen=True)
-class Replayed:
+class ReplayResult:
     """before: as it was recorded. after: worked out again; None where it ran out of time, which nothing repeats."""
 
     evaluation: RecordedEvaluation
@@ -104,7 +104,9 @@ class Replayed:
         return self.after is not None and self.after.audit_id == content_hash(self.before)
 
 
-async def replayed(record: Record, evaluation: RecordedEvaluation, rubric: Rubric | None = None) -> Replayed:
+async def replay_evaluation(
+    record: Record, evaluation: RecordedEvaluation, rubric: Rubric | None = None
+) -> ReplayResult:
     """Work one verdict out again, under its own rubric or another one.
 
     Raises:
@@ -113,16 +115,16 @@ async def replayed(record: Record, evaluation: RecordedEvaluation, rubric: Rubri
     if evaluation.verdict is None:
         raise AuditError(f"evaluation {evaluation.number} has no verdict: its process died before")
     if any(ask.failure and ask.failure.error == "CancelledError" for ask in evaluation.asks):
-        return Replayed(evaluation, evaluation.verdict, None)
+        return ReplayResult(evaluation, evaluation.verdict, None)
     if rubric is not None:
-        check_words(record.rubric(evaluation), rubric)
+        check_questions(record.rubric(evaluation), rubric)
     settings: Mapping[str, Any] = evaluation.agent.settings
     agent = RewardAgent(ReplayJudge([evaluation]), rubric or record.rubric(evaluation), **settings)
     verdict = await agent.evaluate(record.clip(evaluation), record.task(evaluation), evaluation.evidence)
-    return Replayed(evaluation, evaluation.verdict, verdict)
+    return ReplayResult(evaluation, evaluation.verdict, verdict)
 
 
-async def reaggregated(
+async def reaggregate(
     record: Record, evaluations: Iterable[RecordedEvaluation], rubric: Rubric, log: AuditLog
 ) -> list[Verdict]:
     """Work verdicts out under another rubric and write them, with all they rest on, into a log of their own.
@@ -132,14 +134,14 @@ async def reaggregated(
     """
 
     def judge_of(evaluation: RecordedEvaluation) -> tuple[Judge, Rubric]:
-        check_words(record.rubric(evaluation), rubric)
+        check_questions(record.rubric(evaluation), rubric)
         same = [other for other in record.judged() if other.agent.number == evaluation.agent.number]
         return ReplayJudge(same), rubric
 
-    return await judged_again(record, evaluations, judge_of, log)
+    return await judge_again(record, evaluations, judge_of, log)
 
 
-async def judged_again(
+async def judge_again(
     record: Record,
     evaluations: Iterable[RecordedEvaluation],
     judge_of: Callable[[RecordedEvaluation], tuple[Judge, Rubric]],
@@ -165,13 +167,13 @@ async def judged_again(
     return verdicts
 
 
-def check_words(before: Rubric, after: Rubric) -> None:
+def check_questions(before: Rubric, after: Rubric) -> None:
     """Refuse a rubric that would have put another question.
 
     Raises:
         AuditError: names what reads differently, or is new.
     """
-    old, new = dict(_words(before)), dict(_words(after))
+    old, new = dict(_questions(before)), dict(_questions(after))
     if changed := [name for name, words in new.items() if old.get(name) != words]:
         raise AuditError(
             f"rubric {after.version} asks about {', '.join(changed)} in other words than {before.version} did; old "
@@ -179,7 +181,7 @@ def check_words(before: Rubric, after: Rubric) -> None:
         )
 
 
-def _words(rubric: Rubric) -> Iterator[tuple[str, tuple[str, ...]]]:
+def _questions(rubric: Rubric) -> Iterator[tuple[str, tuple[str, ...]]]:
     yield "planning", (rubric.planning.question, *rubric.planning.levels)
     entries = [item for stage in rubric.stages.values() for item in stage.components.items()]
     for name, entry in (*entries, *rubric.hack.patterns.items()):

@@ -36,7 +36,7 @@ SECOND_SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class Chosen:
+class SampledClip:
     """A clip to look at. stratum: what it was drawn for. weight: how many clips of the round it stands for. second: a
     second person should label it too.
     """
@@ -59,7 +59,7 @@ class Sample:
     population: int
     mean_reward: float
     sizes: dict[str, int]
-    chosen: tuple[Chosen, ...]
+    chosen: tuple[SampledClip, ...]
 
 
 def sample_size(mean_reward: float, population: int) -> int:
@@ -86,12 +86,12 @@ def draw(record: Record, round_number: int, *, seed: int = 0, size: int | None =
     mean = float(np.mean(rewards)) if rewards else 0.0
     count = sample_size(mean, len(pool)) if size is None else min(size, len(pool))
     strata = [stratum_of(evaluation, record.rubric(evaluation)) for evaluation in pool]
-    strata = _with_top(pool, strata, round(SHARES["top_reward"] * len(pool)))
+    strata = _mark_top(pool, strata, round(SHARES["top_reward"] * len(pool)))
     rng = numpy_stream(seed, "audit_sample", round_number)
-    drawn, weights, sizes = stratified(strata, count, rng)
+    drawn, weights, sizes = draw_stratified(strata, count, rng)
     second = set(rng.permutation(drawn)[: round(SECOND_SHARE * len(drawn))].tolist())
     chosen = tuple(
-        Chosen(pool[i].number, pool[i].clip_id, _id(pool[i]), strata[i], weights[i], i in second) for i in drawn
+        SampledClip(pool[i].number, pool[i].clip_id, _id(pool[i]), strata[i], weights[i], i in second) for i in drawn
     )
     return Sample(record.head, round_number, seed, len(pool), mean, sizes, chosen)
 
@@ -112,7 +112,7 @@ def stratum_of(evaluation: RecordedEvaluation, rubric: Rubric) -> str:
     return "near_gate" if near else REST
 
 
-def stratified(
+def draw_stratified(
     strata: Sequence[str], count: int, rng: np.random.Generator
 ) -> tuple[list[int], dict[int, float], dict[str, int]]:
     """Draw `count` of the indices. Returns them in order, their weights, and how many clips each stratum has."""
@@ -125,7 +125,7 @@ def stratified(
     chance = {name: quota / max(1, len(members[name])) for name, quota in quotas.items()} | {REST: 0.0}
     drawn = sorted(first + rest)
     weights = {i: 1 / (chance[strata[i]] + (1 - chance[strata[i]]) * at_random) for i in drawn}
-    return drawn, weights, {name: len(found) for name, found in members.items()}
+    return drawn, weights, {name: len(indices) for name, indices in members.items()}
 
 
 def write_sample(path: Path, sample: Sample) -> None:
@@ -142,7 +142,7 @@ def read_sample(path: Path) -> Sample:
         raise AuditError(f"{path} is no sample that `sample` wrote: {error.error_count()} faults") from None
 
 
-def _with_top(pool: Sequence[RecordedEvaluation], strata: Sequence[str], count: int) -> list[str]:
+def _mark_top(pool: Sequence[RecordedEvaluation], strata: Sequence[str], count: int) -> list[str]:
     """The strata with the `count` highest rewards among the clips of none in top_reward."""
     free = [i for i, e in enumerate(pool) if strata[i] == REST and e.verdict is not None and e.verdict.valid]
     best = sorted(free, key=lambda i: (-_reward(pool[i]), i))[:count]

@@ -1,7 +1,7 @@
-"""Reads that were bought once: a content-addressed store on disk.
+"""A content-addressed cache of reads on disk.
 
-The key covers everything that the answer depends on: media, prompt with its options, rubric, model, transport. It makes
-reruns bit-equal, which live servers do not promise.
+The key covers everything that the answer depends on: media, prompt with its options, rubric, model, transport. With it
+reruns are bit-equal, which live servers do not guarantee.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ def cache_key(media_sha: str, prompt_sha: str, rubric_version: str, model: str, 
 class VerdictCache:
     """Reads by key, one JSON file each, written whole or not at all; several processes may share a folder.
 
-    Reads with status ERROR are never kept: a failure is not an answer.
+    Reads with status ERROR are never stored.
     """
 
     def __init__(self, folder: Path) -> None:

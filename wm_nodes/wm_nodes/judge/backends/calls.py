@@ -1,5 +1,7 @@
-"""One question to a chat server and the ladder below it: answer checked; asked once more with the reason; one label
-read per component; ERROR.
+"""One question to a chat server with its fallbacks.
+
+An answer is checked; a refused one is asked for once more with the reason; then each component is read by a label; then
+the read is an ERROR.
 """
 
 import asyncio
@@ -33,7 +35,7 @@ JSON_TRIES = 2
 MEASURED_CALLS = 200
 SEED_LIMIT = 2**31
 Exchange = Mapping[str, Any]
-"""What was asked in words and what came back, as JSON values: the raw material of an audit log."""
+"""The texts of a request and the raw reply, as JSON values, for an audit log."""
 
 
 @dataclass(frozen=True)
@@ -94,14 +96,14 @@ class Prompt:
         self.sha = sha_of([system, user["content"][len(call.media) :], {**self.body, "messages": None}])
 
 
-class Bill:
-    """What one call costs, retries and ladder included. Requests without an answer count as retries only."""
+class CallCost:
+    """Cost of one call with its retries and fallbacks. Requests without an answer count as retries only."""
 
     def __init__(self, num_images: int) -> None:
         self._num_images = num_images
         self.cost = Cost()
 
-    def answered(self, answer: ChatAnswer) -> None:
+    def add_answer(self, answer: ChatAnswer) -> None:
         usage = answer.completion.usage
         self.cost += Cost(
             calls=1,
@@ -113,7 +115,7 @@ class Bill:
             retries=answer.tries - 1,
         )
 
-    def failed(self, error: TransportError) -> None:
+    def add_failure(self, error: TransportError) -> None:
         self.cost += Cost(retries=max(0, error.tries - 1))
 
 
@@ -138,45 +140,45 @@ class Caller:
     def prompt(self, call: Call) -> Prompt:
         return self._label_prompt(call, call.components[0]) if call.vote.kind == "label" else self._json_prompt(call)
 
-    async def answer(self, call: Call, prompt: Prompt, bill: Bill) -> list[Read]:
+    async def answer(self, call: Call, prompt: Prompt, bill: CallCost) -> list[Read]:
         """One Read per component of the call; those without an answer have status ERROR and say why."""
         try:
             if isinstance(prompt.reader, AnswerFormat):
-                return await self._json(call, prompt.body, prompt.reader, bill)
-            return [await self._label(call, call.components[0], prompt, bill)]
+                return await self._ask_json(call, prompt.body, prompt.reader, bill)
+            return [await self._ask_label(call, call.components[0], prompt, bill)]
         except TransportError as error:
-            bill.failed(error)
-            return [_failed(component, call.vote, str(error)) for component in call.components]
+            bill.add_failure(error)
+            return [_failed_read(component, call.vote, str(error)) for component in call.components]
         except AnswerError as error:
-            return [_failed(component, call.vote, str(error)) for component in call.components]
+            return [_failed_read(component, call.vote, str(error)) for component in call.components]
 
-    async def _json(self, call: Call, body: dict[str, Any], form: AnswerFormat, bill: Bill) -> list[Read]:
+    async def _ask_json(self, call: Call, body: dict[str, Any], form: AnswerFormat, bill: CallCost) -> list[Read]:
         messages, problem = body["messages"], ""
         for _ in range(JSON_TRIES):
             answer = await self._send(call, body, bill, self._options.json_timeout_s)
             try:
-                findings = form.read(_finished(answer.completion))
+                findings = form.read(_answer_text(answer.completion))
             except AnswerError as error:
                 problem = str(error)
                 body = {**body, "messages": with_problem(messages, problem)}
                 continue
-            return [_from_json(finding, call.vote) for finding in findings]
+            return [_read_of(finding, call.vote) for finding in findings]
         if call.request.stage is Stage.REFLECT:  # a letter cites no frames
             raise AnswerError(f"{JSON_TRIES} answers were refused, the last one: {problem}")
-        return list(await asyncio.gather(*(self._fallback(call, name, bill, problem) for name in call.components)))
+        return list(await asyncio.gather(*(self._ask_fallback(call, name, bill, problem) for name in call.components)))
 
-    async def _fallback(self, call: Call, component: Component, bill: Bill, problem: str) -> Read:
+    async def _ask_fallback(self, call: Call, component: Component, bill: CallCost, problem: str) -> Read:
         """A label read in place of a JSON answer that was refused twice."""
         try:
-            read = await self._label(call, component, self._label_prompt(call, component), bill)
+            read = await self._ask_label(call, component, self._label_prompt(call, component), bill)
         except (TransportError, AnswerError) as error:
             if isinstance(error, TransportError):
-                bill.failed(error)
+                bill.add_failure(error)
             reason = f"{JSON_TRIES} JSON answers were refused ({problem}); then the label read failed: {error}"
-            return _failed(component, call.vote, reason)
+            return _failed_read(component, call.vote, reason)
         return replace(read, reason=read.reason or f"label read, because JSON answers were refused: {problem}")
 
-    async def _label(self, call: Call, component: Component, prompt: Prompt, bill: Bill) -> Read:
+    async def _ask_label(self, call: Call, component: Component, prompt: Prompt, bill: CallCost) -> Read:
         options, order = self._options, prompt.reader
         assert isinstance(order, tuple)  # label prompts are read by the order of their options
         answer = await self._send(call, prompt.body, bill, options.label_timeout_s)
@@ -185,18 +187,18 @@ class Caller:
         if mass == 0 or (mass < options.min_label_mass and not options.choice_grammar):
             reason = f"label mass {mass:.3f} is below {options.min_label_mass}"
             return Read(component, (), "label", call.vote, mass, Status.ABSTAIN, reason)
-        told = 1.0 if options.choice_grammar else mass
-        return Read(component, map_back(probabilities, order), "label", call.vote, told)
+        label_mass = 1.0 if options.choice_grammar else mass
+        return Read(component, map_back(probabilities, order), "label", call.vote, label_mass)
 
-    async def _send(self, call: Call, body: dict[str, Any], bill: Bill, timeout_s: float) -> ChatAnswer:
+    async def _send(self, call: Call, body: dict[str, Any], bill: CallCost, timeout_s: float) -> ChatAnswer:
         try:
             answer = await self._transport.complete(body, timeout_s=timeout_s, deadline=call.deadline)
         except TransportError as error:
-            self._on_exchange({**asked(call, body), "error": str(error), "tries": error.tries})
+            self._on_exchange({**describe_request(call, body), "error": str(error), "tries": error.tries})
             raise
         took = {"endpoint": answer.endpoint, "tries": answer.tries, "wall_s": answer.wall_s}
-        self._on_exchange({**asked(call, body), "reply": answer.completion.model_dump(mode="json"), **took})
-        bill.answered(answer)
+        self._on_exchange({**describe_request(call, body), "reply": answer.completion.model_dump(mode="json"), **took})
+        bill.add_answer(answer)
         self.latencies_s.append(answer.wall_s)
         return answer
 
@@ -225,8 +227,8 @@ class Caller:
         return Prompt(call, messages, fields, order)
 
 
-def asked(call: Call, body: Mapping[str, Any]) -> dict[str, Any]:
-    """The words of a request and its settings; its images are named by their hash."""
+def describe_request(call: Call, body: Mapping[str, Any]) -> dict[str, Any]:
+    """The texts and settings of a request; its images are named by their hash."""
     system, user = body["messages"]
     words = [part["text"] for part in user["content"][len(call.media) :]]
     return {
@@ -246,7 +248,7 @@ def num_images(media: Sequence[Part]) -> int:
     return sum(url.count(",") for url in videos) + len([part for part in media if part["type"] == "image_url"])
 
 
-def _finished(completion: Completion) -> str:
+def _answer_text(completion: Completion) -> str:
     choice = completion.choices[0]
     if choice.finish_reason != "stop":
         raise AnswerError(f"finish_reason is {choice.finish_reason!r}, not 'stop'")
@@ -255,7 +257,7 @@ def _finished(completion: Completion) -> str:
     return choice.message.content
 
 
-def _from_json(finding: ComponentAnswer, vote: Vote) -> Read:
+def _read_of(finding: ComponentAnswer, vote: Vote) -> Read:
     count = NUM_PLAN_LEVELS if finding.component == PLANNING else NUM_LEVELS
     return Read(
         finding.component,
@@ -268,5 +270,5 @@ def _from_json(finding: ComponentAnswer, vote: Vote) -> Read:
     )
 
 
-def _failed(component: Component, vote: Vote, reason: str) -> Read:
+def _failed_read(component: Component, vote: Vote, reason: str) -> Read:
     return Read(component, (), vote.kind, vote, label_mass=0.0, status=Status.ERROR, reason=reason)

@@ -1,7 +1,7 @@
 """A judge in this process: no server, no download, no GPU (RA-17 to RA-20).
 
-It reads the evidence of wm_nodes.judge.evidence with the heads of a trained folder. All votes of a component get the
-same answer, and a second look finds what the first one found: it never claims new pixels.
+It reads the evidence of wm_nodes.judge.evidence with the heads of a trained folder. It is deterministic: all votes of a
+component and the second read of a reflection get the same answer.
 
     agent = RewardAgent(EmbeddedJudge(load_head(folder)), load_rubric())
 """
@@ -41,11 +41,11 @@ from wm_nodes.judge.evidence.head import HACK, TASK_COMPLETION, JudgeHead, compo
 
 TRANSPORT = "embedded"
 REVISION = "1"
-"""Counted up whenever the same head gives other answers, so that two versions are two judges."""
-KEPT_CLIPS = 64
-"""Clips whose evidence is kept: the stages of one verdict ask one after the other."""
+"""Raised whenever the same head gives other answers, so that two versions have two identities."""
+CACHED_CLIPS = 64
+"""Clips whose evidence is cached, for the stages of one verdict."""
 BLIND_AUROC = 0.75
-"""A component that the validation part could not be told apart better than this is not answered."""
+"""A component with a smaller AUROC on the validation part is not answered."""
 TEXT_LIMIT = 240
 MAX_FRAMES = 64
 
@@ -74,7 +74,7 @@ class EmbeddedJudge:
         self.blind = frozenset(
             name for name in head.questions if not measured.get(name, {}).get("auroc", 1.0) >= BLIND_AUROC
         )
-        self._kept: OrderedDict[str, Evidence] = OrderedDict()
+        self._cache: OrderedDict[str, Evidence] = OrderedDict()
         self._lock = threading.Lock()
         self._num_reads = self._num_abstained = 0
 
@@ -100,11 +100,11 @@ class EmbeddedJudge:
             f"to {head.lengths[1]} frames; tasks {', '.join(story.get('tasks', []))}; cameras "
             f"{', '.join(story.get('cameras', []))}"
         ]
-        for name, found in story.get("validation", {}).items():
+        for name, metrics in story.get("validation", {}).items():
             blind = "  not answered: too weak" if name in self.blind else ""
             lines.append(
-                f"{name:16} balanced accuracy {found['balanced_accuracy']:.2f}, ECE {found['ece']:.3f}, "
-                f"{found['fails']} fails of {found['n']}{blind}"
+                f"{name:16} balanced accuracy {metrics['balanced_accuracy']:.2f}, ECE {metrics['ece']:.3f}, "
+                f"{metrics['fails']} fails of {metrics['n']}{blind}"
             )
         return "\n".join(lines)
 
@@ -120,26 +120,26 @@ class EmbeddedJudge:
             raise JudgeError(f"the embedded judge has no head for {', '.join(unknown)}")
         started = time.monotonic()
         try:
-            foreign, evidence = await asyncio.to_thread(self._measured, request.clip, request.task)
+            foreign, evidence = await asyncio.to_thread(self._measure, request.clip, request.task)
         except ValueError as error:
             raise JudgeError(f"no evidence: {error}") from error
         cost = Cost(calls=1, images=len(request.media), wall_s=time.monotonic() - started)
         reads: list[Read] = []
         for name in request.components:
             for vote in request.votes:
-                found = self._answer(prefix + name, request.task, foreign, evidence)
-                reads.append(replace(found, component=name, vote=vote, cost=cost if not reads else Cost()))
+                answer = self._answer(prefix + name, request.task, foreign, evidence)
+                reads.append(replace(answer, component=name, vote=vote, cost=cost if not reads else Cost()))
         self._num_reads += len(reads)
         self._num_abstained += sum(read.status is Status.ABSTAIN for read in reads)
         return reads
 
     async def health(self) -> Health:
-        """Always there; says how many reads there were, and of how many it could not tell."""
+        """Always available; details count the reads and the abstentions."""
         counts = {"reads": float(self._num_reads), "abstained": float(self._num_abstained)}
         return Health(True, "", counts)
 
     def evidence(self, clip: ClipRef, task: TaskSpec) -> Evidence:
-        """The numbers that the answers come from, by name.
+        """The evidence of a clip by name; cached.
 
         Raises:
             ValueError: frames or reference frame of a wrong shape or type.
@@ -147,20 +147,20 @@ class EmbeddedJudge:
         key = hashlib.sha256(
             f"{clip.sha256} {task.instruction} {task.reference_frame.shape} ".encode() + task.reference_frame.tobytes()
         ).hexdigest()
-        if (kept := self._kept.get(key)) is None:
+        if (numbers := self._cache.get(key)) is None:
             head = self._head
             frames, reference = head.seen(clip.frames), head.seen(task.reference_frame)
-            kept = MappingProxyType(clip_evidence(head.segmenter, frames, reference, task.instruction, head.readers))
+            numbers = MappingProxyType(clip_evidence(head.segmenter, frames, reference, task.instruction, head.readers))
             with self._lock:
-                self._kept[key] = kept
-                while len(self._kept) > KEPT_CLIPS:
-                    self._kept.popitem(last=False)
-        return kept
+                self._cache[key] = numbers
+                while len(self._cache) > CACHED_CLIPS:
+                    self._cache.popitem(last=False)
+        return numbers
 
-    def _measured(self, clip: ClipRef, task: TaskSpec) -> tuple[str, FloatArray]:
+    def _measure(self, clip: ClipRef, task: TaskSpec) -> tuple[str, FloatArray]:
         """Why the clip cannot be judged, or "", and its evidence (1, F)."""
         head = self._head
-        if reason := unfit(head, clip.frames.shape):
+        if reason := unfit_reason(head, clip.frames.shape):
             return reason, np.zeros((1, len(head.names)), np.float32)
         row = head.row(self.evidence(clip, task))
         distance, limit = float(head.familiarity.distance(row)[0]), head.familiarity.limit
@@ -171,15 +171,15 @@ class EmbeddedJudge:
     def _answer(self, target: str, task: TaskSpec, foreign: str, row: FloatArray) -> Read:
         """What the head says of a target; component, vote and cost are the caller's."""
         vote = first_vote(0)
-        if reason := foreign or self._silence(target, task):
+        if reason := foreign or self._silence_reason(target, task):
             return Read(target, (), "embedded", vote, status=Status.ABSTAIN, reason=reason)
         levels, text = self._head.levels(target, row), self._head.evidence_text(target, row)[:TEXT_LIMIT]
-        if reason := self._doubt(target, levels):
+        if reason := self._doubt_reason(target, levels):
             return Read(target, (), "embedded", vote, status=Status.ABSTAIN, reason=reason, evidence_text=text)
         focus = self._focus(row) if target == PLANNING else ()
         return Read(target, levels, "embedded", vote, evidence_text=text, focus=focus)
 
-    def _silence(self, name: str, task: TaskSpec) -> str:
+    def _silence_reason(self, name: str, task: TaskSpec) -> str:
         """Why this target is not answered, or ""."""
         if name in self.blind:
             return f"the embedded judge does not see {name}: validation AUROC is below {BLIND_AUROC}"
@@ -190,7 +190,7 @@ class EmbeddedJudge:
             return f"no geometry for the task {task.instruction!r}: known are '.. into the .. target', '.. above ..'"
         return ""
 
-    def _doubt(self, name: str, levels: tuple[float, ...]) -> str:
+    def _doubt_reason(self, name: str, levels: tuple[float, ...]) -> str:
         """Why the conformal limits allow no answer, or ""."""
         if name not in self._limits:
             return ""
@@ -207,7 +207,7 @@ class EmbeddedJudge:
         return tuple(sorted((name for name in names if p_fail[name] >= 0.5), key=lambda name: -p_fail[name]))
 
 
-def unfit(head: JudgeHead, shape: tuple[int, ...]) -> str:
+def unfit_reason(head: JudgeHead, shape: tuple[int, ...]) -> str:
     """Why no number can be had from a clip of this shape (frames, height, width, 3), or ""."""
     num_frames, height, width = shape[:3]
     if (height, width) != head.picture_size:

@@ -11,7 +11,7 @@ from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import Judge, Stage
 from wm_nodes.judge.backends.cache import VerdictCache
 from wm_nodes.judge.backends.calls import ChatOptions, Exchange
-from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit
+from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit_reason
 from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.routed import RoutedJudge
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
@@ -31,10 +31,11 @@ class OpenedJudge:
 
 def judges_of(settings: JudgeConfig) -> list[JudgeConfig]:
     """The judge with its routes, and its fallbacks, in the order in which they are tried; none has fallbacks itself."""
-    return [settings.model_copy(update={"fallbacks": []}), *(_alone(settings, other) for other in settings.fallbacks)]
+    first = settings.model_copy(update={"fallbacks": []})
+    return [first, *(_single_judge(settings, other) for other in settings.fallbacks)]
 
 
-def _alone(settings: JudgeConfig, other: OtherJudge) -> JudgeConfig:
+def _single_judge(settings: JudgeConfig, other: OtherJudge) -> JudgeConfig:
     """The settings of another judge, who has nobody beside it."""
     given = {name: getattr(other, name) for name in OtherJudge.model_fields}
     return settings.model_copy(update={**given, "routes": [], "fallbacks": []})
@@ -50,7 +51,7 @@ def check_judge(settings: JudgeConfig) -> None:
     for kind, others in (("routes", settings.routes), ("fallbacks", settings.fallbacks)):
         for number, other in enumerate(others):
             try:
-                _check_one(_alone(settings, other))
+                _check_one(_single_judge(settings, other))
             except ValueError as error:
                 raise ValueError(f"judge.{kind}[{number}]: {error}") from None
     stages = [stage for route in settings.routes for stage in route.stages]
@@ -100,11 +101,11 @@ def for_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> JudgeConfig:
     fitting = (str(path) for path in shipped_heads() if load_head(path).picture_size == tuple(shape[1:3]))
     folder = next(fitting, str(shipped_head()))
 
-    def named(judge: AnyJudge) -> AnyJudge:
+    def name_folder(judge: AnyJudge) -> AnyJudge:
         return judge if judge.kind != "embedded" or judge.folder else judge.model_copy(update={"folder": folder})
 
-    routes, fallbacks = [*map(named, settings.routes)], [*map(named, settings.fallbacks)]
-    return named(settings).model_copy(update={"routes": routes, "fallbacks": fallbacks})
+    routes, fallbacks = [*map(name_folder, settings.routes)], [*map(name_folder, settings.fallbacks)]
+    return name_folder(settings).model_copy(update={"routes": routes, "fallbacks": fallbacks})
 
 
 def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
@@ -116,8 +117,8 @@ def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
     """
     settings = for_clips(settings, shape)
     others: list[OtherJudge] = [*settings.routes, *settings.fallbacks]
-    for judge in (settings, *(_alone(settings, other) for other in others)):
-        if judge.kind != "embedded" or not (reason := unfit(load_head(_folder(judge)), shape)):
+    for judge in (settings, *(_single_judge(settings, other) for other in others)):
+        if judge.kind != "embedded" or not (reason := unfit_reason(load_head(_folder(judge)), shape)):
             continue
         raise ValueError(
             f"the embedded judge {_folder(judge)} cannot judge clips of {shape[0]} frames, {shape[1]} x {shape[2]} "
@@ -130,7 +131,7 @@ def judge_name(settings: JudgeConfig) -> str:
     """Who judges, in words for people."""
     embedded = settings.kind == "embedded"
     name = f"embedded judge {_folder(settings)}" if embedded else f"{settings.model} at {', '.join(settings.endpoints)}"
-    by = [f"{'+'.join(route.stages)} by {judge_name(_alone(settings, route))}" for route in settings.routes]
+    by = [f"{'+'.join(route.stages)} by {judge_name(_single_judge(settings, route))}" for route in settings.routes]
     return "; ".join([name, *by])
 
 
@@ -149,10 +150,10 @@ def make_judge(
         MissingPackageError: the client package is not installed.
     """
     check_judge(settings)
-    first = _opened(settings, rubric, reads, on_exchange)
+    first = _open(settings, rubric, reads, on_exchange)
     if not settings.routes:
         return first
-    routed = [_opened(_alone(settings, route), rubric, reads, on_exchange) for route in settings.routes]
+    routed = [_open(_single_judge(settings, route), rubric, reads, on_exchange) for route in settings.routes]
     routes = [([Stage(s) for s in r.stages], o.judge) for r, o in zip(settings.routes, routed, strict=True)]
 
     async def close() -> None:
@@ -162,12 +163,12 @@ def make_judge(
     return OpenedJudge(RoutedJudge(first.judge, routes, rubric), close)
 
 
-def _opened(
+def _open(
     settings: JudgeConfig, rubric: Rubric, reads: Path | None, on_exchange: Callable[[Exchange], None]
 ) -> OpenedJudge:
     """The judge itself, whatever its routes."""
     if settings.kind == "embedded":
-        return OpenedJudge(EmbeddedJudge(load_head(_folder(settings)), settings.conformal), _nothing)
+        return OpenedJudge(EmbeddedJudge(load_head(_folder(settings)), settings.conformal), _close_nothing)
     transport = ChatTransport(
         [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
         retry=RetryPolicy(settings.tries),
@@ -186,5 +187,5 @@ def _folder(settings: JudgeConfig) -> Path:
     return Path(settings.folder) if settings.folder else shipped_head()
 
 
-async def _nothing() -> None:
+async def _close_nothing() -> None:
     """What ends a judge that holds nothing."""

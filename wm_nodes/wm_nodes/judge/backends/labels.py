@@ -45,13 +45,13 @@ def option_probabilities(completion: Completion, letters: Sequence[str]) -> tupl
     by_token: Mapping[str, float] = {top.token: top.logprob for top in (first, *first.top_logprobs)}
     if any(math.isnan(value) or value > ROUNDING for value in by_token.values()):
         raise AnswerError(f"the server gives log-probabilities above 0 or NaN: {dict(by_token)}")
-    found = dict.fromkeys(letters, 0.0)
+    probabilities = dict.fromkeys(letters, 0.0)
     for token, logprob in by_token.items():
-        if token.strip() in found:
-            found[token.strip()] += math.exp(logprob)
-    mass = math.fsum(found.values())
+        if token.strip() in probabilities:
+            probabilities[token.strip()] += math.exp(logprob)
+    mass = math.fsum(probabilities.values())
     if mass > 1 + ROUNDING:
         raise AnswerError(f"probabilities of the options sum to {mass:.4f}")
     if mass == 0:
         return (), 0.0
-    return tuple(probability / mass for probability in found.values()), min(mass, 1.0)
+    return tuple(probability / mass for probability in probabilities.values()), min(mass, 1.0)

@@ -1,4 +1,4 @@
-"""How much an endpoint is asked for at once, and when it is left alone."""
+"""Limit of concurrent calls, and circuit breaker of an endpoint."""
 
 import asyncio
 from collections import deque
@@ -35,14 +35,14 @@ class AdaptiveLimit:
         async with self._freed:
             self._freed.notify_all()
 
-    def overloaded(self, ticket: int) -> None:
+    def record_overload(self, ticket: int) -> None:
         """Halve the limit, unless it was halved since the call with this ticket began."""
         if ticket == self._halvings:
             self._halvings += 1
             self._good = 0
             self.limit = max(1, self.limit // 2)
 
-    def good(self) -> None:
+    def record_success(self) -> None:
         self._good += 1
         if self._good >= self._raise_after:
             self._good = 0

@@ -21,7 +21,17 @@ from wm_nodes.judge.agent.types import (
     Status,
 )
 from wm_nodes.judge.backends.cache import VerdictCache, cache_key
-from wm_nodes.judge.backends.calls import Bill, Call, Caller, ChatOptions, Exchange, Prompt, asked, num_images, sha_of
+from wm_nodes.judge.backends.calls import (
+    Call,
+    CallCost,
+    Caller,
+    ChatOptions,
+    Exchange,
+    Prompt,
+    describe_request,
+    num_images,
+    sha_of,
+)
 from wm_nodes.judge.backends.plans import CallPlan
 from wm_nodes.judge.backends.prompts import Prompts
 from wm_nodes.judge.backends.transport import ChatTransport
@@ -81,10 +91,10 @@ class OpenAIJudge:
             ValueError: no component or vote, one that the rubric does not describe, or a frame that is not there.
         """
         lead, *followers = self._calls(request)
-        reads = await self._bought(lead, follows=False)
-        if _unanswered(reads):
+        reads = await self._read_call(lead, follows=False)
+        if _is_unanswered(reads):
             raise JudgeError(reads[0].reason, reads[0].cost)
-        for more in await asyncio.gather(*(self._bought(call, follows=True) for call in followers)):
+        for more in await asyncio.gather(*(self._read_call(call, follows=True) for call in followers)):
             reads += more
         return reads
 
@@ -122,28 +132,28 @@ class OpenAIJudge:
         media_sha = sha_of(media)
         calls: list[Call] = []
         for vote in request.votes:
-            together = vote.kind == "json" and self._packs(request)
+            together = vote.kind == "json" and self._is_packed(request)
             groups = [request.components] if together else [(name,) for name in request.components]
             calls += [Call(request, media, media_sha, deadline, vote, group) for group in groups]
         return calls
 
-    def _packs(self, request: ReadRequest) -> bool:
+    def _is_packed(self, request: ReadRequest) -> bool:
         if request.stage in (Stage.HACK, Stage.REFLECT):
             return True
         return (self._plan.plan if request.mode == "auto" else request.mode) == "pack"
 
-    async def _bought(self, call: Call, *, follows: bool) -> list[Read]:
+    async def _read_call(self, call: Call, *, follows: bool) -> list[Read]:
         """The reads of one call, from the cache or from the server; its cost is on the first of them."""
         prompt = self._caller.prompt(call)
         question = f"{prompt.sha} {call.vote!r}"
         key = cache_key(call.media_sha, question, self._rubric.version, self._model, TRANSPORT)
         known = None if self._cache is None else self._cache.get(key)
-        reads = await self._asked(call, prompt) if known is None else _again(known)
+        reads = await self._ask(call, prompt) if known is None else _cached_reads(known)
         cost = reads[0].cost
         if known is not None:
-            self._on_exchange({**asked(call, prompt.body), "cached": True})
-        elif int(key[:8], 16) < self._options.repeat_share * 16**8 and not _unanswered(reads):
-            reads = await self._repeated(call, prompt, reads)
+            self._on_exchange({**describe_request(call, prompt.body), "cached": True})
+        elif int(key[:8], 16) < self._options.repeat_share * 16**8 and not _is_unanswered(reads):
+            reads = await self._repeat_call(call, prompt, reads)
         if known is None and self._cache is not None:
             self._cache.put(key, reads)
         self._plan.observe(cost, follows=follows)
@@ -153,17 +163,17 @@ class OpenAIJudge:
         self._counts["abstained"] += sum(read.status is Status.ABSTAIN for read in reads)
         return reads
 
-    async def _repeated(self, call: Call, prompt: Prompt, reads: list[Read]) -> list[Read]:
+    async def _repeat_call(self, call: Call, prompt: Prompt, reads: list[Read]) -> list[Read]:
         """Ask the same once more and count whose likeliest level is another one; the reads stay, with both costs."""
-        again = await self._asked(call, prompt)
-        for one, other in zip(reads, again, strict=True):
-            if one.status is Status.OK and other.status is Status.OK:
+        again = await self._ask(call, prompt)
+        for first, other in zip(reads, again, strict=True):
+            if first.status is Status.OK and other.status is Status.OK:
                 self._counts["repeated"] += 1
-                self._counts["flipped"] += int(np.argmax(one.levels) != np.argmax(other.levels))
+                self._counts["flipped"] += int(np.argmax(first.levels) != np.argmax(other.levels))
         return [replace(reads[0], cost=reads[0].cost + again[0].cost), *reads[1:]]
 
-    async def _asked(self, call: Call, prompt: Prompt) -> list[Read]:
-        bill = Bill(num_images(call.media))
+    async def _ask(self, call: Call, prompt: Prompt) -> list[Read]:
+        bill = CallCost(num_images(call.media))
         reads = await self._caller.answer(call, prompt, bill)
         self._counts["calls"] += bill.cost.calls
         self._counts["retries"] += bill.cost.retries
@@ -173,11 +183,11 @@ class OpenAIJudge:
         ]
 
 
-def _again(known: Sequence[Read]) -> list[Read]:
+def _cached_reads(known: Sequence[Read]) -> list[Read]:
     """Reads from the cache: what they cost then, but no time."""
     return [replace(read, cost=replace(read.cost, wall_s=0.0)) for read in known]
 
 
-def _unanswered(reads: list[Read]) -> bool:
+def _is_unanswered(reads: list[Read]) -> bool:
     """Whether the call behind these reads got no answer at all from any server."""
     return reads[0].cost.calls == 0 and all(read.status is Status.ERROR for read in reads)

@@ -1,4 +1,4 @@
-"""One call per component, or one per stage: decided by what the server's prefix cache is seen to do (RA-16)."""
+"""Choose one call per component or one per stage by the measured hit rate of the server's prefix cache (RA-16)."""
 
 from typing import Literal
 
@@ -23,12 +23,12 @@ class CallPlan:
         self._calls_left = 0
 
     @property
-    def measuring(self) -> bool:
+    def is_measuring(self) -> bool:
         return self._calls_left <= 0
 
     @property
     def plan(self) -> Plan:
-        if self.measuring or (self.cached_ratio is not None and self.cached_ratio >= WORTH_IT):
+        if self.is_measuring or (self.cached_ratio is not None and self.cached_ratio >= WORTH_IT):
             return "fanout"
         return "pack"
 
@@ -36,7 +36,7 @@ class CallPlan:
         """Count one question that was answered, now or in a run whose answer is kept on disk, so that a rerun of the
         same questions decides alike. follows: another one on the same media was answered before it.
         """
-        if not self.measuring:
+        if not self.is_measuring:
             self._calls_left -= cost.calls
             return
         if not follows or not cost.calls:

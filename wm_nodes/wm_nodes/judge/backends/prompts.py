@@ -1,4 +1,4 @@
-"""What a chat judge is asked, laid out so that a server's prefix cache pays.
+"""The prompts of a chat judge, ordered so that a server's prefix cache is used.
 
 Order: system (constant), media with labels, task, rubric of the stage, question, output rule, what was found before.
 Nothing variable stands before the media, and nothing that differs between two questions of a stage before the question.
@@ -78,9 +78,9 @@ class Prompts:
         """Ask for a JSON answer on these components."""
         schema = json.dumps(form.model.model_json_schema(), separators=(",", ":"))
         rule = f"Answer with one JSON object, evidence before level. Its JSON schema: {schema}"
-        texts = [_text(self._ask(request.stage, components)), _text(rule)]
+        texts = [_text(self._question_text(request.stage, components)), _text(rule)]
         if request.prior:
-            texts.append(_text(_found_before(request.prior)))
+            texts.append(_text(_prior_text(request.prior)))
         return self._messages(media, request, texts)
 
     def label_question(
@@ -132,7 +132,7 @@ class Prompts:
         entries = [entry for part in stages for entry in part.components.items()]
         return "\n\n".join(f"{name}: {entry.question}\n{_levels(entry.levels)}" for name, entry in entries)
 
-    def _ask(self, stage: Stage, components: Sequence[Component]) -> str:
+    def _question_text(self, stage: Stage, components: Sequence[Component]) -> str:
         for component in components:
             self.entry(stage, component)
         if stage is Stage.PLAN:
@@ -195,7 +195,7 @@ def _pixels(item: MediaItem, clip: ClipRef, task: TaskSpec) -> UInt8Array:
     return task.reference_frame
 
 
-def _found_before(prior: Sequence[ComponentScore]) -> str:
+def _prior_text(prior: Sequence[ComponentScore]) -> str:
     levels = ("unknown" if (level := prior_level(score)) is None else level for score in prior)
     lines = [f"{score.component}: level {level}. {score.evidence_text}" for score, level in zip(prior, levels)]
     return "Found before, possibly wrong:\n" + "\n".join(lines)

@@ -1,4 +1,4 @@
-"""One judge made of several: each stage is read by the one that was named for it."""
+"""A judge that routes each stage to one of several judges."""
 
 import hashlib
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ class RoutedJudge:
     """Has some stages read by other judges, everything else by `first`. Second looks (REFLECT) go to whoever reads the
     component's own stage.
 
-    Its identity is that of all of them with their stages: verdicts of other routes are verdicts of another judge. It
-    sees as many frames per call as the least of them.
+    Its identity covers all of them with their stages: with other routes it is another judge. Its max_frames is the
+    smallest of theirs.
 
     Raises:
         ValueError: a stage routed twice, a route of REFLECT, or a judge that does not read a component of its stages.
@@ -25,7 +25,8 @@ class RoutedJudge:
 
     def __init__(self, first: Judge, routes: Sequence[tuple[Sequence[Stage], Judge]], rubric: Rubric) -> None:
         self._rubric = rubric
-        self._judges = [("", first), *(("+".join(stage for stage in Stage if stage in of), to) for of, to in routes)]
+        routed_names = ("+".join(stage for stage in Stage if stage in stages) for stages, _ in routes)
+        self._judges = [("", first), *zip(routed_names, (judge for _, judge in routes))]
         routed = [(stage, to) for stages, to in routes for stage in stages]
         self._routes = dict(routed)
         if Stage.REFLECT in self._routes or len(self._routes) < len(routed):
@@ -35,7 +36,7 @@ class RoutedJudge:
         needed |= {stage: set(rubric.stages[stage].components) for stage in GATED}
         needed[Stage.HACK] = set(rubric.hack.patterns if rubric.hack.enabled else ())
         for stage, names in needed.items():
-            able = self._of(stage).capabilities
+            able = self._judge_of(stage).capabilities
             if able.components is not None and (blind := sorted(names - able.components)):
                 raise ValueError(f"{able.judge_id} does not read {', '.join(blind)}; route {stage} to another judge")
         self._components = frozenset[Component]().union(*needed.values())
@@ -43,15 +44,15 @@ class RoutedJudge:
     @property
     def capabilities(self) -> Capabilities:
         able = [(stages or "else", judge.capabilities) for stages, judge in self._judges]
-        who = "; ".join(f"{stages}: {one.judge_id}" for stages, one in able)
+        who = "; ".join(f"{stages}: {part.judge_id}" for stages, part in able)
         return Capabilities(
             f"{TRANSPORT}:{hashlib.sha256(who.encode()).hexdigest()[:12]}", TRANSPORT, who,
-            "; ".join(one.server_version for _, one in able if one.server_version), self._components,
-            media=frozenset.intersection(*(one.media for _, one in able)),
-            max_frames=min(one.max_frames for _, one in able),
-            probabilities=all(one.probabilities for _, one in able), reasons=all(one.reasons for _, one in able),
-            deterministic=all(one.deterministic for _, one in able),
-            card="\n".join(f"{stages}: {one.card or one.judge_id}" for stages, one in able),
+            "; ".join(part.server_version for _, part in able if part.server_version), self._components,
+            media=frozenset.intersection(*(part.media for _, part in able)),
+            max_frames=min(part.max_frames for _, part in able),
+            probabilities=all(part.probabilities for _, part in able), reasons=all(part.reasons for _, part in able),
+            deterministic=all(part.deterministic for _, part in able),
+            card="\n".join(f"{stages}: {part.card or part.judge_id}" for stages, part in able),
         )
 
     async def read(self, request: ReadRequest) -> list[Read]:
@@ -61,10 +62,10 @@ class RoutedJudge:
             JudgeError: one of them could not answer at all.
         """
         if request.stage is not Stage.REFLECT:
-            return await self._of(request.stage).read(request)
+            return await self._judge_of(request.stage).read(request)
         parts: dict[int, tuple[Judge, list[Component]]] = {}
         for name in request.components:
-            judge = self._of(self._rubric.stage_of(name))
+            judge = self._judge_of(self._rubric.stage_of(name))
             parts.setdefault(id(judge), (judge, []))[1].append(name)
         reads: list[Read] = []
         for judge, names in parts.values():
@@ -73,14 +74,16 @@ class RoutedJudge:
 
     async def health(self) -> Health:
         """Available where all are. Details of routed ones carry their stages; open breakers are counted together."""
-        found = [(stages, await judge.health()) for stages, judge in self._judges]
-        details = {f"{stages} {name}".strip(): value for stages, one in found for name, value in one.details.items()}
-        open_breakers = sum(one.details.get(OPEN_BREAKERS, 0.0) for _, one in found)
+        states = [(stages, await judge.health()) for stages, judge in self._judges]
+        details = {
+            f"{stages} {name}".strip(): value for stages, state in states for name, value in state.details.items()
+        }
+        open_breakers = sum(state.details.get(OPEN_BREAKERS, 0.0) for _, state in states)
         return Health(
-            all(one.available for _, one in found),
-            "; ".join(f"{stages} {one.reason}".strip() for stages, one in found if one.reason),
+            all(state.available for _, state in states),
+            "; ".join(f"{stages} {state.reason}".strip() for stages, state in states if state.reason),
             {**details, OPEN_BREAKERS: open_breakers},
         )
 
-    def _of(self, stage: Stage) -> Judge:
+    def _judge_of(self, stage: Stage) -> Judge:
         return self._routes.get(stage, self._judges[0][1])

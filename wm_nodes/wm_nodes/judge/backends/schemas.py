@@ -84,7 +84,7 @@ class AnswerFormat:
         self._prior = prior or {}
         if stage is Stage.REFLECT and (unknown := sorted(set(components) - set(self._prior))):
             raise ValueError(f"reflection needs the earlier level of each component; {', '.join(unknown)} have none")
-        self.name, self.model = self._shape(stage)
+        self.name, self.model = self._make_model(stage)
 
     @property
     def response_format(self) -> dict[str, Any]:
@@ -101,28 +101,28 @@ class AnswerFormat:
         try:
             answer: Any = self.model.model_validate_json(strip_reasoning(text))
         except ValidationError as error:
-            raise AnswerError("; ".join(_where(problem) for problem in error.errors()[:3])) from None
+            raise AnswerError("; ".join(_describe_problem(problem) for problem in error.errors()[:3])) from None
         if self.name == "plan":
-            return [self._plan(answer)]
+            return [self._read_plan(answer)]
         if self.name == "reflect":
-            return self._reflect(answer)
+            return self._read_reflection(answer)
         if self.name == "hack":
-            self._each_once([item.pattern for item in answer.items])
+            self._check_once([item.pattern for item in answer.items])
             worst, best = 0, NUM_LEVELS - 1
             return [
                 ComponentAnswer(item.pattern, worst if item.present else best, item.evidence) for item in answer.items
             ]
         if self.name == "task":
-            return [self._task(answer)]
+            return [self._read_task(answer)]
         items = [answer] if self.name == "component" else answer.items
         names = self._components if self.name == "component" else [item.component for item in items]
-        self._each_once(names)
+        self._check_once(names)
         return [
-            ComponentAnswer(name, item.level, item.evidence, self._cited(item.frames))
+            ComponentAnswer(name, item.level, item.evidence, self._check_cited(item.frames))
             for name, item in zip(names, items, strict=True)
         ]
 
-    def _shape(self, stage: Stage) -> tuple[str, type[BaseModel]]:
+    def _make_model(self, stage: Stage) -> tuple[str, type[BaseModel]]:
         names: Any = Literal[self._components]  # type: ignore[valid-type]
         count = len(self._components)
         if stage is Stage.PLAN:
@@ -137,30 +137,30 @@ class AnswerFormat:
             return "reflect", _model("Reflect", changes=changes, consistent=bool)
         if stage is Stage.HACK:
             pattern = _model("Pattern", pattern=names, evidence=Text, present=bool)
-            return "hack", _model("Hack", items=_exactly(pattern, count))
+            return "hack", _model("Hack", items=_list_of(pattern, count))
         if count == 1:
             return ("task", _Task) if stage is Stage.TC else ("component", _Component)
         item = _model("Item", component=names, evidence=Text, frames=Frames, level=Level)
-        return "stage_pack", _model("StagePack", items=_exactly(item, count))
+        return "stage_pack", _model("StagePack", items=_list_of(item, count))
 
-    def _plan(self, answer: Any) -> ComponentAnswer:
+    def _read_plan(self, answer: Any) -> ComponentAnswer:
         named = [word for word in answer.visible_problems if word != NO_PROBLEM]
         if NO_PROBLEM in answer.visible_problems and named:
             raise AnswerError(f"visible_problems says {NO_PROBLEM!r} beside {named}")
         return ComponentAnswer(PLANNING, answer.level, answer.summary, focus=tuple(dict.fromkeys(named)))
 
-    def _task(self, answer: Any) -> ComponentAnswer:
+    def _read_task(self, answer: Any) -> ComponentAnswer:
         if answer.completed != (answer.progress >= COMPLETED_FROM):
             raise AnswerError(
                 f"completed is {answer.completed} at progress {answer.progress}; "
                 f"completed means progress {COMPLETED_FROM} or more"
             )
         evidence = f"required: {answer.required_end_state}; observed: {answer.observed_end_state}"
-        return ComponentAnswer(self._components[0], answer.progress, evidence, self._cited(answer.frames))
+        return ComponentAnswer(self._components[0], answer.progress, evidence, self._check_cited(answer.frames))
 
-    def _reflect(self, answer: Any) -> list[ComponentAnswer]:
+    def _read_reflection(self, answer: Any) -> list[ComponentAnswer]:
         """Every component with its new level; those that are not changed keep theirs."""
-        found = {name: ComponentAnswer(name, self._prior[name]) for name in self._components}
+        answers = {name: ComponentAnswer(name, self._prior[name]) for name in self._components}
         changed = [change.component for change in answer.changes]
         twice = sorted(name for name, times in Counter(changed).items() if times > 1)
         if twice:
@@ -170,15 +170,15 @@ class AnswerFormat:
                 raise AnswerError(f"old_level of {change.component} was {self._prior[change.component]}")
             if change.new_level == change.old_level:
                 raise AnswerError(f"new_level of {change.component} equals its old_level; leave it out instead")
-            frames = self._cited(change.frames)
-            found[change.component] = ComponentAnswer(change.component, change.new_level, change.reason, frames)
-        return list(found.values())
+            frames = self._check_cited(change.frames)
+            answers[change.component] = ComponentAnswer(change.component, change.new_level, change.reason, frames)
+        return list(answers.values())
 
-    def _each_once(self, names: Sequence[Component]) -> None:
+    def _check_once(self, names: Sequence[Component]) -> None:
         if sorted(names) != sorted(self._components):
             raise AnswerError(f"items must name each of {', '.join(self._components)} once, got {', '.join(names)}")
 
-    def _cited(self, frames: Sequence[int]) -> tuple[int, ...]:
+    def _check_cited(self, frames: Sequence[int]) -> tuple[int, ...]:
         unknown = sorted(set(frames) - self._shown)
         if unknown:
             raise AnswerError(f"frames {unknown} were not shown; cite some of {sorted(self._shown)}")
@@ -203,11 +203,11 @@ def _model(name: str, **properties: Any) -> type[BaseModel]:
     return create_model(name, __base__=_Strict, **fields)
 
 
-def _exactly(item: type[BaseModel], count: int) -> Any:
+def _list_of(item: type[BaseModel], count: int) -> Any:
     return Annotated[list[item], Field(min_length=count, max_length=count)]  # type: ignore[valid-type]
 
 
-def _where(problem: Any) -> str:
+def _describe_problem(problem: Any) -> str:
     """One validation problem in words; pydantic's text for unreadable JSON carries the place."""
     where = ".".join(map(str, problem["loc"]))
     return f"{where}: {problem['msg']}" if where else problem["msg"]

@@ -35,7 +35,7 @@ class TransportError(RuntimeError):
         super().__init__(reason)
         self.status, self.tries = status, tries
 
-    def because(self, reason: str) -> "TransportError":
+    def with_reason(self, reason: str) -> "TransportError":
         """Why the call ends with this error instead of one more try."""
         return TransportError(f"{reason}; last: {self}", status=self.status, tries=self.tries)
 
@@ -160,15 +160,15 @@ class ChatTransport:
 
     async def served_models(self) -> dict[str, list[str]]:
         """Model names by URL, of the endpoints that answer within the time to connect; one try each."""
-        found = {}
+        models = {}
         for server in self._servers:
             try:
                 async with asyncio.timeout(2 * CONNECT_S):
                     page = await server.client.models.list()
             except (self._openai.OpenAIError, TimeoutError, ValueError):
                 continue
-            found[server.endpoint.base_url] = [model.id for model in page.data]
-        return found
+            models[server.endpoint.base_url] = [model.id for model in page.data]
+        return models
 
     async def complete(self, body: Mapping[str, Any], *, timeout_s: float, deadline: float | None = None) -> ChatAnswer:
         """Send one chat completion; `body` holds everything but the model, unknown fields included.
@@ -188,7 +188,7 @@ class ChatTransport:
             picked = self._pick(tried)
             if picked is None:
                 urls = ", ".join(self.open_breakers())
-                raise last.because(f"the circuit breaker of {urls} is open after too many failures")
+                raise last.with_reason(f"the circuit breaker of {urls} is open after too many failures")
             server, admission = picked
             url = server.endpoint.base_url
             tried.add(url)
@@ -200,12 +200,12 @@ class ChatTransport:
                 if failure.refused:
                     raise last from None
                 asked_s = failure.retry_after_s
-            if attempt + 1 < self._retry.tries and not self._untried(tried):
+            if attempt + 1 < self._retry.tries and not self._has_untried(tried):
                 wait_s = max(self._wait_s(attempt), asked_s)
                 if deadline is not None and time.monotonic() + wait_s > deadline:
-                    raise last.because(f"the next try, in {wait_s:.1f} s, is past the deadline")
+                    raise last.with_reason(f"the next try, in {wait_s:.1f} s, is past the deadline")
                 await asyncio.sleep(wait_s)
-        raise last.because(f"gave up after {self._retry.tries} tries")
+        raise last.with_reason(f"gave up after {self._retry.tries} tries")
 
     def _pick(self, tried: set[str]) -> tuple[_Server, Admission] | None:
         """The first endpoint, in order, that admits a call; those that failed in this call come last."""
@@ -215,7 +215,7 @@ class ChatTransport:
                 return server, admission
         return None
 
-    def _untried(self, tried: set[str]) -> bool:
+    def _has_untried(self, tried: set[str]) -> bool:
         """Whether a retry can go to another endpoint at once."""
         return any(not server.breaker.is_open and server.endpoint.base_url not in tried for server in self._servers)
 
@@ -236,12 +236,12 @@ class ChatTransport:
             completion = await self._request(server, body, timeout_s, _left_s(deadline))
         except _FailedTry as failure:
             if failure.status in OVERLOAD or failure.timed_out:
-                limit.overloaded(ticket)
+                limit.record_overload(ticket)
             if not failure.out_of_time:
                 breaker.record(admission, failed=not failure.refused and failure.status != 429)
             raise
         else:
-            limit.good()
+            limit.record_success()
             breaker.record(admission, failed=False)
             return completion
         finally:

@@ -9,50 +9,43 @@ written last: a folder without one is unfinished. Equal arguments give equal byt
     python3 launch_scripts/make_adversarial_set.py FOLDER --policy-view --development --episodes 40 --edits 26
 
 --benchmark is the set that judges are compared on: three tasks, shapes that no judge was trained on, and seeds of its
-own; its test split is fixed by the manifest (benchmark_clips.chosen_rows) and has 400 clips or more.
+own; its test split is fixed by the manifest (rows.select_rows) and has 400 clips or more.
 --development leaves out the episodes of the test part, which training does not read; --diverse does so too, and draws
-cameras, colours, light and push directions from ranges that keep away from what is held out (diverse_looks.py).
---policy-view draws the loops' own scene and camera, most through a world model (policy_view.py).
+cameras, colours, light and push directions from ranges that exclude what is held out (domain_randomization.py).
+--policy-view draws the policy's scene and camera, most through a world model (policy_camera.py).
 """
 
 import argparse
-import io
 import itertools
 import sys
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import default_task, load_config
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.tasks import clip_rules, get_task, task_names
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.types import UInt8Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.tasks import TASKS, get_task
-from wm_nodes.judge.agent.types import media_sha
-from wm_nodes.judge.dataset.domain_randomization import RandomizedScene, drawn_variation
+from wm_nodes.judge.dataset.domain_randomization import RandomizedScene, draw_scene
 from wm_nodes.judge.dataset.edits import (
     RECIPES,
     Division,
     LabelledClip,
     Manifest,
-    ManifestError,
     Origin,
     SceneStates,
     SourceClip,
     StateEdit,
     children,
-    from_bytes,
+    label_rendered,
     manifest_of,
     recorded,
-    rendered,
     stacks,
     to_bytes,
 )
@@ -68,17 +61,14 @@ from wm_nodes.judge.dataset.rendering import (
     cube_half_sizes,
     record_states,
 )
+from wm_nodes.judge.dataset.set_files import MANIFEST, check_set, clip_path, to_file
 from wm_nodes.world_model import load_model_folder
 
-MANIFEST = "manifest.jsonl"
 SIDE_PX = 96
 OBJECT_COLOURS = {
     "blue": (0.05, 0.16, 0.63), "green": (0.05, 0.5, 0.12), "orange": (0.85, 0.4, 0.05), "purple": (0.45, 0.1, 0.6),
 }
 TABLES = {"sand": (0.78, 0.74, 0.66), "slate": (0.42, 0.46, 0.5), "moss": (0.5, 0.58, 0.42)}
-PUSHING = {"expert": 0.5, "short": 0.2, "near_miss": 0.15, "noisy": 0.1, "random": 0.05}
-BEHAVIOURS = {"push_cube": PUSHING, "pull_cube": PUSHING, "reach": {"hover": 0.6, "hover_noisy": 0.3, "near_miss": 0.1}}
-"""Shares by task."""
 HELD_OUT = Division(cameras=("near_high",), objects=("cube/purple",), scenes=("moss",))
 HELD_OUT_SHARE = 0.12
 """Of the episodes, for each held-out camera, object and scene; two thirds of a trained task's are none of them."""
@@ -91,14 +81,16 @@ STEADY = ("expert", "short", "near_miss")
 
 @dataclass(frozen=True)
 class SetPlan:
-    """tasks: in turn. num_episodes: recorded ones, each seen by one camera. edits_per_clip: (recipe, severity) pairs
-    that are tried on each, None for all. seed: episode i is reset with seed + i; look and recipes follow from it.
-    shapes: besides the cube; rare, and test clips only. Not in "reach", whose end state depends on the height.
-    development: episodes that no test part has, num_episodes of them. diverse: scenes of diverse_looks.py. recipes: of
-    the edits. policy: clips of policy_view.py. stacks_per_clip: besides the edits, see generator.stacks.
+    """Settings of a set.
+
+    tasks: built one after the other. num_episodes: recorded per task, each by one camera. edits_per_clip: (recipe,
+    severity) pairs tried on each, None for all. seed: episode i is reset with seed + i and draws everything from it.
+    shapes: besides the cube; rare, and in test clips only; not of tasks whose end state depends on the height.
+    development: only episodes that are in no test part. diverse: scenes of domain_randomization.py. recipes: of the
+    edits. policy: clips of policy_camera.py. stacks_per_clip: besides the edits, see generator.stacks.
     """
 
-    tasks: tuple[str, ...] = ("push_cube",)
+    tasks: tuple[str, ...] = field(default_factory=lambda: (default_task(),))
     num_episodes: int = 8
     edits_per_clip: int | None = None
     seed: int = 0
@@ -115,8 +107,8 @@ class SetPlan:
             raise ValueError("the loops' own scene has one look and the cube alone; leave out diverse and shapes")
         if self.diverse and (self.shapes or not self.development):
             raise ValueError("a diverse set is of the development parts, and of the cube alone; leave out shapes")
-        if self.development and (kept := sorted({*self.tasks} & {*self.division.tasks})):
-            raise ValueError(f"{', '.join(kept)} is held out, a development set has none of it; take another task")
+        if self.development and (excluded := sorted({*self.tasks} & {*self.division.tasks})):
+            raise ValueError(f"{', '.join(excluded)} is held out, a development set has none of it; take another task")
         if self.num_episodes < 1 or min(self.edits_per_clip or 0, self.stacks_per_clip) < 0:
             raise ValueError(
                 f"need at least 1 episode, 0 edits and 0 stacks, got {self.num_episodes}, {self.edits_per_clip} and "
@@ -133,12 +125,12 @@ class SetPlan:
 
     def seeds(self, task: str) -> list[int]:
         """Of the recorded episodes."""
-        found = itertools.count(self.seed)
-        kept = (seed for seed in found if not self.development or self.part(task, seed) != "test")
-        return list(itertools.islice(kept, self.num_episodes))
+        numbers = itertools.count(self.seed)
+        wanted = (seed for seed in numbers if not self.development or self.part(task, seed) != "test")
+        return list(itertools.islice(wanted, self.num_episodes))
 
     def part(self, task: str, seed: int) -> Part:
-        return _drawn_part(task, seed) if self.diverse else self.held_out.part(drawn_origin(task, seed, self.shapes))
+        return _part_of_seed(task, seed) if self.diverse else self.held_out.part(draw_origin(task, seed, self.shapes))
 
 
 BENCHMARK = SetPlan(
@@ -149,8 +141,7 @@ were trained without that task."""
 
 
 class ClipSource:
-    """Recorded clips and redrawn edits of one task; shapes, diverse: see SetPlan. Building it starts the simulator:
-    seconds.
+    """Records clips of one task and renders edits of them. shapes, diverse: see SetPlan. It starts the simulator.
 
     Raises:
         NoRendererError: Vulkan finds no device.
@@ -174,47 +165,47 @@ class ClipSource:
     def origin(self, seed: int) -> Origin:
         if self._policy is not None:
             return self._policy.origin(self._task, seed)
-        drawn = drawn_origin(self._task, seed, self._shapes)
-        return self._variation(seed).origin(self._task, seed, drawn.behaviour) if self._diverse else drawn
+        drawn = draw_origin(self._task, seed, self._shapes)
+        return self._draw_scene(seed).origin(self._task, seed, drawn.behaviour) if self._diverse else drawn
 
     def clip(self, seed: int) -> LabelledClip:
         """Record one episode and draw it."""
         origin = self.origin(seed)
         height = SHAPES[origin.object_id.split("/")[0]]
-        layout = self._variation(seed).look.layout if self._diverse else None
+        layout = self._draw_scene(seed).look.layout if self._diverse else None
         episode = record_states(self._env, origin.behaviour.split()[0], seed, layout)
         states = scene_states(episode, height)
         if self._policy is not None:
-            states = self._policy.ended(states, origin)
+            states = self._policy.end_states(states, origin)
             if origin.scene.startswith(IMAGINED):
-                drawing = self._policy.imagined(self.stage, states, episode)
+                drawing = self._policy.imagine(self.stage, states, episode)
                 if drawing is not None:
-                    return recorded(self._clip_of(drawing, states, origin))
-                origin = self._policy.decoded(origin)
-        return recorded(self._drawn(states, origin))
+                    return recorded(self._make_clip(drawing, states, origin))
+                origin = self._policy.mark_decoded(origin)
+        return recorded(self._draw(states, origin))
 
     def redraw(self, parent: LabelledClip, edit: StateEdit) -> LabelledClip:
-        return rendered(parent, edit, self._drawn(edit.states, parent.clip.origin))
+        return label_rendered(parent, edit, self._draw(edit.states, parent.clip.origin))
 
     def close(self) -> None:
         self._env.close()
         self.stage.close()
 
-    def _variation(self, seed: int) -> RandomizedScene:
-        return drawn_variation(self._task, seed, _drawn_part(self._task, seed))
+    def _draw_scene(self, seed: int) -> RandomizedScene:
+        return draw_scene(self._task, seed, _part_of_seed(self._task, seed))
 
-    def _drawn(self, states: SceneStates, origin: Origin) -> SourceClip:
+    def _draw(self, states: SceneStates, origin: Origin) -> SourceClip:
         if self._policy is not None:
-            drawing = self._policy.drawn(self.stage, states, origin)
+            drawing = self._policy.draw(self.stage, states, origin)
         else:
             camera, look = self._scenery(origin)
             sizes_m = states.half_sizes_m * states.scales
             drawing = self.stage.draw(
                 states.robot_q, states.poses, sizes_m, states.tool, states.goal, camera, look
             )
-        return self._clip_of(drawing, states, origin)
+        return self._make_clip(drawing, states, origin)
 
-    def _clip_of(self, drawing: Drawing, states: SceneStates, origin: Origin) -> SourceClip:
+    def _make_clip(self, drawing: Drawing, states: SceneStates, origin: Origin) -> SourceClip:
         return SourceClip(
             drawing.frames, drawing.masks, drawing.tracks, states, origin,
             instruction_of(origin), self._config.control_hz / (1 if self._policy is None else self._policy.stride),
@@ -222,25 +213,25 @@ class ClipSource:
 
     def _scenery(self, origin: Origin) -> tuple[str | View, SceneAppearance]:
         if self._diverse:
-            variation = self._variation(origin.seed)
+            variation = self._draw_scene(origin.seed)
             return variation.view, variation.look
         colour = origin.object_id.split("/")[1]
         return origin.camera, SceneAppearance(OBJECT_COLOURS[colour], TABLES[origin.scene], seed=origin.seed)
 
 
-def _drawn_part(task: str, seed: int) -> Part:
-    """Of an episode that has nothing of what is held out."""
+def _part_of_seed(task: str, seed: int) -> Part:
+    """The part of an episode whose camera, object and scene are not held out."""
     return HELD_OUT.part(Origin(task, "drawn", "cube/drawn", "drawn", seed))
 
 
-def drawn_origin(task: str, seed: int, shapes: Collection[str] = ()) -> Origin:
+def draw_origin(task: str, seed: int, shapes: Collection[str] = ()) -> Origin:
     """Behaviour, camera and colours of an episode, drawn by `seed`. shapes: see SetPlan."""
     rng = numpy_stream(seed, f"adversarial_origin/{task}")
-    behaviours = BEHAVIOURS[task]
-    behaviour = str(rng.choice(list(behaviours), p=list(behaviours.values())))
+    rules = clip_rules(task)
+    behaviour = str(rng.choice(list(rules.behaviours), p=list(rules.behaviours.values())))
     things = [f"cube/{colour}" for colour in OBJECT_COLOURS]
     camera, thing = _pick(rng, list(CAMERAS), HELD_OUT.cameras), _pick(rng, things, HELD_OUT.objects)
-    others = [shape for shape in SHAPES if shape in shapes and shape != "cube" and task != "reach"]
+    others = [shape for shape in SHAPES if shape in shapes and shape != "cube" and rules.any_height]
     if others and behaviour in STEADY:  # drawn apart, so that everything else is as without them
         apart = numpy_stream(seed, f"adversarial_shape/{task}")
         thing = thing.replace("cube", _pick(apart, ["cube", *others], others))
@@ -254,15 +245,13 @@ def _pick(rng: np.random.Generator, values: Sequence[str], rare: Sequence[str]) 
 
 
 def instruction_of(origin: Origin) -> str:
-    """The task's instruction with the object's colour in place of blue, and its shape in place of the cube. What
-    follows the colour's name, as numbers do that were drawn, is not said.
-    """
+    """The task's instruction with the object's colour and shape in place of "blue" and "cube"."""
     shape, _, colour = origin.object_id.partition("/")
     return get_task(origin.task).instruction.replace("blue", colour.split()[0]).replace("cube", shape)
 
 
 def scene_states(states: EpisodeStates, height: float = 1.0) -> SceneStates:
-    """An episode of the cube in the benchmark's words. height: of the box in its place, over the cube's."""
+    """Convert an episode's states; the cube becomes a box of `height` times its height."""
     num_frames = len(states.poses)
     half_sizes_m, poses = cube_half_sizes(1)[0], states.poses.copy()
     poses[..., 2] += (np.float32(height) - 1) * half_sizes_m[0, 2]  # it stands on the same table
@@ -286,80 +275,31 @@ def build(
         raise FileExistsError(f"{folder / MANIFEST} is there already; take a new folder, or remove the old set")
     skipped: Counter[str] = Counter()
 
-    def kept() -> Iterator[LabelledClip]:
+    def make_clips() -> Iterator[LabelledClip]:
         for task in plan.tasks:
             source = ClipSource(task, config, plan.shapes, diverse=plan.diverse, policy=policy)
             try:
                 for seed in tqdm(plan.seeds(task), desc=task, disable=not progress):
                     parent = source.clip(seed)
-                    made = children(parent, seed, source.redraw, names=plan.recipes, count=plan.edits_per_clip,
+                    edited = children(parent, seed, source.redraw, names=plan.recipes, count=plan.edits_per_clip,
                                     skipped=skipped)
                     stacked = stacks(parent, seed, source.redraw, plan.stacks_per_clip, skipped=skipped)
-                    for clip in (parent, *made, *stacked):
+                    for clip in (parent, *edited, *stacked):
                         write_atomic(clip_path(folder, clip.sha256), to_file(clip))
                         yield clip
             finally:
                 source.close()
 
-    manifest = manifest_of(kept(), plan.held_out)
+    manifest = manifest_of(make_clips(), plan.held_out)
     write_atomic(folder / MANIFEST, to_bytes(manifest))
     return manifest, skipped
-
-
-def clip_path(folder: Path, sha256: str) -> Path:
-    return folder / "clips" / f"{sha256}.npz"
-
-
-def to_file(clip: LabelledClip) -> bytes:
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, frames=clip.clip.frames, masks=clip.clip.masks, fps=np.float64(clip.clip.fps))
-    return buffer.getvalue()
-
-
-def load_set(folder: Path) -> Manifest:
-    """Read and verify a set's manifest.
-
-    Raises:
-        ManifestError: see manifest.from_bytes. OSError: not there.
-    """
-    return from_bytes((folder / MANIFEST).read_bytes())
-
-
-def load_frames(folder: Path, sha256: str) -> UInt8Array:
-    """The frames of a clip, uint8 (T, H, W, 3).
-
-    Raises:
-        ManifestError: the file is missing or damaged, or holds another clip.
-    """
-    path = clip_path(folder, sha256)
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            frames, fps = arrays["frames"], float(arrays["fps"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ManifestError(f"{path} cannot be read: {error}; build the set again") from error
-    if media_sha(frames, fps) != sha256:
-        raise ManifestError(f"{path} holds another clip than its name says; build the set again")
-    checked: UInt8Array = frames
-    return checked
-
-
-def check_set(folder: Path) -> Manifest:
-    """Read the manifest and every clip of a set.
-
-    Raises:
-        ManifestError: what is wrong. OSError: no manifest.
-    """
-    manifest = load_set(folder)
-    for row in manifest.rows:
-        load_frames(folder, row.sha256)
-    return manifest
 
 
 def main(argv: Sequence[str]) -> int:
     """Build a set and print its prevalence. Return the exit code: 0 done, 2 a clear error."""
     parser = argparse.ArgumentParser(prog="adversarial_set", description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="new folder of the set")
-    parser.add_argument("--tasks", nargs="+", choices=sorted(TASKS), default=["push_cube"])
+    parser.add_argument("--tasks", nargs="+", choices=task_names(), default=[default_task()])
     parser.add_argument("--episodes", type=int, default=8, help="recorded episodes per task")
     parser.add_argument("--edits", type=int, help="edits tried on each; all by default")
     parser.add_argument(
@@ -406,9 +346,9 @@ def main(argv: Sequence[str]) -> int:
     print(f"{len(manifest.rows)} clips in {arguments.folder}: " + ", ".join(f"{n} {s}" for s, n in splits.items()))
     print(", ".join(f"{count} {part}" for part, count in sorted(parts.items())))
     print(f"{'label':16} {'pass':>6} {'fail':>6} {'unknown':>8}  fails")
-    for name, found in manifest.prevalence["all"].items():
-        share = found["fail"] / max(1, found["pass"] + found["fail"])
-        print(f"{name:16} {found['pass']:6} {found['fail']:6} {found['unknown']:8}  {share:5.1%}")
+    for name, counts in manifest.prevalence["all"].items():
+        share = counts["fail"] / max(1, counts["pass"] + counts["fail"])
+        print(f"{name:16} {counts['pass']:6} {counts['fail']:6} {counts['unknown']:8}  {share:5.1%}")
     for reason, count in skipped.most_common(10):
         print(f"left out {count} times: {reason}")
     return 0

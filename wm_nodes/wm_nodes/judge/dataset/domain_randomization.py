@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from wm_nodes.config.tasks import clip_rules
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.dataset.edits import Origin
 from wm_nodes.judge.dataset.edits.manifest import Part
@@ -80,7 +81,7 @@ class RandomizedScene:
         )
 
 
-def drawn_variation(task: str, seed: int, part: Part) -> RandomizedScene:
+def draw_scene(task: str, seed: int, part: Part) -> RandomizedScene:
     """Draw the scene of an episode.
 
     Training episodes have nothing that is reserved; those of validation have each factor reserved in half of the
@@ -88,23 +89,27 @@ def drawn_variation(task: str, seed: int, part: Part) -> RandomizedScene:
     """
     rng = numpy_stream(seed, f"diverse_look/{task}")
     wanted = {name: part == "validation" and rng.random() < 0.5 for name in FACTORS}
-    view = _until(lambda: _view(rng), lambda v: camera_gap_m(v) >= CAMERA_GAP_M
-                  and (_distance(v[0], RESERVED_EYE_M) <= RESERVED_CAMERA_M) == wanted["camera"])
+    view = _draw_until(
+        lambda: _draw_view(rng),
+        lambda v: camera_gap_m(v) >= CAMERA_GAP_M
+        and (_distance(v[0], RESERVED_EYE_M) <= RESERVED_CAMERA_M) == wanted["camera"],
+    )
     others = [name for name in HUES_DEGREES if name != RESERVED_COLOUR]
     colour = RESERVED_COLOUR if wanted["object"] else str(rng.choice(others))
     thing = _hsv(rng.uniform(*HUES_DEGREES[colour]), rng.uniform(*SATURATION), rng.uniform(*BRIGHTNESS))
-    table = _until(lambda: _hsv(rng.uniform(0, 360), rng.uniform(*TABLE_SATURATION), rng.uniform(*TABLE_BRIGHTNESS)),
-                   lambda t: _distance(t, MOSS) >= TABLE_GAP
-                   and (_distance(t, RESERVED_TABLE) <= TABLE_GAP) == wanted["table"])
+    table = _draw_until(
+        lambda: _hsv(rng.uniform(0, 360), rng.uniform(*TABLE_SATURATION), rng.uniform(*TABLE_BRIGHTNESS)),
+        lambda t: _distance(t, MOSS) >= TABLE_GAP and (_distance(t, RESERVED_TABLE) <= TABLE_GAP) == wanted["table"],
+    )
     contrast, clutter = rng.uniform(*CONTRAST), int(rng.integers(CLUTTER[0], CLUTTER[1] + 1))
     ambient, strength = (round(float(rng.uniform(*limits)), 3) for limits in (AMBIENT, LAMP))
     side = rng.uniform(0, 2 * np.pi)
-    lamp = (_rounded((np.cos(side), np.sin(side), -1.0)), strength)
+    lamp = (_round3((np.cos(side), np.sin(side), -1.0)), strength)
     shades = (round(0.95 - contrast, 3), round(0.95 + contrast, 3))
     layout, turned = None, False
-    if task == "push_cube":
+    if clip_rules(task).any_heading:
         turned = wanted["heading"]
-        layout = _layout(rng, (RESERVED_HEADING_DEGREES, PULL_DEGREES - HEADING_GAP_DEGREES) if turned
+        layout = _draw_layout(rng, (RESERVED_HEADING_DEGREES, PULL_DEGREES - HEADING_GAP_DEGREES) if turned
                          else (0.0, RESERVED_HEADING_DEGREES))
     reserved = tuple(name for name in FACTORS if (turned if name == "heading" else wanted[name]))
     look = SceneAppearance(thing, table, clutter, seed, shades, ambient, lamp, layout)
@@ -120,15 +125,15 @@ def hue_degrees(colour: Triple) -> float:
     return 360 * colorsys.rgb_to_hsv(*colour)[0]
 
 
-def _view(rng: np.random.Generator) -> View:
+def _draw_view(rng: np.random.Generator) -> View:
     distance, (up, side) = rng.uniform(*DISTANCE_M), np.radians([rng.uniform(*ELEVATION_DEGREES), rng.uniform(
         *AZIMUTH_DEGREES)])
     way = np.array([np.cos(up) * np.cos(side), np.cos(up) * np.sin(side), np.sin(up)])
     target = np.array(TARGET_M) + rng.uniform(-1, 1, 3) * TARGET_JITTER_M
-    return _rounded(TARGET_M + distance * way), _rounded(target)
+    return _round3(TARGET_M + distance * way), _round3(target)
 
 
-def _layout(rng: np.random.Generator, turn_degrees: tuple[float, float]) -> Layout:
+def _draw_layout(rng: np.random.Generator, turn_degrees: tuple[float, float]) -> Layout:
     """A way past the workspace's centre, turned by so much to either side."""
     heading = round(float(np.radians(rng.uniform(*turn_degrees)) * rng.choice([-1.0, 1.0])), 4)
     centre = np.array(CENTRE_M) + rng.uniform(-1, 1, 2) * CENTRE_JITTER_M
@@ -136,10 +141,10 @@ def _layout(rng: np.random.Generator, turn_degrees: tuple[float, float]) -> Layo
     return Layout((round(float(x), 3), round(float(y), 3)), heading)
 
 
-def _until(draw: Callable[[], T], fits: Callable[[T], bool]) -> T:
-    while not fits(found := draw()):
+def _draw_until(draw: Callable[[], T], fits: Callable[[T], bool]) -> T:
+    while not fits(value := draw()):
         pass
-    return found
+    return value
 
 
 def _distance(a: Triple, b: Triple) -> float:
@@ -147,10 +152,10 @@ def _distance(a: Triple, b: Triple) -> float:
 
 
 def _hsv(hue_degrees: float, saturation: float, brightness: float) -> Triple:
-    return _rounded(colorsys.hsv_to_rgb(hue_degrees / 360, saturation, brightness))
+    return _round3(colorsys.hsv_to_rgb(hue_degrees / 360, saturation, brightness))
 
 
-def _rounded(values: ArrayLike) -> Triple:
+def _round3(values: ArrayLike) -> Triple:
     x, y, z = (round(float(value), 3) for value in np.asarray(values))
     return x, y, z
 

@@ -14,17 +14,17 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
-from mani_skill.utils.registration import register_env
 from numpy.typing import ArrayLike, NDArray
 
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.tasks import get_task
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, UInt8Array
-from wm_nodes.environments.maniskill.behaviours import script, turned
+from wm_nodes.environments.maniskill.behaviours import turned
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import record_episode
-from wm_nodes.environments.maniskill.scenes import WmPullCube, WmPushCube, make_scene, render
-from wm_nodes.environments.maniskill.tasks import CUBE_HALF_SIZE_M, get_task
+from wm_nodes.environments.maniskill.scenes import make_scene, render
+from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M
 
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Eye and target of a camera, m, world frame."""
@@ -138,7 +138,7 @@ def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int, layout: 
     env.reset(seeds=np.array([seed], np.uint64))
     rng, scale = numpy_stream(seed, "behaviour"), env.spec.action_scale[0]
     if layout is None:
-        scripted = script(behaviour, env.ground_truth[0], rng, scale)
+        scripted = get_task(env.spec.task).script(behaviour, env.ground_truth[0], rng, scale)
     else:
         env.lay_out(layout.cube_m, layout.heading_rad)
         scripted = turned(behaviour, env.ground_truth[0], rng, scale, layout.heading_rad)
@@ -154,8 +154,8 @@ def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int, layout: 
         del scene._after_simulation_step
     keep()
     arrays = {name: np.stack([frame[name] for frame in frames]) for name in frames[0]}
-    kept = {name: a if name == "contact" else a.astype(np.float32) for name, a in arrays.items()}
-    return EpisodeStates(**kept, actions=episode.actions, commanded=episode.states)
+    stacked = {name: a if name == "contact" else a.astype(np.float32) for name, a in arrays.items()}
+    return EpisodeStates(**stacked, actions=episode.actions, commanded=episode.states)
 
 
 class _ClipScene(BaseEnv):  # type: ignore[misc]
@@ -170,18 +170,6 @@ class _ClipScene(BaseEnv):  # type: ignore[misc]
         ]
 
 
-class WmClipPushCube(_ClipScene, WmPushCube):
-    pass
-
-
-class WmClipPullCube(_ClipScene, WmPullCube):
-    pass
-
-
-register_env("WmClipPushCube-v1", max_episode_steps=10_000)(WmClipPushCube)
-register_env("WmClipPullCube-v1", max_episode_steps=10_000)(WmClipPullCube)
-
-
 class ClipStage:
     """Draws states of one task's scene; physics never runs.
 
@@ -193,8 +181,7 @@ class ClipStage:
     """
 
     def __init__(self, task: str, config: SimulationConfig, *, policy: bool = False) -> None:
-        scene = get_task(task).scene
-        self._env = make_scene(scene if policy else scene.replace("Wm", "WmClip", 1), config)
+        self._env = make_scene(get_task(task).scene, config, *(() if policy else (_ClipScene,)))
         self._size = self._env.image_size = config.image_size
         self._build()
 
@@ -225,7 +212,7 @@ class ClipStage:
             place = self._env.goal_region.pose.raw_pose[0].numpy()
             place[:3] = *goal[t, :2], GOAL_Z_M
             self._env.goal_region.set_pose(sapien.Pose(p=place[:3], q=place[3:]))
-            shown = [self._box(half, look.thing, pose) for half, pose in zip(half_sizes_m[t], poses[t])]
+            shown = [self._add_box(half, look.thing, pose) for half, pose in zip(half_sizes_m[t], poses[t])]
             self._env.scene.update_render()
             sensor.capture()
             seen = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=True)
@@ -269,23 +256,23 @@ class ClipStage:
             for j in range(tiles):
                 place = [TILE_M * (i - TILES / 2) + 0.05, TILE_M * (j - TILES / 2), TILE_TOP_M / 2]
                 shade = np.clip(table * rng.uniform(*look.shades), 0, 1)
-                self._drawn.append(self._box([half, half, TILE_TOP_M / 2], shade, [*place, 1, 0, 0, 0]))
+                self._drawn.append(self._add_box([half, half, TILE_TOP_M / 2], shade, [*place, 1, 0, 0, 0]))
         clutter = []
         for _ in range(look.num_clutter):
             size, side = rng.uniform(0.008, 0.016, 3), rng.choice([-1.0, 1.0])
             place = [rng.uniform(-0.08, 0.2), side * rng.uniform(0.1, 0.16), size[2], 1, 0, 0, 0]
             if look.layout is not None:
-                place[:2] = _beside(look.layout, place[0], place[1])
-            clutter.append(self._box(size, rng.uniform(0.1, 0.9, 3), place))
+                place[:2] = _offset(look.layout, place[0], place[1])
+            clutter.append(self._add_box(size, rng.uniform(0.1, 0.9, 3), place))
         self._drawn += clutter
         self._scene.render_system.ambient_light = [look.ambient] * 3
         if look.lamp is not None:
-            self._drawn.append(self._lamp(*look.lamp))
+            self._drawn.append(self._add_lamp(*look.lamp))
         robot = {link._objs[0].entity.per_scene_id: ROBOT for link in self._env.agent.robot.links}
         self._look, self._labels = look, robot | {entity.per_scene_id: CLUTTER for entity in clutter}
         return self._labels
 
-    def _box(self, half_size_m: ArrayLike, colour: ArrayLike, pose: ArrayLike) -> sapien.Entity:
+    def _add_box(self, half_size_m: ArrayLike, colour: ArrayLike, pose: ArrayLike) -> sapien.Entity:
         size, rgb, at = (np.asarray(values, np.float64).tolist() for values in (half_size_m, colour, pose))
         material = sapien.render.RenderMaterial(base_color=[*rgb, 1.0])
         body = sapien.render.RenderBodyComponent()
@@ -297,7 +284,7 @@ class ClipStage:
         self._last_id = int(entity.per_scene_id)
         return entity
 
-    def _lamp(self, direction: tuple[float, float, float], strength: float) -> sapien.Entity:
+    def _add_lamp(self, direction: tuple[float, float, float], strength: float) -> sapien.Entity:
         light = sapien.render.RenderDirectionalLightComponent()
         light.color = [strength] * 3
         entity = sapien.Entity()
@@ -307,7 +294,7 @@ class ClipStage:
         return entity
 
 
-def _beside(layout: Layout, ahead_m: float, left_m: float) -> tuple[float, float]:
+def _offset(layout: Layout, ahead_m: float, left_m: float) -> tuple[float, float]:
     """x y m of a place so far along a layout's way and to its left, from where its cube starts."""
     cos, sin = np.cos(layout.heading_rad), np.sin(layout.heading_rad)
     x, y = layout.cube_m

@@ -25,11 +25,11 @@ def clip_evidence(
     Raises:
         ValueError: wrong shapes or types; names them.
     """
-    numbers, sequence = measured_clip(segmenter, frames, reference, instruction)
+    numbers, sequence = measure_clip(segmenter, frames, reference, instruction)
     return {**numbers, **readings(readers, sequence)}
 
 
-def measured_clip(
+def measure_clip(
     segmenter: Segmenter, frames: UInt8Array, reference: UInt8Array, instruction: str
 ) -> tuple[dict[str, float], ObjectSequence]:
     """The numbers, and what a reader reads. Arguments and errors as those of clip_evidence."""

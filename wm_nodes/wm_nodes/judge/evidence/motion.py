@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import BoolArray, UInt8Array
-from wm_nodes.judge.evidence.objects import FAR, TOUCH, Floats, Numbers, Scene, filled
+from wm_nodes.judge.evidence.objects import FAR, TOUCH, Floats, Numbers, Scene, fill_gaps
 from wm_nodes.judge.evidence.pictures import TURN
 from wm_nodes.judge.evidence.quantiles import median, quantile
 from wm_nodes.judge.evidence.segmentation import OBJECT, ROBOT
@@ -55,13 +55,13 @@ def motion_evidence(scene: Scene, outline: Outline) -> Numbers:
     """Evidence of one clip."""
     size, gap = scene.size, scene.gap
     known = np.isfinite(outline.area)
-    place, hand = filled(outline.centre) / size, filled(scene.tool) / size
-    found = {
+    place, hand = fill_gaps(outline.centre) / size, fill_gaps(scene.tool) / size
+    evidence = {
         **_jumps(outline, place, hand, gap, known), **_passing(place, hand), **_contact(outline, gap),
         **_shapes(outline, place, gap, known),
     }
-    values = np.clip(np.nan_to_num(np.array(list(found.values()), np.float64)), -FAR, FAR)
-    return dict(zip(found, values.tolist()))
+    values = np.clip(np.nan_to_num(np.array(list(evidence.values()), np.float64)), -FAR, FAR)
+    return dict(zip(evidence, values.tolist()))
 
 
 def outline_of(scene: Scene, pictures: UInt8Array) -> Outline:
@@ -81,7 +81,7 @@ def outline_of(scene: Scene, pictures: UInt8Array) -> Outline:
         shown = masks[t, rows, columns]
         mask = shown == OBJECT
         solid = mask.view(np.uint8)
-        weights = _coloured(pictures[t, rows, columns], mask)
+        weights = _colour_weights(pictures[t, rows, columns], mask)
         area = float(weights.sum())
         if area < SMALLEST_PX / 2:
             continue
@@ -100,7 +100,7 @@ def outline_of(scene: Scene, pictures: UInt8Array) -> Outline:
     return Outline(numbers[:, 0], numbers[:, 1:3], numbers[:, 3:5], numbers[:, 5:], ring, hollow)
 
 
-def _coloured(picture: UInt8Array, mask: BoolArray) -> NDArray[np.float32]:
+def _colour_weights(picture: UInt8Array, mask: BoolArray) -> NDArray[np.float32]:
     """(H, W) in [0, 1], how much of the object's colour a pixel in or around its mask has."""
     chroma = picture.astype(np.float32) @ TURN
     mean = chroma[mask].mean()
@@ -180,10 +180,10 @@ def _shapes(outline: Outline, place: Floats, gap: Floats, known: BoolArray) -> N
     clear = known & (gap > CLEAR)
     steady = clear[1:] & clear[:-1] & (np.linalg.norm(np.diff(place, axis=0), axis=1) < PLACE)
     start, end = (clear & (np.linalg.norm(place - place[t], axis=1) < PLACE) for t in (0, -1))
-    found: Numbers = {}
+    evidence: Numbers = {}
     for name, values in zip(SHAPES, (tall, wide, area, long - long[first])):
         free, seen = values[clear], values[known]
-        found |= {
+        evidence |= {
             f"outline_{name}_clear_max": free.max(initial=-FAR) if len(free) else 0.0,
             f"outline_{name}_clear_min": free.min(initial=FAR) if len(free) else 0.0,
             f"outline_{name}_clear_last": _median(free[-3:]), f"outline_{name}_seen_last": _median(seen[-3:]),
@@ -192,7 +192,7 @@ def _shapes(outline: Outline, place: Floats, gap: Floats, known: BoolArray) -> N
             f"outline_{name}_start": np.abs(values[start]).max(initial=0.0),
             f"outline_{name}_end": np.ptp(values[end]) if end.any() else 0.0,
         }
-    return found
+    return evidence
 
 
 def _mean(values: Floats) -> float:

@@ -74,13 +74,13 @@ def object_evidence(scene: Scene, reference: UInt8Array, instruction: str) -> Nu
     """
     masks, thing, size, gap, tool = scene.masks, scene.thing, scene.size, scene.gap, scene.tool
     target = target_of(masks[0], reference, instruction)
-    place, known = filled(thing.centre), np.isfinite(thing.area)
+    place, known = fill_gaps(thing.centre), np.isfinite(thing.area)
     return {
         **_shape(thing, gap, known),
         **_outline(thing, known),
-        **_reshaped(thing, place, gap, size),
-        **_covered(masks, thing),
-        **_touching(masks, thing, gap, size),
+        **_measure_reshaping(thing, place, gap, size),
+        **_measure_cover(masks, thing),
+        **_measure_touch(masks, thing, gap, size),
         **_movement(place, known, size),
         **_causes(place, known, gap, tool, size),
         **_task(place, tool, target, size, instruction),
@@ -117,8 +117,8 @@ def find_target(reference: UInt8Array, mask: UInt8Array, colour: str) -> Target 
     if stats[largest, cv2.CC_STAT_AREA] < 4 * SMALLEST_PX:
         return None
     hull = cv2.convexHull(cv2.findNonZero((labels == largest).astype(np.uint8)))
-    filled = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1)
-    points = np.argwhere(filled).astype(np.float64)
+    hull_mask = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), hull, 1)
+    points = np.argwhere(hull_mask).astype(np.float64)
     spread = np.cov(points.T) + 0.1 * np.eye(2)
     return Target(points.mean(0), np.linalg.inv(4 * spread))  # a disc's variance is r^2 / 4
 
@@ -133,7 +133,7 @@ def robot_gaps(arm: NDArray[np.bool_], thing: NDArray[np.bool_]) -> Floats:
     return gaps
 
 
-def filled(points: Floats) -> Floats:
+def fill_gaps(points: Floats) -> Floats:
     """The last known place stands for a missing one; the first known one before it; zeros where none is known."""
     known = np.flatnonzero(np.isfinite(points[:, 0]))
     if not len(known):
@@ -179,7 +179,7 @@ def _outline(thing: Track, known: NDArray[np.bool_]) -> Numbers:
     }
 
 
-def _reshaped(thing: Track, place: Floats, gap: Floats, size: float) -> Numbers:
+def _measure_reshaping(thing: Track, place: Floats, gap: Floats, size: float) -> Numbers:
     """Change of the outline while nothing covers the object and it stays where it is: a rigid thing has none."""
     lag = min(RESHAPED_FRAMES, len(place) - 1)
     free = (gap > TOUCH) & np.isfinite(thing.area)
@@ -193,7 +193,7 @@ def _reshaped(thing: Track, place: Floats, gap: Floats, size: float) -> Numbers:
     }
 
 
-def _touching(masks: UInt8Array, thing: Track, gap: Floats, size: float) -> Numbers:
+def _measure_touch(masks: UInt8Array, thing: Track, gap: Floats, size: float) -> Numbers:
     """How much of the object is left to see, and how much robot is where it is, while the robot touches it."""
     area0 = thing.area[0] if np.isfinite(thing.area[0]) else SMALLEST_PX
     seen, inside = [], []
@@ -207,7 +207,7 @@ def _touching(masks: UInt8Array, thing: Track, gap: Floats, size: float) -> Numb
     }
 
 
-def _covered(masks: UInt8Array, thing: Track) -> Numbers:
+def _measure_cover(masks: UInt8Array, thing: Track) -> Numbers:
     """Whether a missing object is hidden by the robot, and how much of its first place the robot goes over."""
     there = masks[0] == OBJECT
     over = (masks[1:] == ROBOT)[:, there].mean(1) if there.any() else np.zeros(len(masks) - 1)
@@ -215,7 +215,7 @@ def _covered(masks: UInt8Array, thing: Track) -> Numbers:
     lost = ~np.isfinite(thing.area[1:])
     reach = np.zeros(len(lost))
     for t in np.flatnonzero(lost):  # the robot around the place where the object was last
-        place = filled(thing.centre)[t]
+        place = fill_gaps(thing.centre)[t]
         row, column = (int(np.clip(value, 0, size - 1)) for value, size in zip(place, masks.shape[1:]))
         side = int(np.ceil(np.sqrt(thing.area[0] if np.isfinite(thing.area[0]) else SMALLEST_PX))) + 1
         window = masks[t + 1, max(0, row - side) : row + side + 1, max(0, column - side) : column + side + 1]
@@ -264,12 +264,12 @@ def _causes(place: Floats, known: NDArray[np.bool_], gap: Floats, tool: Floats, 
     last_touch = int(np.flatnonzero(touched)[-1]) if touched.any() else 0
     after = (place[-1] - place[last_touch]) / size
     loose = place[last_touch:, 0] if last_touch < len(place) - 1 else place[-1:, 0]
-    hand = filled(tool)
+    hand = fill_gaps(tool)
     sweep = np.diff(hand, axis=0) / size
     way = hand[-1] - hand[0]
     course = way / (np.linalg.norm(way) + 1e-6)
     beside = (hand - place) @ course / size
-    held = np.where(touched[1:] & touched[:-1], np.linalg.norm(sweep, axis=1) - length, 0.0)
+    slip = np.where(touched[1:] & touched[:-1], np.linalg.norm(sweep, axis=1) - length, 0.0)
     relative = np.linalg.norm(hand - place, axis=1) / size
     return {
         "gap_min": float(gap.min()), "gap_last": float(gap[-1]),
@@ -284,7 +284,7 @@ def _causes(place: Floats, known: NDArray[np.bool_], gap: Floats, tool: Floats, 
         "tool_path": min(FAR, float(np.linalg.norm(sweep, axis=1).sum())),
         "tool_net": min(FAR, float(np.linalg.norm(way) / size)),
         "tool_passed": float(np.clip(beside.max(), -FAR, FAR)),
-        "slipped": float(np.clip(held.sum(), -FAR, FAR)),
+        "slipped": float(np.clip(slip.sum(), -FAR, FAR)),
         "tool_near_min": min(FAR, float(relative.min())),
     }
 
@@ -292,7 +292,7 @@ def _causes(place: Floats, known: NDArray[np.bool_], gap: Floats, tool: Floats, 
 def _task(place: Floats, tool: Floats, target: Target | None, size: float, instruction: str) -> Numbers:
     """How far the clip gets: the object towards the target, the tool towards a place above the object."""
     distance = np.full(len(place), FAR) if target is None else np.minimum(target.distance(place), FAR)
-    relative = np.clip((filled(tool) - place) / size, -FAR, FAR)
+    relative = np.clip((fill_gaps(tool) - place) / size, -FAR, FAR)
     length = np.linalg.norm(relative, axis=1)
     start, end = float(distance[0]), float(distance[-1])
     return {

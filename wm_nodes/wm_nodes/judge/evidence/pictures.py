@@ -47,7 +47,7 @@ def pictures_of(frames: UInt8Array, reference: UInt8Array) -> ClipPictures:
     check_clip(frames, reference)
     colours = np.concatenate([reference[None], frames])
     greys = np.stack([cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in colours])
-    cells = np.stack([shrunk(picture, GRID) for picture in colours])
+    cells = np.stack([shrink(picture, GRID) for picture in colours])
     planes = np.ascontiguousarray(cells.transpose(3, 0, 1, 2))
     return ClipPictures(colours, greys, cells, planes, np.abs(planes[:, 1:] - planes[:, :1]).mean(0))
 
@@ -62,7 +62,7 @@ def check_clip(frames: UInt8Array, reference: UInt8Array) -> None:
         )
 
 
-def shrunk(image: NDArray[np.generic], side: int) -> Floats:
+def shrink(image: NDArray[np.generic], side: int) -> Floats:
     """(side, side, C) float32; area means where the image is larger."""
     cells: Floats = cv2.resize(image.astype(np.float32), (side, side), interpolation=cv2.INTER_AREA)
     return cells

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.evidence.pictures import TURN, ClipPictures, shrunk
+from wm_nodes.judge.evidence.pictures import TURN, ClipPictures, shrink
 from wm_nodes.judge.evidence.quantiles import median, quantile
 
 COARSE = 24
@@ -30,7 +30,7 @@ Numbers = dict[str, float]
 
 def pixel_evidence(pictures: ClipPictures) -> Numbers:
     """Evidence of one clip."""
-    coarse = np.stack([shrunk(cells, COARSE) for cells in pictures.cells[1:]])
+    coarse = np.stack([shrink(cells, COARSE) for cells in pictures.cells[1:]])
     return {
         **_sharpness(pictures.greys),
         **_exposure(pictures.planes),
@@ -47,7 +47,7 @@ def _sharpness(greys: UInt8Array) -> Numbers:
     smoother = np.stack([cv2.blur(grey, (7, 7)) for grey in smooth])
     fine = np.stack([cv2.absdiff(a, b) for a, b in zip(greys, smooth)])
     coarse = np.stack([cv2.absdiff(a, b) for a, b in zip(smooth, smoother)])
-    detail = np.stack([shrunk(image, TILES) for image in fine])  # (1 + T, S, S)
+    detail = np.stack([shrink(image, TILES) for image in fine])  # (1 + T, S, S)
     share = fine.mean((1, 2)) / (coarse.mean((1, 2)) + 0.5)
     ratio = (detail[1:] + 0.3) / (detail[0] + 0.3)
     total = (detail[1:].mean((1, 2)) + 0.1) / (detail[0].mean() + 0.1)
@@ -102,17 +102,17 @@ def _agreement(planes: Floats, away: Floats) -> Numbers:
     """Difference from the reference frame: how much of the picture, where, and whether it comes at once."""
     changed = away > CHANGED_LEVELS
     typical = _over_cells(away)
-    tiles = np.stack([shrunk(frame, TILES) for frame in away])
+    tiles = np.stack([shrink(frame, TILES) for frame in away])
     steps = _over_cells(np.abs(np.diff(planes[:, 1:], axis=1)).mean(0))
     static = np.abs(planes[:, 1:] - planes[:, 1:2]).mean(0).max(0) < CHANGED_LEVELS
-    kept = away[-1][static]
+    differences = away[-1][static]
     return {
         "reference_first": float(away[0].mean()),
         "reference_median": float(typical.mean()),
         "reference_median_first": float(typical[0]), "changed_first": float(changed[0].mean()),
         "tiles_changed_low": quantile(tiles[-1], 0.25), "tile_changed_most": float(tiles.max()),
         "picture_steps": float(steps.mean()), "static_share": float(static.mean()),
-        "static_away": float(kept.mean()) if kept.size else 0.0,
+        "static_away": float(differences.mean()) if differences.size else 0.0,
     }
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from wm_nodes.core.types import BoolArray, UInt8Array
 from wm_nodes.judge.evidence.objects import HUES_DEGREES
-from wm_nodes.judge.evidence.pictures import GRID, TURN, ClipPictures, shrunk
+from wm_nodes.judge.evidence.pictures import GRID, TURN, ClipPictures, shrink
 from wm_nodes.judge.evidence.quantiles import median, quantile
 from wm_nodes.judge.evidence.registration import registration_evidence
 from wm_nodes.judge.evidence.segmentation import CLUTTER, OBJECT, ROBOT, SCENE
@@ -31,7 +31,7 @@ def region_evidence(pictures: ClipPictures, masks: UInt8Array, instruction: str)
     """
     robot, thing = _means(pictures.colours, masks, (ROBOT, OBJECT))
     colours = [word for word in instruction.lower().split() if word in HUES_DEGREES]
-    scene = np.stack([shrunk(mask == SCENE, GRID) > 0.99 for mask in masks])
+    scene = np.stack([shrink(mask == SCENE, GRID) > 0.99 for mask in masks])
     return {
         **_scene(pictures, scene),
         **registration_evidence(pictures.greys, scene),
@@ -39,13 +39,13 @@ def region_evidence(pictures: ClipPictures, masks: UInt8Array, instruction: str)
         **_hue(thing),
         **_paint(thing, "object"),
         **_paint(robot, "robot"),
-        **_named(thing, colours),
+        **_named_hue(thing, colours),
         **_robot(masks == ROBOT),
-        "share_unsure": float((masks[1:] != _smoothed(masks[1:])).mean()),
+        "share_unsure": float((masks[1:] != _smooth(masks[1:])).mean()),
     }
 
 
-def _smoothed(masks: UInt8Array) -> UInt8Array:
+def _smooth(masks: UInt8Array) -> UInt8Array:
     """Each mask after a 3 x 3 median: speckles are where the segmentation is not sure."""
     return np.stack([cv2.medianBlur(mask, 3) for mask in masks])
 
@@ -53,7 +53,7 @@ def _smoothed(masks: UInt8Array) -> UInt8Array:
 def _scene(pictures: ClipPictures, open_cells: BoolArray) -> Numbers:
     """The scene where it is in view, in the clip and in the reference frame: colour, texture, things that are gone."""
     both = open_cells[1:] & open_cells[0]
-    detail = np.stack([shrunk(np.abs(cv2.Laplacian(grey, cv2.CV_16S)), GRID) for grey in pictures.greys])
+    detail = np.stack([shrink(np.abs(cv2.Laplacian(grey, cv2.CV_16S)), GRID) for grey in pictures.greys])
     away = pictures.away * both
     share = both.mean((1, 2)) + 1e-6
     mean = away.mean((1, 2)) / share
@@ -65,7 +65,7 @@ def _scene(pictures: ClipPictures, open_cells: BoolArray) -> Numbers:
     texture = ((detail[1:] * both).mean((1, 2)) / share + 0.2) / ((detail[0] * both).mean((1, 2)) / share + 0.2)
     part = _tiles(both)
     tiles, parts = _tiles(away) / (part + 0.05), part > 0.3
-    kept = (_tiles(detail[1:] * both) + 0.1) / (_tiles(detail[0] * both) + 0.1)
+    texture_ratio = (_tiles(detail[1:] * both) + 0.1) / (_tiles(detail[0] * both) + 0.1)
     return {
         "scene_away_mean": float(mean.mean()), "scene_away_first": float(mean[0]), "scene_away_last": float(mean[-1]),
         "scene_away_step": float(np.diff(mean).max()),
@@ -74,7 +74,7 @@ def _scene(pictures: ClipPictures, open_cells: BoolArray) -> Numbers:
         "scene_offset_last": float(offset[-1]), "scene_offset_max": float(offset.max()),
         "scene_offset_step": float(np.abs(np.diff(offset)).max()), "scene_texture": float(texture.mean()),
         "scene_texture_min": float(texture.min()),
-        "scene_tile_texture": float(kept[parts].min()) if parts.any() else 1.0,
+        "scene_tile_texture": float(texture_ratio[parts].min()) if parts.any() else 1.0,
         "scene_spread": float(np.array(spread).mean() / (spread0 + 1)),
         "scene_share": float(share.mean()),
     }
@@ -103,8 +103,8 @@ def _clutter(masks: UInt8Array) -> Numbers:
     """Of each uninvolved thing of the reference frame: is something still there that is no scene?"""
     number, labels = cv2.connectedComponents((masks[0] == CLUTTER).astype(np.uint8), connectivity=8)
     things = [labels == i for i in range(1, number)]
-    kept = [(masks[1:][:, thing] != SCENE).mean(1) for thing in things if thing.sum() >= SMALLEST_PX]
-    share = np.array(kept) if kept else np.ones((1, len(masks) - 1))
+    shares = [(masks[1:][:, thing] != SCENE).mean(1) for thing in things if thing.sum() >= SMALLEST_PX]
+    share = np.array(shares) if shares else np.ones((1, len(masks) - 1))
     area = (masks == CLUTTER).sum((1, 2)).astype(np.float64)
     late = share[:, len(share[0]) // 2 :].mean(1)
     return {
@@ -145,7 +145,7 @@ def _hue(means: Floats) -> Numbers:
     }
 
 
-def _named(means: Floats, colours: list[str]) -> Numbers:
+def _named_hue(means: Floats, colours: list[str]) -> Numbers:
     """Hue of the object against the one that the instruction names, degrees; 0 where it names none."""
     shown = means[1:][np.isfinite(means[1:, 0])]
     if not colours or not len(shown):

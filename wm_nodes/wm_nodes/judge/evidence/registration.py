@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.evidence.pictures import GRID, shrunk
+from wm_nodes.judge.evidence.pictures import GRID, shrink
 
 BLUR_PX = 1.2
 """Of a picture of GRID x GRID."""
@@ -29,7 +29,7 @@ def registration_evidence(greys: UInt8Array, scene: NDArray[np.bool_]) -> dict[s
     Args:
         greys: uint8 (1 + T, H, W), the reference frame first. scene: bool (1 + T, GRID, GRID), only scene is there.
     """
-    images = np.stack([cv2.GaussianBlur(shrunk(grey, GRID), (0, 0), BLUR_PX) for grey in greys])
+    images = np.stack([cv2.GaussianBlur(shrink(grey, GRID), (0, 0), BLUR_PX) for grey in greys])
     around = np.ones((5, 5), np.uint8)  # the blur spreads what is no scene
     open_cells = np.stack([cv2.erode(mask.astype(np.uint8), around, borderValue=1) for mask in scene])
     moves, left = camera_moves(images, (open_cells[1:] * open_cells[:-1]).astype(np.float32))

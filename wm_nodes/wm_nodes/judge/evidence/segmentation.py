@@ -54,7 +54,7 @@ class Segmenter(nn.Module):
         height, width = images.shape[1:3]
         padding = ((0, 0), (0, -height % MULTIPLE_PX), (0, -width % MULTIPLE_PX), (0, 0))
         parts = [
-            _unfolded(_likeliest(self._folded_logits(_folded(np.pad(images[start : start + BATCH], padding, "edge")))))
+            _unfold(_argmax(self._folded_logits(_fold(np.pad(images[start : start + BATCH], padding, "edge")))))
             for start in range(0, len(images), BATCH)
         ]
         return np.concatenate(parts)[:, :height, :width]
@@ -64,7 +64,7 @@ def _block(inputs: int, outputs: int, stride: int) -> nn.Sequential:
     return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.ReLU(inplace=True))
 
 
-def _folded(images: UInt8Array) -> Tensor:
+def _fold(images: UInt8Array) -> Tensor:
     """pixel_unshuffle by 2 of 2 x / 255 - 1, float (N, 12, H / 2, W / 2). Bytes are moved in a quarter of the time."""
     count, height, width = images.shape[:3]
     folded = np.empty((count, 3, 2, 2, height // 2, width // 2), np.float32)
@@ -74,7 +74,7 @@ def _folded(images: UInt8Array) -> Tensor:
     return pixels.div_(255).mul_(2).sub_(1).contiguous(memory_format=torch.channels_last)  # convolutions are faster
 
 
-def _unfolded(labels: Tensor) -> UInt8Array:
+def _unfold(labels: Tensor) -> UInt8Array:
     """pixel_shuffle by 2, uint8 (N, H, W), of (N, 4, H / 2, W / 2)."""
     count, _, height, width = labels.shape
     images = np.empty((count, height, 2, width, 2), np.uint8)
@@ -83,7 +83,7 @@ def _unfolded(labels: Tensor) -> UInt8Array:
     return images.reshape(count, 2 * height, 2 * width)
 
 
-def _likeliest(folded_logits: Tensor) -> Tensor:
+def _argmax(folded_logits: Tensor) -> Tensor:
     """argmax over classes, uint8 (N, 4, H / 2, W / 2); the first of equals. Tensor.argmax is far slower."""
     count, _, height, width = folded_logits.shape
     logits = folded_logits.contiguous().view(count, NUM_CLASSES, 4, height, width)

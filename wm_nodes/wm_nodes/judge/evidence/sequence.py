@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.judge.evidence.motion import Outline
-from wm_nodes.judge.evidence.objects import Floats, Scene, Target, filled
+from wm_nodes.judge.evidence.objects import Floats, Scene, Target, fill_gaps
 from wm_nodes.judge.evidence.segmentation import OBJECT, ROBOT
 from wm_nodes.judge.evidence.tracks import SMALLEST_PX
 
@@ -59,7 +59,7 @@ def object_sequence(scene: Scene, outline: Outline, pictures: UInt8Array, target
         pictures: uint8 (T, H, W, 3), the reference frame first.
     """
     size, known = scene.size, np.isfinite(outline.area)
-    place, hand = filled(outline.centre), filled(scene.tool)
+    place, hand = fill_gaps(outline.centre), fill_gaps(scene.tool)
     area0 = float(outline.area[known][0]) if known.any() else float(SMALLEST_PX)
     measures = np.concatenate([outline.spread, outline.axes], 1)
     first = measures[int(known.argmax())]

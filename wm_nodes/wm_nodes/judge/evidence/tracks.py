@@ -30,12 +30,12 @@ class Track:
     second: Floats
 
 
-def track(found: BoolArray) -> Track:
+def track(masks: BoolArray) -> Track:
     """Follow the largest blob of bool (T, H, W)."""
-    count = len(found)
+    count = len(masks)
     nan = np.full((count, 9), np.nan)
     second = np.zeros(count)
-    for t, mask in enumerate(found):
+    for t, mask in enumerate(masks):
         above, before, labels, stats, centres = _blobs(mask)
         if not len(stats):
             continue
@@ -57,9 +57,9 @@ def track(found: BoolArray) -> Track:
     return Track(nan[:, 0], nan[:, 1:3], nan[:, 3:7], nan[:, 7:], second)
 
 
-def second_areas(found: BoolArray) -> Floats:
+def second_areas(masks: BoolArray) -> Floats:
     """(T,) px of the next to largest blob of bool (T, H, W), 0 where there is none."""
-    return np.array([_second(_blobs(mask)[3]) for mask in found], np.float64)
+    return np.array([_second(_blobs(mask)[3]) for mask in masks], np.float64)
 
 
 def _second(stats: NDArray[np.int32]) -> int:

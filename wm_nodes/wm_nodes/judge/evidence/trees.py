@@ -113,14 +113,14 @@ def fit_trees(
 def _edges(rows: FloatArray) -> list[FloatArray]:
     """At most NUM_BINS - 1 borders per feature, between values that occur; one at the value where there is only one."""
     shares = np.linspace(0, 1, NUM_BINS + 1)[1:-1]
-    found = []
+    edges = []
     for column in rows.T:
         values = np.unique(column)
         middle = (values[1:] + values[:-1]) / 2
         if len(middle) >= NUM_BINS:
             middle = np.unique(np.quantile(column, shares))
-        found.append((middle if len(middle) else values).astype(np.float32))
-    return found
+        edges.append((middle if len(middle) else values).astype(np.float32))
+    return edges
 
 
 def _best_split(

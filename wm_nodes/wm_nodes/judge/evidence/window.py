@@ -26,11 +26,11 @@ class Window:
         """
         if pictures.shape[-3:] != (self.height, self.width, 3):
             raise ValueError(f"pictures must be {self.height} x {self.width} px of 3 colours, got {pictures.shape}")
-        return self._scaled(pictures[..., self.first : self.end, :], cv2.INTER_CUBIC)
+        return self._scale(pictures[..., self.first : self.end, :], cv2.INTER_CUBIC)
 
     def masks(self, masks: UInt8Array) -> UInt8Array:
         """uint8 (T, side, side) of masks (T, height, end - first) of the window's columns."""
-        return self._scaled(masks[..., None], cv2.INTER_NEAREST)[..., 0]
+        return self._scale(masks[..., None], cv2.INTER_NEAREST)[..., 0]
 
     def track(self, track: FloatArray) -> FloatArray:
         """Rows and columns (T, 2) in px of the columns' own picture, in px of the scaled one."""
@@ -38,7 +38,7 @@ class Window:
         moved: FloatArray = (track + np.float32(0.5)) * scale - np.float32(0.5)
         return moved
 
-    def _scaled(self, pictures: UInt8Array, interpolation: int) -> UInt8Array:
+    def _scale(self, pictures: UInt8Array, interpolation: int) -> UInt8Array:
         flat = np.ascontiguousarray(pictures).reshape(-1, *pictures.shape[-3:])
         size = (self.side, self.side)
         scaled = np.stack([cv2.resize(picture, size, interpolation=interpolation) for picture in flat])

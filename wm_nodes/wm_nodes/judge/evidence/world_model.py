@@ -79,7 +79,7 @@ def model_evidence(
     signal = torch.cat([torch.zeros(1), done_signal(logits)[0][:, index]])
     shown = states[::per_frame]
     moved = (read[1:] - read[:-1]) - (shown[1:] - shown[:-1])
-    found = {
+    evidence = {
         "tokenizer_error": float(difference.mean()), "tokenizer_error_worst": float(blocks.max()),
         "surprise": float(errors.mean()), "surprise_max": float(errors.max()),
         "surprise_over_still": float(torch.log((errors.mean() + 1e-4) / (still.mean() + 1e-4))),
@@ -89,7 +89,9 @@ def model_evidence(
         "done_end": float(signal[-1]), "done_max": float(signal.max()),
         "done_rise": float((signal[1:] >= signal[:-1] - 1e-6).float().mean()),
     }
-    return found if task.goal_image is None else found | _goal(latents, tokenizer.encode(task.goal_image[None])[0])
+    if task.goal_image is not None:
+        evidence |= _goal(latents, tokenizer.encode(task.goal_image[None])[0])
+    return evidence
 
 
 def _errors(

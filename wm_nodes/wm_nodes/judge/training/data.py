@@ -3,20 +3,16 @@
 Shapes: T frames, H W 3 image.
 """
 
-import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.types import TaskSpec
-from wm_nodes.judge.dataset.build import clip_path, load_set
 from wm_nodes.judge.dataset.edits import Manifest, ManifestError
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
-from wm_nodes.judge.dataset.rows import judged_clip
+from wm_nodes.judge.dataset.rows import read_clip
+from wm_nodes.judge.dataset.set_files import load_array, load_set
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +54,5 @@ def set_clips(sets: Sequence[tuple[Path, Manifest]], parts: Sequence[Part]) -> I
     """
     for folder, manifest in sets:
         for row in rows_of(manifest, parts):
-            clip, task = judged_clip(folder, row)
-            yield SetClip(row, clip.frames, _load_masks(folder, row.sha256), task)
-
-
-def _load_masks(folder: Path, sha256: str) -> UInt8Array:
-    path = clip_path(folder, sha256)
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            masks: UInt8Array = arrays["masks"]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ManifestError(f"{path} cannot be read: {error}; build the set again") from error
-    return masks
+            clip, task = read_clip(folder, row)
+            yield SetClip(row, clip.frames, load_array(folder, row.sha256, "masks"), task)

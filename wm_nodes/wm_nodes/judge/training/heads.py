@@ -1,7 +1,7 @@
-"""Fit the heads of the embedded judge to labels, and say how well they do (RA-18 to RA-20).
+"""Fit the heads of the embedded judge to labels, and measure them (RA-18 to RA-20).
 
-Trees come from the training part; what turns log-odds into probabilities, and where a clip is too foreign to judge,
-from the validation part. Shapes: N clips, F evidence.
+Trees are fitted on the training part; the calibration of their log-odds and the limit beyond which a clip is out of
+distribution, on the validation part. Shapes: N clips, F evidence.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from wm_nodes.core.reward_statistics import (
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.statistics import (
     auroc,
     balanced_accuracy,
     expected_calibration_error,
     recall_at,
     wilson_of_share,
 )
-from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.judge.agent.levels import p_fail_of
 from wm_nodes.judge.agent.types import PLANNING
@@ -43,12 +43,12 @@ UNKNOWN = -1
 SHRINKAGE = 0.3
 """Share of the identity in the covariance of standardised evidence."""
 COVERAGE = 0.99
-"""Share of the validation part that is near enough to training to be judged."""
+"""Share of the validation part that counts as in distribution."""
 MIN_SLOPE, MAX_SLOPE = 0.1, 3.0
 FLAG, MAX_FALSE_FLAGS = 0.8, 0.02
 """The agent confirms a pattern from this probability on (rubrics: hack.confirm)."""
 CONFORMAL = (0.8, 0.9, 0.95, 0.98)
-"""Coverages whose limits are kept with a judge."""
+"""Coverages whose limits are saved with a judge."""
 LAST_FAIL = {PLANNING: 1, TC: 2}
 """The highest level that counts as failing, where it is not 0."""
 MIN_CASES = 5
@@ -60,7 +60,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """evidence: (N, F) in the order of `names`. rows: what is known of each clip."""
+    """Evidence (N, F) in the order of `names`, and the manifest row of each clip with its labels."""
 
     names: tuple[str, ...]
     evidence: FloatArray
@@ -72,12 +72,12 @@ class Examples:
 
     @property
     def clean(self) -> BoolArray:
-        """(N,), nothing fails."""
+        """bool (N,), True where no label fails."""
         return np.array([row.labels.overall for row in self.rows], bool)
 
 
 def true_levels(target: str, rows: Sequence[ManifestRow]) -> Levels:
-    """(N,) of levels; 0 or 1 for components (passes) and patterns (absent); UNKNOWN where nobody knows."""
+    """Labels (N,): levels, or 1 for a component that passes and for an absent pattern, else 0; UNKNOWN without one."""
     return np.array([_true_level(target, row) for row in rows], np.int64)
 
 
@@ -101,8 +101,8 @@ def fit_questions(
     Raises:
         ValueError: a question has only one answer in the training part; names target and level.
     """
-    levels, held = true_levels(target, train.rows), true_levels(target, validation.rows)
-    known, held_known = levels != UNKNOWN, held != UNKNOWN
+    levels, held_out_levels = true_levels(target, train.rows), true_levels(target, validation.rows)
+    known, held_out_known = levels != UNKNOWN, held_out_levels != UNKNOWN
     questions = []
     for k in range(num_questions(target)):
         above = levels[known] > k
@@ -112,19 +112,19 @@ def fit_questions(
         weights = np.where(above, 0.5 / above.mean(), 0.5 / (1 - above.mean()))
         rng = numpy_stream(seed, f"judge_trees/{target}", k)
         trees = fit_trees(train.evidence[known], above, weights, settings, rng)
-        odds = trees.log_odds(validation.evidence[held_known]).astype(np.float64)
-        line = _line(odds, held[held_known] > k, float(above.mean()))
+        odds = trees.log_odds(validation.evidence[held_out_known]).astype(np.float64)
+        line = _line(odds, held_out_levels[held_out_known] > k, float(above.mean()))
         if target.startswith(HACK):
-            line = _flagging_line(line[0], odds, held[held_known] > k)
+            line = _flagging_line(line[0], odds, held_out_levels[held_out_known] > k)
         questions.append(HeadQuestion(trees, *line))
     return tuple(questions)
 
 
 def _flagging_line(slope: float, odds: Floats, absent: BoolArray) -> tuple[float, float]:
-    """A line that puts the threshold with the best recall less false flags at a pattern's probability of FLAG.
+    """(slope, offset) that give the threshold with the largest recall - false flags a pattern probability of FLAG.
 
-    The agent confirms a pattern by this probability, so that it is a decision first and a probability second. At most
-    MAX_FALSE_FLAGS of the clips without the pattern are flagged; the threshold lies midway between two clips.
+    The agent confirms a pattern from this probability on. At most MAX_FALSE_FLAGS of the clips without the pattern are
+    flagged; the threshold is midway between two clips.
     """
     ordered = np.unique(odds)
     thresholds = np.concatenate([[ordered[0] - 1], (ordered[1:] + ordered[:-1]) / 2])
@@ -137,9 +137,10 @@ def _flagging_line(slope: float, odds: Floats, absent: BoolArray) -> tuple[float
 
 
 def _line(odds: Floats, above: BoolArray, share: float) -> tuple[float, float]:
-    """(slope, offset) of the likeliest sigmoid, by Newton steps; Platt's smoothed targets keep it finite.
+    """(slope, offset) of the sigmoid of maximum likelihood, by Newton steps on Platt's smoothed targets.
 
-    share: of the training labels; what balanced training took out of the odds where too few cases can say.
+    share: of passing training labels; with fewer than MIN_CASES validation cases only the balance of training is
+    corrected by it.
     """
     passes, fails = int(above.sum()), int((~above).sum())
     if min(passes, fails) < MIN_CASES:
@@ -156,23 +157,23 @@ def _line(odds: Floats, above: BoolArray, share: float) -> tuple[float, float]:
 
 
 def fit_familiarity(train: Examples, validation: Examples) -> Familiarity:
-    """Learn what evidence looks like, faults included, and the distance within which COVERAGE of validation lies."""
+    """Fit the distribution of the evidence, faults included, and the distance that covers COVERAGE of validation."""
     low, centre, high = np.quantile(train.evidence.astype(np.float64), (0.25, 0.5, 0.75), axis=0)
     spread = train.evidence.std(0, dtype=np.float64)
     scale = np.maximum(np.maximum((high - low) / 1.35, 0.5 * spread), 1e-3)
     z = np.clip((train.evidence - centre) / scale, -CLIP_AT, CLIP_AT)
     covariance = (1 - SHRINKAGE) * (z.T @ z) / len(z) + SHRINKAGE * np.eye(z.shape[1])
-    found = Familiarity(
+    unlimited = Familiarity(
         centre.astype(np.float32), scale.astype(np.float32), np.linalg.inv(covariance).astype(np.float32), 0.0
     )
-    limit = float(np.quantile(found.distance(validation.evidence), COVERAGE))
-    return Familiarity(found.centre, found.scale, found.precision, limit)
+    limit = float(np.quantile(unlimited.distance(validation.evidence), COVERAGE))
+    return Familiarity(unlimited.centre, unlimited.scale, unlimited.precision, limit)
 
 
 def fit_all(
     train: Examples, validation: Examples, settings: TreeSettings, seed: int, *, progress: bool = True
 ) -> dict[str, tuple[HeadQuestion, ...]]:
-    """Questions of every target."""
+    """Fit the questions of every target."""
     targets = tqdm(TARGETS, desc="heads", disable=not progress)
     return {target: fit_questions(target, train, validation, settings, seed) for target in targets}
 
@@ -192,7 +193,7 @@ def conformal_limits(
     lowest, highest = np.sort(p_fail[(levels != UNKNOWN) & (levels <= last)]), np.sort(p_fail[levels > last])[::-1]
     limits = {}
     for coverage in CONFORMAL:
-        ranks = [int((1 - coverage) * (len(of) + 1) + 1e-9) for of in (lowest, highest)]
+        ranks = [int((1 - coverage) * (len(scores) + 1) + 1e-9) for scores in (lowest, highest)]
         low = float(lowest[ranks[0] - 1]) if ranks[0] else 0.0
         limits[f"{coverage:g}"] = (low, float(highest[ranks[1] - 1]) if ranks[1] else 1.0)
     return limits
@@ -201,9 +202,11 @@ def conformal_limits(
 def conformal_errors(
     questions: Mapping[str, tuple[HeadQuestion, ...]], limits: Mapping[str, tuple[float, float]], examples: Examples
 ) -> dict[str, Any]:
-    """What abstaining between conformal limits costs and saves. answered: share of the clips in which every target is.
-    targets: of each one the share without answer, and how many of the clips that fail are said to pass (fail_as_pass)
-    and of those that pass to fail (pass_as_fail), first if it always decided.
+    """Measure what abstaining between conformal limits costs and saves.
+
+    answered: share of the clips on which every target is answered. targets: by target, silent (share without answer),
+    fail_as_pass (share of failing clips that are called passing) and pass_as_fail (the reverse); the last two as
+    (without abstaining, with abstaining).
     """
     answered, targets = np.ones(len(examples.rows), bool), {}
     for target, (low, high) in limits.items():
@@ -225,28 +228,33 @@ def _p_fail(questions: Mapping[str, tuple[HeadQuestion, ...]], target: str, exam
     return np.array([p_fail_of(levels_of(target, column)) for column in above.T])
 
 
-def measured(questions: Mapping[str, tuple[HeadQuestion, ...]], target: str, examples: Examples) -> dict[str, Any]:
-    """n, prevalence of fails, accuracy, balanced accuracy, AUROC and ECE of a target; of task completion's pass is
-    meant from "nearly" on; planning also says how often the likeliest level is the true one, and a hacking pattern
-    which share of it and of the other clips is flagged, and which could be at 5 % false flags.
+def measure_target(
+    questions: Mapping[str, tuple[HeadQuestion, ...]], target: str, examples: Examples
+) -> dict[str, Any]:
+    """Measure how well a target's questions agree with the labels.
+
+    Keys: n, fails (clips that fail), accuracy, balanced_accuracy, auroc, ece. Task completion passes from level 3
+    ("nearly") on. Targets of several levels also have level_accuracy: share of clips whose likeliest level is the true
+    one. Hacking patterns also have flagged and false_flags (shares of the clips with and without the pattern) and
+    recall_at_5, the recall at 5 % false flags.
     """
     levels = true_levels(target, examples.rows)
     known = levels != UNKNOWN
     above = np.minimum.accumulate(above_levels(questions, target, examples.evidence[known]), 0)
     k = LAST_FAIL.get(target, 0)
     truth, p = levels[known] > k, above[k]
-    found = {
+    metrics = {
         "n": int(known.sum()), "fails": int((~truth).sum()), "accuracy": float(((p >= 0.5) == truth).mean()),
         "balanced_accuracy": balanced_accuracy(truth, p >= 0.5), "auroc": auroc(truth, p),
         "ece": expected_calibration_error(truth, p),
     }
     if len(above) > 1:
         full = np.concatenate([np.ones((1, len(p))), above, np.zeros((1, len(p)))])
-        found["level_accuracy"] = float(((full[:-1] - full[1:]).argmax(0) == levels[known]).mean())
+        metrics["level_accuracy"] = float(((full[:-1] - full[1:]).argmax(0) == levels[known]).mean())
     if target.startswith(HACK):
         flagged = 1 - p >= FLAG
-        found |= {
+        metrics |= {
             "flagged": wilson_of_share(flagged[~truth])[0], "false_flags": wilson_of_share(flagged[truth])[0],
             "recall_at_5": recall_at(~truth, 1 - p, 0.05),
         }
-    return {name: round(value, 4) if isinstance(value, float) else value for name, value in found.items()}
+    return {name: round(value, 4) if isinstance(value, float) else value for name, value in metrics.items()}

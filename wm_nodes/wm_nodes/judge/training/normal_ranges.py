@@ -1,9 +1,8 @@
-"""Bands of endogenous evidence for the reward agent, from recordings in which nothing is wrong (RA-13, RA-17).
+"""Measure the bands of endogenous evidence from faultless recordings, and write them as a rubric pack (RA-13, RA-17).
 
-A signal outside of its band disagrees with a component that passes: the agent votes on it, and looks again. Bands hold
-for one world model, one camera and one number of actions between two frames, so they are data of their own: a rubric
-pack that extends another one. Every recording counts as it is and as the model's tokenizer draws it: the loops judge
-clips that it decoded, and recorded pictures stand stiller than any that were.
+A signal outside its band contradicts a component that passes: the agent then votes on it and reflects. Bands hold for
+one world model, one camera and one number of actions between two frames, so they are a pack that extends another one.
+Every recording is measured as it is and as decoded by the model's tokenizer, because the loops judge decoded clips.
 
     python -m wm_nodes.judge.training.normal_ranges MODEL_DIR BAG [BAG ...] --check BAG [BAG ...] --output bands.yaml
 """
@@ -32,13 +31,14 @@ from wm_nodes.recording import read_episodes
 from wm_nodes.world_model import WorldModels, load_model_folder
 
 LEAST = 50
-"""Clips; of fewer, the outermost ones say too little about the edge of a band."""
+"""Clips needed to estimate the edge of a band."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """component: what cannot pass while the signal is on the wrong `side` of its band. of: the clips that show where
-    that is; done: those whose task is done at the end.
+    """The component that a signal contradicts beyond one side of its band.
+
+    of: the clips that the band is measured on; "done": those whose task is done at the end.
     """
 
     component: str
@@ -79,12 +79,12 @@ def clip_rows(models: WorldModels, episodes: Iterator[Episode], stride: int) -> 
         actions = episode.actions[: count * stride].reshape(count, -1)
         task = TaskSpec(episode.instruction, episode.task, "", frames[0], actions=actions)
         for shown in (frames, models.tokenizer.decode(models.tokenizer.encode(frames)).numpy()):
-            found = {**pixel_evidence(pictures_of(shown, frames[0])), **model_evidence(models, shown, task)}
-            yield {name: found[name] for name in SIGNALS}, bool(episode.success[count * stride])
+            evidence = {**pixel_evidence(pictures_of(shown, frames[0])), **model_evidence(models, shown, task)}
+            yield {name: evidence[name] for name in SIGNALS}, bool(episode.success[count * stride])
 
 
 def bands_of(rows: Sequence[tuple[Row, bool]], tail: float) -> dict[str, dict[str, float | str]]:
-    """A band per signal: `tail` of the clips that it is taken from lie outside, on the wrong side.
+    """A band per signal, with the share `tail` of its clips outside.
 
     Raises:
         ValueError: fewer than LEAST clips for a signal, or a tail that is no share.
@@ -104,13 +104,13 @@ def bands_of(rows: Sequence[tuple[Row, bool]], tail: float) -> dict[str, dict[st
     return bands
 
 
-def outside(rows: Sequence[tuple[Row, bool]], rubric: Rubric) -> dict[str, int]:
-    """Clips outside of each band, of those it is meant for, and under "any" outside of at least one."""
+def count_outside(rows: Sequence[tuple[Row, bool]], rubric: Rubric) -> dict[str, int]:
+    """Count the clips outside each band, among those that it applies to, and ("any") outside at least one."""
     counts = dict.fromkeys((*rubric.evidence, "any"), 0)
     for row, done in rows:
         meant = {name: value for name, value in row.items() if done or SIGNALS[name].of == "all"}
-        found = conflicting_evidence(rubric, meant)
-        for name in [*found, "any"] if found else []:
+        conflicts = conflicting_evidence(rubric, meant)
+        for name in [*conflicts, "any"] if conflicts else []:
             counts[name] += 1
     return counts
 
@@ -144,12 +144,12 @@ def main(argv: Sequence[str]) -> int:
         head = f"# python -m wm_nodes.judge.training.normal_ranges {' '.join(argv)}\n# from {len(rows)} clips\n"
         write_atomic(arguments.output, (head + yaml.safe_dump(pack, sort_keys=False)).encode())
         rubric = load_rubric(str(arguments.output))
-        kept = _rows(models, arguments.check, arguments.stride)
+        checked = _rows(models, arguments.check, arguments.stride)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"{arguments.output}: rubric {rubric.version}; {len(rows)} clips, {len(kept)} to check")
-    counts = {"bands": outside(rows, rubric), "check": outside(kept, rubric)}
+    print(f"{arguments.output}: rubric {rubric.version}; {len(rows)} clips, {len(checked)} to check")
+    counts = {"bands": count_outside(rows, rubric), "check": count_outside(checked, rubric)}
     print(f"{'evidence':22} {'component':16} {'low':>9} {'high':>9} {'outside':>8} {'check':>6}")
     for name, band in rubric.evidence.items():
         numbers = f"{band.low:9.4g} {band.high:9.4g} {counts['bands'][name]:8} {counts['check'][name]:6}"

@@ -33,8 +33,8 @@ WHOLE_PICTURE = frozenset({
 """Recipes on pixels or time after which a mask still shows what can be seen."""
 
 
-def masks_hold(row: ManifestRow) -> bool:
-    """Whether the masks of a clip say what is seen in it; in imagined ones things are near those places only."""
+def has_true_masks(row: ManifestRow) -> bool:
+    """Whether the masks of a clip match its pixels; in imagined clips they are only near."""
     return not row.origin.scene.startswith(IMAGINED) and all(
         edit.severity == "mild" or edit.recipe in WHOLE_PICTURE or RECIPES[edit.recipe].kind == "S"
         for edit in row.edits
@@ -45,7 +45,7 @@ def segmentation_data(clips: Iterable[SetClip], seed: int) -> tuple[UInt8Array, 
     """Return images (N, H, W, 3) and masks (N, H, W): FRAMES_PER_CLIP of each clip whose masks hold."""
     images, masks = [], []
     for clip in clips:
-        if masks_hold(clip.row):
+        if has_true_masks(clip.row):
             rng = numpy_stream(seed, f"segmenter_frames/{clip.row.sha256}")
             chosen = rng.choice(len(clip.frames), min(FRAMES_PER_CLIP, len(clip.frames)), replace=False)
             images.append(clip.frames[chosen])
@@ -69,7 +69,7 @@ def train_segmenter(
     steps = trange(num_steps, desc="segmenter", disable=not progress)
     for _ in steps:
         chosen = torch.randint(len(pictures), (BATCH,), generator=generator)
-        pixels, wanted = _varied(pictures[chosen].permute(0, 3, 1, 2).float() / 255, labels[chosen].long(), generator)
+        pixels, wanted = _augment(pictures[chosen].permute(0, 3, 1, 2).float() / 255, labels[chosen].long(), generator)
         loss = F.cross_entropy(model(pixels), wanted, weights)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -79,22 +79,22 @@ def train_segmenter(
     return model.eval().requires_grad_(False)
 
 
-def _varied(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Other colours, light, sides and distances, so that shapes count: half of the pictures each, drawn evenly.
+def _augment(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Augment images, each change with probability 1/2 and a uniform amount, so that the network learns shapes.
 
     Colours are turned about the grey axis by any angle; the light is 0.7 to 1.3; the picture is mirrored; and it is
     turned by up to 15 degrees and scaled by 0.8 to 1.25.
     """
     count = len(pixels_N3HW)
-    some, amount = torch.rand(4, count, generator=generator) < 0.5, torch.rand(4, count, generator=generator) * 2 - 1
-    angle = torch.where(some[0], amount[0] * math.pi, 0.0)
+    chosen, amount = torch.rand(4, count, generator=generator) < 0.5, torch.rand(4, count, generator=generator) * 2 - 1
+    angle = torch.where(chosen[0], amount[0] * math.pi, 0.0)
     cos, up, down = angle.cos(), *((1 - angle.cos()) / 3 + side * angle.sin() / math.sqrt(3) for side in (-1, 1))
     same = cos + (1 - cos) / 3
     turn = torch.stack([same, up, down, down, same, up, up, down, same], 1).view(count, 3, 3)
     pixels = torch.einsum("nij,njhw->nihw", turn, pixels_N3HW)
-    pixels = pixels * torch.where(some[1], 1 + 0.3 * amount[1], 1.0).view(-1, 1, 1, 1)
-    roll, scale = (some[3] * amount[3]) * math.radians(15), 1.25 ** torch.where(some[3], amount[2], 0.0)
-    side = torch.where(some[2], -1.0, 1.0)
+    pixels = pixels * torch.where(chosen[1], 1 + 0.3 * amount[1], 1.0).view(-1, 1, 1, 1)
+    roll, scale = (chosen[3] * amount[3]) * math.radians(15), 1.25 ** torch.where(chosen[3], amount[2], 0.0)
+    side = torch.where(chosen[2], -1.0, 1.0)
     zero = torch.zeros(count)
     affine = torch.stack(
         [scale * roll.cos() * side, -scale * roll.sin(), zero, scale * roll.sin() * side, scale * roll.cos(), zero], 1
@@ -107,10 +107,10 @@ def _varied(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator)
 
 def overlaps(model: Segmenter, images: UInt8Array, masks: UInt8Array) -> dict[str, float]:
     """Intersection over union of each class over all pixels, of the classes that the masks have."""
-    found = model.masks(images)
+    predicted = model.masks(images)
     names = ("scene", "robot", "object", "clutter")
     return {
-        name: float(((found == i) & (masks == i)).sum() / max(1, ((found == i) | (masks == i)).sum()))
+        name: float(((predicted == i) & (masks == i)).sum() / max(1, ((predicted == i) | (masks == i)).sum()))
         for i, name in enumerate(names)
         if (masks == i).any()
     }

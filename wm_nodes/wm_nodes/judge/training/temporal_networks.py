@@ -1,8 +1,9 @@
-"""Train the networks that see the object over time, each on half of the recordings (RA-17).
+"""Train the temporal networks ("readers") of the embedded judge by cross-fitting (RA-17).
 
-Trees that read a network's answers must learn how good these are on clips it was not trained on. So each is trained on
-half of the recordings, and a training clip's numbers are the mean of those that were trained without its recording; on
-every other clip it is the mean of all that counts. Shapes: N clips, T frames, K questions, in the order of READS.
+The trees use the networks' answers as evidence, so these must be as reliable in training as on new clips. Therefore
+each network is trained on half of the recordings, and a training clip gets the mean answer of the networks that were
+not trained on its recording; every other clip gets the mean of all. Shapes: N clips, T frames, K questions, in the
+order of READS.
 """
 
 import hashlib
@@ -48,7 +49,7 @@ class TemporalData:
 
 
 def temporal_data(sequences: Sequence[ObjectSequence], rows: Sequence[ManifestRow]) -> TemporalData:
-    """What the readers learn from, of clips and what is known of them."""
+    """Training data of the readers: sequences, answers by label, and folds by recording."""
     answers = [_answers(question, rows) for question in READS]
     return TemporalData(sequences, np.stack(answers, 1), np.array([row.origin.seed % FOLDS for row in rows], np.int64))
 
@@ -64,27 +65,25 @@ def cross_fit(
     """`count` readers per fold, and log-odds (N, K) of every clip, the mean of those that have not seen its recording.
 
     Args:
-        folder: of finished readers, which are taken up again: files named by everything they depend on.
+        folder: of finished readers, which are loaded; the file names hash everything they depend on.
 
     Raises:
         ValueError: one of the folds has no clips. OSError: a full disk.
     """
-    readers, held = [], np.zeros(data.answers.shape, np.float32)
+    readers, log_odds = [], np.zeros(data.answers.shape, np.float32)
     for fold in range(FOLDS):
         trained = np.flatnonzero(data.folds != fold)
         if not len(trained) or len(trained) == len(data.folds):
             raise ValueError(f"recordings of one parity of seeds only: {len(data.folds)} clips; build larger sets")
-        own = [
-            _kept_reader(folder, data, trained, epochs, stream_seed(seed, "reader", fold + FOLDS * number), progress)
-            for number in range(count)
-        ]
+        seeds = [stream_seed(seed, "reader", fold + FOLDS * number) for number in range(count)]
+        own = [_load_or_train_reader(folder, data, trained, epochs, each, progress) for each in seeds]
         for i in np.flatnonzero(data.folds == fold):
-            held[i] = list(readings(own, data.sequences[i]).values())
+            log_odds[i] = list(readings(own, data.sequences[i]).values())
         readers += own
-    return tuple(readers), held
+    return tuple(readers), log_odds
 
 
-def _kept_reader(
+def _load_or_train_reader(
     folder: Path, data: TemporalData, trained: Levels, epochs: int, seed: int, progress: bool
 ) -> TemporalNetwork:
     path = folder / f"reader-{_key(data, trained, epochs, seed)}.safetensors"
@@ -97,11 +96,11 @@ def _kept_reader(
 
 
 def _key(data: TemporalData, chosen: Levels, epochs: int, seed: int) -> str:
-    found = hashlib.sha256(f"{epochs} {seed}".encode())
-    found.update(Path(__file__).read_bytes() + Path(sequence.__file__).read_bytes() + data.answers[chosen].tobytes())
+    digest = hashlib.sha256(f"{epochs} {seed}".encode())
+    digest.update(Path(__file__).read_bytes() + Path(sequence.__file__).read_bytes() + data.answers[chosen].tobytes())
     for i in chosen:
-        found.update(data.sequences[i].crops.tobytes() + data.sequences[i].numbers.tobytes())
-    return found.hexdigest()[:16]
+        digest.update(data.sequences[i].crops.tobytes() + data.sequences[i].numbers.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def train_temporal_network(
@@ -122,7 +121,7 @@ def train_temporal_network(
             optimiser, LEARNING_RATE, total_steps=max(MIN_STEPS, len(batches)), pct_start=0.1
         )
         for batch in (steps := tqdm(batches, "reader", disable=not progress)):
-            crops, known = _varied(*_stacked(data, batch), rng)
+            crops, known = _augment(*_stack(data, batch), rng)
             wanted = torch.from_numpy(data.answers[batch])
             weight = torch.where(wanted > 0, weights[1], weights[0]) * (wanted != UNKNOWN)
             aim = wanted.clamp(0).float() * (1 - 2 * SMOOTHING) + SMOOTHING
@@ -141,7 +140,7 @@ def train_temporal_network(
 
 
 def _weights(answers: Levels) -> Tensor:
-    """(2, K), of no and of yes: between those of the data and alike for both, so that rare faults count more."""
+    """Loss weights (2, K) of no and yes: square roots of the balancing weights, so that rare faults count more."""
     known = (answers != UNKNOWN).sum(0)
     counts = np.stack([(answers == answer).sum(0) for answer in (0, 1)])
     return torch.from_numpy(np.sqrt(0.5 * known / np.maximum(counts, 1)).astype(np.float32))
@@ -157,13 +156,13 @@ def _batches(data: TemporalData, chosen: Levels, rng: np.random.Generator) -> It
     yield from (batches[i] for i in rng.permutation(len(batches)))
 
 
-def _stacked(data: TemporalData, batch: Levels) -> tuple[Tensor, Tensor]:
+def _stack(data: TemporalData, batch: Levels) -> tuple[Tensor, Tensor]:
     crops = np.stack([data.sequences[i].crops for i in batch])
     return torch.from_numpy(crops), torch.from_numpy(np.stack([data.sequences[i].numbers for i in batch]))
 
 
-def _varied(crops: Tensor, numbers: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Mirrored, colours exchanged, half of the clips each; other gains and offsets of colours; noise on the numbers."""
+def _augment(crops: Tensor, numbers: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Augment clips: half mirrored, half with exchanged colours; random colour gains and offsets, noise on numbers."""
     count = len(crops)
     mirrored = torch.from_numpy(rng.random(count) < 0.5)
     crops = torch.where(mirrored[:, None, None, None, None], crops.flip(3), crops)

@@ -1,7 +1,7 @@
-"""Make the embedded judge from adversarial sets: segmenter, evidence, heads, limits (RA-17 to RA-20).
+"""Train the embedded judge on adversarial sets: segmenter, evidence, heads, limits (RA-17 to RA-20).
 
-Finished stages lie in the folder and are taken up again: segmenter.safetensors, evidence-*.npz and sequences-*.npz per
-set and part, and reader-*.safetensors, named by everything they depend on; of these, labels for the readers only.
+Finished stages are files of the folder and are loaded by the next call: segmenter.safetensors, evidence-*.npz and
+sequences-*.npz per set and part, and reader-*.safetensors. Their names hash everything they depend on.
 """
 
 import hashlib
@@ -20,18 +20,18 @@ from tqdm import tqdm
 import wm_nodes.judge.evidence
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import FloatArray
-from wm_nodes.judge.dataset.build import load_frames
 from wm_nodes.judge.dataset.edits import COMPONENTS, TC, Manifest
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part, to_bytes
 from wm_nodes.judge.dataset.policy_camera import SEEN
-from wm_nodes.judge.evidence.clip import measured_clip
+from wm_nodes.judge.dataset.set_files import load_frames
+from wm_nodes.judge.evidence.clip import measure_clip
 from wm_nodes.judge.evidence.head import JudgeHead
 from wm_nodes.judge.evidence.segmentation import Segmenter
 from wm_nodes.judge.evidence.sequence import ObjectSequence, TemporalNetwork, reading_names, readings
 from wm_nodes.judge.evidence.trees import TreeSettings
 from wm_nodes.judge.evidence.window import Window
 from wm_nodes.judge.training.data import load_sets, rows_of, set_clips
-from wm_nodes.judge.training.heads import TARGETS, Examples, conformal_limits, fit_all, fit_familiarity, measured
+from wm_nodes.judge.training.heads import TARGETS, Examples, conformal_limits, fit_all, fit_familiarity, measure_target
 from wm_nodes.judge.training.segmenter import overlaps, segmentation_data, train_segmenter
 from wm_nodes.judge.training.temporal_networks import cross_fit, temporal_data
 
@@ -41,22 +41,23 @@ Sets = Sequence[tuple[Path, Manifest]]
 
 @dataclass(frozen=True)
 class JudgePlan:
-    """sets: folders of adversarial sets. segmenter_steps: batches. readers: networks over time per half of the
-    recordings. reader_epochs: times that each sees its clips. seed: of everything drawn. window: what the clips show of
-    the pictures that will be judged, of sets that were drawn so (policy_view.py).
-    """
+    """Settings of a judge's training."""
 
     sets: tuple[Path, ...]
+    """Folders of adversarial sets."""
     segmenter_steps: int = 2800
+    """Batches that the segmenter is trained on."""
     readers: int = 1
+    """Temporal networks per half of the recordings."""
     reader_epochs: int = 16
     trees: TreeSettings = field(default_factory=TreeSettings)
     seed: int = 0
     window: Window | None = None
+    """The part of the judged pictures that the clips show, for sets of the policy's camera (policy_camera.py)."""
 
 
 def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> JudgeHead:
-    """Train every part; the head's story holds data, seeds and what the validation part measures, not yet who and when.
+    """Train every part of a judge; the head's story holds the data, the seeds and the metrics on the validation part.
 
     Raises:
         ManifestError: a damaged set. ValueError: sets too small to learn from. OSError: a full disk.
@@ -68,7 +69,7 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
             "a judge reads either the clips of --policy-view or others: give --policy-view to sets that were made so, "
             "and to no other"
         )
-    segmenter, segmenter_story = _segmenter(folder, sets, plan, progress)
+    segmenter, segmenter_story = _load_or_train_segmenter(folder, sets, plan, progress)
     train, validation = (
         collect_evidence(folder, sets, part, segmenter, progress=progress) for part in ("train", "validation")
     )
@@ -77,26 +78,26 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     readers: tuple[TemporalNetwork, ...] = ()
     if plan.readers:
         data = temporal_data(collect_sequences(folder, sets, "train", segmenter), train.rows)
-        readers, held = cross_fit(
+        readers, log_odds = cross_fit(
             folder, data, count=plan.readers, epochs=plan.reader_epochs, seed=plan.seed, progress=progress
         )
-        train = with_readings(train, held)
-        validation = _read(folder, sets, "validation", segmenter, readers, validation)
+        train = with_readings(train, log_odds)
+        validation = _add_readings(folder, sets, "validation", segmenter, readers, validation)
     questions = fit_all(train, validation, plan.trees, plan.seed, progress=progress)
     low, high = np.quantile(train.evidence[train.clean], (0.05, 0.95), axis=0).astype(np.float32)
     recorded = [
         load_frames(path, row.sha256).shape for path, manifest in sets for row in rows_of(manifest, ["train"])
         if row.sha256 == row.root
     ]
-    found = [shape[0] for shape in recorded]
-    lengths = (-(-2 * min(found) // 3), 3 * max(found) // 2)
+    num_frames = [shape[0] for shape in recorded]
+    lengths = (-(-2 * min(num_frames) // 3), 3 * max(num_frames) // 2)
     story = {
-        "data": [_described(path, manifest) for path, manifest in sets], "seed": plan.seed,
+        "data": [_describe_set(path, manifest) for path, manifest in sets], "seed": plan.seed,
         "fitted": {"train": len(train.rows), "validation": len(validation.rows)},
         "segmenter": segmenter_story, "trees": vars(plan.trees), "reader_epochs": plan.reader_epochs,
         "tasks": sorted({row.origin.task for row in train.rows}),
         "cameras": sorted({row.origin.camera.split()[0] for row in train.rows}),
-        "validation": {target: measured(questions, target, validation) for target in TARGETS},
+        "validation": {target: measure_target(questions, target, validation) for target in TARGETS},
         "conformal": {target: conformal_limits(questions, target, validation) for target in (*COMPONENTS, TC)},
     }
     known = fit_familiarity(train, validation)
@@ -110,40 +111,41 @@ def collect_evidence(
     folder: Path, sets: Sets, part: Part, segmenter: Segmenter, readers: Sequence[TemporalNetwork] = (), *,
     progress: bool = True,
 ) -> Examples:
-    """Evidence of every clip of a part of all sets, that of readers in the end; kept in `folder` per set."""
+    """Evidence of every clip of a part of all sets, with the readers' answers last; cached in `folder` per set."""
     names: tuple[str, ...] = ()
-    found, rows = [], []
+    values, rows = [], []
     for path, manifest in sets:
         chosen = rows_of(manifest, [part])
         if not chosen:
             continue
-        with np.load(_measured(folder, path, manifest, part, segmenter, progress)[0], allow_pickle=False) as arrays:
+        with np.load(_measure_part(folder, path, manifest, part, segmenter, progress)[0], allow_pickle=False) as arrays:
             names = tuple(str(name) for name in arrays["names"])
-            found.append(arrays["values"])
+            values.append(arrays["values"])
         rows += chosen
-    examples = Examples(names, np.concatenate(found) if found else np.zeros((0, 0), np.float32), rows)
-    return _read(folder, sets, part, segmenter, readers, examples) if readers and rows else examples
+    examples = Examples(names, np.concatenate(values) if values else np.zeros((0, 0), np.float32), rows)
+    return _add_readings(folder, sets, part, segmenter, readers, examples) if readers and rows else examples
 
 
 def collect_sequences(folder: Path, sets: Sets, part: Part, segmenter: Segmenter) -> list[ObjectSequence]:
-    """What a reader reads of every clip of a part of all sets, whose evidence has been collected."""
-    found = []
+    """The object sequence of every clip of a part of all sets; collect_evidence must have run before."""
+    collected = []
     for path, manifest in sets:
         if rows_of(manifest, [part]):
-            with np.load(_measured(folder, path, manifest, part, segmenter, False)[1], allow_pickle=False) as arrays:
+            _, file = _measure_part(folder, path, manifest, part, segmenter, False)
+            with np.load(file, allow_pickle=False) as arrays:
                 ends = np.cumsum(arrays["lengths"])[:-1]
                 both = (np.split(arrays[name], ends) for name in ("crops", "numbers"))
-                found += [ObjectSequence(*pair) for pair in zip(*both, strict=True)]
-    return found
+                collected += [ObjectSequence(*pair) for pair in zip(*both, strict=True)]
+    return collected
 
 
 def with_readings(examples: Examples, log_odds: FloatArray) -> Examples:
-    """The examples with what the readers answer, (N, K), as their last numbers."""
+    """The examples with the readers' log-odds (N, K) as their last evidence."""
     evidence = np.concatenate([examples.evidence, log_odds], 1)
     return Examples(examples.names + reading_names(), evidence, examples.rows)
 
 
-def _read(
+def _add_readings(
     folder: Path, sets: Sets, part: Part, segmenter: Segmenter, readers: Sequence[TemporalNetwork], examples: Examples
 ) -> Examples:
     sequences = collect_sequences(folder, sets, part, segmenter)
@@ -151,24 +153,24 @@ def _read(
     return with_readings(examples, np.array(answers, np.float32))
 
 
-def _measured(
+def _measure_part(
     folder: Path, path: Path, manifest: Manifest, part: Part, segmenter: Segmenter, progress: bool
 ) -> tuple[Path, Path]:
-    """Evidence and sequences of the clips of a part of a set, in files that are made where they are missing."""
+    """Paths of the evidence and the sequences of a set's part, which are measured where the files are missing."""
     chosen = rows_of(manifest, [part])
     key = _key(chosen, segmenter)
     evidence, sequences = (folder / f"{name}-{key}.npz" for name in ("evidence", "sequences"))
     if not evidence.exists() or not sequences.exists():
         name = f"evidence of {path.name} {part}"
         clips = tqdm(set_clips([(path, manifest)], [part]), name, len(chosen), disable=not progress)
-        found = [measured_clip(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
+        measurements = [measure_clip(segmenter, c.frames, c.task.reference_frame, c.task.instruction) for c in clips]
         _keep(
-            sequences, lengths=np.array([len(sequence.crops) for _, sequence in found]),
-            crops=np.concatenate([sequence.crops for _, sequence in found]),
-            numbers=np.concatenate([sequence.numbers for _, sequence in found]),
+            sequences, lengths=np.array([len(sequence.crops) for _, sequence in measurements]),
+            crops=np.concatenate([sequence.crops for _, sequence in measurements]),
+            numbers=np.concatenate([sequence.numbers for _, sequence in measurements]),
         )
-        values = np.array([list(numbers.values()) for numbers, _ in found], np.float32)
-        _keep(evidence, names=np.array(list(found[0][0])), values=values)
+        values = np.array([list(numbers.values()) for numbers, _ in measurements], np.float32)
+        _keep(evidence, names=np.array(list(measurements[0][0])), values=values)
     return evidence, sequences
 
 
@@ -179,21 +181,23 @@ def _keep(path: Path, **arrays: NDArray[Any]) -> None:
 
 
 def _key(rows: Sequence[ManifestRow], segmenter: Segmenter) -> str:
-    """Of clips, their reference frames, what instructions are made of, weights and code."""
+    """Hash of the clips, their reference frames and instructions, the segmenter's weights and the code."""
     shown = "".join(f"{row.sha256} {row.root} {row.origin.task} {row.origin.object_id}\n" for row in rows)
-    return hashlib.sha256(shown.encode() + _state(segmenter) + _sources()).hexdigest()[:16]
+    return hashlib.sha256(shown.encode() + _weights_digest(segmenter) + _code_digest()).hexdigest()[:16]
 
 
-def _segmenter(folder: Path, sets: Sets, plan: JudgePlan, progress: bool) -> tuple[Segmenter, dict[str, Any]]:
-    """Train the segmenter, or take up the one that lies there; and say how it was made. Weights are float16's."""
+def _load_or_train_segmenter(
+    folder: Path, sets: Sets, plan: JudgePlan, progress: bool
+) -> tuple[Segmenter, dict[str, Any]]:
+    """Load the segmenter of the folder, or train it; return it and how it was trained. Weights are of float16."""
     path = folder / SEGMENTER
     if not path.exists():
         images, masks = segmentation_data(set_clips(sets, ["train"]), plan.seed)
         model = train_segmenter(images, masks, num_steps=plan.segmenter_steps, seed=plan.seed, progress=progress)
-        held = segmentation_data(set_clips(sets, ["validation"]), plan.seed)
+        validation = segmentation_data(set_clips(sets, ["validation"]), plan.seed)
         story = {
             "sets": [str(folder.name) for folder, _ in sets], "pictures": len(images), "steps": plan.segmenter_steps,
-            "seed": plan.seed, "overlap": {name: round(value, 4) for name, value in overlaps(model, *held).items()},
+            "seed": plan.seed, "overlap": {name: round(iou, 4) for name, iou in overlaps(model, *validation).items()},
         }
         write_atomic(path.with_suffix(".json"), (json.dumps(story, indent=1) + "\n").encode())
         write_atomic(path, save({name: tensor.half() for name, tensor in model.state_dict().items()}))
@@ -203,17 +207,17 @@ def _segmenter(folder: Path, sets: Sets, plan: JudgePlan, progress: bool) -> tup
     return segmenter.eval().requires_grad_(False), story
 
 
-def _described(path: Path, manifest: Manifest) -> dict[str, Any]:
+def _describe_set(path: Path, manifest: Manifest) -> dict[str, Any]:
     parts = {part: sum(row.part == part for row in manifest.rows) for part in ("train", "validation", "test")}
     return {"set": path.name, "manifest_sha256": hashlib.sha256(to_bytes(manifest)).hexdigest(), "clips": parts}
 
 
-def _state(segmenter: Segmenter) -> bytes:
+def _weights_digest(segmenter: Segmenter) -> bytes:
     return hashlib.sha256(save(dict(segmenter.state_dict()))).digest()
 
 
-def _sources() -> bytes:
-    """Of the code that computes evidence: a changed number is another number."""
+def _code_digest() -> bytes:
+    """Hash of the code that computes evidence."""
     folder = Path(str(wm_nodes.judge.evidence.__path__[0]))
     others = ("__init__", "head", "trees", "window")
     files = (path for path in sorted(folder.glob("*.py")) if path.stem not in others)

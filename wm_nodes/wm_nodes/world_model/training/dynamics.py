@@ -80,7 +80,7 @@ def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEp
         states=torch.from_numpy(episodes.states),
         actions=torch.from_numpy(episodes.actions),
         success=torch.from_numpy(episodes.success),
-        truth=torch.from_numpy(probe_targets(episodes.ground_truth)),
+        truth=torch.from_numpy(probe_targets(episodes.ground_truth, episodes.tasks[0])),
         step_mask=torch.from_numpy(episodes.step_mask),
     )
 

@@ -30,7 +30,7 @@ def train_position_probe(
     """
     height, width = episodes.images.shape[2:4]
     images = episodes.images.reshape(-1, height, width, 3)
-    truth = probe_targets(episodes.ground_truth.reshape(len(images), -1))
+    truth = probe_targets(episodes.ground_truth.reshape(len(images), -1), episodes.tasks[0])
     frames = np.flatnonzero(episodes.frame_mask.reshape(-1) & np.isfinite(truth).all(-1))
     if not len(frames):
         raise ValueError("no recorded frame has ground truth; the judge's probe needs simulator episodes")

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import LoopSettings, TrainingLoop
@@ -19,8 +20,6 @@ from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.dynamics import HUBER_DELTA, LatentEpisodes, done_losses, token_weights
 from wm_nodes.world_model.training.tokenizer import probe_loss
 
-DEMONSTRATORS = ("expert", "hover")
-"""Behaviours without noise. Golden trajectories must have one best future: the mean of many is blurred."""
 STEPS_AFTER_SUCCESS = 2
 
 
@@ -38,7 +37,7 @@ def train_text_model(
     """
     rows = golden_rows(episodes)
     if not len(rows):
-        raise ValueError(f"no successful episode of {' or '.join(DEMONSTRATORS)} to learn goals from; collect more")
+        raise ValueError(f"no successful episode of {' or '.join(demonstrators())} to learn goals from; collect more")
     settings = config.world_model
     model = TextModel(
         settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
@@ -82,21 +81,20 @@ def train_text_model(
     return model, metrics
 
 
+def demonstrators() -> tuple[str, ...]:
+    """Behaviours without noise. Golden trajectories must have one best future: the mean of many is blurred."""
+    return tuple(sorted({get_task(name).demonstrator for name in task_names()}))
+
+
 def golden_rows(episodes: EpisodeArrays) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
     """(R, 3): episode, task, steps to learn from, for every noiseless episode that succeeds at a task."""
     rows = []
     for episode, behaviour in enumerate(episodes.behaviours):
-        if behaviour not in DEMONSTRATORS:
-            continue
-        for task in range(len(episodes.tasks)):
+        for task, name in enumerate(episodes.tasks):
             wins = np.flatnonzero(episodes.success[episode, :, task])
-            if len(wins) and wins[0] > 0 and _is_meant(behaviour, episodes.tasks[task]):
+            if len(wins) and wins[0] > 0 and behaviour == get_task(name).demonstrator:
                 rows.append((episode, task, min(int(wins[0]) + STEPS_AFTER_SUCCESS, int(episodes.lengths[episode]))))
     return np.array(rows, np.int64).reshape(-1, 3)
-
-
-def _is_meant(behaviour: str, task: str) -> bool:
-    return (behaviour == "hover") == (task == "reach")
 
 
 def _rollout(

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import get_task
 from wm_nodes.core.seeding import numpy_stream, torch_stream
-from wm_nodes.core.specs import GROUND_TRUTH_NAMES
 from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import LoopSettings, TrainingLoop
@@ -42,7 +42,7 @@ def train_tokenizer(
     height, width = episodes.images.shape[2:4]
     frames = np.flatnonzero(episodes.frame_mask)
     images = episodes.images.reshape(-1, height, width, 3)
-    truth = probe_targets(episodes.ground_truth.reshape(len(images), -1))
+    truth = probe_targets(episodes.ground_truth.reshape(len(images), -1), episodes.tasks[0])
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(numpy_stream(seed, "tokenizer_init").integers(2**31))
         codec = Tokenizer(settings, height, width)
@@ -88,9 +88,11 @@ def foreground_weight(pixels_B3HW: Tensor, background_3HW: Tensor, extra: float)
     return 1 + extra * contrast.clamp(max=1)
 
 
-def probe_targets(ground_truth: FloatArray) -> FloatArray:
-    """The values of PROBE_NAMES (..., P), in m, out of ground truth in the order of GROUND_TRUTH_NAMES."""
-    return np.ascontiguousarray(ground_truth[..., [GROUND_TRUTH_NAMES.index(name) for name in PROBE_NAMES]])
+def probe_targets(ground_truth: FloatArray, task: str) -> FloatArray:
+    """The values of PROBE_NAMES (..., P), in m, out of a task's ground truth; NaN where the task has no such value."""
+    names = get_task(task).ground_truth_names
+    unknown = np.full(ground_truth.shape[:-1], np.nan, np.float32)
+    return np.stack([ground_truth[..., names.index(n)] if n in names else unknown for n in PROBE_NAMES], -1)
 
 
 def probe_loss(tokenizer: Tokenizer, probed_BP: Tensor, targets_BP: Tensor) -> Tensor:

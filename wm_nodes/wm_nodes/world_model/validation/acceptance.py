@@ -1,4 +1,4 @@
-"""Does this world model deserve that a policy is trained in it? Judged on held-out real episodes before any update
+"""Whether a world model passes acceptance: measured on held-out real episodes, before a policy is trained in it
 (RS-12).
 
 The numbers come from rollout_evaluation: recorded actions rolled out open-loop from recorded first frames. Positions
@@ -14,13 +14,12 @@ import numpy as np
 from rich.table import Table
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import get_task
 from wm_nodes.core.statistics import newcombe_difference
 from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.reports.console_table import make_table
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
-
-CONTACT_FREE = ("reach",)
-"""Tasks that are not about moving an object: only the tool is judged."""
 
 MORE_TRAINING = (
     "train longer (world_model.num_iterations) or on more episodes near contact (data.num_episodes, data.behaviours)"
@@ -73,20 +72,15 @@ class AcceptanceReport:
     def table(self) -> Table:
         """The criteria for the terminal; remedies where they failed."""
         words = "passed" if self.passed else "FAILED"
-        table = Table(
-            title=f"gate {words}: {self.task}, {self.episodes} held-out real episodes",
-            caption="\n".join(self.notes) or None,
-        )
-        table.add_column("criterion")
-        table.add_column("value", justify="right")
-        table.add_column("must be")
-        table.add_column("")
+        rows = []
         for row in self.criteria:
             limit = "" if row.threshold is None else f" {row.threshold:g}"
             value = f"{row.value:.3f}" if math.isfinite(row.value) else "undefined"
             mark = "[green]passed" if row.passed else f"[red]failed[/]: {row.remedy}"
-            table.add_row(row.name, value, row.rule + limit, mark)
-        return table
+            rows.append((row.name, value, row.rule + limit, mark))
+        title = f"acceptance {words}: {self.task}, {self.episodes} held-out real episodes"
+        columns, caption = ("criterion", "value", "must be", ""), "\n".join(self.notes) or None
+        return make_table(title, columns, rows, left=("criterion", "must be", ""), caption=caption)
 
 
 def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> dict[str, float]:
@@ -125,7 +119,7 @@ def criteria_of(
     real: tuple[int, int] | None,
 ) -> tuple[tuple[Criterion, ...], tuple[str, ...]]:
     """Criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model."""
-    gate, task = config.gate, config.task
+    limits, task = config.acceptance, config.task
     notes = [
         f"Errors are those of the full horizon over those of copying the first frame; the object's over the episodes "
         f"in which it moved more than {100 * MOVED_M:g} cm; the probe alone errs by "
@@ -133,20 +127,20 @@ def criteria_of(
         f"{_at(metrics, 'tool_floor_cm', num_steps):.2f} cm (tool) on real frames."
     ]
     criteria = []
-    if task in CONTACT_FREE:
+    if not get_task(task).moves_object:
         notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
     else:
         ratio = _at(metrics, "object_moved_ratio", num_steps)
-        criteria.append(_below(f"object error / copying, step {num_steps}", ratio, gate.object_error_ratio))
+        criteria.append(_below(f"object error / copying, step {num_steps}", ratio, limits.object_error_ratio))
     ratio = _at(metrics, "tool_ratio", num_steps)
-    criteria.append(_below(f"tool error / copying, step {num_steps}", ratio, gate.tool_error_ratio))
+    criteria.append(_below(f"tool error / copying, step {num_steps}", ratio, limits.tool_error_ratio))
     for kind, threshold, remedy in (
-        ("precision", gate.done_precision, MORE_NEAR_MISSES), ("recall", gate.done_recall, MORE_SUCCESSES),
+        ("precision", limits.done_precision, MORE_NEAR_MISSES), ("recall", limits.done_recall, MORE_SUCCESSES),
     ):
         value = float(metrics[f"done_{task}_{kind}"])
         criteria.append(Criterion(f"done {kind} on rollouts", value, threshold, ">=", value >= threshold, remedy))
-    if not gate.require_success_agreement:
-        notes.append("Agreement of imagined and real success was not asked for (gate.require_success_agreement).")
+    if not limits.require_success_agreement:
+        notes.append("Agreement of imagined and real success was not asked for (acceptance.require_success_agreement).")
     elif imagined is None or real is None:
         notes.append("Agreement of imagined and real success was not judged: no policy was measured in both.")
     else:

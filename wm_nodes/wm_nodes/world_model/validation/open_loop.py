@@ -1,4 +1,4 @@
-"""Does the action model deserve to be trained in? Open-loop rollouts of held-out episodes against what really happened.
+"""Open-loop rollouts of held-out episodes by the action model, against what really happened.
 
 Shapes: E episodes, T steps, S tokens, D values per token, J tasks, P probed values (PROBE_NAMES).
 
@@ -98,7 +98,7 @@ def evaluate_rollouts(
     successful when the signal exceeds `threshold` anywhere, against success anywhere in the recording.
     """
     imagined = imagine_episodes(tokenizer, model, episodes)
-    truth = probe_targets(episodes.ground_truth)
+    truth = probe_targets(episodes.ground_truth, episodes.tasks[0])
     read = probe.read if probe else partial(_read_frames, tokenizer)
     real, told = read(episodes.images), read(imagined.frames)
     moved = np.linalg.norm(truth[:, -1, OBJECT] - truth[:, 0, OBJECT], axis=-1) > MOVED_M

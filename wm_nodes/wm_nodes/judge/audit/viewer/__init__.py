@@ -17,14 +17,14 @@ from typing import Any
 from urllib.parse import quote
 
 from wm_nodes.core.files import write_atomic
-from wm_nodes.judge.agent.levels import settled
+from wm_nodes.judge.agent.levels import settle
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import GATED, PLANNING, Read, Verdict
 from wm_nodes.judge.audit.labels import FORMAT, HACK
 from wm_nodes.judge.audit.log import AuditError
 from wm_nodes.judge.audit.media import FOLDER
 from wm_nodes.judge.audit.reading import Record, RecordedEvaluation
-from wm_nodes.judge.audit.sampling import Chosen, Sample
+from wm_nodes.judge.audit.sampling import Sample, SampledClip
 from wm_nodes.judge.decisions import OVERALL, decisions_of
 
 FILE_NAME = "view.html"
@@ -39,14 +39,14 @@ def write_view(
         AuditError: an evaluation has no verdict, or the sample is of another log.
     """
     path = Path(path)
-    chosen = {one.evaluation: one for one in sample.chosen} if sample else {}
-    clips = [_clip(record, evaluation, chosen.get(evaluation.number)) for evaluation in evaluations]
+    chosen = {clip.evaluation: clip for clip in sample.chosen} if sample else {}
+    clips = [_describe_clip(record, evaluation, chosen.get(evaluation.number)) for evaluation in evaluations]
     names = [[clip["evaluation"], clip["audit_id"]] for clip in clips]
     data = {
         "format": FORMAT, "head": record.head,
         "page": hashlib.sha256(json.dumps(names).encode()).hexdigest()[:16],
         "media": quote(os.path.relpath(record.folder / FOLDER, path.parent)), "hack": HACK,
-        "rubrics": {version: _words(rubric) for version, rubric in record.rubrics.items()}, "clips": clips,
+        "rubrics": {version: _describe_rubric(rubric) for version, rubric in record.rubrics.items()}, "clips": clips,
     }
     write_atomic(path, page(f"audit of {record.folder.resolve().name}", data).encode())
     return path
@@ -54,10 +54,10 @@ def write_view(
 
 def page(title: str, data: Mapping[str, Any]) -> str:
     """The page. data: JSON values; what the script reads."""
-    style, script = (_part(name) for name in ("viewer.css", "viewer.js"))
+    style, script = (_read_part(name) for name in ("viewer.css", "viewer.js"))
     policy = (
-        f"default-src 'none'; img-src 'self' file:; style-src {_allowed(style)}; script-src {_allowed(script)}; "
-        "base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; img-src 'self' file:; style-src {_source_expression(style)}; "
+        f"script-src {_source_expression(script)}; base-uri 'none'; form-action 'none'"
     )
     text = json.dumps(data, allow_nan=False)
     for character in "<>&\u2028\u2029":
@@ -71,16 +71,16 @@ def page(title: str, data: Mapping[str, Any]) -> str:
     )
 
 
-def _allowed(text: str) -> str:
+def _source_expression(text: str) -> str:
     """The source expression of a content security policy that lets just this text in."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _part(name: str) -> str:
+def _read_part(name: str) -> str:
     return (resources.files("wm_nodes.judge.audit.viewer") / name).read_text()
 
 
-def _words(rubric: Rubric) -> dict[str, Any]:
+def _describe_rubric(rubric: Rubric) -> dict[str, Any]:
     """What each row means, in the order of the page."""
     entries = [(PLANNING, rubric.planning)]
     rows = [{"name": name, "stage": "PLAN", "question": e.question, "levels": list(e.levels)} for name, e in entries]
@@ -99,7 +99,7 @@ def _words(rubric: Rubric) -> dict[str, Any]:
     return {"rows": [*rows, whole], "thresholds": {str(stage): rubric.stages[stage].threshold for stage in GATED}}
 
 
-def _clip(record: Record, evaluation: RecordedEvaluation, chosen: Chosen | None) -> dict[str, Any]:
+def _describe_clip(record: Record, evaluation: RecordedEvaluation, chosen: SampledClip | None) -> dict[str, Any]:
     verdict = evaluation.verdict
     if verdict is None or (chosen is not None and chosen.audit_id != verdict.audit_id):
         raise AuditError(f"evaluation {evaluation.number} has no verdict, or the sample is of another log")
@@ -120,7 +120,7 @@ def _clip(record: Record, evaluation: RecordedEvaluation, chosen: Chosen | None)
             {"stage": str(s.stage), "status": str(s.status), "s": _number(s.s), "passed": s.passed, "veto": s.vetoed_by}
             for s in verdict.stages
         ],
-        "rows": _rows(evaluation, verdict, record.rubric(evaluation)),
+        "rows": _describe_rows(evaluation, verdict, record.rubric(evaluation)),
         "reflections": [
             {"triggers": list(second.triggers), "changes": [
                 {"component": c.component, "before": _number(c.before), "after": _number(c.after), "reason": c.reason,
@@ -133,7 +133,7 @@ def _clip(record: Record, evaluation: RecordedEvaluation, chosen: Chosen | None)
     }
 
 
-def _rows(evaluation: RecordedEvaluation, verdict: Verdict, rubric: Rubric) -> dict[str, Any]:
+def _describe_rows(evaluation: RecordedEvaluation, verdict: Verdict, rubric: Rubric) -> dict[str, Any]:
     """What the judge says of each row: value (True, False, a level, None), why, and the votes behind it."""
     decisions = decisions_of(verdict)
     asked = [(ask.stage, read) for ask in evaluation.asks for read in ask.reads]
@@ -143,23 +143,23 @@ def _rows(evaluation: RecordedEvaluation, verdict: Verdict, rubric: Rubric) -> d
     rows[PLANNING] = {
         "value": decisions[PLANNING].value if PLANNING in decisions else None, "why": plan.reason if plan else "",
         "decided_by": f"focus: {', '.join(plan.focus) or 'none'}" if plan else "", "frames": [],
-        "votes": [_vote(read) for read in planning],
+        "votes": [_describe_vote(read) for read in planning],
     }
     for score in (score for stage in verdict.stages for score in stage.components):
         rows[score.component] = {
             "value": decisions[score.component].value if score.component in decisions else None,
             "s": _number(score.s), "p_fail": _number(score.p_fail), "margin": _number(score.margin),
             "why": score.evidence_text, "decided_by": score.decided_by, "reason": score.reason,
-            "frames": list(score.frames_cited), "votes": [_vote(read) for read in score.votes],
+            "frames": list(score.frames_cited), "votes": [_describe_vote(read) for read in score.votes],
         }
     for flag in verdict.hack_flags:
         reads = [read for stage, read in asked if stage == "HACK" and read.component == flag.pattern]
-        looks = [settled([read], rubric.voting.min_label_mass) for read in reads]
+        looks = [settle([read], rubric.voting.min_label_mass) for read in reads]
         rows[HACK + flag.pattern] = {
             "value": not flag.confirmed, "p_fail": _number(flag.p_present), "why": flag.evidence_text,
             "decided_by": "confirmed by a second read" if flag.confirmed else "not confirmed",
             "reason": "; ".join(look.reason for look in looks if look.reason), "frames": [],
-            "votes": [_vote(read) for read in reads],
+            "votes": [_describe_vote(read) for read in reads],
         }
     rows[OVERALL] = {
         "value": decisions[OVERALL].value if OVERALL in decisions else None, "why": "", "decided_by": "all gates",
@@ -168,7 +168,7 @@ def _rows(evaluation: RecordedEvaluation, verdict: Verdict, rubric: Rubric) -> d
     return rows
 
 
-def _vote(read: Read) -> dict[str, Any]:
+def _describe_vote(read: Read) -> dict[str, Any]:
     return {
         "index": read.vote.index, "kind": read.source, "polarity": read.vote.polarity, "status": str(read.status),
         "levels": [_number(p) for p in read.levels], "mass": _number(read.label_mass), "why": read.evidence_text,

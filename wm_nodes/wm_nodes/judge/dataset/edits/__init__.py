@@ -32,8 +32,16 @@ from wm_nodes.judge.dataset.edits.manifest import (
     to_bytes,
 )
 from wm_nodes.judge.dataset.edits.planning import planning_level
-from wm_nodes.judge.dataset.edits.recipes import RECIPES, Recipe, StateEdit, apply, edit_states, recipes_sha, rendered
-from wm_nodes.judge.dataset.edits.truth import TASK_RULES, TaskRule, failed_physics, recorded, tc_level
+from wm_nodes.judge.dataset.edits.recipes import (
+    RECIPES,
+    Recipe,
+    StateEdit,
+    apply,
+    edit_states,
+    label_rendered,
+    recipes_sha,
+)
+from wm_nodes.judge.dataset.edits.truth import failed_physics, recorded, tc_level
 
 __all__ = [
     "BACKGROUND",
@@ -44,7 +52,6 @@ __all__ = [
     "RECIPES",
     "ROBOT",
     "SPLITS",
-    "TASK_RULES",
     "TC",
     "ClipTruth",
     "Division",
@@ -59,19 +66,18 @@ __all__ = [
     "SceneStates",
     "SourceClip",
     "StateEdit",
-    "TaskRule",
     "apply",
     "children",
     "edit_states",
     "failed_physics",
     "from_bytes",
+    "label_rendered",
     "manifest_of",
     "planning_level",
     "prevalence",
     "recipes_sha",
     "recorded",
     "regenerate",
-    "rendered",
     "replay",
     "stacks",
     "tc_level",

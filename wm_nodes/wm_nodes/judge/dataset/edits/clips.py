@@ -68,8 +68,8 @@ class SceneStates:
             "poses": (num_frames, max(1, things), 7), "scales": (num_frames, things, 3), "half_sizes_m": (things, 3),
             "contact": (num_frames,), "goal": (num_frames, 3),
         }
-        found = {name: getattr(self, name) for name in wanted} | {f"flags[{n}]": v for n, v in self.flags.items()}
-        for name, values in found.items():
+        arrays = {name: getattr(self, name) for name in wanted} | {f"flags[{n}]": v for n, v in self.flags.items()}
+        for name, values in arrays.items():
             shape, dtype = wanted.get(name, (num_frames,)), bool if name[:5] in ("conta", "flags") else np.float32
             if values.shape != shape or values.dtype != dtype:
                 raise ValueError(

@@ -54,8 +54,8 @@ def children(
         on_defect = recipe.on_defect and severity == "fail"
         try:
             if on_defect and defect is None:
-                defect = _defective(parent, seed, redraw)
-            child = edited(defect if on_defect and defect else parent, recipe.name, severity, seed, redraw)
+                defect = _make_defect(parent, seed, redraw)
+            child = apply_edit(defect if on_defect and defect else parent, recipe.name, severity, seed, redraw)
         except NotApplicableError as reason:
             if skipped is not None:
                 skipped[f"{recipe.name} {severity}: {reason}"] += 1
@@ -80,18 +80,18 @@ def stacks(
     for index in range(count):
         rng = numpy_stream(seed, f"adversarial_stack/{parent.sha256}/{index}")
         try:
-            clip = _defective(parent, int(rng.integers(2**31)), redraw) if index % 2 else parent
+            clip = _make_defect(parent, int(rng.integers(2**31)), redraw) if index % 2 else parent
         except NotApplicableError as reason:
             if skipped is not None:
                 skipped[f"stack: {reason}"] += 1
             continue
-        clip = _stacked(clip, rng)
+        clip = _stack(clip, rng)
         if clip.sha256 not in seen:
             seen.add(clip.sha256)
             yield clip
 
 
-def _stacked(clip: LabelledClip, rng: np.random.Generator) -> LabelledClip:
+def _stack(clip: LabelledClip, rng: np.random.Generator) -> LabelledClip:
     """The clip with as many mild edits as `rng` draws, or as apply to it."""
     missing, touched = 1 + rng.integers(MOST_STACKED), set[Component]()
     for place in rng.permutation(len(FRAME_RECIPES)):
@@ -107,7 +107,7 @@ def _stacked(clip: LabelledClip, rng: np.random.Generator) -> LabelledClip:
     return clip
 
 
-def edited(parent: LabelledClip, name: str, severity: Severity, seed: int, redraw: Redraw | None) -> LabelledClip:
+def apply_edit(parent: LabelledClip, name: str, severity: Severity, seed: int, redraw: Redraw | None) -> LabelledClip:
     """Apply one recipe of any kind.
 
     Raises:
@@ -124,15 +124,15 @@ def replay(root: LabelledClip, edits: Sequence[Edit], redraw: Redraw | None) -> 
     """The clip that a chain of edits makes of its recorded clip."""
     clip = root
     for edit in edits:
-        clip = edited(clip, edit.recipe, edit.severity, edit.seed, redraw)
+        clip = apply_edit(clip, edit.recipe, edit.severity, edit.seed, redraw)
     return clip
 
 
-def _defective(parent: LabelledClip, seed: int, redraw: Redraw | None) -> LabelledClip:
+def _make_defect(parent: LabelledClip, seed: int, redraw: Redraw | None) -> LabelledClip:
     """A child in which physics fails, by a recipe drawn by the seed."""
     for index in numpy_stream(seed, f"adversarial_defect/{parent.sha256}").permutation(len(STATE_RECIPES)):
         try:
-            return edited(parent, STATE_RECIPES[index], "fail", seed, redraw)
+            return apply_edit(parent, STATE_RECIPES[index], "fail", seed, redraw)
         except NotApplicableError:
             continue
     raise NotApplicableError("no state recipe makes a physical defect of this clip, so there is none to hide")

@@ -117,8 +117,8 @@ def prevalence(rows: Sequence[ManifestRow]) -> Prevalence:
         known = [{**row.labels.passed, "overall": row.labels.overall} for row in chosen]
         counts[name] = {}
         for component in (*COMPONENTS, TC, "overall"):
-            found = Counter(passed.get(component) for passed in known)
-            counts[name][component] = {"pass": found[True], "fail": found[False], "unknown": found[None]}
+            outcomes = Counter(passed.get(component) for passed in known)
+            counts[name][component] = {"pass": outcomes[True], "fail": outcomes[False], "unknown": outcomes[None]}
     return counts
 
 
@@ -139,7 +139,7 @@ def check(manifest: Manifest) -> None:
     if [row.sha256 for row in manifest.rows] != sorted(by_sha):
         raise ManifestError("the clips are not in order of their hashes, or one is there twice; build the set again")
     for row in manifest.rows:
-        if (row.part, row.split) != _place(row.origin, row.edits, row.labels, manifest.division):
+        if (row.part, row.split) != _part_and_split(row.origin, row.edits, row.labels, manifest.division):
             raise ManifestError(f"clip {row.sha256[:12]} is not of {row.part}, {row.split}; build the set again")
         root = by_sha.get(row.root)
         if root is None or root.edits:
@@ -173,7 +173,7 @@ def from_bytes(data: bytes) -> Manifest:
             raise ManifestError(f"the manifest has format {header.get('format')!r}, not {FORMAT!r}; build it again")
         if (len(lines), _sha(lines)) != (header["clips"], header["clips_sha256"]):
             raise ManifestError(f"the manifest is damaged: {len(lines)} clips of another hash than it says; restore it")
-        division = Division(**{name: _tupled(value) for name, value in header["division"].items()})
+        division = Division(**{name: _as_tuple(value) for name, value in header["division"].items()})
         manifest = Manifest(division, tuple(_read_row(json.loads(line)) for line in lines), header["recipes"])
         counted = header["prevalence"]
     except ManifestError:
@@ -193,15 +193,15 @@ def regenerate(row: ManifestRow, root: LabelledClip, redraw: Redraw | None) -> L
         ManifestError: other pixels, amounts or labels come out.
     """
     clip = replay(root, row.edits, redraw)
-    found = (root.sha256, clip.sha256, clip.edits, clip.labels)
-    if found != (row.root, row.sha256, row.edits, row.labels):
+    description = (root.sha256, clip.sha256, clip.edits, clip.labels)
+    if description != (row.root, row.sha256, row.edits, row.labels):
         raise ManifestError(
             f"clip {row.sha256[:12]} ({_chain(row)}) came out as {clip.sha256[:12]}: another renderer or recorded clip"
         )
     return clip
 
 
-def _place(origin: Origin, edits: Sequence[Edit], labels: ClipTruth, division: Division) -> tuple[Part, Split]:
+def _part_and_split(origin: Origin, edits: Sequence[Edit], labels: ClipTruth, division: Division) -> tuple[Part, Split]:
     hacked = any(edit.severity == "fail" and get_recipe(edit.recipe).pattern for edit in edits)
     if hacked != (labels.pattern is not None):
         raise ManifestError(f"label {labels.pattern!r} does not fit the recipes {[edit.recipe for edit in edits]}")
@@ -210,7 +210,7 @@ def _place(origin: Origin, edits: Sequence[Edit], labels: ClipTruth, division: D
 
 def _row(clip: LabelledClip, division: Division) -> ManifestRow:
     origin = clip.clip.origin
-    part, split = _place(origin, clip.edits, clip.labels, division)
+    part, split = _part_and_split(origin, clip.edits, clip.labels, division)
     return ManifestRow(clip.sha256, clip.root, origin, clip.edits, clip.labels, part, split)
 
 
@@ -238,7 +238,7 @@ def _read_row(values: dict[str, Any]) -> ManifestRow:
     return ManifestRow(origin=Origin(**values.pop("origin")), edits=edits, labels=labels, **values)
 
 
-def _tupled(value: Any) -> Any:
+def _as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 

@@ -25,7 +25,7 @@ MIN_PULL_M = 0.01
 
 def ghost_motion(states: SceneStates, share: float, rng: np.random.Generator) -> SceneStates:
     """The object follows its path while the robot stays home, for that share of the robot's motion."""
-    _moved(states)
+    _check_moved(states)
     stay = np.float32(share)
     home = states.at(np.zeros(len(states), np.intp))
     return replace(
@@ -38,14 +38,14 @@ def ghost_motion(states: SceneStates, share: float, rng: np.random.Generator) ->
 
 def pass_through(states: SceneStates, share: float, rng: np.random.Generator) -> SceneStates:
     """The robot keeps its path, the object that share of its place at the start: the robot goes through it."""
-    _moved(states)
+    _check_moved(states)
     stay = np.float32(share)
-    return _placed(states, (1 - stay) * states.thing + stay * states.thing[:1])
+    return _place_thing(states, (1 - stay) * states.thing + stay * states.thing[:1])
 
 
 def early_motion(states: SceneStates, frames: float, rng: np.random.Generator) -> SceneStates:
     """The object leads the contact by so many frames, a fraction by interpolation."""
-    _moved(states)
+    _check_moved(states)
     if not states.contact.any() or states.contact[: round(frames) + 1].any():
         raise NotApplicableError(f"no first contact after frame {round(frames)}: the object cannot lead it")
     times = np.minimum(np.arange(len(states)) + frames, len(states) - 1)
@@ -62,23 +62,23 @@ def early_motion(states: SceneStates, frames: float, rng: np.random.Generator) -
 
 def teleport(states: SceneStates, distance_m: float, rng: np.random.Generator) -> SceneStates:
     """The object is so far to a side at once, from a frame on when nothing touches it."""
-    free = [t for t in range(2, len(states) - 1) if not _touched_around(states, t)]
+    free = [t for t in range(2, len(states) - 1) if not _is_touched_near(states, t)]
     if not free:
         raise NotApplicableError("the object is touched all through the clip")
     angle = rng.uniform(0, 2 * np.pi)
     offset = np.zeros_like(states.thing)
     offset[rng.choice(free) :, :2] = distance_m * np.array([np.cos(angle), np.sin(angle)])
-    return _placed(states, states.thing + offset)
+    return _place_thing(states, states.thing + offset)
 
 
-def sunk(states: SceneStates, depth_m: float, rng: np.random.Generator) -> SceneStates:
+def sink(states: SceneStates, depth_m: float, rng: np.random.Generator) -> SceneStates:
     """The object lies that deep in the table."""
     if np.abs(states.bottom_m).max() > MIN_PULL_M:
         raise NotApplicableError("the object does not lie on the table all through")
-    return _placed(states, states.thing - np.array([0, 0, depth_m], np.float32))
+    return _place_thing(states, states.thing - np.array([0, 0, depth_m], np.float32))
 
 
-def pulled_in(states: SceneStates, share: float, rng: np.random.Generator) -> SceneStates:
+def pull_in(states: SceneStates, share: float, rng: np.random.Generator) -> SceneStates:
     """While it is touched the object is that share of the way inside the tool, and it moves on from there."""
     if not states.contact.any():
         raise NotApplicableError("the object is never touched")
@@ -89,7 +89,7 @@ def pulled_in(states: SceneStates, share: float, rng: np.random.Generator) -> Sc
     frames = np.arange(len(states))
     offset = way[np.clip(frames, first, last)]
     offset[frames < first] = 0
-    return _placed(states, states.thing + offset)
+    return _place_thing(states, states.thing + offset)
 
 
 def stretch(states: SceneStates, share: float, rng: np.random.Generator) -> SceneStates:
@@ -104,7 +104,7 @@ def stretch(states: SceneStates, share: float, rng: np.random.Generator) -> Scen
     scales[:, 0] *= (1 + ramp * (factors - 1)).astype(np.float32)
     lift = states.half_sizes_m[0, 2] * (scales[:, 0, 2] - states.scales[:, 0, 2])
     raised = states.thing + lift[:, None] * np.array([0, 0, 1], np.float32)
-    return replace(_placed(states, raised), scales=scales)
+    return replace(_place_thing(states, raised), scales=scales)
 
 
 def second_copy(states: SceneStates, distance_m: float, rng: np.random.Generator) -> SceneStates:
@@ -126,7 +126,7 @@ def levitation(states: SceneStates, height_m: float, rng: np.random.Generator) -
     if start > len(states) - RAMP_FRAMES - 1:
         raise NotApplicableError("the object is not let go of early enough to rise")
     rise = (_ramp(len(states), start) * height_m).astype(np.float32)
-    return _placed(states, states.thing + rise[:, None] * np.array([0, 0, 1], np.float32))
+    return _place_thing(states, states.thing + rise[:, None] * np.array([0, 0, 1], np.float32))
 
 
 def _ramp(num_frames: int, start: int) -> NDArray[np.float64]:
@@ -134,17 +134,17 @@ def _ramp(num_frames: int, start: int) -> NDArray[np.float64]:
     return np.clip((np.arange(num_frames) - start + 1) / RAMP_FRAMES, 0, 1)
 
 
-def _moved(states: SceneStates) -> None:
+def _check_moved(states: SceneStates) -> None:
     way = float(np.linalg.norm(states.thing - states.thing[:1], axis=1).max())
     if way < MOVED_M:
         raise NotApplicableError(f"the object moves {100 * way:.1f} cm; {100 * MOVED_M:.0f} cm are needed")
 
 
-def _touched_around(states: SceneStates, frame: int) -> bool:
+def _is_touched_near(states: SceneStates, frame: int) -> bool:
     return bool(states.contact[max(0, frame - 2) : frame + 2].any())
 
 
-def _placed(states: SceneStates, centres: FloatArray) -> SceneStates:
+def _place_thing(states: SceneStates, centres: FloatArray) -> SceneStates:
     poses = states.poses.copy()
     poses[:, 0, :3] = centres
     return replace(states, poses=poses)

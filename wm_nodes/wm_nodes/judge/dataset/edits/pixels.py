@@ -22,45 +22,45 @@ SWAP_AT = 1 / 3
 
 def blur_all(clip: SourceClip, sigma_px: float, rng: np.random.Generator) -> SourceClip:
     """Everything out of focus."""
-    return _with(clip, images.blur(_floats(clip), sigma_px))
+    return _with_frames(clip, images.blur(_floats(clip), sigma_px))
 
 
 def expose(clip: SourceClip, gain: float, rng: np.random.Generator) -> SourceClip:
     """Exposure, as a factor of the grey level."""
-    return _with(clip, _floats(clip) * np.float32(gain))
+    return _with_frames(clip, _floats(clip) * np.float32(gain))
 
 
 def drift_hue(clip: SourceClip, degrees: float, rng: np.random.Generator) -> SourceClip:
     """All colours turn, linearly from the first frame to the last."""
     turn = rng.choice([-1.0, 1.0]) * degrees
     shares = np.linspace(0, 1, len(clip))
-    return _with(clip, np.stack([images.turn_hue(f, turn * s) for f, s in zip(_floats(clip), shares)]))
+    return _with_frames(clip, np.stack([images.turn_hue(f, turn * s) for f, s in zip(_floats(clip), shares)]))
 
 
 def flicker(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceClip:
     """The exposure jumps by +- share from frame to frame."""
     signs = np.where((np.arange(len(clip)) + rng.integers(2)) % 2, 1.0, -1.0)
     gains = 1 + share * signs * rng.uniform(0.8, 1.0, len(clip))
-    return _with(clip, _floats(clip) * gains.astype(np.float32)[:, None, None, None])
+    return _with_frames(clip, _floats(clip) * gains.astype(np.float32)[:, None, None, None])
 
 
 def recolour_object(clip: SourceClip, degrees: float, rng: np.random.Generator) -> SourceClip:
     """The object has another colour than the instruction names, all through."""
     turned = images.turn_hue(_floats(clip), rng.choice([-1.0, 1.0]) * degrees)
-    return _only(clip, turned, clip.masks == OBJECT)
+    return _blend(clip, turned, clip.masks == OBJECT)
 
 
 def vanish_object(clip: SourceClip, opacity: float, rng: np.random.Generator) -> SourceClip:
     """The object fades into the scene behind it, from a frame in the first half on."""
     start = int(rng.integers(0, max(1, len(clip) // 2)))
-    mask = _seen(clip, OBJECT)
+    mask = _visible_mask(clip, OBJECT)
     mask[:start] = False
-    return _only(clip, (1 - opacity) * _floats(clip) + opacity * _plate(clip), mask)
+    return _blend(clip, (1 - opacity) * _floats(clip) + opacity * _plate(clip), mask)
 
 
 def copy_object(clip: SourceClip, opacity: float, rng: np.random.Generator) -> SourceClip:
     """A second object beside the first one, from a frame in the first half on."""
-    start, mask = int(rng.integers(0, max(1, len(clip) // 2))), _seen(clip, OBJECT)
+    start, mask = int(rng.integers(0, max(1, len(clip) // 2))), _visible_mask(clip, OBJECT)
     rows, columns = np.nonzero(mask[start:].any(0))
     if not len(rows):
         raise NotApplicableError("the object is hidden to the end: nothing to copy")
@@ -71,25 +71,25 @@ def copy_object(clip: SourceClip, opacity: float, rng: np.random.Generator) -> S
     copied &= clip.masks == BACKGROUND
     if not copied[-1].any():
         raise NotApplicableError("no room for a second object beside the first one")
-    return _only(clip, (1 - opacity) * frames + opacity * np.roll(frames, away, axis=2), copied)
+    return _blend(clip, (1 - opacity) * frames + opacity * np.roll(frames, away, axis=2), copied)
 
 
 def tint_robot(clip: SourceClip, opacity: float, rng: np.random.Generator) -> SourceClip:
     """The arm in another colour. A tint, not a turn of hue: arms are grey."""
     colour = rng.permutation([230.0, 120.0, 20.0]).astype(np.float32)
-    return _only(clip, (1 - opacity) * _floats(clip) + opacity * colour, _seen(clip, ROBOT))
+    return _blend(clip, (1 - opacity) * _floats(clip) + opacity * colour, _visible_mask(clip, ROBOT))
 
 
 def cut_robot(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceClip:
     """A link is missing: a band across the arm shows the scene behind it."""
-    mask = _seen(clip, ROBOT)
+    mask = _visible_mask(clip, ROBOT)
     rows = np.arange(mask.shape[1])[None, :, None]
     seen = mask.any(2)
     top, bottom = seen.argmax(1), mask.shape[1] - 1 - seen[:, ::-1].argmax(1)
     height = np.maximum(1, np.rint(share * (bottom - top + 1)))
     start = top + rng.uniform(0.2, 0.8) * (bottom - top + 1 - height)
     band = (rows >= start[:, None, None]) & (rows < (start + height)[:, None, None])
-    return _only(clip, np.broadcast_to(_plate(clip), clip.frames.shape), mask & band)
+    return _blend(clip, np.broadcast_to(_plate(clip), clip.frames.shape), mask & band)
 
 
 def shift_camera(clip: SourceClip, amount: float, rng: np.random.Generator) -> SourceClip:
@@ -120,31 +120,31 @@ def tremble(clip: SourceClip, amplitude_px: float, rng: np.random.Generator) -> 
 
 def hide_contact(clip: SourceClip, opacity: float, rng: np.random.Generator) -> SourceClip:
     """A dark blurred patch follows the object and covers where it is touched."""
-    return _darkened(clip, opacity, radius_px=0.16 * clip.frames.shape[2], blur_px=3.0)
+    return _darken(clip, opacity, radius_px=0.16 * clip.frames.shape[2], blur_px=3.0)
 
 
 def cast_shadow(clip: SourceClip, opacity: float, rng: np.random.Generator) -> SourceClip:
     """A wide soft shadow follows the object."""
-    return _darkened(clip, opacity, radius_px=0.28 * clip.frames.shape[2], blur_px=0.0)
+    return _darken(clip, opacity, radius_px=0.28 * clip.frames.shape[2], blur_px=0.0)
 
 
 def flatten_background(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceClip:
     """The scene is pulled to its median colour."""
     mask = _scenery(clip)
     median = np.median(clip.frames[mask], axis=0).astype(np.float32)
-    return _only(clip, (1 - share) * _floats(clip) + share * median, mask)
+    return _blend(clip, (1 - share) * _floats(clip) + share * median, mask)
 
 
 def smooth_background(clip: SourceClip, sigma_px: float, rng: np.random.Generator) -> SourceClip:
     """The scene loses its texture."""
-    return _with(clip, images.blur_within(_floats(clip), _scenery(clip), sigma_px))
+    return _with_frames(clip, images.blur_within(_floats(clip), _scenery(clip), sigma_px))
 
 
 def remove_clutter(clip: SourceClip, opacity: float, rng: np.random.Generator) -> SourceClip:
     """Things that have no part in the task fade into the table, from one third of the clip on."""
-    mask = _seen(clip, DISTRACTOR)
+    mask = _visible_mask(clip, DISTRACTOR)
     mask[: _swap_frame(clip)] = False
-    return _only(clip, (1 - opacity) * _floats(clip) + opacity * _plate(clip), mask)
+    return _blend(clip, (1 - opacity) * _floats(clip) + opacity * _plate(clip), mask)
 
 
 def swap_table(clip: SourceClip, levels: float, rng: np.random.Generator) -> SourceClip:
@@ -153,10 +153,10 @@ def swap_table(clip: SourceClip, levels: float, rng: np.random.Generator) -> Sou
     mask[: _swap_frame(clip)] = False
     middle = clip.frames[mask].mean(0)
     signs = np.where((middle + signs * levels > 255) | (middle + signs * levels < 0), -signs, signs)
-    return _only(clip, _floats(clip) + (levels * signs).astype(np.float32), mask)
+    return _blend(clip, _floats(clip) + (levels * signs).astype(np.float32), mask)
 
 
-def _darkened(clip: SourceClip, opacity: float, radius_px: float, blur_px: float) -> SourceClip:
+def _darken(clip: SourceClip, opacity: float, radius_px: float, blur_px: float) -> SourceClip:
     """Pull a disc around the object to a sixth of its brightness, blurred; where the object is hidden, it stays."""
     track, frames = clip.tracks["object"], _floats(clip)
     known = np.flatnonzero(np.isfinite(track).all(1))
@@ -167,7 +167,7 @@ def _darkened(clip: SourceClip, opacity: float, radius_px: float, blur_px: float
     patch = np.stack([images.disc((float(r), float(c)), radius_px, height, width) for r, c in centres])[..., None]
     dark = (images.blur(frames, blur_px) if blur_px else frames) / np.float32(6)
     alpha = np.float32(opacity) * patch
-    return _with(clip, (1 - alpha) * frames + alpha * dark)
+    return _with_frames(clip, (1 - alpha) * frames + alpha * dark)
 
 
 def _warp(clip: SourceClip, moves: list[tuple[float, float, float, float]]) -> SourceClip:
@@ -188,7 +188,7 @@ def _warp(clip: SourceClip, moves: list[tuple[float, float, float, float]]) -> S
             row, column = track[t] - middle - (down, right)
             track[t] = zoom * np.array([cos * row + sin * column, cos * column - sin * row]) + middle
     moved = {name: track.astype(np.float32) for name, track in tracks.items()}
-    return replace(_with(clip, frames), masks=masks, tracks=moved)
+    return replace(_with_frames(clip, frames), masks=masks, tracks=moved)
 
 
 def _drift(clip: SourceClip) -> list[float]:
@@ -203,16 +203,16 @@ def _floats(clip: SourceClip) -> Images:
     return clip.frames.astype(np.float32)
 
 
-def _with(clip: SourceClip, frames: Images) -> SourceClip:
+def _with_frames(clip: SourceClip, frames: Images) -> SourceClip:
     return replace(clip, frames=images.to_uint8(frames))
 
 
-def _only(clip: SourceClip, edited: Images, mask: BoolArray) -> SourceClip:
+def _blend(clip: SourceClip, edited: Images, mask: BoolArray) -> SourceClip:
     """The clip with `edited` pixels where the mask (T, H, W) holds, and its own elsewhere."""
     return replace(clip, frames=np.where(mask[..., None], images.to_uint8(edited), clip.frames))
 
 
-def _seen(clip: SourceClip, label: int) -> BoolArray:
+def _visible_mask(clip: SourceClip, label: int) -> BoolArray:
     mask = np.asarray(clip.masks == label)
     if not mask.any():
         raise NotApplicableError(f"no pixel of the clip has mask value {label}")

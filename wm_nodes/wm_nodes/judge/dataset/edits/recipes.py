@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from wm_nodes.config.tasks import clip_rules
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.dataset.edits import physics, pixels, timing
 from wm_nodes.judge.dataset.edits.clips import (
@@ -26,7 +27,7 @@ from wm_nodes.judge.dataset.edits.clips import (
     Severity,
     SourceClip,
 )
-from wm_nodes.judge.dataset.edits.truth import failed_physics, task_rule, tc_level
+from wm_nodes.judge.dataset.edits.truth import failed_physics, tc_level
 
 REVISION = 2
 """Counted up whenever code changes what a recipe draws or what truth.py says; recipes_sha sees ranges by itself."""
@@ -119,8 +120,8 @@ _ALL = (
            pattern="physics"),
     Recipe("teleport", "S", physics.teleport, (0.0015, 0.003), (0.045, 0.06), "m", ("interaction",),
            pattern="physics"),
-    Recipe("sunk", "S", physics.sunk, (0.001, 0.002), (0.014, 0.02), "m", ("geometry",), pattern="physics"),
-    Recipe("pulled_in", "S", physics.pulled_in, (0.02, 0.06), (0.65, 0.85), "of the way", ("geometry",),
+    Recipe("sunk", "S", physics.sink, (0.001, 0.002), (0.014, 0.02), "m", ("geometry",), pattern="physics"),
+    Recipe("pulled_in", "S", physics.pull_in, (0.02, 0.06), (0.65, 0.85), "of the way", ("geometry",),
            ("interaction",), pattern="physics"),
     Recipe("stretch", "S", physics.stretch, (0.02, 0.05), (0.5, 0.9), "of the size", ("deformation",),
            ("geometry",), pattern="physics"),
@@ -158,7 +159,7 @@ def apply(parent: LabelledClip, name: str, severity: Severity, seed: int) -> Lab
     if recipe.kind == "S":
         raise ValueError(f"recipe {name!r} edits states; use edit_states, render them, then rendered")
     amount, rng = _draw_amount(parent, recipe, severity, seed)
-    return _child(parent, recipe.edit(parent.clip, amount, rng), Edit(name, severity, seed, amount))
+    return _make_child(parent, recipe.edit(parent.clip, amount, rng), Edit(name, severity, seed, amount))
 
 
 def edit_states(parent: LabelledClip, name: str, severity: Severity, seed: int) -> StateEdit:
@@ -178,13 +179,13 @@ def edit_states(parent: LabelledClip, name: str, severity: Severity, seed: int) 
     return StateEdit(recipe.edit(parent.clip.states, amount, rng), Edit(name, severity, seed, amount))
 
 
-def rendered(parent: LabelledClip, edited: StateEdit, clip: SourceClip) -> LabelledClip:
+def label_rendered(parent: LabelledClip, edited: StateEdit, clip: SourceClip) -> LabelledClip:
     """Label the clip that was rendered from edited states.
 
     Raises:
         NotApplicableError: as apply.
     """
-    return _child(parent, clip, edited.edit)
+    return _make_child(parent, clip, edited.edit)
 
 
 def get_recipe(name: str) -> Recipe:
@@ -198,7 +199,7 @@ def _draw_amount(
 ) -> tuple[float, np.random.Generator]:
     if severity not in ("mild", "fail"):
         raise ValueError(f"severity must be mild or fail, got {severity!r}")
-    if severity == "fail" and recipe.on_defect and not _physics_fails(parent.labels):
+    if severity == "fail" and recipe.on_defect and not _has_physics_failure(parent.labels):
         raise NotApplicableError(f"{recipe.name} hides a physical defect, this clip has none; use a state recipe first")
     if severity == "fail" and recipe.on_success and parent.labels.tc_level < 4:
         raise NotApplicableError(f"{recipe.name} needs a completed task, got level {parent.labels.tc_level}")
@@ -207,22 +208,22 @@ def _draw_amount(
     return float(rng.uniform(low, high)), rng
 
 
-def _child(parent: LabelledClip, clip: SourceClip, edit: Edit) -> LabelledClip:
+def _make_child(parent: LabelledClip, clip: SourceClip, edit: Edit) -> LabelledClip:
     recipe = get_recipe(edit.recipe)
-    labels = _failed(parent, clip, recipe) if edit.severity == "fail" else _unchanged(parent, clip)
+    labels = _failed_labels(parent, clip, recipe) if edit.severity == "fail" else _unchanged_labels(parent, clip)
     child = LabelledClip(clip, labels, (*parent.edits, edit), parent.root)
     if child.sha256 == parent.sha256 or (edit.severity == "fail" and seen_share(parent.clip, clip) < SEEN_SHARE):
         raise NotApplicableError(f"{recipe.name} ({edit.severity}) changes nothing in this clip that could be seen")
     return child
 
 
-def _failed(parent: LabelledClip, clip: SourceClip, recipe: Recipe) -> ClipTruth:
+def _failed_labels(parent: LabelledClip, clip: SourceClip, recipe: Recipe) -> ClipTruth:
     """Forced failures; what the states break besides; what nobody can tell is left out."""
     components = dict(parent.labels.components)
     if recipe.hides_motion:
         components = {name: passed for name, passed in components.items() if passed or name not in PHYSICS}
     components = {name: passed for name, passed in components.items() if not passed or name not in recipe.unknown}
-    broken = _newly_broken(parent, clip) if recipe.kind == "S" else frozenset[Component]()
+    broken = _new_failures(parent, clip) if recipe.kind == "S" else frozenset[Component]()
     components |= dict.fromkeys((*recipe.fails, *broken), False)
     level = parent.labels.tc_level
     if recipe.kind != "P":  # other states at the end, or other frames
@@ -230,16 +231,16 @@ def _failed(parent: LabelledClip, clip: SourceClip, recipe: Recipe) -> ClipTruth
     return ClipTruth(components, min(level, recipe.tc_cap), recipe.pattern or parent.labels.pattern)
 
 
-def _unchanged(parent: LabelledClip, clip: SourceClip) -> ClipTruth:
+def _unchanged_labels(parent: LabelledClip, clip: SourceClip) -> ClipTruth:
     """The parent's labels, where the end of the clip is still worth the same and no physics broke."""
     if _truth_level(clip) != _truth_level(parent.clip):
         raise NotApplicableError("even a mild edit changes how far the task gets in this clip")
-    if not parent.edits and (fresh := _newly_broken(parent, clip)):
+    if not parent.edits and (fresh := _new_failures(parent, clip)):
         raise NotApplicableError(f"even a mild edit breaks {', '.join(sorted(fresh))} in this clip")
     return parent.labels
 
 
-def _newly_broken(parent: LabelledClip, clip: SourceClip) -> frozenset[Component]:
+def _new_failures(parent: LabelledClip, clip: SourceClip) -> frozenset[Component]:
     """What the parent's states show is in its labels, or it is what the simulator did."""
     return failed_physics(clip.states) - failed_physics(parent.clip.states)
 
@@ -251,8 +252,8 @@ def seen_share(before: SourceClip, after: SourceClip) -> float:
 
 
 def _truth_level(clip: SourceClip) -> int:
-    return tc_level(clip.states, task_rule(clip.origin.task))
+    return tc_level(clip.states, clip_rules(clip.origin.task).label)
 
 
-def _physics_fails(labels: ClipTruth) -> bool:
+def _has_physics_failure(labels: ClipTruth) -> bool:
     return any(labels.components.get(name) is False for name in PHYSICS)

@@ -19,13 +19,13 @@ FROZEN_FROM_PX = 0.5
 def freeze(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceClip:
     """The first frame stands for that share of the clip, then the rest runs faster; share 1 shows nothing else."""
     hold = max(2, round(share * len(clip)))
-    rest = _rounded(np.linspace(0, len(clip) - 1, len(clip) - hold + 1)[1:])
+    rest = _round(np.linspace(0, len(clip) - 1, len(clip) - hold + 1)[1:])
     return clip.at(np.concatenate([np.zeros(hold, np.intp), rest]))
 
 
 def slow(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceClip:
     """The first 1 - share of the motion is stretched over the whole clip."""
-    return clip.at(_rounded(np.linspace(0, (1 - share) * (len(clip) - 1), len(clip))))
+    return clip.at(_round(np.linspace(0, (1 - share) * (len(clip) - 1), len(clip))))
 
 
 def jitter(clip: SourceClip, amplitude_px: float, rng: np.random.Generator) -> SourceClip:
@@ -58,8 +58,8 @@ def drop(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceClip
     count = max(1, round(share * len(clip)))
     peak = int(frame_energy(clip.frames).argmax()) if count > 1 else int(rng.integers(1, len(clip) - 1))
     first = int(np.clip(peak - count // 2, 1, len(clip) - 1 - count))
-    kept = np.delete(np.arange(len(clip)), range(first, first + count))
-    return clip.at(np.append(kept, np.full(count, len(clip) - 1)))
+    order = np.delete(np.arange(len(clip)), range(first, first + count))
+    return clip.at(np.append(order, np.full(count, len(clip) - 1)))
 
 
 def repeat(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceClip:
@@ -70,5 +70,5 @@ def repeat(clip: SourceClip, share: float, rng: np.random.Generator) -> SourceCl
     return clip.at(np.where(frames <= again, frames, frames - count))
 
 
-def _rounded(positions: NDArray[np.float64]) -> Order:
+def _round(positions: NDArray[np.float64]) -> Order:
     return np.rint(positions).astype(np.intp)

@@ -5,12 +5,10 @@ recipe forces labels; failed_physics judges what else an edit of the states brok
 the collision engine: thresholds are what a viewer of the clip could see, all in m per frame. Shapes: T frames.
 """
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.config.tasks import TaskRule, clip_rules
 from wm_nodes.judge.dataset.edits.clips import COMPONENTS, ClipTruth, Component, LabelledClip, SceneStates, SourceClip
 
 SUNK_M = 0.004
@@ -34,41 +32,6 @@ RESHAPED = 0.1
 """A relative change of size beyond this is a deformation failure."""
 CONTACT_FRAMES = 1
 """Contact this many frames before or after explains a motion: contact is sampled once per frame."""
-
-
-@dataclass(frozen=True)
-class TaskRule:
-    """When a task is done, and how far it got before.
-
-    mover: what has to reach the goal. radius_m: how near. above_thing_m: the goal is this far above thing 0, whatever
-    the states' goal is; None: it is the states'. max_lift_m: the thing may be this far above the table at the
-    end, None where it may be anywhere. flags: sub-flags that must hold at the end. half, nearly: progress from which
-    levels 2 and 3 begin; 1 is the edge of the goal. started_m: an approach by this much is level 1.
-    """
-
-    mover: Literal["object", "tool"]
-    radius_m: float
-    above_thing_m: float | None = None
-    max_lift_m: float | None = None
-    flags: tuple[str, ...] = ()
-    half: float = 0.3
-    nearly: float = 0.8
-    started_m: float = 0.03
-
-
-TASK_RULES = {
-    "reach": TaskRule("tool", 0.02, above_thing_m=0.08),
-    "push_cube": TaskRule("object", 0.1, max_lift_m=5e-3),
-    "pull_cube": TaskRule("object", 0.1, max_lift_m=5e-3),
-}
-"""By task of the simulator (environments/maniskill/tasks.py, the same distances)."""
-
-
-def task_rule(task: str) -> TaskRule:
-    """Raises ValueError for a task without a rule."""
-    if task not in TASK_RULES:
-        raise ValueError(f"no rule for task {task!r}; known: {', '.join(TASK_RULES)}; add one to TASK_RULES")
-    return TASK_RULES[task]
 
 
 def tc_level(states: SceneStates, rule: TaskRule) -> int:
@@ -107,7 +70,7 @@ def failed_physics(states: SceneStates) -> frozenset[Component]:
 
 def recorded(clip: SourceClip) -> LabelledClip:
     """A clip drawn straight from the simulator: clean pixels, real physics, task as the states say."""
-    level = tc_level(clip.states, task_rule(clip.origin.task))
+    level = tc_level(clip.states, clip_rules(clip.origin.task).label)
     return LabelledClip(clip, ClipTruth(dict.fromkeys(COMPONENTS, True), level))
 
 

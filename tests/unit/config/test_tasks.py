@@ -1,0 +1,124 @@
+"""Task files: what is shipped, how a file is found, and that no other module knows a task by its name."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import wm_nodes
+from wm_nodes.apps import train_policy
+from wm_nodes.config.load import ConfigError, default_task, load_config
+from wm_nodes.config.tasks import VARIABLE, clip_rules, get_task, model_tasks, task_names
+from wm_nodes.core.specs import simulation_spec
+
+TASKS = ("pull_cube", "push_cube", "reach")
+NAMED_IN = {"launching/scenarios.py", "judge/dataset/build.py", "judge/clip_files.py", "apps/judge_clips.py"}
+"""The default task of launch files, the tasks of a fixed set of clips, and two examples of a line of clips.jsonl."""
+
+
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [
+        ("reach", "ea4d3fba83e312e0b7af747775e87e31129b77f07077e968a7dd4ec437a34ad4"),
+        ("push_cube", "48941cf0cad1ce6ed2d75e31390bb7cc7ba7c678aaef70df89a42643a3e59e3b"),
+        ("pull_cube", "75070b706a6d254ece54844ff11575b1933685732c2c6632e824718ded0e4569"),
+    ],
+)
+def test_a_recorded_specification_of_a_shipped_task_stays_what_it_is(task: str, expected: str) -> None:
+    assert simulation_spec(task, load_config("cpu", {"task": task}).simulation, 1).spec_hash == expected
+
+
+def test_the_shipped_tasks_are_found_and_share_models_as_the_shipped_one_says() -> None:
+    assert task_names() == TASKS and default_task() in TASKS
+    assert model_tasks("reach") == model_tasks("push_cube") == ("reach", "push_cube")
+    assert model_tasks("pull_cube") == ("pull_cube",)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_task_belongs_to_its_model_and_its_shares_and_seeds_are_complete(task: str) -> None:
+    assert task in model_tasks(task) and {model_tasks(other) for other in model_tasks(task)} == {model_tasks(task)}
+    numbers = [policy.number for other in model_tasks(task) for policy in get_task(other).weak_policies]
+    assert len(numbers) == len(set(numbers)) > 0
+    for shares in (clip_rules(task).behaviours, clip_rules(task).policy_behaviours):
+        assert sum(shares.values()) == pytest.approx(1)
+
+
+def test_no_module_but_its_file_knows_a_task_by_its_name() -> None:
+    root = Path(wm_nodes.__file__).parent
+    named = {
+        str(path.relative_to(root)) for path in root.rglob("*.py")
+        if re.search(rf"[\"']({'|'.join(TASKS)})[\"']", path.read_text())
+    }
+    assert {name for name in named if not name.startswith("environments/maniskill/tasks/")} == NAMED_IN
+
+
+def test_a_task_is_read_without_the_simulator() -> None:
+    code = (
+        "import sys; from wm_nodes.config.tasks import get_task, task_names; tasks = [*map(get_task, task_names())]; "
+        "print({'mani_skill', 'sapien', 'mplib', 'torch'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
+
+
+def test_launch_files_list_the_tasks_of_a_further_package(tmp_path: Path) -> None:
+    write_package(tmp_path, "launched_tasks", pour="")
+    code = "from wm_nodes.launching.scenarios import ARGUMENTS; print({a.name: a for a in ARGUMENTS}['task'].choices)"
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True,
+        env={**os.environ, VARIABLE: "launched_tasks", "PYTHONPATH": path},
+    )
+    assert done.stdout == "('pour', 'pull_cube', 'push_cube', 'reach')\n"
+
+
+def test_the_command_line_and_the_settings_name_the_known_tasks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_package(tmp_path, "listed_tasks", stir="", _parts="")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(VARIABLE, " listed_tasks, ")
+    with pytest.raises(ConfigError, match="unknown task 'fly'; choose one of pull_cube, push_cube, reach, stir"):
+        load_config("cpu", {"task": "fly"})
+    with pytest.raises(SystemExit):
+        train_policy._parser().parse_args(["--task", "fly"])
+    assert "stir" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("package", "files", "error"),
+    [
+        ("absent_tasks", None, r"WM_TASKS names 'absent_tasks', no package"),
+        ("empty_tasks", {"blank": "TASK = 1"}, r"blank\.py has no TASK = Task\(\.\.\.\)"),
+        ("double_tasks", {"reach": ""}, r"'reach' is in wm_nodes\.environments\.maniskill\.tasks and in double_tasks"),
+    ],
+)
+def test_a_wrong_task_file_is_one_clear_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, package: str, files: dict[str, str] | None, error: str
+) -> None:
+    if files is not None:
+        write_package(tmp_path, package, **files)
+        monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(VARIABLE, package)
+    with pytest.raises(ValueError, match=error):
+        get_task(next(iter(files or ["blank"])) if package != "double_tasks" else "unheard")
+
+
+def test_a_task_without_rules_for_the_judge_says_what_its_file_lacks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    text = "from dataclasses import replace\n\nfrom wm_nodes.config.tasks import get_task\n\n"
+    write_package(tmp_path, "ruleless_tasks", wave=f"{text}TASK = replace(get_task('reach'), clips=None)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv(VARIABLE, "ruleless_tasks")
+    with pytest.raises(ValueError, match=r"'wave' has no rule to label clips by; give its file clips=ClipRules"):
+        clip_rules("wave")
+
+
+def write_package(folder: Path, name: str, **files: str) -> None:
+    (folder / name).mkdir()
+    for module, text in {"__init__": "", **files}.items():
+        (folder / name / f"{module}.py").write_text(text)

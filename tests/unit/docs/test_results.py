@@ -1,0 +1,399 @@
+"""The tables of the result pages say what the result files and the shipped manifests hold."""
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import pytest
+
+import wm_nodes
+from benchmarks.video_rl.comparison import paired_interval
+from wm_nodes.core.statistics import bootstrap_mean, paired_difference, wilson_interval
+
+ROOT = Path(wm_nodes.__file__).parents[1]
+DOCS, FILES = ROOT / "docs", ROOT / "benchmarks" / "results"
+GUIDES = ("README", "audit", "embedded_judge", "model_refresh", "public_video_models")
+SHIPPED = Path(wm_nodes.__file__).parent / "pretrained"
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+Run = dict[str, Any]
+Rows = Iterator[str]
+
+
+def read(name: str) -> Run:
+    content: Run = json.loads((FILES / name).read_text())
+    return content
+
+
+def runs(name: str) -> dict[str, Run]:
+    """The runs of a .jsonl file by name."""
+    return {run["run"]: run for run in map(json.loads, (FILES / name).read_text().splitlines())}
+
+
+def row(*cells: object) -> str:
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def percent(value: float) -> str:
+    return f"{100 * value:.1f}"
+
+
+def interval(value: float, low: float, high: float, digits: int) -> str:
+    """A difference with its 95 % interval, bold where 0 lies outside."""
+    text = f"{value:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+    return f"**{text}**" if low > 0 or high < 0 else text
+
+
+def share(found: Run, name: str = "accuracy") -> str:
+    return f"{percent(found[name])} [{percent(found['low'])}, {percent(found['high'])}]"
+
+
+# --- policy_rl.md -----------------------------------------------------------------------------------------------
+def study_rows() -> Rows:
+    lines = list(map(json.loads, (FILES / "policy_rl_seed_study.jsonl").read_text().splitlines()))
+    study = {(line["task"], line["arm"], line["seed"]): line for line in lines}
+    for task in ("push_cube", "reach"):
+        seeds = range(5)
+        models = [study[task, "world_model", seed] for seed in seeds]
+        controls = [study.get((task, "simulator", seed)) for seed in seeds]
+        for seed, model, control in zip(seeds, models, controls):
+            yield row(
+                task, seed, *(percent(model[key]["successes"] / 200) for key in ("real_before", "real_after")),
+                points(model["success_before"], model["success_after"]),
+                percent(model["imagined_after"]["successes"] / 256),
+                percent(control["real_after"]["successes"] / 200) if control else "",
+            )
+        before, after = ([x for model in models for x in model[key]] for key in ("success_before", "success_after"))
+        yield row(task, "0-4", percent(mean(before)), percent(mean(after)), points(before, after), "", "")
+        pairs = [(model, control) for model, control in zip(models, controls) if control]
+        in_model = [x for model, _ in pairs for x in model["success_after"]]
+        in_simulator = [x for _, control in pairs for x in control["success_after"]]
+        yield row(task, percent(mean(in_model)), percent(mean(in_simulator)), points(in_model, in_simulator))
+
+
+def points(before: list[bool], after: list[bool]) -> str:
+    found = paired_difference(before, after)
+    return interval(100 * found.difference, 100 * found.low, 100 * found.high, 1)
+
+
+def refresh_rows() -> Rows:
+    run = read("policy_rl_model_refresh.json")
+    for number, part in enumerate(run["rounds"], 1):
+        decision = part.get("verdict") or {}
+        answer = {True: "accepted", False: "refused", None: ""}[decision.get("accepted")]
+        imagined, real = part["imagined"]["successes"], part["real"]["successes"]
+        yield row(number, 8 * number, f"{imagined}/256", f"{real}/200", answer)
+        for check in decision.get("rows", []):
+            if check["name"] == "object error / copying":
+                yield row(number, check["episodes"], f"{check['old']:.3f}", f"{check['new']:.3f}")
+    found = run["paired"]
+    yield interval(100 * found["difference"], 100 * found["low"], 100 * found["high"], 1)
+
+
+# --- video_rl.md ------------------------------------------------------------------------------------------------
+def diversity_rows() -> Rows:
+    seeds = runs("video_rl_diversity.jsonl").values()
+    for arm, base, shared in (
+        ("DynDiff 0.2 sparse, rms", "CPS 0.2", True),
+        ("DynDiff 0.4 gated, rms", "CPS 0.4", True),
+        ("DynDiff 0.2 sparse, rms", "CPS 0.2", False),
+        ("DynDiff 0.6 gated", "CPS 0.6", False),
+        ("DynDiff 0.6 gated", "CPS 0.6", True),
+    ):
+        found = [compared(run["comparisons"], arm, base, shared_noise=shared) for run in seeds]
+        noise = ", ".join(f"{value:.2f}" for value in found[0]["noise_share"])
+        yield row(
+            f"{arm} - {base}", "shared" if shared else "own", noise,
+            *(interval(one["difference"], one["low"], one["high"], 3) for one in found),
+        )
+
+
+def compared(comparisons: list[Run], arm: str, base: str, **more: object) -> Run:
+    wanted = {"arm": arm, "base": base, **more}
+    (found,) = [one for one in comparisons if all(one[key] == value for key, value in wanted.items())]
+    return found
+
+
+def clip_rows() -> Rows:
+    seeds = runs("video_rl_clips.jsonl").values()
+    for arm, base in (("DynDiff 0.2 sparse, rms", "CPS 0.2"), ("DynDiff 0.4 gated, rms", "CPS 0.4")):
+        for shared in (True, False):
+            found = [compared(run["comparisons"], arm, base, shared_noise=shared) for run in seeds]
+            yield row(
+                f"{arm} - {base}", "shared" if shared else "own",
+                *(interval(*one["diversity"], digits=3) for one in found),
+            )
+
+
+def learning_rows() -> Rows:
+    found = read("video_rl_learning.json")["comparisons"]
+    for arm, base in (
+        ("DynDiff 0.6 gated, rms, cps, shared", "CPS 0.46, shared"),
+        ("DynDiff 0.2 sparse, rms, cps, shared", "CPS 0.2, shared"),
+        ("DynDiff 0.6 gated, rms, cps, shared", "CPS 0.6, shared"),
+        ("DynDiff 0.6 gated, rms, cps, window", "CPS 0.6, window"),
+        ("DynDiff 0.6 gated", "CPS 0.6"),
+        ("Flow-GRPO 0.7", "CPS 0.6"),
+        ("CPS 0.6, window", "CPS 0.6, shared"),
+        ("Mix-GRPO 0.7", "CPS 0.6, window"),
+    ):
+        one = compared(found, arm, base)
+        differences = (difference(one, "reward", 3), difference(one, "background", 4))
+        yield row(f"{arm} - {base}", len(one["seeds"]), *differences)
+
+
+def difference(comparison: Run, name: str, digits: int) -> str:
+    found = comparison["differences"][name]
+    return interval(found["mean"], found["low"], found["high"], digits)
+
+
+def clip_learning_rows() -> Rows:
+    found = read("video_rl_clip_learning.json")
+    measures = (("tracking", 3), ("object_cm", 2), ("tool_cm", 2), ("psnr_db", 3))
+    for arm in ("CPS 0.4", "DynDiff 0.6 gated, rms"):
+        trained = [one for one in found["rows"] if one["arm"] == arm]
+        yield row(arm, *(change(trained, name, digits) for name, digits in measures))
+    one = compared(found["comparisons"], "DynDiff 0.6 gated, rms", "CPS 0.4")
+    yield row("difference", *(difference(one, name, digits) for name, digits in measures))
+
+
+def change(trained: list[Run], name: str, digits: int) -> str:
+    found = paired_interval([mean(one["after"][name]) - mean(one["before"][name]) for one in trained])
+    return interval(found.mean, found.low, found.high, digits)
+
+
+def cost_rows() -> Rows:
+    three = runs("video_rl_cost.jsonl").values()
+    for same in zip(*(run["rows"] for run in three)):
+        shares = (one["kl_s"] / (one["forward_s"] + one["kl_s"] + one["backward_s"]) for one in same)
+        kept = f"{same[-1]['bytes'] / 2**20:.2f}"
+        yield row(same[0]["model"], same[0]["anchor"], ", ".join(map(percent, shares)), kept)
+
+
+def rollout_rows() -> Rows:
+    three = runs("video_rl_cost.jsonl").values()
+    for same in zip(*(run["rollouts"] for run in three)):
+        shares = (f"{100 * (one['mask_share'] + one['cache_share']):.2f}" for one in same)
+        yield f"{same[0]['model']}: {', '.join(shares)}"
+
+
+def ablation_rows() -> Rows:
+    for one in read("video_rl_ablations.json")["comparisons"]:
+        values = (difference(one, name, digits) for name, digits in (("reward", 3), ("obeyed", 2), ("background", 4)))
+        yield row(f"{one['arm']} - {one['base']}", *values)
+
+
+def resolution_rows() -> Rows:
+    rows = read("video_rl_resolution.json")["rows"]
+    for shown in ("model", "the model's own size, enlarged", "codec alone", "first frame repeated"):
+        sizes = [one for one in rows if one["shown"] == shown]
+        yield row(shown, *("{:.3f} [{:.3f}, {:.3f}]".format(*bootstrap_mean(one["tracking"], seed=0)) for one in sizes))
+
+
+def hacking_rows() -> Rows:
+    rows = read("video_rl_hacking.json")["rows"]
+    for arm in ("honest reward", "consistency alone", "consistency, frozen anchor"):
+        trained = [one for one in rows if one["arm"] == arm]
+        alarms = sum(bool({"obeyed", "mass"} & set(one["hacked"])) for one in trained)
+        ends = [one["evaluations"][-1] for one in trained]
+        after = (", ".join(f"{end[name]:.2f}" for end in ends) for name in ("consistency", "obeyed", "mass"))
+        yield row(arm, *after, f"{alarms} of 3")
+
+
+# --- judge.md ---------------------------------------------------------------------------------------------------
+def table_rows() -> Rows:
+    for one in runs("judge_table.jsonl")["shipped"]["rows"]:
+        yield row(one["name"], f"{one['paper']:.0f}", one["n"], share(one), percent(one["balanced"]))
+
+
+def pattern_rows() -> Rows:
+    for one in runs("judge_table.jsonl")["shipped"]["patterns"]:
+        rates = (percent(one["false_positives"]), percent(one["best_recall"]))
+        yield row(one["pattern"], one["n"], share(one, "recall"), *rates)
+
+
+def conformal_rows() -> Rows:
+    both = [{one["name"]: one for one in run["rows"]} for run in runs("judge_table.jsonl").values()]
+    for name in ("planning", "PC", "task_completion", "overall"):
+        yield row(name, *(cell for table in both for cell in (table[name]["n"], share(table[name]))))
+
+
+def stacked_rows() -> Rows:
+    table = runs("judge_stacked_edits.jsonl")
+    both = [table[name] for name in ("trained on single edits", "shipped")]
+    for name in ("planning", "PC", "overall"):
+        yield row(name, *(share(one) for run in both for one in run["rows"] if one["name"] == name))
+    physics = [one for run in both for one in run["patterns"] if one["pattern"] == "physics"]
+    yield row("physics flagged", *(share(one, "recall") for one in physics))
+    yield row("false flags", *(percent(one["false_positives"]) for one in physics))
+    yield row("physics at 5 % false positives", *(percent(one["best_recall"]) for one in physics))
+
+
+def efficiency_rows() -> Rows:
+    for one in read("judge_efficiency.json")["compared"]:
+        saved = (f"{100 * one['saved'][name]:.0f}" for name in ("calls", "pixels", "tokens"))
+        gap = one["difference"]
+        yield row(one["against"], one["n"], *saved, interval(*(100 * gap[k] for k in ("difference", "low", "high")), 1))
+
+
+def judge_hacking_rows() -> Rows:
+    found = runs("judge_hacking.jsonl")
+    for clips, names in (
+        ("push and reach, all edits", ("push and reach, all edits", "fresh push and reach, all edits")),
+        ("push and reach, visible edits", ("push and reach, visible edits",)),
+        ("pull, all edits", ("pull, all edits", "fresh pull, all edits")),
+        ("pull, visible edits", ("pull, visible edits",)),
+    ):
+        curves = [curve for name in names for curve in found[name]["curves"]]
+        yield row(clips, *(beaten(curves, reward) for reward in ("agent", "mean score", "pixel similarity")))
+
+
+def beaten(curves: list[Run], reward: str) -> str:
+    """How many searches ended at or above the reward of their clean recording, with Wilson's interval in percent."""
+    chosen = [curve for curve in curves if curve["reward"] == reward]
+    n = sum(curve["searches"] for curve in chosen)
+    wins = sum(round(curve["wins"] * curve["searches"]) for curve in chosen)
+    low, high = wilson_interval(wins, n)
+    return f"{wins} of {n} [{100 * low:.0f}, {100 * high:.0f} %]"
+
+
+def control_rows() -> Rows:
+    rows = {one["name"]: one for one in read("judge_label_control.json")["rows"]}
+    names = ("planning", "VQ", "IF", "PC", "task_completion", "overall")
+    yield row(*(share(rows[name]) for name in names))
+
+
+def imagined_rows() -> Rows:
+    for task, run in runs("judge_imagined_vs_real.jsonl").items():
+        for one in run["agreement"]:
+            judged, quality = f"{one['judged']} of {one['n']}", f"{one['auroc']:.3f}"
+            yield row(task, one["kind"], judged, quality, share(one), percent(one["balanced"]))
+        done = run["done_signal"]
+        quality = f"{done['auroc']:.3f}"
+        yield row(task, "done signal", "200 of 200", quality, percent(done["accuracy"]), percent(done["balanced"]))
+
+
+def policy_camera_rows() -> Rows:
+    for name, run in runs("judge_policy_camera.jsonl").items():
+        planning, physics = run["planning"], run["hack/physics"]
+        n = physics["fails"]
+        found = (of_counts(round(physics[key] * n), n) for key in ("recall_at_5", "flagged"))
+        exact = of_counts(round(planning["level_accuracy"] * planning["n"]), planning["n"])
+        yield row(name, exact, *found, percent(physics["false_flags"]))
+
+
+# --- speed.md ---------------------------------------------------------------------------------------------------
+def speed_summary_rows() -> Rows:
+    for name, run in runs("speed.jsonl").items():
+        low, high = run["graph"]["overhead_95"]
+        ratios = (run["imagined_over_simulator"], run.get("imagined_over_stock_simulator"))
+        yield row(
+            name, f"{run['graph_overhead']:.2f} [{low:.2f}, {high:.2f}]", f"{run['step_growth']:.2f}",
+            f"{run['imagined_steps_per_s']:.0f}", *("" if one is None else f"{one:.1f}" for one in ratios),
+        )
+
+
+def stage_rows() -> Rows:
+    first, second = (runs("speed.jsonl")[name]["stages"] for name in ("full, 1", "full, 2"))
+    for stage in first:
+        yield row(stage, *(f"{stages[stage]['ms']:.1f}" for stages in (first, second)))
+
+
+# --- shipped_models.md ------------------------------------------------------------------------------------------
+def heldout(folder: str) -> Run:
+    metrics: Run = json.loads((SHIPPED / folder / "manifest.json").read_text())["heldout"]
+    return metrics
+
+
+def world_model_rows() -> Rows:
+    found = heldout("table_top_cube")
+    for text, name in (("object that moved, cm", "object_moved"), ("tool, cm", "tool")):
+        yield row(text, *(f"{found[f'{name}_{kind}_cm_h16']:.2f}" for kind in ("rollout", "floor", "copy")))
+    yield row("PSNR, dB", *(f"{found[f'psnr_{kind}_db_h16']:.1f}" for kind in ("rollout", "recon", "copy")))
+
+
+def done_rows() -> Rows:
+    found = heldout("table_top_cube")
+    for task in ("push_cube", "reach"):
+        rates = {name: found[f"done_{task}_{name}"] for name in ("auc", "recall", "real_rate", "imagined_rate")}
+        n = found["episodes"]
+        hits = round(rates["recall"] * rates["real_rate"] * n)
+        shares = (of_counts(hits, round(rates[name] * n)) for name in ("imagined_rate", "real_rate"))
+        yield row(task, f"{rates['auc']:.3f}", *shares)
+
+
+def of_counts(hits: int, n: int) -> str:
+    low, high = wilson_interval(hits, n)
+    return f"{hits} of {n}, {percent(hits / n)} [{percent(low)}, {percent(high)}]"
+
+
+def video_model_rows() -> Rows:
+    found = heldout("table_top_cube/video_model")
+    measures = {"object, cm": ("object_cm", 2), "tool, cm": ("tool_cm", 2), "tracking score": ("tracking", 3)}
+    for text, (name, digits) in {**measures, "PSNR, dB": ("psnr_db", 1)}.items():
+        yield row(text, *(f"{found[key]:.{digits}f}" for key in (name, f"copy_{name}")))
+
+
+def judge_rows() -> Rows:
+    both = [json.loads((SHIPPED / name / "judge.json").read_text()) for name in ("clip_judge", "policy_judge")]
+    for name in ("interaction", "deformation", "geometry", "task_completion", "planning", "hack/physics"):
+        yield row(
+            name,
+            *(
+                f"{one[key]:.3f}" if key == "auroc" else percent(one[key])
+                for judge in both
+                for one in [judge["validation"][name]]
+                for key in ("balanced_accuracy", "auroc")
+            ),
+        )
+
+
+TABLES: dict[str, list[Callable[[], Rows]]] = {
+    "policy_rl": [study_rows, refresh_rows],
+    "video_rl": [
+        diversity_rows, clip_rows, learning_rows, clip_learning_rows, cost_rows, rollout_rows, ablation_rows,
+        resolution_rows, hacking_rows,
+    ],
+    "judge": [
+        table_rows, pattern_rows, conformal_rows, stacked_rows, efficiency_rows, judge_hacking_rows, control_rows,
+        imagined_rows, policy_camera_rows,
+    ],
+    "speed": [speed_summary_rows, stage_rows],
+    "shipped_models": [world_model_rows, done_rows, video_model_rows, judge_rows],
+}
+
+
+@pytest.mark.parametrize(("page", "rows"), [(page, rows) for page in TABLES for rows in TABLES[page]])
+def test_every_row_of_a_table_is_what_its_file_holds(page: str, rows: Callable[[], Rows]) -> None:
+    text = (DOCS / "results" / f"{page}.md").read_text()
+    missing = [expected for expected in rows() if expected not in text]
+    assert not missing
+
+
+def test_every_result_file_is_linked_from_a_page_and_every_relative_link_of_a_document_leads_somewhere() -> None:
+    pages = [*DOCS.glob("*.md"), *DOCS.glob("*/*.md")]
+    targets = {
+        (page, (page.parent / target.split("#")[0]).resolve())
+        for page in pages
+        for target in LINK.findall(page.read_text())
+        if ":" not in target and not target.startswith("#")
+    }
+    assert not [(str(page), str(target)) for page, target in targets if not target.exists()]
+    linked = {target for _, target in targets}
+    assert not [path.name for path in FILES.iterdir() if path.suffix != ".md" and path.resolve() not in linked]
+
+
+def words(*pages: Path) -> int:
+    """Words and numbers of the pages; a table's bars and dashes are none."""
+    return sum(len(re.findall(r"\S*\w\S*", page.read_text())) for page in pages)
+
+
+def test_documents_are_short() -> None:
+    results, guides = sorted((DOCS / "results").glob("*.md")), [DOCS / f"{name}.md" for name in GUIDES]
+    assert not [page.name for page in results if words(page) > 1500]
+    assert words(*results, *guides) <= 7000
+    assert words(DOCS / "audit.md") <= 900
+    assert words(DOCS / "README.md") <= 250
+    assert words(*(DOCS / "adr").glob("*.md")) <= 900

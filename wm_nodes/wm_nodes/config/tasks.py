@@ -1,0 +1,175 @@
+"""What a task is, and where the files of the tasks are found.
+
+A task is one file, <name>.py, with TASK = Task(...). wm_nodes/environments/maniskill/tasks says how to write one. Files
+are found by the name of their package and imported when a task is asked for, so that every layer may ask. Standard
+library only: launch files list the tasks too. Shapes: P simulator ground truth, A action, S state.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import os
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float32]
+
+PACKAGES = ("wm_nodes.environments.maniskill.tasks",)
+VARIABLE = "WM_TASKS"
+"""Environment variable with the names of further packages of task files, separated by commas."""
+
+
+@dataclass(frozen=True)
+class WeakPolicy:
+    """A policy cloned from a few demonstrations, whose noisy episodes a world model learns from too."""
+
+    number: int
+    """Decides the seeds; no two tasks of one world model have the same."""
+    demonstrations: int
+    noise: float
+    """Standard deviation of the exploration noise, normalised action units."""
+
+
+@dataclass(frozen=True)
+class TaskRule:
+    """When a clip shows the task done, and how far it got before."""
+
+    mover: Literal["object", "tool"]
+    """What has to reach the goal."""
+    radius_m: float
+    """How near it has to be."""
+    above_thing_m: float | None = None
+    """The goal is this far above thing 0, whatever the states' goal is; None: it is the states'."""
+    max_lift_m: float | None = None
+    """The thing may be this far above the table at the end; None: anywhere."""
+    flags: tuple[str, ...] = ()
+    """Sub-flags that must hold at the end."""
+    half: float = 0.3
+    nearly: float = 0.8
+    """Progress from which levels 2 and 3 begin; 1 is the edge of the goal."""
+    started_m: float = 0.03
+    """An approach by this much is level 1."""
+
+
+@dataclass(frozen=True)
+class ClipRules:
+    """How the judge's data sets record and label clips of the task."""
+
+    label: TaskRule
+    behaviours: Mapping[str, float]
+    """Shares of the scripted behaviours, seen by the near cameras; they add up to 1."""
+    policy_behaviours: Mapping[str, float]
+    """The same for the policy's camera: more of those who miss, as a policy in training does."""
+    any_height: bool = True
+    """False where the end state depends on the height of the object, which then is always the cube."""
+    any_heading: bool = False
+    """The way from the object to the goal may be turned, see behaviours.turned."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Everything that is known of one task. Its name is that of its file."""
+
+    instruction: str
+    """What the text model and the judge read."""
+    scene: Callable[[], Any]
+    """Returns ManiSkill's environment class, to which scenes.py adds cameras and a plain table top; imports the
+    simulator only when it is called. Tasks with the same function share one scene."""
+    ground_truth_names: tuple[str, ...]
+    """Simulator truth in this order: positions in m, angles in rad, world frame. A world model's probes learn those of
+    PROBE_NAMES (world_model/tokenizer.py) that are among them."""
+    measure: Callable[[Any, Floats | None], Floats]
+    """(ManiSkill environment, ground truth right after the reset or None at the reset) -> ground truth (P,)."""
+    success: Callable[[Floats], NDArray[np.bool_]]
+    """Ground truth (..., P) -> (...,); False where it is NaN."""
+    waypoints: Callable[[Floats], list[Floats]]
+    """Ground truth (P,) -> world tool positions (3,) of a demonstration, which MPLib plans a path through."""
+    script: Callable[[str, Floats, np.random.Generator, float], Callable[[Floats, Floats], Floats]]
+    """(behaviour, ground truth (P,) at the reset, random stream, metres of a full-scale action) -> act(ground truth
+    (P,), state (S,)) -> action (A,) of one scripted episode. Raises ValueError for an unknown behaviour."""
+    clips: ClipRules | None = None
+    """None: the judge's data sets have no clips of this task."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Dotted settings of loop 1 laid over base.yaml, below the preset and the command line; thresholds, and the rubric
+    pack of the judge (judge.rubric) where the task has one."""
+    demonstrator: str = "expert"
+    """The scripted behaviour whose successes teach the text model."""
+    moves_object: bool = True
+    """False: the error of the object is not part of a world model's acceptance, only the tool's."""
+    model_tasks: tuple[str, ...] = ()
+    """The tasks that one world model serves, because they share a scene, this one among them: one done output each,
+    in this order. The last one's episodes are recorded for all. Empty: this task alone."""
+    weak_policies: tuple[WeakPolicy, ...] = ()
+    """Used where data.policy_episodes is not 0."""
+
+
+def task_names() -> tuple[str, ...]:
+    """Every known task, sorted."""
+    return tuple(sorted(_files()))
+
+
+def check_task(name: str) -> str:
+    """Return the name of a known task. Raises ValueError that names the known ones."""
+    if name not in (known := task_names()):
+        raise ValueError(f"unknown task {name!r}; choose one of {', '.join(known)}")
+    return name
+
+
+@functools.cache
+def get_task(name: str) -> Task:
+    """Import the task's file.
+
+    Raises:
+        ValueError: no such task, or its file defines none; names what is known.
+    """
+    module = importlib.import_module(f"{_files()[check_task(name)]}.{name}")
+    task = getattr(module, "TASK", None)
+    if not isinstance(task, Task):
+        raise ValueError(f"{module.__file__} has no TASK = Task(...); see {PACKAGES[0]}")
+    return task
+
+
+def model_tasks(name: str) -> tuple[str, ...]:
+    """The tasks of the world model that serves this one."""
+    return get_task(name).model_tasks or (name,)
+
+
+def success(task: str, ground_truth: Floats) -> NDArray[np.bool_]:
+    """Whether `task` is done in each (..., P) ground truth; False where it is NaN."""
+    return get_task(task).success(ground_truth)
+
+
+def clip_rules(name: str) -> ClipRules:
+    """Raises ValueError for a task of which the judge's data sets have no clips."""
+    rules = get_task(name).clips
+    if rules is None:
+        raise ValueError(f"task {name!r} has no rule to label clips by; give its file clips=ClipRules(...)")
+    return rules
+
+
+def _files() -> dict[str, str]:
+    """Package by task.
+
+    Raises:
+        ValueError: a package is missing, or two have the same task.
+    """
+    found: dict[str, str] = {}
+    for package in (*PACKAGES, *filter(None, (part.strip() for part in os.environ.get(VARIABLE, "").split(",")))):
+        try:
+            folders = importlib.import_module(package).__path__
+        except (ModuleNotFoundError, AttributeError) as error:
+            raise ValueError(f"{VARIABLE} names {package!r}, no package that Python finds; see PYTHONPATH") from error
+        for module in pkgutil.iter_modules(folders):
+            if module.name.startswith("_"):
+                continue
+            if module.name in found:
+                raise ValueError(f"task {module.name!r} is in {found[module.name]} and in {package}; rename one")
+            found[module.name] = package
+    return found

@@ -1,0 +1,256 @@
+"""Settings of loop 2, the post-training of the video model. The numbers live in presets/video/*.yaml, not here."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from wm_nodes.config.schema import (
+    Fraction,
+    JudgeConfig,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    SettingsSection,
+    TaskName,
+)
+
+Anchor = Literal["buffer", "frozen", "lora_off", "moving", "dual"]
+
+
+class FlowMatchingConfig(SettingsSection):
+    num_iterations: PositiveInt
+    learning_rate: PositiveFloat
+    drop: Fraction
+    """Share of videos whose actions and instruction are hidden, for classifier-free guidance."""
+
+
+class VideoModelConfig(SettingsSection):
+    """The embedded video model."""
+
+    codec: Literal["patch", "tokenizer"]
+    """patch: principal components of patches; tokenizer: the frozen tokenizer of the task's shipped world model."""
+    patch: PositiveInt
+    channels: PositiveInt
+    """Codec `patch` only: side of a patch, px, and how many components are kept."""
+    stride: PositiveInt
+    """Recorded steps between two frames."""
+    num_conditioning: NonNegativeInt
+    """Leading frames that are given."""
+    text_dim: NonNegativeInt
+    """Values per hashed word of the instruction."""
+    width: PositiveInt
+    depth: PositiveInt
+    """Of the network."""
+    batch_size: PositiveInt
+    """Clips per training step."""
+    training: FlowMatchingConfig
+
+
+class GroupConfig(SettingsSection):
+    contexts: PositiveInt
+    """Per iteration."""
+    group_size: PositiveInt
+    """Videos of each context."""
+    shared_noise: bool
+    """One initial noise for all videos of a context."""
+
+
+class VideoEvaluationConfig(SettingsSection):
+    """Held-out contexts, one ODE clip each, before, during and after training."""
+
+    contexts: PositiveInt
+    num_steps: PositiveInt
+    """Sampler steps."""
+    every: NonNegativeInt
+    """Buffers between two evaluations of the learner; 0: none."""
+    window: Annotated[int, Field(ge=3)]
+    """Newest evaluations over which training reward and held-out scores are compared, against reward hacking."""
+
+
+class WindowConfig(SettingsSection):
+    """Which sampler steps are stochastic."""
+
+    strategy: Literal["all", "progressive", "random", "decay", "exp_decay", "fast"]
+    """all: every step. Else a window of `size` steps. progressive: it moves on by one every `period` iterations; decay:
+    after fewer iterations the further it is, down to a quarter of the period; exp_decay: the same, exponentially from
+    step 13 on; random: it is drawn anew each iteration; fast: so, in the first half (Flow-GRPO-Fast)."""
+    size: PositiveInt
+    period: PositiveInt
+
+
+class MaskConfig(SettingsSection):
+    """Where the arm dyndiff explores; see video_model/mask.py."""
+
+    m_min: Annotated[float, Field(gt=0, le=1)]
+    """Exploration left where nothing moves; a cell without any has no density. 0.05 is very little."""
+    quantile: Fraction
+    """Cells whose intensity of motion reaches this quantile (q of DD-8) count as dynamic."""
+    combine: Literal["gated", "sparse", "convex", "max"]
+    """How intensity I and sparse prior P become the mask (DD-9). gated: m_min + (1 - m_min) I P, the paper's reading;
+    sparse: m_min + (1 - m_min) P; convex: m_min + (1 - m_min)(a I + (1 - a) P); max: max(m_min, I P)."""
+    convex_share: Fraction
+    """a of `convex`."""
+    channel_norm: Literal["rms", "l1", "max"]
+    """How the channels of a temporal difference become one intensity (DD-7)."""
+    norm: Literal["max", "q99"]
+    """What an intensity is divided by; q99 is the 0.99 quantile, less sensitive to one hot cell."""
+    norm_scope: Literal["sample", "frame"]
+    """Over the whole sample, or per frame (gives still frames full exploration)."""
+    diff: Literal["backward", "central"]
+    """Temporal difference of DD-6."""
+    budget: Literal["literal", "rms", "peak"]
+    """DD-9b. literal: unchanged; rms: its mean square over generated cells becomes 1; peak: over dynamic ones."""
+    time_limit: float
+    """Above this t the mask is 1 everywhere, because the clean estimate says little about motion near pure noise."""
+
+
+class SamplerConfig(SettingsSection):
+    arm: Literal["ode", "cps", "dyndiff", "flow", "dance", "sage"]
+    """flow: Flow-GRPO; dance: DanceGRPO; sage: SAGE-GRPO."""
+    eta: NonNegativeFloat
+    """Noise level; in [0, 1] for cps and dyndiff."""
+    sigma_map: Literal["sin", "linear"]
+    """sigma_base = s sin(pi eta / 2), or eta s."""
+    mask: MaskConfig
+    mask_on: Literal["std", "var", "eta"]
+    """What the mask scales: the standard deviation, its square, or eta."""
+    mask_dtype: Literal["float32", "float16"]
+    """The mask is rounded to it before it is used, so that a stored mask is the used one."""
+
+    @field_validator("eta")
+    @classmethod
+    def _folds(cls, eta: float, info: ValidationInfo) -> float:
+        if info.data.get("arm") in ("cps", "dyndiff") and eta > 1:
+            raise ValueError(f"eta must be in [0, 1] for {info.data['arm']}, whose sine map folds beyond")
+        return eta
+
+
+class RolloutConfig(SettingsSection):
+    """How videos are sampled."""
+
+    num_steps: PositiveInt
+    shift: PositiveFloat
+    """Of the flow times towards the noise; 1: none."""
+    cfg: float
+    """Classifier-free guidance g of v_u + g (v_c - v_u); 1: off."""
+    sampler: SamplerConfig
+    storage_dtype: Literal["float32", "bfloat16"]
+    """Of the kept latents; a state is rounded to it before its log-probability is taken."""
+    noise_store: Literal["zeta", "zeta_bfloat16", "seed"]
+    """What is kept of each step's noise. zeta: all, as large as the latents; zeta_bfloat16: half as large, with a KL of
+    1e-6 at its own anchor; seed: only the seed it was drawn from, needs float32 latents."""
+    micro_batch: PositiveInt
+    """Videos per network call."""
+
+    @field_validator("noise_store")
+    @classmethod
+    def _can_be_drawn_again(cls, noise_store: str, info: ValidationInfo) -> str:
+        if noise_store == "seed" and info.data.get("storage_dtype") != "float32":
+            raise ValueError("seed needs storage_dtype float32: what rounding a state changes cannot be drawn again")
+        return noise_store
+
+
+class AdvantageConfig(SettingsSection):
+    clip: PositiveFloat
+    """Of the normalised advantage."""
+    mix: Literal["reward", "advantage"]
+    """Several rewards are added before they are normalised, or each is normalised and then weighed."""
+    std_scope: Literal["group", "global", "running"]
+    ddof: NonNegativeInt
+    best_of_n: NonNegativeInt
+    """Videos of a group that train, best and worst; 0: all."""
+    floor: NonNegativeFloat
+    """A group with std < floor max(1, |mean|) has no spread."""
+    source: Literal["reward", "win_rate"]
+    """What is normalised; win_rate: Pref-GRPO's share of wins against the others of the group."""
+
+
+class KlConfig(SettingsSection):
+    mode: Literal["mean", "logk2", "logk3", "velocity", "none"]
+    beta: NonNegativeFloat
+    """Weight."""
+    anchor: Anchor
+    """buffer: what sampled; frozen: the model as it was at the start; lora_off: the same with the adapter switched off;
+    moving: the weights of every `moving_updates`-th update; dual: buffer always, and frozen on every `dual_every`-th
+    update."""
+    moving_updates: PositiveInt
+    dual_every: PositiveInt
+
+
+class GrpoConfig(SettingsSection):
+    """The update of the video model's weights."""
+
+    advantage: AdvantageConfig
+    kl: KlConfig
+    trains: Literal["all", "condition"]
+    """Every parameter that asks for a gradient, or those that carry the condition alone."""
+    clip_low: NonNegativeFloat
+    clip_high: NonNegativeFloat
+    """The probability ratio is clipped to [1 - clip_low, 1 + clip_high]."""
+    logprob_weight: Literal["full", "cps", "base"]
+    mask_source: Literal["cached", "recompute"]
+    ratio_norm: bool
+    """Centre the log ratio and scale it by the standard deviation."""
+    equalise: bool
+    """Weigh steps by SAGE's equaliser."""
+    updates_per_buffer: PositiveInt
+    """Optimizer steps on one buffer."""
+    passes: Literal["full", "parts"]
+    """Each optimizer step on the whole buffer, or on its own part of the videos."""
+    step_fraction: Fraction
+    step_select: Literal["random", "first", "tmin"]
+    """Which stochastic steps train. random: this share of them, drawn per video; first: the first ones; tmin:
+    those with t >= step_fraction."""
+    min_s: NonNegativeFloat
+    """Steps that end below this time never train."""
+    cfg: float
+    """Guidance of the training pass."""
+    micro_batch: PositiveInt
+    """Transitions per network call."""
+    learning_rate: NonNegativeFloat
+    weight_decay: NonNegativeFloat
+    max_grad_norm: PositiveFloat
+    ema_decay: Annotated[float, Field(ge=0, lt=1)]
+    """Decay of the average of the weights that is evaluated; 0: none."""
+    max_staleness: NonNegativeInt
+    """Optimizer steps between sampling and training that are still accepted."""
+
+    @model_validator(mode="after")
+    def _one_ratio(self) -> Self:
+        """logprob_weight, mask_source and ratio_norm each say what the ratio is; two of them contradict each other."""
+        others = {"logprob_weight": self.logprob_weight != "full", "ratio_norm": self.ratio_norm}
+        if self.mask_source == "recompute" and any(others.values()):
+            given = ", ".join(f"{name} {getattr(self, name)}" for name, other in others.items() if other)
+            raise ValueError(
+                f"mask_source recompute has the full likelihood (DD-12), got {given}; take logprob_weight full and "
+                "ratio_norm false, or mask_source cached"
+            )
+        if all(others.values()):
+            raise ValueError(
+                f"ratio_norm replaces the weight of the likelihood, got logprob_weight {self.logprob_weight}; take full"
+            )
+        return self
+
+
+class VideoRlConfig(SettingsSection):
+    """Everything of a run of loop 2."""
+
+    seed: NonNegativeInt
+    task: TaskName
+    iterations: NonNegativeInt
+    """Buffers to train on."""
+    data_episodes: PositiveInt
+    """Simulator episodes to train the video model on and to draw contexts from."""
+    context_episodes: PositiveInt
+    """Those of a run whose video model is the shipped one."""
+    rewards: dict[str, float]
+    """Weight of each reward: a score against the recording (video_rl/reference_reward.py), or `agent`, which needs a
+    judge."""
+    judge: JudgeConfig
+    model: VideoModelConfig
+    groups: GroupConfig
+    evaluation: VideoEvaluationConfig
+    window: WindowConfig
+    rollout: RolloutConfig
+    grpo: GrpoConfig

@@ -1,0 +1,24 @@
+"""Pull the cube into the goal disc, towards the robot."""
+
+from dataclasses import replace
+from typing import Any
+
+from wm_nodes.config.tasks import WeakPolicy, clip_rules
+from wm_nodes.environments.maniskill.tasks import push_cube
+
+
+def scene() -> Any:
+    from mani_skill.envs.tasks.tabletop.pull_cube import PullCubeEnv
+
+    return PullCubeEnv
+
+
+TASK = replace(
+    push_cube.TASK,
+    instruction="pull the blue cube into the red target",
+    scene=scene,
+    settings={},
+    model_tasks=(),
+    weak_policies=(WeakPolicy(4, 4, 0.3),),
+    clips=replace(clip_rules("push_cube"), any_heading=False),
+)

@@ -1,0 +1,44 @@
+"""Move the gripper above the cube, in the scene of push_cube."""
+
+import numpy as np
+
+from wm_nodes.config.tasks import ClipRules, Task, TaskRule, WeakPolicy
+from wm_nodes.core.types import BoolArray, FloatArray
+from wm_nodes.environments.maniskill import table_top
+from wm_nodes.environments.maniskill.behaviours import script
+from wm_nodes.environments.maniskill.tasks.push_cube import scene
+
+TOLERANCE_M = 0.02
+
+
+def tool_above_cube(truth: FloatArray) -> BoolArray:
+    gap = truth[..., table_top.TOOL] - table_top.above_cube(truth)
+    return np.asarray(np.linalg.norm(gap, axis=-1) < TOLERANCE_M)
+
+
+def waypoints(truth: FloatArray) -> list[FloatArray]:
+    return [table_top.above_cube(truth)]
+
+
+TASK = Task(
+    instruction="move the gripper above the blue cube",
+    scene=scene,
+    ground_truth_names=table_top.GROUND_TRUTH_NAMES,
+    measure=table_top.measure,
+    success=tool_above_cube,
+    waypoints=waypoints,
+    script=script,
+    # Nine demonstrations leave the policy between about 20 and 50 % in the simulator, depending on the seed.
+    # Threshold 0.4, chosen on training episodes: success within 2 cm is rare there, and at 0.7 a third of it is missed.
+    settings={"sft.num_demonstrations": 9, "reward.success_threshold": 0.4},
+    demonstrator="hover",
+    moves_object=False,
+    model_tasks=("reach", "push_cube"),
+    weak_policies=(WeakPolicy(1, 8, 0.25), WeakPolicy(3, 4, 0.4)),
+    clips=ClipRules(
+        TaskRule("tool", TOLERANCE_M, above_thing_m=table_top.HOVER_HEIGHT_M),
+        behaviours={"hover": 0.6, "hover_noisy": 0.3, "near_miss": 0.1},
+        policy_behaviours={"hover": 0.45, "hover_noisy": 0.3, "near_miss": 0.15, "random": 0.1},
+        any_height=False,
+    ),
+)
