@@ -16,7 +16,7 @@ from wm_msgs.action import Train
 from wm_msgs.msg import ErrorCode, PolicyVersion, RewardBatch, TransitionBatch
 from wm_msgs.srv import EvaluateReward, InferAction, LoadPolicy
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.policy_rl.training_run import weights_uri
+from wm_nodes.policy_rl.training_run import POLICY_FILES
 from wm_nodes.ros import convert
 
 pytestmark = pytest.mark.graph
@@ -84,7 +84,7 @@ def infer(client: Client, bad: bool) -> tuple[Any, str, Any]:
 
 
 def load(client: Client, bad: bool) -> tuple[Any, str, Any]:
-    return LoadPolicy, "policy/load", LoadPolicy.Request(uri="nowhere.safetensors" if bad else weights_uri(1))
+    return LoadPolicy, "policy/load", LoadPolicy.Request(uri="nowhere.safetensors" if bad else POLICY_FILES.uri(1))
 
 
 def evaluate(client: Client, bad: bool) -> tuple[Any, str, Any]:

@@ -5,6 +5,7 @@ import hashlib
 import signal
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,7 @@ from rclpy.parameter import Parameter
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
 from wm_nodes.launching.scenarios import VIDEO_TOPICS
 from wm_nodes.recording import recover
-from wm_nodes.video_model.buffer import concatenate_buffers
+from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.recorded_buffers import read_clips
@@ -155,10 +156,20 @@ def test_cancel_is_answered_at_once_while_the_video_model_hangs_and_leaves_no_go
     loop.assert_undisturbed(loop.train(1))
 
 
+def repeated(buffer: RolloutBuffer, times: int) -> RolloutBuffer:
+    """The videos of a buffer, `times` times."""
+    index = torch.arange(len(buffer)).repeat(times)
+    return replace(
+        buffer, rollout=buffer.rollout.rows(index), condition=buffer.condition.rows(index),
+        group_ids=buffer.group_ids[index], sample_ids=buffer.sample_ids[index], valid=buffer.valid[index],
+        rewards={name: values[index] for name, values in buffer.rewards.items()},
+    )
+
+
 def test_cancel_is_answered_at_once_during_an_update_and_takes_it_back(loop: VideoLoop) -> None:
     done = loop.train(1)
     small = loop.local.buffer(done.iterations, done.iterations)
-    uri, _ = _buffer(loop, "large.safetensors", concatenate_buffers([small] * 150).to_bytes())
+    uri, _ = _buffer(loop, "large.safetensors", repeated(small, 150).to_bytes())
     handle = loop.send(from_buffers=[uri])
     time.sleep(1.5)  # it has read the file, and trains for many times as long
     began = time.monotonic()

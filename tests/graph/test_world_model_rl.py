@@ -35,7 +35,7 @@ from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescor
 from wm_nodes.video_rl.reference_reward import ClipScores, load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
 from wm_nodes.video_rl.train import post_train
-from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, evaluated_uri, version_uri
+from wm_nodes.video_rl.training_run import CHECKPOINT, VIDEO_FILES, VideoRun, evaluated_uri
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -92,7 +92,7 @@ def test_the_graph_gives_the_weights_of_video_rl_train_bit_for_bit(
     for buffer, _ in post_train(run, source, config.iterations):
         frames.append(folder.codec.decode(buffer.rollout.latents))
     run.close()
-    for uri in (version_uri(4), evaluated_uri(4, config)):
+    for uri in (VIDEO_FILES.uri(4), evaluated_uri(4, config)):
         assert (tmp_path / uri).read_bytes() == (run_dir / uri).read_bytes()
 
     with Bag(Path(read_summary(run_dir)["bag"])) as bag:
@@ -213,7 +213,7 @@ def test_training_again_from_the_recording_gives_the_same_weights_and_other_rewa
     assert {name: row["after"] for name, row in read_summary(tmp_path / "same")["scores"].items()} == scores
     other = ["--run-dir", str(tmp_path / "other"), "--set", "rewards.object_cm=-0.1", "--no-tensorboard"]
     assert main(["retrain", str(run_dir), *other]) == 0
-    assert (tmp_path / "other" / version_uri(4)).read_bytes() != live["video_000004.safetensors"]
+    assert (tmp_path / "other" / VIDEO_FILES.uri(4)).read_bytes() != live["video_000004.safetensors"]
     assert read_metrics(tmp_path / "other", "grpo")[0]["reward_mean"] == pytest.approx(
         np.mean(recorded(run_dir)[0].total.numpy() - 0.1 * recorded(run_dir)[0].scores["object_cm"].numpy())
     )
@@ -235,7 +235,7 @@ def test_training_again_names_a_buffer_that_is_gone_or_another_one(
     finally:
         path.write_bytes(data)
     assert main(["retrain", str(run_dir), "--run-dir", str(tmp_path / "b"), "--no-tensorboard"]) == 0  # goes on
-    assert (tmp_path / "b" / version_uri(4)).read_bytes() == (run_dir / version_uri(4)).read_bytes()
+    assert (tmp_path / "b" / VIDEO_FILES.uri(4)).read_bytes() == (run_dir / VIDEO_FILES.uri(4)).read_bytes()
     shutil.move(run_dir / CHECKPOINT, tmp_path / "checkpoint")
     try:
         assert main(["retrain", str(run_dir), "--run-dir", str(tmp_path / "c")]) == 2
@@ -251,7 +251,7 @@ def test_recordings_that_are_named_stand_in_for_new_episodes(run_dir: Path, tmp_
     named = [f"--bags={kept['train'] / 'shard_00000000'}", f"--heldout-bags={kept['heldout'] / 'shard_00500000'}"]
     done = start([*ARGUMENTS, *named, "--run-dir", str(tmp_path / "run")], ros_domain)
     assert done.returncode == 0 and "recordings" in done.stdout, done.stdout + done.stderr
-    assert (tmp_path / "run" / version_uri(4)).read_bytes() == (run_dir / version_uri(4)).read_bytes()
+    assert (tmp_path / "run" / VIDEO_FILES.uri(4)).read_bytes() == (run_dir / VIDEO_FILES.uri(4)).read_bytes()
     assert main(["rescore", str(tmp_path / "run")]) == 0
     other = start([*ARGUMENTS, "--run-dir", str(tmp_path / "run")], ros_domain)
     assert other.returncode == 2 and "begun with another configuration" in " ".join(other.stdout.split())

@@ -25,7 +25,7 @@ from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, rollout_settings
 from wm_nodes.video_rl.train import post_train
-from wm_nodes.video_rl.training_run import version_uri
+from wm_nodes.video_rl.training_run import VIDEO_FILES
 
 EPISODES, STEPS, STRIDE = 4, 4, 2
 ITERATIONS = 1000
@@ -185,7 +185,7 @@ class VideoLoop:
 
     def newest(self, result: TrainVideo.Result) -> bytes:
         """The weights file of a result's version."""
-        return (self.graph.folder / version_uri(result.policy_version)).read_bytes()
+        return (self.graph.folder / VIDEO_FILES.uri(result.policy_version)).read_bytes()
 
     def assert_undisturbed(self, result: TrainVideo.Result) -> None:
         """Assert that the goal finished, with the weights of the loop in this process, bit for bit."""

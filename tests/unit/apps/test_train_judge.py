@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evidence_table import EVIDENCE
 from pushed_box import push_clip, redrawn
 
 from wm_nodes.apps.train_judge import main
 from wm_nodes.judge.dataset.edits import Division, LabelledClip, children, manifest_of, to_bytes
 from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
-from wm_nodes.judge.evidence.definitions import EVIDENCE
 from wm_nodes.judge.evidence.segmentation import Segmenter
 from wm_nodes.judge.training.data import load_sets, rows_of, set_clips
 from wm_nodes.judge.training.segmenter import has_true_masks, overlaps, segmentation_data, train_segmenter
@@ -59,7 +59,7 @@ def test_what_cannot_be_trained_or_measured_is_named(
         assert main([*arguments, *SHORT]) == 2
         return capsys.readouterr().err
 
-    assert "holds no readable judge" in error(str(tmp_path), str(toy_set), "--measure", "test")
+    assert "holds no judge.json" in error(str(tmp_path), str(toy_set), "--measure", "test")
     assert "No such file" in error(str(tmp_path), str(tmp_path / "none"))
     other = write_set(tmp_path / "other", Division(validation=0.3, test=0.0))
     assert "use sets of one division" in error(str(tmp_path), str(toy_set), str(other))

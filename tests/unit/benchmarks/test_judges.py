@@ -344,7 +344,7 @@ def test_the_command_prints_and_writes_the_table(
         (["table", str(folder), "--stages", "PC"], "needs --url http://HOST:PORT/v1 and --model NAME"),
         (["table", str(folder), "--judge", "simulator", "--stages", "PC"], "got --judge simulator"),
         (["comparisons", str(folder), "--url", "http://127.0.0.1:1/v1"], "--model NAME"),
-        (["table", str(folder), "--folder", str(tmp_path)], "holds no readable judge"),
+        (["table", str(folder), "--folder", str(tmp_path)], "holds no judge.json"),
         (["table", str(folder), "--judge", "simulator", "--error", "2"], "got 2.0"),
     ):
         assert main(wrong) == 2

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from evidence_table import EVIDENCE
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import task_names
@@ -15,7 +16,6 @@ from wm_nodes.judge.backends.factory import check_judge, make_judge
 from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, instruction_of
 from wm_nodes.judge.dataset.edits import LabelledClip
 from wm_nodes.judge.dataset.edits.generator import apply_edit
-from wm_nodes.judge.evidence.definitions import EVIDENCE
 from wm_nodes.judge.evidence.head import load_head
 from wm_nodes.judge.evidence.sequence import reading_names
 from wm_nodes.judge.training.heads import CONFORMAL

@@ -54,7 +54,7 @@ def test_cloning_raises_success_and_leaves_critic_and_log_std_alone() -> None:
     start = evaluate(policy, ReachToy(10, 0), 40, 1_000_000).success_rate
     result = train_sft(policy, DEMOS, settings(), 0)
     assert evaluate(policy, ReachToy(10, 0), 40, 1_000_000).success_rate > start + 0.4
-    assert result.final_loss < 0.3 * float(result.losses[0])
+    assert result.losses[-len(result.losses) // 10 :].mean() < 0.3 * float(result.losses[0])
     after = policy.state_dict()
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert all(name.startswith(("actor.", "feature_")) for name in changed)

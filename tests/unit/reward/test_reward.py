@@ -1,14 +1,11 @@
 """Rewards against numbers worked by hand; missing is missing. RS-5, RS-7, RS-8."""
 
-import pickle
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RewardConfig
@@ -22,10 +19,8 @@ from wm_nodes.reward import (
     EndogenousReward,
     RewardInput,
     RuleReward,
-    load_lpips,
     pixel_l1,
 )
-from wm_nodes.reward.lpips import alexnet_layers, vgg16_layers
 
 SIDE_PX = 8
 RANDOM = np.random.default_rng(0)
@@ -175,30 +170,14 @@ def test_wrong_input_is_named() -> None:
         pixel_l1(grey(0), grey(0, 0))
 
 
-@pytest.fixture(scope="module")
-def lpips_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Random weights under torchvision's and lpips' names: safetensors backbone, .pth linear weights."""
-    folder = tmp_path_factory.mktemp("lpips")
-    torch.manual_seed(0)
-    layers = alexnet_layers()
-    save_file(
-        {f"features.{name}": tensor for layer in layers for name, tensor in layer.state_dict().items()},
-        folder / "alexnet-random.safetensors",
-    )
-    channels = (64, 192, 384, 256, 256)
-    linear = {f"lin{i}.model.1.weight": torch.rand(1, size, 1, 1) for i, size in enumerate(channels)}
-    torch.save(linear, folder / "alex.pth")
-    return folder
-
-
-def distances(lpips_folder: Path) -> list[Distance]:
+def distances() -> list[Distance]:
     mean = EncoderDistance(lambda images: images.float().mean((1, 2)), scale=10.0)
-    return [pixel_l1, mean, load_lpips(lpips_folder, "alex")]
+    return [pixel_l1, mean]
 
 
-def test_every_distance_is_zero_for_equal_images_symmetric_and_positive_otherwise(lpips_folder: Path) -> None:
+def test_every_distance_is_zero_for_equal_images_symmetric_and_positive_otherwise() -> None:
     images, others = RANDOM.integers(0, 256, (2, 3, 64, 64, 3), dtype=np.uint8)
-    for distance in distances(lpips_folder):
+    for distance in distances():
         np.testing.assert_array_equal(distance(images, images), np.zeros(3), err_msg=distance.name)
         np.testing.assert_allclose(distance(images, others), distance(others, images), rtol=1e-5)
         assert (distance(images, others) > 0).all() and distance(images, others).dtype == np.float32
@@ -218,36 +197,3 @@ def test_a_calibrated_distance_is_one_on_average_between_starts_and_goals() -> N
     np.testing.assert_allclose(calibrated(grey(0, 0), grey(10, 30)), [0.5, 1.5])
     with pytest.raises(ValueError, match="scale must be finite and > 0, got 0"):
         EncoderDistance.calibrated(encode, grey(0), grey(0))
-
-
-def test_lpips_is_the_formula_of_the_paper_on_the_first_layer(lpips_folder: Path) -> None:
-    images, others = RANDOM.integers(0, 256, (2, 2, 64, 64, 3), dtype=np.uint8)
-    model = load_lpips(lpips_folder, "alex")
-    linear = torch.load(lpips_folder / "alex.pth", weights_only=True)["lin0.model.1.weight"].reshape(-1)
-    model._weights = [linear, *(torch.zeros_like(weight) for weight in model._weights[1:])]
-    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
-    features = []
-    for batch in (images, others):
-        scaled = ((batch / 127.5 - 1 - shift) / scale).transpose(0, 3, 1, 2)
-        maps = model._layers[0](torch.from_numpy(scaled).float()).detach().numpy()
-        features.append(maps / (np.sqrt((maps**2).sum(1, keepdims=True)) + 1e-10))
-    expected = ((features[0] - features[1]) ** 2 * linear.numpy()[None, :, None, None]).sum(1).mean((1, 2))
-    np.testing.assert_allclose(model(images, others), expected, rtol=1e-4)
-
-
-def test_vgg_layers_carry_torchvisions_parameter_names() -> None:
-    names = [name for layer in vgg16_layers() for name, _ in layer.named_parameters() if name.endswith("weight")]
-    assert names == [f"{i}.weight" for i in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)]
-
-
-def test_missing_wrong_and_unsafe_lpips_files_are_refused(lpips_folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="vgg16"):
-        load_lpips(lpips_folder, "vgg")
-    save_file({"features.0.weight": torch.zeros(1)}, tmp_path / "alexnet.safetensors")
-    save_file({"lin0.model.1.weight": torch.zeros(1)}, tmp_path / "lin_alex.safetensors")
-    with pytest.raises(ValueError, match=r"features\.0\.weight in .* has shape \(1,\), expected \(64, 3, 11, 11\)"):
-        load_lpips(tmp_path, "alex")
-    (tmp_path / "alexnet.safetensors").unlink()
-    (tmp_path / "alexnet.pth").write_bytes(pickle.dumps(Path("runs code when read")))
-    with pytest.raises(pickle.UnpicklingError):
-        load_lpips(tmp_path, "alex")

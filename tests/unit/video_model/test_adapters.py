@@ -25,6 +25,7 @@ pytest.importorskip("peft")
 from video_toys import grpo_config, kl_config  # noqa: E402
 
 from wm_nodes.apps.check_video_model import main as doctor  # noqa: E402
+from wm_nodes.core.model_folder import ModelFolderError  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
     Condition,
     RolloutBuffer,
@@ -40,7 +41,6 @@ from wm_nodes.video_model.adapters import (  # noqa: E402
     CosmosVelocity,
     LoadSettings,
     MissingPackageError,
-    ModelFolderError,
     PublicVelocity,
     TextEncoder,
     VideoCodec,

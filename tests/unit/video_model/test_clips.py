@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.load import VIDEO, ConfigError, dump_config, load_video_config, preset_names
+from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.recording.episode_arrays import EpisodeArrays
-from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import NetworkSettings, RolloutSettings, VideoNetwork
 from wm_nodes.video_model.clips import Clips, cut_clips
 from wm_nodes.video_model.codec import PatchCodec
@@ -180,10 +180,10 @@ def make_folder(folder: Path) -> Path:
 def test_a_folder_comes_back_equal_and_a_changed_file_is_refused(tmp_path: Path) -> None:
     folder = load_video_folder(make_folder(tmp_path / "model"))
     assert folder.clip == {"stride": 2, "num_conditioning": 1} and folder.network.settings.text_dim == 4
-    with pytest.raises(WeightsError, match=r"manifest\.json"):
+    with pytest.raises(ModelFolderError, match=r"manifest\.json"):
         load_video_folder(tmp_path)
     data = bytearray((tmp_path / "model" / "network.safetensors").read_bytes())
     data[-1] ^= 1
     (tmp_path / "model" / "network.safetensors").write_bytes(data)
-    with pytest.raises(WeightsError):
+    with pytest.raises(ModelFolderError):
         load_video_folder(tmp_path / "model")

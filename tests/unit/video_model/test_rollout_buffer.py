@@ -29,7 +29,6 @@ from wm_nodes.video_model import (
     RolloutSettings,
     SamplerSettings,
     StepContext,
-    concatenate_buffers,
     config_hash,
     step,
     step_noise,
@@ -283,27 +282,6 @@ def test_a_video_is_valid_while_all_of_its_rewards_are_finite() -> None:
     assert buffer.with_rewards(rewards).valid.tolist() == [True, False, False, True]
     with pytest.raises(RolloutBufferError, match=r"reward a has shape \(3,\), the buffer 4 videos"):
         buffer.with_rewards({"a": torch.zeros(3)})
-
-
-def test_two_halves_make_the_whole_buffer() -> None:
-    settings, model = toy_rollout_settings(), Analytic(swirl)
-    first, second = (
-        toy_buffer(model, settings, groups=1, iteration=0),
-        toy_buffer(model, settings, groups=1, iteration=0),
-    )
-    second = replace(second, group_ids=second.group_ids + 1)
-    whole = concatenate_buffers([first, second])
-    assert len(whole) == 8 and whole.group_ids.tolist() == [0] * 4 + [1] * 4
-    assert whole.rollout.zeta is not None and whole.rollout.zeta.shape[0] == len(whole.rewards["brightness"]) == 8
-    assert torch.equal(whole.rollout.latents[4:], second.rollout.latents)
-    assert_close(whole.rollout.noise_share, first.rollout.noise_share)
-
-
-@pytest.mark.parametrize("changes", [{"policy_version": 9}, {"config_hash": "x" * 64}, {"iteration": 7}])
-def test_parts_of_different_runs_do_not_make_a_buffer(changes: dict[str, object]) -> None:
-    part = toy_buffer(Analytic(swirl), toy_rollout_settings(), groups=1)
-    with pytest.raises(RolloutBufferError, match="do not belong together"):
-        concatenate_buffers([part, replace(part, **changes)])  # type: ignore[arg-type]
 
 
 def test_rows_of_a_condition_are_repeated_in_groups() -> None:

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from wm_nodes.config.load import load_config, load_video_config
+from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.seeding import torch_stream
-from wm_nodes.training.weights import WeightsError
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_model.tokenizer_codec import TokenizerCodec, codec_of_world_model
@@ -67,10 +67,10 @@ def test_beside_its_world_model_the_folder_needs_no_codec_of_its_own(world_model
         codec.tokenizer.background.add_(0.1)
     save_video_folder(folder, codec, network, {"stride": 2}, {"seed": 0})
     (folder / "codec.safetensors").unlink()
-    with pytest.raises(WeightsError, match="made with another tokenizer"):
+    with pytest.raises(ModelFolderError, match="made with another tokenizer"):
         load_video_folder(folder)
     shutil.move(folder, tmp_path / "alone")
-    with pytest.raises(WeightsError, match=r"codec\.safetensors is missing"):
+    with pytest.raises(ModelFolderError, match=r"codec\.safetensors is missing"):
         load_video_folder(tmp_path / "alone")
 
 

@@ -16,7 +16,7 @@ from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl.reference_reward import ClipScores, more_is_better
-from wm_nodes.video_rl.training_run import VideoRun, evaluated_uri, progress, version_uri
+from wm_nodes.video_rl.training_run import VIDEO_FILES, VideoRun, evaluated_uri, progress
 from wm_nodes.video_rl.validation import alarm_text, alarms_of, hacked_now
 
 ROLLOUT = toy_rollout_settings(micro_batch=8)
@@ -155,7 +155,7 @@ def test_averaged_weights_are_scored_and_lie_beside_each_version_that_is_kept(
     names = {path.name for path in (tmp_path / "video_policies").iterdir()}
     assert names == {f"{kind}_00000{version}.safetensors" for kind in ("video", "averaged") for version in (4, 6)}
     own, averaged = tiny_network(seed=1), tiny_network(seed=1)
-    load_weights(own, (tmp_path / version_uri(6)).read_bytes())
+    load_weights(own, (tmp_path / VIDEO_FILES.uri(6)).read_bytes())
     load_weights(averaged, (tmp_path / evaluated_uri(6, settings)).read_bytes())
     for name, value in weights(averaged).items():
         assert torch.equal(value, run.learner.averaged[name]) and torch.equal(value, heldout.seen[-1][name])
@@ -164,7 +164,7 @@ def test_averaged_weights_are_scored_and_lie_beside_each_version_that_is_kept(
 
 
 def test_without_an_average_the_version_itself_is_evaluated_and_no_checkpoint_is_no_progress(tmp_path: Path) -> None:
-    assert evaluated_uri(4, config()) == version_uri(4)
+    assert evaluated_uri(4, config()) == VIDEO_FILES.uri(4)
     assert progress(tmp_path) == (0, 0)
 
 
@@ -188,4 +188,4 @@ def test_a_skipped_buffer_is_counted_in_the_log_and_a_resumed_run_samples_by_the
     assert [line["skipped"] for line in read_metrics(stopped, "grpo")] == [0, 1, 0]
     assert "kl_1" not in read_metrics(stopped, "grpo")[1] and read_metrics(stopped, "grpo")[1]["kept"] == 0
     assert progress(straight) == progress(stopped) == (4, 3)
-    assert (straight / version_uri(4)).read_bytes() == (stopped / version_uri(4)).read_bytes()
+    assert (straight / VIDEO_FILES.uri(4)).read_bytes() == (stopped / VIDEO_FILES.uri(4)).read_bytes()

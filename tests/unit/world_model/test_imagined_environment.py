@@ -11,13 +11,13 @@ from safetensors.torch import load_file, save_file
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.tool_control import next_state
 from wm_nodes.core.types import FloatArray, StepResult
 from wm_nodes.world_model import (
     ActionModel,
     ImaginedEnvironment,
-    ModelFolderError,
     TextModel,
     Tokenizer,
     WorldModels,

@@ -28,7 +28,7 @@ from wm_nodes.world_model.training.dynamics import (
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.text import train_text_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
-from wm_nodes.world_model.validation.open_loop import auc, detection_metrics, evaluate_rollouts, format_rollouts
+from wm_nodes.world_model.validation.open_loop import auc, detection_metrics, evaluate_rollouts
 
 TASKS = ("push_cube", "reach")
 
@@ -205,4 +205,3 @@ def test_rollouts_of_a_trained_model_follow_pushed_objects_better_than_copying_t
     metrics = evaluate_rollouts(tokenizer, model, arrays(32, 10_000), threshold=0.5)
     assert metrics["tool_ratio_h12"] < 0.6
     assert metrics["object_moved_ratio_h12"] < 0.7
-    assert "h12" in format_rollouts(metrics)

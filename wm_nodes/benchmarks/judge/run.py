@@ -4,8 +4,8 @@ import asyncio
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -123,11 +123,6 @@ async def judge_rows(
         for row in rows:
             group.create_task(judge_row(row))
     return [fresh[row.sha256] for row in rows]
-
-
-def plain(outcomes: Sequence[Outcome]) -> list[Mapping[str, Any]]:
-    """For --json."""
-    return [asdict(outcome) for outcome in outcomes]
 
 
 def _lines(path: Path) -> Iterator[Outcome]:

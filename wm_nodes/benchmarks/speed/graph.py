@@ -37,7 +37,7 @@ def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, 
     }
     served: dict[str, ParameterValue] = {"backend": "world_model", "model_dir": str(model), "starts_file": str(starts)}
     still: dict[str, ParameterValue] = {
-        "backend": "factory", "backend_factory": "benchmarks.speed.noop_environment:make_still_environment",
+        "backend": "factory", "backend_factory": "benchmarks.speed.noop_environment:make_noop_environment",
     }
     module = "wm_nodes.nodes.environment_node"
     graph_nodes = (

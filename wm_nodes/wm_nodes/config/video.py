@@ -122,7 +122,7 @@ class SamplerConfig(SettingsSection):
     @classmethod
     def _folds(cls, eta: float, info: ValidationInfo) -> float:
         if info.data.get("arm") in ("cps", "dyndiff") and eta > 1:
-            raise ValueError(f"eta must be in [0, 1] for {info.data['arm']}, whose sine map folds beyond")
+            raise ValueError(f"eta must be in [0, 1] for {info.data['arm']}, got {eta}: its sine map folds beyond")
         return eta
 
 

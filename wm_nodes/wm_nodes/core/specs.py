@@ -13,7 +13,6 @@ from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.tasks import get_task
 
 SOURCE_IMAGINED, SOURCE_SIMULATOR, SOURCE_REAL, SOURCE_REPLAY = 0, 1, 2, 3
-SOURCE_NAMES = ("imagined", "simulator", "real", "replay")
 
 POLICY_FIELDS = (
     "height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale", "state_names",

@@ -16,7 +16,6 @@ from wm_nodes.judge.evidence.pictures import pictures_of
 from wm_nodes.judge.evidence.pixels import pixel_evidence
 from wm_nodes.judge.evidence.world_model import MODEL_EVIDENCE, model_evidence
 from wm_nodes.world_model import WorldModels, load_model_folder
-from wm_nodes.world_model.folder import ModelFolderError
 
 
 class ClipEvidence:
@@ -71,7 +70,7 @@ class ClipEvidence:
     def _measure_model(self, clip: ClipRef, task: TaskSpec) -> dict[str, float]:
         try:
             return model_evidence(self._load(), clip.frames, task)
-        except (ValueError, ModelFolderError):  # of other cameras, another task, or without its actions
+        except ValueError:  # of other cameras, another task, or without its actions
             return {}
 
     def _load(self) -> WorldModels:
@@ -83,6 +82,6 @@ class ClipEvidence:
 
 @functools.cache
 def pixel_names() -> frozenset[str]:
-    """The evidence that needs no model; definitions.EVIDENCE says what each is."""
+    """The evidence that needs no model; docs/embedded_judge_evidence.csv says what each is."""
     black = np.zeros((2, 8, 8, 3), np.uint8)
     return frozenset(pixel_evidence(pictures_of(black, black[0])))

@@ -22,10 +22,11 @@ from wm_nodes.judge.service import agent_scores, buffer_jobs, clip_fps
 from wm_nodes.nodes.judge import services
 from wm_nodes.nodes.judge.services import JudgeServices, deadline_of
 from wm_nodes.ros import convert
-from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.worker import Work
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder

@@ -9,14 +9,15 @@ from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
 from wm_nodes.nodes.factories import existing, make_policy
 from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
-from wm_nodes.policy_rl.training_run import weights_uri
+from wm_nodes.policy_rl.training_run import POLICY_FILES
 from wm_nodes.ros import convert
-from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.worker import Work
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
@@ -95,7 +96,7 @@ class EvaluationNode(ManagedNode):
             self._holder.follow(newest, self.run_dir)
         else:
             version = int(goal.policy_version)
-            self._holder.load(read_weights(weights_uri(version), self.run_dir), version)
+            self._holder.load(read_weights(POLICY_FILES.uri(version), self.run_dir), version)
         return self._holder.version
 
     @staticmethod

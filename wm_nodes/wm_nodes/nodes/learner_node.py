@@ -1,9 +1,10 @@
 """learner: asks the policy for rollouts, joins what the graph publishes about them, trains, announces new versions."""
 
-import signal
 import sys
 import time
 import zlib
+from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from sensor_msgs.msg import Image
 
 from wm_msgs.action import Replay, Train
 from wm_msgs.action import Rollout as RolloutAction
-from wm_msgs.msg import EnvSpec, ErrorCode, PolicyVersion, RewardBatch, TransitionBatch
+from wm_msgs.msg import EnvSpec, ErrorCode, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import AGENT
@@ -26,17 +27,16 @@ from wm_nodes.nodes.learner.replay_assembler import ReplayAssembler
 from wm_nodes.nodes.learner.report import LearnerReport
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.nodes.learner.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
+from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
 from wm_nodes.policy_rl.rollouts import Canceled
-from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining, follow, weights_uri
+from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
-from wm_nodes.ros.actions import Work, WorkerAction
-from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import COMMON, Param, read_parameters
-from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost, WireError
-from wm_nodes.training.ranks import Ranks, join
+from wm_nodes.ros.params import COMMON, Param
+from wm_nodes.ros.wire import WireError
+from wm_nodes.ros.worker import Work
+from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import INLINE_LIMIT_BYTES, WeightsError, load_weights
 
 MAX_CHUNK_BYTES = 4 << 20
@@ -63,28 +63,18 @@ PARAMS = (
 )
 
 
-class LearnerNode(ManagedNode):
+class LearnerNode(TrainingNode):
     """Action train; services learner/save, learner/get_weights; publishes policy/version, learner/metrics."""
 
+    inline_limit_bytes = INLINE_LIMIT_BYTES
+
     def __init__(self, ranks: Ranks | None = None, **node_arguments: Any) -> None:
-        super().__init__("learner", PARAMS, **node_arguments)
-        self._ranks = ranks or Ranks()
+        super().__init__(PARAMS, ranks, **node_arguments)
 
     def configure(self) -> None:
         self._config = self.run_config()
-        policy = make_policy(self._config, str(self.param("model_dir")), str(self.param("policy_factory")))
-        if self.param("initial_policy"):
-            path = existing(str(self.param("initial_policy")), "initial_policy")
-            try:
-                load_weights(policy, path.read_bytes())
-            except WeightsError as error:
-                raise ValueError(f"initial_policy {path}: {error}") from None
-        learner = make_learner(policy, self._config, str(self.param("learner_factory")), self._ranks)
-        self._training = PolicyTraining(
-            policy, learner, self.run_dir, resume=bool(self.param("resume")),
-            keep_versions=int(self.param("keep_versions")), metadata={"tokenizer_sha256": policy.encoder.sha256},
-            ranks=self._ranks,
-        )
+        values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
+        self._training = make_run(values, self.run_dir, self.ranks)
         self._report = LearnerReport(self, tensorboard=bool(self.param("tensorboard")))
         self.own(self._report.close)
         self._spec: EnvironmentSpec | None = None
@@ -95,7 +85,6 @@ class LearnerNode(ManagedNode):
         )
         self._joiner, self._reward_name, self._max_episode_steps = RolloutAssembler(), "", 0
         self._replayed = ReplayAssembler(self._withhold)
-        self._versions = self.publish_on("policy/version")
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("env/image", self._on_image)
         self._credit = self.listen("env/transition", self._on_transition, credit=True)
@@ -106,16 +95,12 @@ class LearnerNode(ManagedNode):
         self.own(self._rollouts.destroy)
         self._replay = ActionClient(self, Replay, "replay")
         self.own(self._replay.destroy)
-        self._action = WorkerAction(self, Train, "train", self._train, self._describe)
-        self.own(self._action.destroy)
+        self.serve_training(self._training, Train, "train", "policy/version")
 
     def activate(self) -> None:
-        self._announce()
+        self.announce()
         if self.param("replay_at_start"):
             self._train_from_replay(str(self.param("replay_at_start")))
-
-    def deactivate(self, reason: str) -> None:
-        self._action.stop(reason)
 
     def cleanup(self) -> None:
         if hasattr(self, "_training"):
@@ -144,46 +129,22 @@ class LearnerNode(ManagedNode):
 
     # Training, in a worker thread.
 
-    def _train(self, work: Work) -> Train.Result:
+    def train(self, work: Work, result: Train.Result) -> None:
         goal: Train.Goal = work.request
-        began = time.monotonic()
-        first_samples = self._training.progress.samples
-        result = Train.Result(termination_reason=Train.Result.FINISHED)
-        source: RolloutSource | None = None
-        try:
-            if self._training.ensure_saved():
-                self._announce()
-            source = self._source(work, goal)
+        began, first_samples = time.monotonic(), self._training.progress.samples
+        with closing(self._source(work, goal)) as source:
             for update in range(int(goal.updates)):
                 work.check()
                 if self._over_limit(goal, began, first_samples):
                     result.termination_reason = Train.Result.LIMIT
-                    break
+                    return
                 following = self._next(source, live=not goal.from_bags and not goal.from_replay)
                 if following is None:
                     result.termination_reason = Train.Result.EXHAUSTED if update else Train.Result.FAILED
                     result.message = self._exhausted(goal, update, source.left_out)
-                    break
+                    return
                 self._count_dropped(following[1])
                 self._update(work, goal, update, *following)
-        except PeerLost as error:
-            result.termination_reason, result.message = Train.Result.PEER_LOST, str(error)
-        except TrainingPaused as pause:
-            result.termination_reason, result.message = Train.Result.PAUSED, str(pause)
-        except Canceled:
-            work.check()
-        except (WireError, ValueError, OSError, FloatingPointError) as error:
-            result.termination_reason, result.message = Train.Result.FAILED, str(error)
-        finally:
-            if source is not None:
-                source.close()
-        if result.termination_reason in (Train.Result.PEER_LOST, Train.Result.FAILED, Train.Result.PAUSED):
-            self.say_failed_goal(f"training ended: {result.message}")
-        elif result.message:
-            self.get_logger().warning(f"training ended: {result.message}")
-        else:
-            self.get_logger().info(f"training ended after update {self._training.progress.updates}")
-        return self._fill(result)
 
     def _next(self, source: RolloutSource, *, live: bool) -> tuple[Rollout, DroppedTransitions] | None:
         """The next rollout to train on. One whose episodes the agent could not judge pauses live training, which then
@@ -256,8 +217,11 @@ class LearnerNode(ManagedNode):
         except FloatingPointError as error:
             self._report.nonfinite(self._training.progress, error)
             raise
+        except Canceled:
+            work.check()
+            raise
         self.diagnostics.latency("update", time.perf_counter() - began)
-        self._announce()
+        self.announce()
         samples_per_s = float(rollout.valid_TN.sum()) / max(time.perf_counter() - began, 1e-9)
         progress = self._training.progress
         self._report.updated(progress, metrics, samples_per_s)
@@ -274,28 +238,12 @@ class LearnerNode(ManagedNode):
             )
         )
 
-    def _fill(self, result: Train.Result) -> Train.Result:
+    def fill(self, result: Train.Result) -> Train.Result:
         progress = self._training.progress
         result.policy_version, result.updates, result.samples = progress.version, progress.updates, progress.samples
         result.mean_return, result.success_rate = progress.mean_return, progress.success_rate
-        result.checkpoint_uri = str(self._training.checkpoint.relative_to(self.run_dir))
+        result.checkpoint_uri = self._training.checkpoint
         return result
-
-    def _describe(self, reason: int, text: str) -> Train.Result:
-        return self._fill(Train.Result(termination_reason=reason, message=text))
-
-    # Publishing.
-
-    def _announce(self) -> None:
-        packed, progress = self._training.packed, self._training.progress
-        message = PolicyVersion(
-            version=progress.version, train_step=progress.updates, uri=weights_uri(progress.version),
-            sha256=packed.sha256, size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
-        )
-        message.header.stamp = self.get_clock().now().to_msg()
-        if len(packed.data) <= INLINE_LIMIT_BYTES:
-            message.inline_data = convert.bytes_field(packed.data)
-        self._versions.publish(message)
 
     # Callbacks.
 
@@ -352,10 +300,11 @@ class LearnerNode(ManagedNode):
 
     def _on_save(self, request: SaveCheckpoint.Request, response: SaveCheckpoint.Response) -> SaveCheckpoint.Response:
         try:
-            if self._action.busy:
+            if self.training:
                 raise WireError(ErrorCode.BUSY, "training is running and saves after every update; cancel it or wait")
-            path = self.run_dir / request.uri if request.uri else None
-            response.uri = str(self._training.save_checkpoint(path))
+            path = self.run_dir / (request.uri or self._training.checkpoint)
+            self._training.save_checkpoint(path)
+            response.uri = str(path)
         except WireError as error:
             return convert.fill_error(response, error)
         except OSError as error:
@@ -370,7 +319,8 @@ class LearnerNode(ManagedNode):
                 raise WireError(
                     ErrorCode.OUT_OF_RANGE, f"max_bytes must lie in 1..{MAX_CHUNK_BYTES}, got {request.max_bytes}"
                 )
-            version, data = self._training.weights_of(request.version)
+            version = request.version or self._training.saved_version
+            data = self._training.weights_of(version).data
             if request.offset >= len(data):
                 raise WireError(
                     ErrorCode.OUT_OF_RANGE,
@@ -387,21 +337,25 @@ class LearnerNode(ManagedNode):
         return response
 
 
-def follow_rank_0(ranks: Ranks) -> int:
-    """The process of another rank: reads the learner's parameters, then leaves the graph to rank 0."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    values = read_parameters("learner", (*COMMON, *PARAMS))
-    config = load_config(values["config_file"])
-    policy = make_policy(config, values["model_dir"], values["policy_factory"])
-    learner = make_learner(policy, config, values["learner_factory"], ranks)
-    follow(policy, learner, Path(values["run_dir"]), ranks)
-    return 0
+def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> PolicyTraining:
+    """The run that a node's parameters describe."""
+    config = load_config(str(values["config_file"]))
+    policy = make_policy(config, str(values["model_dir"]), str(values["policy_factory"]))
+    if values["initial_policy"]:
+        path = existing(str(values["initial_policy"]), "initial_policy")
+        try:
+            load_weights(policy, path.read_bytes())
+        except WeightsError as error:
+            raise ValueError(f"initial_policy {path}: {error}") from None
+    learner = make_learner(policy, config, str(values["learner_factory"]), ranks)
+    return PolicyTraining(
+        policy, learner, run_dir, resume=bool(values["resume"]), keep_versions=int(values["keep_versions"]),
+        metadata={"tokenizer_sha256": policy.encoder.sha256}, ranks=ranks,
+    )
 
 
 def main() -> int:
-    """One process, or under torchrun rank 0 as the node and the other ranks behind it."""
-    ranks = join()
-    return follow_rank_0(ranks) if ranks.rank else run_node(lambda: LearnerNode(ranks))
+    return run_learner(LearnerNode, PARAMS, make_run)
 
 
 if __name__ == "__main__":

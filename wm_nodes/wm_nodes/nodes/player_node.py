@@ -20,7 +20,7 @@ from wm_nodes.recording import Bag, BagError
 from wm_nodes.recording.cdr import session_and_seq
 from wm_nodes.recording.playback import Playback
 from wm_nodes.ros import diagnostics
-from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.convert import time_msg
 from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -28,6 +28,7 @@ from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import Cancelled
+from wm_nodes.ros.worker import Work
 
 FEEDBACK_S = 0.2
 CREDITED = "env/transition"

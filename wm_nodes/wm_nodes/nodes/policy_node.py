@@ -21,7 +21,7 @@ from wm_nodes.policy_rl.image_policy import PolicyOutput
 from wm_nodes.policy_rl.rollouts import action_noise, reset_seeds
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.ros import convert, diagnostics
-from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
 from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.lifecycle import ManagedNode
@@ -29,6 +29,7 @@ from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.ros.worker import Work
 
 FEEDBACK_S = 0.5
 HOLD_ARRIVES = Duration(seconds=1)
@@ -78,7 +79,7 @@ class PolicyNode(ManagedNode):
         self._spec: EnvironmentSpec | None = None
         self._announced: PolicyVersion | None = None
         self._last_reply: Reply | None = None
-        self._first_messages = StartBarrier(self)
+        self._first_messages = StartBarrier(self, self.links.book)
         timeout_s = float(self.param("step_timeout_s"))
         self._environment: EnvironmentClient = (
             RosEnvironmentClient(self, timeout_s=timeout_s) if self._local_environment is None

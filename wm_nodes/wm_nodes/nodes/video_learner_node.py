@@ -1,7 +1,6 @@
 """learner of loop 2: asks for clips and their scores, trains the video model by GRPO, announces new versions."""
 
 import math
-import signal
 import sys
 import threading
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -15,24 +14,23 @@ import torch
 from rclpy.action import ActionClient
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
-from wm_msgs.msg import ClipScores, PolicyVersion
+from wm_msgs.msg import ClipScores
 from wm_nodes.config.load import load_video_config
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
+from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
 from wm_nodes.ros import convert, diagnostics
-from wm_nodes.ros.actions import Work, WorkerAction
 from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.endpoint_matching import StartBarrier
-from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import COMMON, Param, read_parameters
-from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.params import COMMON, Param
 from wm_nodes.ros.wire import Cancelled, PeerLost
-from wm_nodes.training.ranks import Ranks, join
+from wm_nodes.ros.worker import Work
+from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
 from wm_nodes.video_rl.reference_reward import rewarded
-from wm_nodes.video_rl.training_run import CHECKPOINT, VideoRun, version_uri
+from wm_nodes.video_rl.training_run import VideoRun
 from wm_nodes.video_rl.validation import alarm_text, validation_scores
 
 PARAMS = (
@@ -53,73 +51,54 @@ PARAMS = (
 )
 
 
-class VideoLearnerNode(ManagedNode):
+class VideoLearnerNode(TrainingNode):
     """Action video/train; calls video/generate and clips/evaluate; publishes video/version."""
 
     def __init__(self, ranks: Ranks | None = None, **node_arguments: Any) -> None:
-        super().__init__("learner", PARAMS, **node_arguments)
-        self._ranks = ranks or Ranks()
+        super().__init__(PARAMS, ranks, **node_arguments)
 
     def configure(self) -> None:
         values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
-        self._run = make_run(values, self.run_dir, self._ranks)
-        self.own(self._run.close)
-        self._watched = self._run.hacked
-        self._versions = self.publish_on("video/version")
-        self._first_messages = StartBarrier(self)
+        self._video = make_run(values, self.run_dir, self.ranks)
+        self.own(self._video.close)
+        self._watched = self._video.hacked
+        self._first_messages = StartBarrier(self, self.links.book)
         self._generate = ActionClient(self, GenerateClips, "video/generate")
         self._evaluate = ActionClient(self, EvaluateClips, "clips/evaluate")
         self.own(self._generate.destroy)
         self.own(self._evaluate.destroy)
-        self._action = WorkerAction(self, TrainVideo, "video/train", self._train, self._describe)
-        self.own(self._action.destroy)
+        self.serve_training(self._video, TrainVideo, "video/train", "video/version")
 
     def activate(self) -> None:
-        for version in sorted({self._run.sampling_version, self._run.version}):
-            self._announce(version)
-
-    def deactivate(self, reason: str) -> None:
-        self._action.stop(reason)
+        for version in sorted({self._video.sampling_version, self._video.version}):
+            self.announce(version)
 
     def update_diagnostics(self) -> None:
-        if hasattr(self, "_run"):
-            self.diagnostics.gauge("version", self._run.version)
-            self.diagnostics.gauge("iterations", self._run.iterations)
-            self.diagnostics.gauge("staleness", self._run.staleness)
+        if hasattr(self, "_video"):
+            self.diagnostics.gauge("version", self._video.version)
+            self.diagnostics.gauge("iterations", self._video.iterations)
+            self.diagnostics.gauge("staleness", self._video.staleness)
 
     # Training, in a worker thread.
 
-    def _train(self, work: Work) -> TrainVideo.Result:
+    def train(self, work: Work, result: TrainVideo.Result) -> None:
         goal: TrainVideo.Goal = work.request
-        result = TrainVideo.Result(termination_reason=TrainVideo.Result.FINISHED)
-        try:
-            count = len(goal.from_buffers) or int(goal.iterations)
-            if not count:
-                raise ValueError("iterations is 0 and from_buffers is empty; ask for at least 1")
-            if not goal.from_buffers:
-                self._first_messages.wait(work)
-            if self._announced != self._run.version:  # its files could not be written when it was made
-                self._announce(self._run.version)
-            with closing(self._read(goal.from_buffers) if goal.from_buffers else self._fresh(work, count)) as buffers:
-                for done, buffer in enumerate(buffers, 1):
-                    invalid = len(buffer) - int(buffer.valid.sum())
-                    if invalid:
-                        self.diagnostics.count("invalid_rewards", invalid, text=f"{invalid} clips without reward")
-                    report = self._run.train(buffer, work.check)
-                    if report.skipped:
-                        self.diagnostics.count("skipped_buffers", text="no group of a buffer has rewards that differ")
-                    self._announce(self._run.version)
-                    self._tell(work, report, done, count)
-                    self._warn()
-        except PeerLost as error:
-            result.termination_reason, result.message = TrainVideo.Result.PEER_LOST, str(error)
-        except TrainingPaused as pause:
-            result.termination_reason, result.message = TrainVideo.Result.PAUSED, str(pause)
-        except (ValueError, OSError, FloatingPointError) as error:
-            result.termination_reason, result.message = TrainVideo.Result.FAILED, str(error)
-        if result.message:
-            self.say_failed_goal(f"training ended: {result.message}")
-        return self._fill(result)
+        count = len(goal.from_buffers) or int(goal.iterations)
+        if not count:
+            raise ValueError("iterations is 0 and from_buffers is empty; ask for at least 1")
+        if not goal.from_buffers:
+            self._first_messages.wait(work)
+        with closing(self._read(goal.from_buffers) if goal.from_buffers else self._fresh(work, count)) as buffers:
+            for done, buffer in enumerate(buffers, 1):
+                invalid = len(buffer) - int(buffer.valid.sum())
+                if invalid:
+                    self.diagnostics.count("invalid_rewards", invalid, text=f"{invalid} clips without reward")
+                report = self._video.train(buffer, work.check)
+                if report.skipped:
+                    self.diagnostics.count("skipped_buffers", text="no group of a buffer has rewards that differ")
+                self.announce()
+                self._tell(work, report, done, count)
+                self._warn()
 
     def _read(self, uris: Sequence[str]) -> Generator[RolloutBuffer]:
         for uri in uris:
@@ -131,7 +110,7 @@ class VideoLearnerNode(ManagedNode):
         Where the settings allow the staleness, the next one is being made meanwhile; there is never more than one under
         way. Closed early, this leaves none.
         """
-        run, closed = self._run, threading.Event()
+        run, closed = self._video, threading.Event()
         ahead: Future[RolloutBuffer] | None = None
 
         def check() -> None:
@@ -179,7 +158,7 @@ class VideoLearnerNode(ManagedNode):
     def _tell(self, work: Work, report: BufferReport, done: int, count: int) -> None:
         work.feedback(
             TrainVideo.Feedback(
-                iteration=done, policy_version=self._run.version, reward_mean=report.reward_mean,
+                iteration=done, policy_version=self._video.version, reward_mean=report.reward_mean,
                 zero_std_ratio=report.zero_std_ratio, progress=done / count,
                 kl=report.updates[-1].kl if report.updates else math.nan,
             )
@@ -187,9 +166,9 @@ class VideoLearnerNode(ManagedNode):
 
     def _warn(self) -> None:
         """Say what a new held-out evaluation says of reward hacking."""
-        if self._run.hacked is self._watched:
+        if self._video.hacked is self._watched:
             return
-        self._watched = self._run.hacked
+        self._watched = self._video.hacked
         text = alarm_text(self._watched)
         if text:
             self.get_logger().warning(f"reward hacking: {text}")
@@ -197,23 +176,10 @@ class VideoLearnerNode(ManagedNode):
         else:
             self.diagnostics.clear_condition("reward_hacking")
 
-    def _announce(self, version: int) -> None:
-        packed, newest = self._run.weights_of(version), version == self._run.version
-        message = PolicyVersion(
-            version=version, train_step=self._run.iterations - (not newest), uri=version_uri(version),
-            sha256=packed.sha256, size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
-        )
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._versions.publish(message)
-        self._announced = version
-
-    def _fill(self, result: TrainVideo.Result) -> TrainVideo.Result:
-        result.policy_version, result.iterations = self._run.version, self._run.iterations
-        result.checkpoint_uri = CHECKPOINT
+    def fill(self, result: TrainVideo.Result) -> TrainVideo.Result:
+        result.policy_version, result.iterations = self._video.version, self._video.iterations
+        result.checkpoint_uri = self._video.checkpoint
         return result
-
-    def _describe(self, reason: int, text: str) -> TrainVideo.Result:
-        return self._fill(TrainVideo.Result(termination_reason=reason, message=text))
 
 
 def with_scores(buffer: RolloutBuffer, scores: ClipScores) -> RolloutBuffer:
@@ -244,18 +210,8 @@ def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun
     )
 
 
-def follow_rank_0(ranks: Ranks) -> int:
-    """The process of another rank: reads the learner's parameters, then leaves the graph to rank 0."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    values = read_parameters("learner", (*COMMON, *PARAMS))
-    make_run(values, Path(str(values["run_dir"])), ranks).follow()
-    return 0
-
-
 def main() -> int:
-    """One process, or under torchrun rank 0 as the node and the other ranks behind it."""
-    ranks = join()
-    return follow_rank_0(ranks) if ranks.rank else run_node(lambda: VideoLearnerNode(ranks))
+    return run_learner(VideoLearnerNode, PARAMS, make_run)
 
 
 if __name__ == "__main__":

@@ -16,12 +16,13 @@ from wm_nodes.core.types import UInt8Array
 from wm_nodes.nodes.policy.weights import read_weights
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.ros import convert
-from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import WireError
+from wm_nodes.ros.worker import Work
 from wm_nodes.training.weights import WeightsError, load_weights
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder

@@ -23,11 +23,6 @@ class SftResult:
     losses: NDArray[np.float32]
     num_samples: int
 
-    @property
-    def final_loss(self) -> float:
-        """Mean of the last tenth of the iterations."""
-        return float(self.losses[-max(1, len(self.losses) // 10) :].mean())
-
 
 def demonstrations(episodes: Iterable[Episode], count: int) -> list[Episode]:
     """Return the first `count` expert episodes that reach success.

@@ -14,13 +14,14 @@ from typing import Any
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.config.tasks import get_task, model_tasks
+from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.environments.maniskill.collection import CollectionPlan
 from wm_nodes.environments.record import TRAINING_SEEDS, acceptance_plan, collect_plan, scripted_plan
 from wm_nodes.policy_rl.factories import policy_actor
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import ActionModel, WorldModels, load_model_folder, save_refreshed_folder
-from wm_nodes.world_model.folder import MANIFEST, read_manifest
+from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.training.dynamics import train_action_model
 from wm_nodes.world_model.validation.acceptance import model_metrics
 
@@ -69,7 +70,7 @@ class RefreshDecision:
 
 def check_refreshable(model_dir: Path) -> None:
     """Raise ValueError for a model whose tokens are quantised: only the continuous action model can be refreshed."""
-    kind = read_manifest(model_dir)["tokenizer"]["kind"]
+    kind = read_world_manifest(model_dir)["tokenizer"]["kind"]
     if kind != "continuous":
         raise ValueError(
             f"{model_dir} has tokenizer.kind {kind}; rounds refresh continuous models only: use --rounds 1 or a model "

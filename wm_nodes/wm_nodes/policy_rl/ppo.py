@@ -7,24 +7,28 @@ loss = RS-10b clipped policy + value_weight * RS-10c value - entropy_weight * en
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load, save
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.schema import PpoConfig
-from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.advantages import explained_variance, gae, masked_normalise
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.losses import approximate_kl, clip_fraction, clipped_policy_loss, value_loss
 from wm_nodes.policy_rl.rollouts import Canceled
-from wm_nodes.training.checkpoint import metadata_of, optimizer_tensors, restore_optimizer, section
+from wm_nodes.training.checkpoint import (
+    optimizer_tensors,
+    read_checkpoint,
+    restore_optimizer,
+    section,
+    write_checkpoint,
+)
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import check_same_layout
 
@@ -67,17 +71,15 @@ class PpoLearner:
     """Trains `policy` in place.
 
     Args:
-        reference: the policy that kl_reference_weight keeps it close to; None: `policy` as it is now.
         seed: of the minibatch order (stream `ppo_order`).
         ranks: this process's place among the learner's processes.
     """
 
     def __init__(
-        self, policy: ImagePolicy, config: PpoConfig, *, seed: int, reference: ImagePolicy | None = None,
-        ranks: Ranks | None = None,
+        self, policy: ImagePolicy, config: PpoConfig, *, seed: int, ranks: Ranks | None = None
     ) -> None:
         self.policy, self.config, self.seed = policy, config, seed
-        self.reference = reference if reference is not None else policy.clone()
+        self.reference = policy.clone()
         self.ranks = ranks or Ranks()
         self.updates = 0
         critic = list(policy.critic.parameters())
@@ -111,10 +113,8 @@ class PpoLearner:
 
     def save(self, path: Path) -> None:
         """Write optimiser, reference policy and counters, atomically."""
-        tensors = {f"optimizer.{name}": tensor for name, tensor in optimizer_tensors(self._optimizer).items()}
-        tensors |= {f"reference.{name}": tensor for name, tensor in self.reference.state_dict().items()}
-        tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-        write_atomic(path, save(tensors, {"updates": str(self.updates), "seed": str(self.seed)}))
+        sections = {"optimizer": optimizer_tensors(self._optimizer), "reference": self.reference.state_dict()}
+        write_checkpoint(path, sections, {"updates": str(self.updates), "seed": str(self.seed)})
 
     def load(self, path: Path) -> None:
         """Continue exactly from save().
@@ -122,13 +122,11 @@ class PpoLearner:
         Raises:
             ValueError: the file is of another architecture or seed.
         """
-        data = path.read_bytes()
-        metadata = metadata_of(data)
+        tensors, metadata = read_checkpoint(path)
         if int(metadata["seed"]) != self.seed:
             raise ValueError(
                 f"{path} was made with seed {metadata['seed']}, this run has {self.seed}; use a new run folder"
             )
-        tensors = load(data)
         reference = section(tensors, "reference.")
         check_same_layout(self.reference.state_dict(), reference, what=str(path))
         self.reference.load_state_dict(reference)
@@ -261,6 +259,3 @@ class PpoLearner:
             states = torch.from_numpy(rollout.next_states_TN[needed])
             values[torch.from_numpy(needed)] = self.policy.value(features, states)
         return values
-
-
-METRIC_NAMES = tuple(field.name for field in fields(PpoMetrics))

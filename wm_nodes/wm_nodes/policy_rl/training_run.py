@@ -1,13 +1,13 @@
-"""The state of policy training in a run folder: weights, version, counts, checkpoints. No rclpy.
+"""A run folder of loop 1: the policy with its versions, counts and checkpoint, resumed where it stopped.
 
-Version v is written as run_dir/policies/policy_<v>.safetensors. The checkpoint that holds version v is on disk before
-v is announced, so that a version number never stands for two different weights, restarts included.
+Versions: run_dir/policies/policy_<version>.safetensors, from 1.
 """
 
 import json
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,9 +20,10 @@ from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.rollouts import Canceled, rollout_statistics, terminate_at_episode_end
 from wm_nodes.training.ranks import Ranks, broadcast_rollout
+from wm_nodes.training.run_folder import TrainingRun, VersionFiles
 from wm_nodes.training.weights import PackedWeights, load_weights, pack_weights
 
-CHECKPOINT = Path("checkpoints") / "learner.json"
+POLICY_FILES = VersionFiles("policies/policy")
 
 
 @dataclass(frozen=True)
@@ -66,36 +67,42 @@ class Progress:
     success_rate: float = math.nan
 
 
-class PolicyTraining:
-    """Updates a policy and keeps its versions in a run folder.
+class PolicyTraining(TrainingRun):
+    """Updates a policy; every update leaves a version and a checkpoint.
+
+    The checkpoint is a JSON file; beside it lie the weights and, in a .learner file, the algorithm's state.
 
     Args:
         resume: continue from the newest checkpoint of the run folder, where there is one.
-        keep_versions: weights files kept; older ones are deleted.
     """
+
+    files, checkpoint = POLICY_FILES, "checkpoints/learner.json"
 
     def __init__(
         self, policy: ImagePolicy, learner: Learner, run_dir: Path, *, resume: bool, keep_versions: int,
         metadata: Mapping[str, str], ranks: Ranks | None = None,
     ) -> None:
-        self._ranks = ranks or Ranks()
-        self.policy, self.learner, self.run_dir = policy, learner, run_dir
+        super().__init__(run_dir, keep_versions, ranks)
+        self.policy, self.learner, self._metadata = policy, learner, dict(metadata)
         self.progress = Progress()
-        self._keep_versions, self._metadata = keep_versions, dict(metadata)
-        self.packed: PackedWeights
-        self._saved = True
-        if resume and self.checkpoint.is_file():
-            self._restore()
+        if self.ranks.rank:
+            barrier(self.ranks)  # until rank 0 has written its checkpoint
+            self.progress = restore(policy, learner, run_dir / self.checkpoint)
+            return
+        if resume and (run_dir / self.checkpoint).is_file():
+            self.progress = restore(policy, learner, run_dir / self.checkpoint)
         else:
-            self.progress.version = self._last_version() + 1
-            self.save_checkpoint()
-        self._write_version()
-        barrier(self._ranks)
+            self.progress.version = max(self.files.versions(run_dir), default=0) + 1
+        self.save()
+        barrier(self.ranks)
 
     @property
-    def checkpoint(self) -> Path:
-        """The file that marks a complete checkpoint; its sibling .learner holds the algorithm's state."""
-        return self.run_dir / CHECKPOINT
+    def version(self) -> int:
+        return self.progress.version
+
+    @property
+    def updates(self) -> int:
+        return self.progress.updates
 
     def update(
         self,
@@ -116,7 +123,7 @@ class PolicyTraining:
         """
         began = time.perf_counter()
         trained = terminate_at_episode_end(rollout) if paid_at_end else rollout
-        broadcast_rollout(trained, self._ranks)
+        broadcast_rollout(trained, self.ranks)
         found = self.learner.update(trained, should_stop=should_stop)
         statistics = rollout_statistics(rollout)
         progress = self.progress
@@ -127,63 +134,41 @@ class PolicyTraining:
         progress.dropped_gap += dropped.gap
         progress.dropped_stale += dropped.stale
         progress.mean_return, progress.success_rate = statistics.mean_return, statistics.success_rate
-        self._saved = False
-        self.ensure_saved()
+        self.save()
         metrics = _numbers(found)
         metrics["update_s"] = time.perf_counter() - began
         metrics |= {"episodes": float(statistics.episodes), "cut_episodes": float(statistics.cut)}
         return metrics
 
-    def ensure_saved(self) -> bool:
-        """Write the files of the newest version if a full disk, say, kept them from it; return whether it did."""
-        if self._saved:
-            return False
-        self.save_checkpoint()
-        self._write_version()
-        self._saved = True
-        return True
+    def follow(self) -> None:
+        while (rollout := broadcast_rollout(None, self.ranks)) is not None:
+            with suppress(Canceled, ValueError, FloatingPointError):  # rank 0 has raised and reported the same
+                self.learner.update(rollout)
 
     def close(self) -> None:
         """Let the other ranks end."""
-        broadcast_rollout(None, self._ranks)
+        broadcast_rollout(None, self.ranks)
 
-    def save_checkpoint(self, path: Path | None = None) -> Path:
-        """Write weights, learner state and counts; return the file that names them."""
-        path = path or self.checkpoint
-        self.packed = pack_weights(self.policy, {**self._metadata, "policy_version": str(self.progress.version)})
-        generation = self.progress.updates
+    def write_files(self) -> PackedWeights:
+        packed = self.save_checkpoint(self.run_dir / self.checkpoint)
+        write_atomic(self.run_dir / self.files.uri(self.version), packed.data)
+        return packed
+
+    def save_checkpoint(self, path: Path) -> PackedWeights:
+        """Write weights, learner state and counts; `path` becomes the file that names them. Return the weights."""
+        packed = pack_weights(self.policy, {**self._metadata, "policy_version": str(self.version)})
+        generation = self.updates
         weights, state = (path.with_name(f"{path.stem}_{generation:06d}.{kind}") for kind in ("safetensors", "learner"))
-        write_atomic(weights, self.packed.data)
+        write_atomic(weights, packed.data)
         self.learner.save(state)
         content = {"progress": asdict(self.progress), "weights": weights.name, "learner": state.name,
-                   "sha256": self.packed.sha256}
+                   "sha256": packed.sha256}
         write_atomic(path, json.dumps(content, indent=1).encode())
         for kind in ("safetensors", "learner"):
             for old in path.parent.glob(f"{path.stem}_*.{kind}"):
                 if old not in (weights, state):
                     old.unlink(missing_ok=True)
-        return path
-
-    def weights_of(self, version: int) -> tuple[int, bytes]:
-        """Return (version, bytes); 0 means the newest. Raises FileNotFoundError."""
-        version = version or self.progress.version
-        if version == self.progress.version:
-            return version, self.packed.data
-        return version, (self.run_dir / weights_uri(version)).read_bytes()
-
-    def _restore(self) -> None:
-        self.progress = restore(self.policy, self.learner, self.checkpoint)
-        self.packed = pack_weights(self.policy, {**self._metadata, "policy_version": str(self.progress.version)})
-
-    def _write_version(self) -> None:
-        write_atomic(self.run_dir / weights_uri(self.progress.version), self.packed.data)
-        files = sorted((self.run_dir / "policies").glob("policy_*.safetensors"))
-        for old in files[: -self._keep_versions]:
-            old.unlink(missing_ok=True)
-
-    def _last_version(self) -> int:
-        names = [path.stem.removeprefix("policy_") for path in (self.run_dir / "policies").glob("policy_*.safetensors")]
-        return max((int(name) for name in names if name.isdigit()), default=0)
+        return packed
 
 
 def restore(policy: ImagePolicy, learner: Learner, checkpoint: Path) -> Progress:
@@ -202,22 +187,6 @@ def restore(policy: ImagePolicy, learner: Learner, checkpoint: Path) -> Progress
             f"checkpoint {checkpoint} does not fit: {error}; go on with the configuration it was made by, or begin "
             "anew in another run_dir"
         ) from None
-
-
-def follow(policy: ImagePolicy, learner: Learner, run_dir: Path, ranks: Ranks) -> None:
-    """Be a rank other than 0: start from rank 0's checkpoint and make its updates until it ends."""
-    barrier(ranks)
-    restore(policy, learner, run_dir / CHECKPOINT)
-    while (rollout := broadcast_rollout(None, ranks)) is not None:
-        try:
-            learner.update(rollout)
-        except (Canceled, ValueError, FloatingPointError):
-            continue
-
-
-def weights_uri(version: int) -> str:
-    """File name of a policy version, relative to the run folder."""
-    return f"policies/policy_{version:06d}.safetensors"
 
 
 def barrier(ranks: Ranks) -> None:

@@ -10,7 +10,6 @@ from wm_nodes.reward.base import (
 )
 from wm_nodes.reward.distances import Distance, EncoderDistance, pixel_l1
 from wm_nodes.reward.endogenous import EndogenousReward
-from wm_nodes.reward.lpips import Lpips, load_lpips
 from wm_nodes.reward.rule import RuleReward
 
 __all__ = [
@@ -20,11 +19,9 @@ __all__ = [
     "Distance",
     "EncoderDistance",
     "EndogenousReward",
-    "Lpips",
     "RewardInput",
     "RewardModel",
     "RewardResult",
     "RuleReward",
-    "load_lpips",
     "pixel_l1",
 ]

@@ -7,45 +7,13 @@ blocking one cannot be cancelled. Here the executor only accepts, cancels and se
 import threading
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 
 from wm_nodes.ros.wire import Cancelled
-
-if TYPE_CHECKING:
-    from wm_nodes.ros.lifecycle import ManagedNode
-
-
-@dataclass
-class Work:
-    """One goal at work. request: the goal message; feedback(message) publishes feedback."""
-
-    request: Any
-    feedback: Callable[[Any], None]
-    _stop: threading.Event
-    reason: str = ""
-    """Why it must stop: "cancelled", "deactivated", ...; empty while it may go on."""
-
-    @property
-    def stopped(self) -> bool:
-        return self._stop.is_set()
-
-    def stop(self, reason: str) -> None:
-        self.reason = self.reason or reason
-        self._stop.set()
-
-    def check(self) -> None:
-        """Raise Cancelled when the work must stop; call at least twice a second."""
-        if self.stopped:
-            raise Cancelled(self.reason)
-
-    def sleep(self, seconds: float) -> None:
-        """Wait, but raise Cancelled as soon as the work must stop."""
-        self._stop.wait(seconds)
-        self.check()
+from wm_nodes.ros.worker import Work, WorkerNode
 
 
 class _ThreadedServer(ActionServer):  # type: ignore[misc]
@@ -73,7 +41,7 @@ class WorkerAction:
     """
 
     def __init__(
-        self, node: "ManagedNode", action_type: type[Any], name: str, run: Callable[[Work], Any],
+        self, node: WorkerNode, action_type: type[Any], name: str, run: Callable[[Work], Any],
         describe: Callable[[int, str], Any],
     ) -> None:
         self._node, self._type, self._name, self._run, self._describe = node, action_type, name, run, describe

@@ -50,10 +50,6 @@ class Diagnostics:
                 self._events[key] = (level, text or key.replace("_", " "), time.monotonic())
         self.refresh()
 
-    def counter(self, key: str) -> int:
-        with self._lock:
-            return self._counters.get(key, 0)
-
     def gauge(self, key: str, value: object) -> None:
         """Set a value that is shown as it is."""
         with self._lock:
@@ -75,10 +71,6 @@ class Diagnostics:
             present = self._conditions.pop(key, None) is not None
         if present:
             self.refresh()
-
-    def conditions(self) -> dict[str, tuple[int, str]]:
-        with self._lock:
-            return dict(self._conditions)
 
     def refresh(self) -> None:
         """Publish now if the level has changed since the last message."""

@@ -10,15 +10,14 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rclpy.node import Node
 
 from wm_msgs.msg import NodeLinks
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
-
-if TYPE_CHECKING:
-    from wm_nodes.ros.actions import Work
-    from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.worker import Work, WorkerNode
 
 Ends = Callable[[str], set[str]]
 """Topic name to the nodes (fully qualified) whose end of it is known."""
@@ -127,12 +126,17 @@ class EndpointTable:
 
 
 class Links:
-    """The part of a node that keeps its EndpointTable and talks on run/links."""
+    """The part of a node that keeps its EndpointTable and talks on run/links.
 
-    def __init__(self, node: "ManagedNode") -> None:
-        self._node = node
-        self.book = EndpointTable(node.get_fully_qualified_name(), node.session)
-        self._publisher = StampedPublisher(node, "run/links", node.session)
+    Args:
+        session: of the node.
+        is_active: whether the node is active.
+    """
+
+    def __init__(self, node: Node, session: int, is_active: Callable[[], bool]) -> None:
+        self._node, self._is_active = node, is_active
+        self.book = EndpointTable(node.get_fully_qualified_name(), session)
+        self._publisher = StampedPublisher(node, "run/links", session)
         row = topic("run/links")
         self._subscription = node.create_subscription(row.type, row.name, self._on_links, row.reader_qos)
 
@@ -141,7 +145,7 @@ class Links:
         node = self._node
         changed = self.book.refresh(
             {publisher.topic_name for publisher in node.publishers},
-            {subscription.topic_name for subscription in node.subscriptions}, node.active,
+            {subscription.topic_name for subscription in node.subscriptions}, self._is_active(),
             lambda name: _nodes_of(node.get_subscriptions_info_by_topic(name)),
             lambda name: _nodes_of(node.get_publishers_info_by_topic(name)),
         )
@@ -158,16 +162,18 @@ class Links:
 class StartBarrier:
     """Holds a data flow back until no node of the graph can miss its first messages; once for each lack.
 
-    node: has the parameters await_nodes and match_timeout_s.
+    Args:
+        node: has the parameters await_nodes and match_timeout_s.
+        book: what this node knows about the links of all nodes.
     """
 
-    def __init__(self, node: "ManagedNode") -> None:
-        self._node = node
+    def __init__(self, node: WorkerNode, book: EndpointTable) -> None:
+        self._node, self._book = node, book
         self._given_up: set[str] = set()
 
-    def wait(self, work: "Work") -> None:
+    def wait(self, work: Work) -> None:
         """Return when all active nodes know each other, or, with a warning, after match_timeout_s."""
-        node, book = self._node, self._node.links.book
+        node, book = self._node, self._book
         namespace = node.get_namespace().rstrip("/")
         awaited = [f"{namespace}/{name}" for name in node.param("await_nodes") if name]
         deadline = time.monotonic() + float(node.param("match_timeout_s"))

@@ -2,16 +2,13 @@
 
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
 
 from wm_msgs.msg import Credit
 from wm_nodes.ros.qos import CREDIT_WINDOW, topic
 from wm_nodes.ros.sequence_numbers import GapTracker
-
-if TYPE_CHECKING:
-    from wm_nodes.ros.lifecycle import ManagedNode
 
 SILENT_S = 5.0
 """A consumer that has held the producer up for so long without a word is dropped."""
@@ -76,7 +73,7 @@ class ConsumerCredits:
     While `withheld`, the newest grant of the session is repeated: the producer waits and knows that someone is there.
     """
 
-    def __init__(self, node: "ManagedNode", topic_name: str, window: int = CREDIT_WINDOW, *, below: str = "") -> None:
+    def __init__(self, node: Node, topic_name: str, window: int = CREDIT_WINDOW, *, below: str = "") -> None:
         self._node, self._topic_name, self._window = node, topic_name, window
         row = topic("flow/credit")
         self._publisher = node.create_publisher(Credit, below + row.name, row.qos)

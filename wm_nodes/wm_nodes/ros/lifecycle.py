@@ -69,7 +69,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         row = topic("run/state")
         self._state_publisher = self.create_publisher(RunState, row.name, row.qos)
         self._state_subscription = self.create_subscription(RunState, row.name, self._on_run_state, row.reader_qos)
-        self.links = Links(self)
+        self.links = Links(self, self.session, lambda: self._active)
         self._heartbeat_timer = self.create_timer(HEARTBEAT_S, self._on_heartbeat, clock=steady)
         self._diagnostics_timer = self.create_timer(1.0, self._on_diagnostics, clock=steady)
 
@@ -170,10 +170,6 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         if grantor is not None:
             self._entities.append(grantor.close)
         return grantor
-
-    def tracker(self, name: str) -> GapTracker:
-        """The gap counts of a topic this node listens to."""
-        return self._trackers.setdefault(name, GapTracker())
 
     def serve(self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service until cleanup."""

@@ -2,10 +2,29 @@
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors.torch import load, save
 from torch import Tensor
+
+from wm_nodes.core.files import write_atomic
+
+
+def write_checkpoint(path: Path, sections: Mapping[str, Mapping[str, Tensor]], metadata: Mapping[str, str]) -> None:
+    """Write tensors as "<section>.<name>" and the metadata, atomically. Raises OSError."""
+    tensors = {
+        f"{prefix}.{name}": tensor.detach().to("cpu", copy=True).contiguous()
+        for prefix, named in sections.items() for name, tensor in named.items()
+    }
+    write_atomic(path, save(tensors, dict(metadata)))
+
+
+def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return (tensors, metadata) of write_checkpoint(). Raises OSError, or SafetensorError for a damaged file."""
+    data = path.read_bytes()
+    return load(data), metadata_of(data)
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -33,3 +52,10 @@ def metadata_of(data: bytes) -> dict[str, str]:
     header: dict[str, Any] = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     texts: dict[str, str] = header.get("__metadata__", {})
     return texts
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """The metadata of a safetensors file, without reading its tensors."""
+    with open(path, "rb") as file:
+        size = file.read(8)
+        return metadata_of(size + file.read(int.from_bytes(size, "little")))

@@ -12,12 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors.torch import load, save
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from wm_nodes.core.files import write_atomic
-from wm_nodes.training.checkpoint import metadata_of, optimizer_tensors, restore_optimizer, section
+from wm_nodes.training.checkpoint import (
+    optimizer_tensors,
+    read_checkpoint,
+    restore_optimizer,
+    section,
+    write_checkpoint,
+)
 
 CHECKPOINT_PERIOD_S = 240.0
 WARMUP_FRACTION = 0.03
@@ -119,15 +123,14 @@ class TrainingLoop:
         """Write model, average, optimiser and iteration, atomically; nothing without a run_dir."""
         if self.checkpoint_path is None:
             return
-        tensors = {f"model.{key}": value for key, value in self.model.state_dict().items()}
-        tensors |= {f"averaged.{key}": value for key, value in self.averaged.items()}
-        tensors |= {f"optimizer.{key}": value for key, value in optimizer_tensors(self.optimizer).items()}
-        tensors = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
-        write_atomic(self.checkpoint_path, save(tensors, {"iteration": str(self.iteration)}))
+        sections = {
+            "model": self.model.state_dict(), "averaged": self.averaged,
+            "optimizer": optimizer_tensors(self.optimizer),
+        }
+        write_checkpoint(self.checkpoint_path, sections, {"iteration": str(self.iteration)})
 
     def _resume(self, path: Path) -> None:
-        data = path.read_bytes()
-        tensors = load(data)
+        tensors, metadata = read_checkpoint(path)
         try:
             self.model.load_state_dict(section(tensors, "model."))
         except RuntimeError as error:
@@ -137,7 +140,7 @@ class TrainingLoop:
             ) from None
         self.averaged = {key: value.clone() for key, value in section(tensors, "averaged.").items()}
         restore_optimizer(self.optimizer, section(tensors, "optimizer."))
-        self.iteration = int(metadata_of(data)["iteration"])
+        self.iteration = int(metadata["iteration"])
 
     def _logged(self) -> dict[str, float]:
         """The last metrics of a run that is resumed; empty at its start."""

@@ -1,7 +1,7 @@
 """A flow-matching video model, its stochastic samplers, and what GRPO stores of them. DD-3 to DD-12."""
 
-from wm_nodes.video_model.buffer import RolloutBuffer, RolloutBufferError, concatenate_buffers, config_hash
-from wm_nodes.video_model.conditions import Condition, concatenate
+from wm_nodes.video_model.buffer import RolloutBuffer, RolloutBufferError, config_hash
+from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import SamplerSettings, Step, StepContext, estimates, step
 from wm_nodes.video_model.mask import MaskSettings, dynamic_mask
 from wm_nodes.video_model.network import NetworkSettings, VelocityModel, VideoNetwork, guided_velocity
@@ -24,8 +24,6 @@ __all__ = [
     "VelocityModel",
     "VideoNetwork",
     "VideoRollout",
-    "concatenate",
-    "concatenate_buffers",
     "config_hash",
     "dynamic_mask",
     "estimates",

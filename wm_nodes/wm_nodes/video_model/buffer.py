@@ -14,8 +14,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from wm_nodes.video_model.conditions import Condition, concatenate
-from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout, concatenate_rollouts
+from wm_nodes.video_model.conditions import Condition
+from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout
 
 _METADATA_KEY = "rollout_buffer"
 _ROLLOUT_TENSORS = ("latents", "states", "mask", "sigma_base", "zeta", "seeds", "noise_share", "times")
@@ -140,26 +140,3 @@ class RolloutBuffer:
         tensors |= {f"reward.{name}": value for name, value in self.rewards.items()}
         tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids, "valid": self.valid}
         return {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
-
-
-def concatenate_buffers(parts: list[RolloutBuffer]) -> RolloutBuffer:
-    """One buffer of the groups of all parts, which must agree on settings, version, iteration and steps."""
-    first = parts[0]
-    for part in parts[1:]:
-        if (part.config_hash, part.policy_version, part.iteration, part.rollout.steps) != (
-            first.config_hash, first.policy_version, first.iteration, first.rollout.steps
-        ):
-            raise RolloutBufferError(
-                f"buffers of versions {first.policy_version} and {part.policy_version}, iterations {first.iteration} "
-                f"and {part.iteration}, settings {first.config_hash[:12]} and {part.config_hash[:12]} do not belong "
-                f"together"
-            )
-    return replace(
-        first,
-        rollout=concatenate_rollouts([part.rollout for part in parts]),
-        condition=concatenate([part.condition for part in parts]),
-        group_ids=torch.cat([part.group_ids for part in parts]),
-        sample_ids=torch.cat([part.sample_ids for part in parts]),
-        rewards={name: torch.cat([part.rewards[name] for part in parts]) for name in first.rewards},
-        valid=torch.cat([part.valid for part in parts]),
-    )

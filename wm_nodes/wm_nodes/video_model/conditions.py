@@ -37,14 +37,6 @@ class Condition:
         return Condition(*(tensor.repeat_interleave(times, 0) for tensor in (self.frames, self.actions, self.text)))
 
 
-def concatenate(conditions: list[Condition]) -> Condition:
-    return Condition(
-        torch.cat([c.frames for c in conditions]),
-        torch.cat([c.actions for c in conditions]),
-        torch.cat([c.text for c in conditions]),
-    )
-
-
 def hashed_words(texts: Sequence[str], size: int) -> Tensor:
     """Return an embedding of instructions that needs no weights, (B, L, size): each word's own fixed random vector.
 

@@ -3,7 +3,6 @@
 A folder inside a world model's folder whose codec is that model's tokenizer may leave codec.safetensors out.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,13 +11,19 @@ from typing import Any
 from torch import nn
 
 from wm_nodes.config.schema import TokenizerConfig
-from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import (
+    MANIFEST,
+    ModelFolderError,
+    read_manifest,
+    read_model_file,
+    write_model_folder,
+)
 from wm_nodes.training.weights import WeightsError, load_weights, pack_weights
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.tokenizer_codec import Codec, TokenizerCodec, codec_of_world_model
 
-MANIFEST, CODEC, NETWORK = "manifest.json", "codec.safetensors", "network.safetensors"
+CODEC, NETWORK = "codec.safetensors", "network.safetensors"
 FORMAT = 2
 KINDS = {PatchCodec: "patch", TokenizerCodec: "tokenizer"}
 
@@ -37,31 +42,22 @@ def save_video_folder(
     folder: Path, codec: Codec, network: VideoNetwork, clip: Mapping[str, int], story: Mapping[str, Any]
 ) -> Path:
     """Write the folder; the manifest, which names the files' sha256, comes last."""
-    hashes = {}
-    for name, module in ((CODEC, codec), (NETWORK, network)):
-        packed = pack_weights(module)
-        write_atomic(folder / name, packed.data)
-        hashes[name] = packed.sha256
+    packed = {CODEC: pack_weights(codec), NETWORK: pack_weights(network)}
     manifest = {
         "format": FORMAT, "codec": {"kind": KINDS[type(codec)], **codec.settings()},
-        "network": asdict(network.settings), "clip": dict(clip), "sha256": hashes, **story,
+        "network": asdict(network.settings), "clip": dict(clip),
+        "sha256": {name: weights.sha256 for name, weights in packed.items()}, **story,
     }
-    write_atomic(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
-    return folder
+    return write_model_folder(folder, {name: weights.data for name, weights in packed.items()}, manifest)
 
 
 def load_video_folder(folder: Path) -> VideoFolder:
     """Load and verify a folder, in evaluation mode.
 
     Raises:
-        WeightsError: names the file, what is wrong, and the remedy.
+        ModelFolderError: names the file, what is wrong, and the remedy.
     """
-    path = Path(folder) / MANIFEST
-    if not path.is_file():
-        raise WeightsError(f"{folder} holds no {MANIFEST}; name the folder of a trained video model")
-    manifest: dict[str, Any] = json.loads(path.read_text())
-    if manifest.get("format") != FORMAT:
-        raise WeightsError(f"{path}: format {manifest.get('format')!r}, this version reads {FORMAT}; train it anew")
+    manifest = read_manifest(folder, "video model", FORMAT)
     network = VideoNetwork(NetworkSettings(**manifest["network"]))
     _load(Path(folder) / NETWORK, network, manifest["sha256"][NETWORK])
     codec = _codec(Path(folder), manifest["sha256"][CODEC], **manifest["codec"])
@@ -72,7 +68,8 @@ def _codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Codec:
     if kind == "tokenizer" and not (folder / CODEC).is_file() and (folder.parent / MANIFEST).is_file():
         shared = codec_of_world_model(folder.parent)
         if pack_weights(shared).sha256 != sha256:
-            raise WeightsError(f"{folder} was made with another tokenizer than that of {folder.parent}; train it anew")
+            text = f"{folder} was made with another tokenizer than that of {folder.parent}; train it anew"
+            raise ModelFolderError(text)
         return shared
     codec: Codec
     if kind == "patch":
@@ -85,7 +82,8 @@ def _codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Codec:
 
 
 def _load(path: Path, module: nn.Module, sha256: str) -> None:
-    if not path.is_file():
-        raise WeightsError(f"{path} is missing; copy the whole model folder")
-    load_weights(module, path.read_bytes(), sha256=sha256)
+    try:
+        load_weights(module, read_model_file(path, sha256))
+    except WeightsError as error:
+        raise ModelFolderError(f"{path}: {error}") from None
     module.eval()

@@ -81,8 +81,8 @@ class VideoRollout:
         """Root mean square of noise_share over the stochastic steps; 0 by ODE."""
         return float(self.noise_share.square().mean().sqrt()) if len(self.noise_share) else 0.0
 
-    def rows(self, index: slice) -> "VideoRollout":
-        """Some of the videos, as views; noise_share is that of all."""
+    def rows(self, index: Tensor | slice) -> "VideoRollout":
+        """Some of the videos, as views for a slice; noise_share is that of all."""
         tensors = {name: getattr(self, name)[index] for name in ("latents", "states", "mask", "sigma_base", "seeds")}
         return replace(self, **tensors, zeta=None if self.zeta is None else self.zeta[index])
 
@@ -137,24 +137,6 @@ def sample_videos(
         rollout.noise_share.add_(squares, alpha=len(part.latents) / len(noise))
         on_progress(min(rows.stop, len(noise)), len(noise))
     return replace(rollout, noise_share=rollout.noise_share.sqrt())
-
-
-def concatenate_rollouts(parts: list[VideoRollout]) -> VideoRollout:
-    """The videos of all parts, which were sampled with the same steps."""
-    total = sum(len(part.latents) for part in parts)
-    squares = torch.stack([part.noise_share.square() * (len(part.latents) / total) for part in parts])
-    return VideoRollout(
-        latents=torch.cat([part.latents for part in parts]),
-        steps=parts[0].steps,
-        state_steps=parts[0].state_steps,
-        states=torch.cat([part.states for part in parts]),
-        mask=torch.cat([part.mask for part in parts]),
-        sigma_base=torch.cat([part.sigma_base for part in parts]),
-        zeta=None if parts[0].zeta is None else torch.cat([part.zeta for part in parts if part.zeta is not None]),
-        seeds=torch.cat([part.seeds for part in parts]),
-        noise_share=squares.sum(0).sqrt(),
-        times=parts[0].times,
-    )
 
 
 def _unsampled(

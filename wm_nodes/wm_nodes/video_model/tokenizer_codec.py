@@ -81,7 +81,7 @@ class TokenizerCodec(nn.Module):
 
 
 def codec_of_world_model(folder: Path) -> TokenizerCodec:
-    """The tokenizer of a world-model folder. Raises WeightsError as load_model_folder does."""
+    """The tokenizer of a world-model folder. Raises ModelFolderError."""
     found = load_model_folder(folder)
     config = TokenizerConfig.model_validate(found.manifest["tokenizer"])
     codec = TokenizerCodec(config, found.tokenizer.height, found.tokenizer.width)

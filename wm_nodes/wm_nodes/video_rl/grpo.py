@@ -18,13 +18,17 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load, save
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.video import GrpoConfig
-from wm_nodes.core.files import write_atomic
-from wm_nodes.training.checkpoint import metadata_of, optimizer_tensors, restore_optimizer, section
+from wm_nodes.training.checkpoint import (
+    optimizer_tensors,
+    read_checkpoint,
+    restore_optimizer,
+    section,
+    write_checkpoint,
+)
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.video_model.buffer import RolloutBuffer
@@ -309,14 +313,13 @@ class GrpoLearner:
 
     def save(self, path: Path, *, iteration: int) -> None:
         """Write everything that train() depends on, atomically: trained weights, EMA, anchor, optimizer, counters."""
-        tensors = {f"model.{name}": p for name, p in _trained(self.model)}
-        tensors |= {f"averaged.{name}": value for name, value in self.averaged.items()}
-        tensors |= {f"anchor.{name}": value for name, value in self._terms.anchor.items()}
-        tensors |= {f"optimizer.{key}": value for key, value in optimizer_tensors(self._optimizer).items()}
+        sections = {
+            "model": dict(_trained(self.model)), "averaged": self.averaged, "anchor": self._terms.anchor,
+            "optimizer": optimizer_tensors(self._optimizer),
+        }
         header = {"version": self.version, "seed": self.seed, "iteration": iteration, "skipped": self.skipped}
         header |= {f.name: getattr(self._running, f.name) for f in fields(self._running)}
-        tensors = {name: _kept(tensor).contiguous() for name, tensor in tensors.items()}
-        write_atomic(path, save(tensors, {"grpo": json.dumps(header)}))
+        write_checkpoint(path, sections, {"grpo": json.dumps(header)})
 
     def load(self, path: Path) -> int:
         """Continue exactly from save(); return its iteration.
@@ -324,9 +327,9 @@ class GrpoLearner:
         Raises:
             ValueError: the file is damaged, or of another architecture, seed, KL anchor or EMA.
         """
-        data = path.read_bytes()
         try:
-            tensors, header = load(data), json.loads(metadata_of(data)["grpo"])
+            tensors, metadata = read_checkpoint(path)
+            header = json.loads(metadata["grpo"])
         except (SafetensorError, KeyError, ValueError) as error:
             raise WeightsError(f"{path} is no complete checkpoint of GRPO ({error}); use a new run folder") from error
         if header["seed"] != self.seed:

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.flow_matching import train_video_model
-from wm_nodes.video_model.folder import MANIFEST, VideoFolder, load_video_folder, save_video_folder
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
 from wm_nodes.video_model.tokenizer_codec import Codec, codec_of_world_model
 from wm_nodes.video_rl.reference_reward import score_clips
 from wm_nodes.video_rl.validation import kept_scores

@@ -8,7 +8,6 @@ optimizer steps of one buffer it may be sampled while the learner trains on buff
 sampling_version follows from the run folder alone: a resumed run asks for what an undisturbed one had.
 """
 
-import hashlib
 import json
 import threading
 from collections.abc import Callable
@@ -17,10 +16,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 from wm_nodes.config.video import VideoRlConfig
-from wm_nodes.training.checkpoint import metadata_of
+from wm_nodes.training.checkpoint import read_metadata
 from wm_nodes.training.metrics import MetricsWriter, read_metrics
 from wm_nodes.training.ranks import Ranks, broadcast_bytes
-from wm_nodes.training.weights import PackedWeights, save_weights, unpack_weights
+from wm_nodes.training.run_folder import TrainingRun, VersionFiles
+from wm_nodes.training.weights import PackedWeights, save_weights
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
 from wm_nodes.video_rl.reward_hacking import HackedMetric
@@ -28,16 +28,12 @@ from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.validation import SECTION, HeldoutScores, alarm_scalars, hacked_now
 
 CHECKPOINT = "checkpoints/video_learner.safetensors"
-
-
-def version_uri(version: int) -> str:
-    """File name of a version of the network, relative to the run folder."""
-    return f"video_policies/video_{version:06d}.safetensors"
+VIDEO_FILES, AVERAGED_FILES = VersionFiles("video_policies/video"), VersionFiles("video_policies/averaged")
 
 
 def evaluated_uri(version: int, config: VideoRlConfig) -> str:
     """File name of the weights of a version that are evaluated: the averaged ones where the run keeps an average."""
-    return _averaged_uri(version) if config.grpo.ema_decay > 0 else version_uri(version)
+    return (AVERAGED_FILES if config.grpo.ema_decay > 0 else VIDEO_FILES).uri(version)
 
 
 def progress(run_dir: Path) -> tuple[int, int]:
@@ -45,29 +41,28 @@ def progress(run_dir: Path) -> tuple[int, int]:
     path = run_dir / CHECKPOINT
     if not path.is_file():
         return 0, 0
-    with open(path, "rb") as file:
-        size = file.read(8)
-        header = json.loads(metadata_of(size + file.read(int.from_bytes(size, "little")))["grpo"])
+    header = json.loads(read_metadata(path)["grpo"])
     return int(header["version"]), int(header["iteration"])
 
 
-class VideoRun:
+class VideoRun(TrainingRun):
     """Trains `network` on buffers; every buffer leaves a version, a checkpoint and a line of metrics.
 
     Args:
         keep_versions: files kept in run_dir/video_policies, at least 2.
-        ranks: this process's place; rank 0 calls train() and close(), the others follow().
         heldout: scores of held-out contexts by the network's weights, asked for by rank 0 after every
             `evaluation.every`-th buffer while the network has its averaged weights; None: never.
     """
+
+    files, checkpoint = VIDEO_FILES, CHECKPOINT
 
     def __init__(
         self, network: VideoNetwork, config: VideoRlConfig, run_dir: Path, *, keep_versions: int = 20,
         tensorboard: bool = False, ranks: Ranks | None = None, heldout: HeldoutScores | None = None,
     ) -> None:
-        self.network, self.config, self.run_dir, self._keep = network, config, run_dir, keep_versions
-        self._heldout = heldout
-        self._ranks, self._training = ranks or Ranks(), threading.Lock()
+        super().__init__(run_dir, keep_versions, ranks)
+        self.network, self.config, self._heldout = network, config, heldout
+        self._training = threading.Lock()
         self.learner = GrpoLearner(
             network, config.grpo, rollout_settings(config.rollout), seed=config.seed, ranks=ranks,
             reward_weights=config.rewards,
@@ -76,21 +71,22 @@ class VideoRun:
         """Buffers trained on in the run folder."""
         if (run_dir / CHECKPOINT).is_file():
             self.iterations = self.learner.load(run_dir / CHECKPOINT)
-        older = [] if self.learner.skipped else [version for version in self._versions() if version < self.version]
+        older = [] if self.learner.skipped else [v for v in self.files.versions(run_dir) if v < self.version]
         self.previous_version = max(older, default=self.version)
         """The version before the last buffer; that of now before any, and after one that was skipped."""
         self.staleness = 0
         """Optimizer steps between sampling and training of the last buffer."""
-        self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self._ranks.rank == 0 else None
-
-        self.packed: PackedWeights | None = None
-        """The weights of `version`, once their files are written."""
+        self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self.ranks.rank == 0 else None
         self.hacked: list[HackedMetric] = []
         """What the newest held-out evaluation says of reward hacking, DD-2."""
 
     @property
     def version(self) -> int:
         return self.learner.version
+
+    @property
+    def updates(self) -> int:
+        return self.iterations
 
     @property
     def prefetches(self) -> bool:
@@ -110,16 +106,16 @@ class VideoRun:
                 several ranks it is not called: one that stopped would leave the others waiting.
 
         Raises:
-            As GrpoLearner.train; or OSError where saving fails: the training was then made, and save() tries again.
+            As GrpoLearner.train; or OSError where saving fails: the training was then made; ensure_saved() tries again.
         """
         with self._training:
-            if self._ranks.size > 1 and self._ranks.rank == 0:
-                broadcast_bytes(buffer.to_bytes(), self._ranks)
+            if self.ranks.size > 1 and self.ranks.rank == 0:
+                broadcast_bytes(buffer.to_bytes(), self.ranks)
             before, self.staleness = self.version, self.version - buffer.policy_version
-            with self.network.register_forward_pre_hook(lambda *_: check() if self._ranks.size == 1 else None):
+            with self.network.register_forward_pre_hook(lambda *_: check() if self.ranks.size == 1 else None):
                 report = self.learner.train(buffer)
             self.iterations += 1
-            self.previous_version, self.packed = before, None
+            self.previous_version = before
             if self._metrics is not None:
                 self.save()
                 self._metrics.write("grpo", self.iterations, {**flat_metrics(report), "staleness": self.staleness})
@@ -127,44 +123,28 @@ class VideoRun:
             return report
 
     def follow(self) -> None:
-        """Be a rank other than 0: make rank 0's training until it closes."""
-        while (data := broadcast_bytes(None, self._ranks)) is not None:
+        while (data := broadcast_bytes(None, self.ranks)) is not None:
             with suppress(ValueError, FloatingPointError):  # rank 0 has raised and reported the same
                 self.train(RolloutBuffer.from_bytes(data))
 
-    def save(self) -> PackedWeights:
-        """Write the version and the checkpoint, the checkpoint last; return the version's weights."""
-        path = self.run_dir / version_uri(self.version)
-        packed = save_weights(self.network, path, {"version": str(self.version)})
+    def write_files(self) -> PackedWeights:
+        packed = save_weights(
+            self.network, self.run_dir / self.files.uri(self.version), {"version": str(self.version)}
+        )
         if self.learner.averaged:
             with self.learner.averaged_weights():
-                path = self.run_dir / _averaged_uri(self.version)
+                path = self.run_dir / AVERAGED_FILES.uri(self.version)
                 save_weights(self.network, path, {"version": f"{self.version}, averaged"})
         self.learner.save(self.run_dir / CHECKPOINT, iteration=self.iterations)
-        for old in self._versions()[: -self._keep]:
-            for uri in (version_uri(old), _averaged_uri(old)):
-                (self.run_dir / uri).unlink(missing_ok=True)
-        self.packed = packed
+        AVERAGED_FILES.prune(self.run_dir, self._keep_versions)
         return packed
-
-    def weights_of(self, version: int) -> PackedWeights:
-        """The weights of the newest version, written first where they are not, or of an older one from its file.
-
-        Raises:
-            OSError: no such file, or the newest one cannot be written.
-        """
-        if version == self.version:
-            return self.packed or self.save()
-        data = (self.run_dir / version_uri(version)).read_bytes()
-        _, metadata = unpack_weights(data)
-        return PackedWeights(data, hashlib.sha256(data).hexdigest(), metadata["arch_hash"], metadata)
 
     def close(self) -> None:
         """Wait for the training at hand; let the other ranks end."""
         with self._training:
             if self._metrics is not None:
                 self._metrics.close()
-                broadcast_bytes(None, self._ranks)
+                broadcast_bytes(None, self.ranks)
 
     def _watch(self, metrics: MetricsWriter) -> None:
         every = self.config.evaluation.every
@@ -175,15 +155,6 @@ class VideoRun:
         lines = [*read_metrics(self.run_dir), {"section": SECTION, "step": self.iterations, **scores}]
         self.hacked = hacked_now(lines, self.config.evaluation.window)
         metrics.write(SECTION, self.iterations, {**scores, **alarm_scalars(self.hacked)})
-
-    def _versions(self) -> list[int]:
-        """The versions in the run folder, ascending."""
-        names = (path.stem for path in (self.run_dir / "video_policies").glob("video_*.safetensors"))
-        return sorted(int(name.removeprefix("video_")) for name in names)
-
-
-def _averaged_uri(version: int) -> str:
-    return f"video_policies/averaged_{version:06d}.safetensors"
 
 
 def flat_metrics(report: BufferReport) -> dict[str, float]:

@@ -1,26 +1,17 @@
 """World models that stand in for the simulator: frame codec, next-frame models, goals, imagined environment."""
 
-from wm_nodes.world_model.dynamics import ActionModel, done_signal
-from wm_nodes.world_model.folder import (
-    ModelFolderError,
-    WorldModels,
-    load_model_folder,
-    save_model_folder,
-    save_refreshed_folder,
-)
+from wm_nodes.world_model.dynamics import ActionModel
+from wm_nodes.world_model.folder import WorldModels, load_model_folder, save_model_folder, save_refreshed_folder
 from wm_nodes.world_model.imagined_environment import ImaginedEnvironment, load_starts
-from wm_nodes.world_model.text import ImaginedGoals, TextModel, imagine_goals
+from wm_nodes.world_model.text import TextModel, imagine_goals
 from wm_nodes.world_model.tokenizer import Tokenizer
 
 __all__ = [
     "ActionModel",
     "ImaginedEnvironment",
-    "ImaginedGoals",
-    "ModelFolderError",
     "TextModel",
     "Tokenizer",
     "WorldModels",
-    "done_signal",
     "imagine_goals",
     "load_model_folder",
     "load_starts",

@@ -46,26 +46,18 @@ def decided_after(num_passes: int, num_tokens: int) -> list[int]:
     return counts
 
 
-def decode_frame(
-    predict: PredictLogits,
-    like_BSD: Tensor,
-    num_passes: int,
-    *,
-    temperature: float = 0.0,
-    generator: torch.Generator | None = None,
-) -> DecodedFrame:
+def decode_frame(predict: PredictLogits, like_BSD: Tensor, num_passes: int) -> DecodedFrame:
     """Decide all tokens in `num_passes` passes, the most confident first; a decided token never changes.
 
     Args:
         like_BSD: fixes shape and device, its values are not read.
-        temperature: 0 takes the most probable code; above 0 codes are drawn with `generator`.
     """
     batch, num_tokens, num_bits = like_BSD.shape
     bits = torch.zeros_like(like_BSD)
     passes = torch.zeros(batch, num_tokens, dtype=torch.long, device=like_BSD.device)
     for number, count in enumerate(decided_after(num_passes, num_tokens), 1):
         decided = passes > 0
-        drafts, confidence = choose_codes(predict(bits, decided), num_bits, temperature, generator)
+        drafts, confidence = choose_codes(predict(bits, decided), num_bits)
         ranked = confidence.masked_fill(decided, float("inf")).argsort(dim=1, descending=True, stable=True)
         rank = ranked.argsort(dim=1)
         fresh = (rank < count) & ~decided
@@ -74,18 +66,12 @@ def decode_frame(
     return DecodedFrame(bits, passes)
 
 
-def choose_codes(
-    logits: Logits, num_bits: int, temperature: float = 0.0, generator: torch.Generator | None = None
-) -> tuple[Tensor, Tensor]:
-    """Bits (..., D) and log-probability (...,) of one code per token."""
+def choose_codes(logits: Logits, num_bits: int) -> tuple[Tensor, Tensor]:
+    """Bits (..., D) and log-probability (...,) of the most probable code per token."""
     chosen, confidence = list[Tensor](), list[Tensor]()
     for part, part_bits in zip(logits, code_parts(num_bits), strict=True):
         log_probabilities = part.float().log_softmax(-1)
-        if temperature > 0:
-            weights = (log_probabilities / temperature).softmax(-1)
-            index = torch.multinomial(weights.flatten(0, -2), 1, generator=generator).view(weights.shape[:-1])
-        else:
-            index = log_probabilities.argmax(-1)
+        index = log_probabilities.argmax(-1)
         chosen.append(indices_to_bits(index, part_bits))
         confidence.append(log_probabilities.gather(-1, index.unsqueeze(-1)).squeeze(-1))
     return torch.cat(chosen, -1), torch.stack(confidence).sum(0)

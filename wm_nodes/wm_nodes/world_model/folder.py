@@ -13,13 +13,14 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from wm_nodes.config.schema import SimulationConfig, TokenizerConfig, WorldModelConfig
+from wm_nodes.core.model_folder import ModelFolderError, read_manifest, read_model_file, write_model_folder
+from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.text import TextModel
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 
-MANIFEST = "manifest.json"
 FILES = {
     "tokenizer": "tokenizer.safetensors",
     "action": "action_model.safetensors",
@@ -27,10 +28,6 @@ FILES = {
     "probe": "position_probe.safetensors",
 }
 FORMAT = 1
-
-
-class ModelFolderError(ValueError):
-    """A world-model folder that is incomplete, damaged, or of another architecture."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +72,10 @@ def save_model_folder(
     probe: PositionProbe | None = None,
 ) -> Path:
     """Write the models as float16 and the manifest; `story`: data, seeds, commands, metrics, machine, date."""
-    folder.mkdir(parents=True, exist_ok=True)
-    hashes: dict[str, str] = {}
     modules: dict[str, nn.Module | None] = {"tokenizer": tokenizer, "action": action, "text": text, "probe": probe}
-    for key, module in modules.items():
-        if module is None:
-            (folder / FILES[key]).unlink(missing_ok=True)
-            continue
-        hashes[key] = _write_module(folder / FILES[key], module)
+    packed = {key: _pack(module) for key, module in modules.items() if module is not None}
+    for key in FILES.keys() - packed.keys():
+        (folder / FILES[key]).unlink(missing_ok=True)
     manifest = {
         "format": FORMAT,
         "tasks": list(tasks),
@@ -94,11 +87,10 @@ def save_model_folder(
         "tokenizer": tokenizer_config.model_dump(),
         "world_model": world_model_config.model_dump(),
         "simulation": simulation.model_dump(),
-        "sha256": hashes,
+        "sha256": _hashes(packed),
         **story,
     }
-    _write(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
-    return folder
+    return write_model_folder(folder, {FILES[key]: data for key, data in packed.items()}, manifest)
 
 
 def save_refreshed_folder(
@@ -108,14 +100,12 @@ def save_refreshed_folder(
 
     Tasks, scene and sizes stay those of the source's manifest; `story` goes on top of it. The manifest comes last.
     """
-    manifest = read_manifest(source)
-    folder.mkdir(parents=True, exist_ok=True)
-    for key in manifest["sha256"].keys() - {"action"}:
-        _write(folder / FILES[key], (Path(source) / FILES[key]).read_bytes())
-    hashes = manifest["sha256"] | {"action": _write_module(folder / FILES["action"], action)}
+    manifest = read_world_manifest(source)
+    packed = {key: (source / FILES[key]).read_bytes() for key in manifest["sha256"].keys() - {"action"}}
+    packed["action"] = _pack(action)
+    hashes = manifest["sha256"] | _hashes({"action": packed["action"]})
     manifest |= {"world_model": world_model_config.model_dump(), "sha256": hashes, **story}
-    _write(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
-    return folder
+    return write_model_folder(folder, {FILES[key]: data for key, data in packed.items()}, manifest)
 
 
 def load_model_folder(folder: Path) -> WorldModels:
@@ -124,7 +114,7 @@ def load_model_folder(folder: Path) -> WorldModels:
     Raises:
         ModelFolderError: names the file, what is wrong, and the remedy.
     """
-    manifest = read_manifest(folder)
+    manifest = read_world_manifest(folder)
     tokenizer_config = TokenizerConfig.model_validate(manifest["tokenizer"])
     config = WorldModelConfig.model_validate(manifest["world_model"])
     num_tasks = len(manifest["tasks"])
@@ -152,55 +142,34 @@ def action_model_class(kind: str) -> type[ActionModel] | type[TokenActionModel]:
     return TokenActionModel if kind == "lfq" else ActionModel
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    path = Path(folder) / MANIFEST
-    if not path.is_file():
-        raise ModelFolderError(f"{folder} holds no {MANIFEST}; name the folder of a trained world model")
-    manifest: dict[str, Any] = json.loads(path.read_text())
-    if manifest.get("format") != FORMAT:
-        raise ModelFolderError(f"{path}: format {manifest.get('format')!r}, this version reads {FORMAT}; train it anew")
-    return manifest
+def read_world_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a world-model folder. Raises ModelFolderError."""
+    return read_manifest(folder, "world model", FORMAT)
 
 
 def _load(folder: Path, key: str, module: nn.Module, manifest: Mapping[str, Any]) -> None:
     path = Path(folder) / FILES[key]
-    if not path.is_file():
-        raise ModelFolderError(f"{path} is missing; copy the whole model folder")
-    data = path.read_bytes()
-    if hashlib.sha256(data).hexdigest() != manifest["sha256"][key]:
-        raise ModelFolderError(f"{path} is not the file its manifest names (sha256 differs): copy the folder again")
-    try:
-        tensors = load(data)
-    except SafetensorError as error:
-        raise ModelFolderError(f"{path} is damaged: {error}") from None
     expected = module.state_dict()
-    for name in sorted(expected.keys() | tensors.keys()):
-        have, want = tensors.get(name), expected.get(name)
-        if have is None or want is None or have.shape != want.shape:
-            raise ModelFolderError(
-                f"{path} is of another architecture: {name} is {_shape(have)} in the file and {_shape(want)} in the "
-                "model; train it anew with this version"
-            )
-    module.load_state_dict({name: tensor.to(expected[name].dtype) for name, tensor in tensors.items()})
+    try:
+        tensors = load(read_model_file(path, manifest["sha256"][key]))
+        tensors = {name: tensor.to(expected[name].dtype) if name in expected else tensor
+                   for name, tensor in tensors.items()}
+        check_same_layout(expected, tensors, what=str(path))
+    except (SafetensorError, WeightsError) as error:
+        raise ModelFolderError(f"{error}; train it anew with this version") from None
+    module.load_state_dict(tensors)
     module.eval().requires_grad_(False)
-
-
-def _shape(tensor: Tensor | None) -> str:
-    return "absent" if tensor is None else str(tuple(tensor.shape))
 
 
 def _compact(tensor: Tensor) -> Tensor:
     return tensor.detach().cpu().to(torch.float16 if tensor.is_floating_point() else tensor.dtype).contiguous()
 
 
-def _write_module(path: Path, module: nn.Module) -> str:
-    """Write a module as float16; return the file's sha256."""
-    data = save({name: _compact(tensor) for name, tensor in module.state_dict().items()})
-    _write(path, data)
-    return hashlib.sha256(data).hexdigest()
+def _pack(module: nn.Module) -> bytes:
+    """A module's weights as float16."""
+    data: bytes = save({name: _compact(tensor) for name, tensor in module.state_dict().items()})
+    return data
 
 
-def _write(path: Path, data: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_bytes(data)
-    temporary.replace(path)
+def _hashes(packed: Mapping[str, bytes]) -> dict[str, str]:
+    return {key: hashlib.sha256(data).hexdigest() for key, data in packed.items()}

@@ -28,15 +28,15 @@ def indices_to_bits(indices: Tensor, num_bits: int) -> Tensor:
     return ((indices.unsqueeze(-1) & powers) != 0).float() * 2 - 1
 
 
-def entropy_loss(values_BSD: Tensor, *, temperature: float = 1.0, diversity: float = 1.0) -> Tensor:
-    """E[H(p)] - diversity H(E[p]) of the code posterior, per bit and in nats.
+def entropy_loss(values_BSD: Tensor) -> Tensor:
+    """E[H(p)] - H(E[p]) of the code posterior, per bit and in nats.
 
-    The posterior factorises: p(bit_j = 1 | u) = sigmoid(4 u_j / temperature), so the per-sample entropy is the sum of
+    The posterior factorises: p(bit_j = 1 | u) = sigmoid(4 u_j), so the per-sample entropy is the sum of
     the bits' entropies. The entropy of the batch mean is exact up to MAX_EXACT_ENTROPY_BITS bits; above that the sum
     over bits, an upper bound, takes its place.
     """
     num_bits = values_BSD.shape[-1]
-    probabilities = torch.sigmoid(4 * values_BSD.float() / temperature).reshape(-1, num_bits)
+    probabilities = torch.sigmoid(4 * values_BSD.float()).reshape(-1, num_bits)
     sample_entropy = _binary_entropy(probabilities).sum(-1).mean()
     if num_bits <= MAX_EXACT_ENTROPY_BITS:
         codes = indices_to_bits(torch.arange(2**num_bits, device=values_BSD.device), num_bits)
@@ -45,7 +45,7 @@ def entropy_loss(values_BSD: Tensor, *, temperature: float = 1.0, diversity: flo
         batch_entropy = -(joint * torch.log(joint.clamp_min(1e-9))).sum()
     else:
         batch_entropy = _binary_entropy(probabilities.mean(0)).sum()
-    return (sample_entropy - diversity * batch_entropy) / num_bits
+    return (sample_entropy - batch_entropy) / num_bits
 
 
 def _binary_entropy(probabilities: Tensor) -> Tensor:

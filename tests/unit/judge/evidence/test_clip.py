@@ -6,11 +6,11 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+from evidence_table import EVIDENCE
 from pushed_box import HALF_M, draw, push_clip, pushing_states, redrawn
 
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.judge.dataset.edits import LabelledClip, SourceClip, apply, edit_states
-from wm_nodes.judge.evidence.definitions import EVIDENCE
 from wm_nodes.judge.evidence.motion import motion_evidence, outline_of
 from wm_nodes.judge.evidence.objects import FAR, find_target, object_evidence, scene_of
 from wm_nodes.judge.evidence.pictures import pictures_of
@@ -181,7 +181,7 @@ def test_every_number_is_finite_for_any_length_size_and_content(make: Callable[[
         found = evidence_of(frames, frames[0], masks)
         assert {name: v for name, v in found.items() if not np.isfinite(v)} == {}
         assert set(found) == set(EVIDENCE)
-        low, high = (np.array([getattr(EVIDENCE[name], end) for name in found]) for end in ("low", "high"))
+        low, high = np.array([EVIDENCE[name] for name in found]).T
         outside = (np.array(list(found.values())) < low) | (np.array(list(found.values())) > high + 1e-6)
         assert [name for name, bad in zip(found, outside) if bad] == []
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from imagined_clip import STEPS, imagined, models
 
+from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.judge.agent.types import TaskSpec
 from wm_nodes.judge.evidence.world_model import MODEL_EVIDENCE, model_evidence
-from wm_nodes.world_model.folder import ModelFolderError
 
 
 def evidence(

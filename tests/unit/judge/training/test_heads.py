@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.types import FloatArray
 from wm_nodes.judge.agent.levels import p_fail_of
 from wm_nodes.judge.agent.types import PLANNING
@@ -18,7 +19,6 @@ from wm_nodes.judge.evidence.head import (
     MANIFEST,
     TENSORS,
     HeadQuestion,
-    JudgeFolderError,
     JudgeHead,
     levels_of,
     load_head,
@@ -259,20 +259,20 @@ def test_a_damaged_folder_or_another_list_of_evidence_is_refused(head: JudgeHead
     def saved(name: str) -> Path:
         return save_head(tmp_path / name, head)
 
-    with pytest.raises(JudgeFolderError, match="holds no readable judge"):
+    with pytest.raises(ModelFolderError, match=r"holds no judge\.json"):
         load_head(tmp_path / "nothing")
-    with pytest.raises(JudgeFolderError, match="has format 'x'"):
+    with pytest.raises(ModelFolderError, match="has format 'x'"):
         load_head(damaged(saved("format"), format="x"))
-    with pytest.raises(JudgeFolderError, match="is not the file its manifest names"):
+    with pytest.raises(ModelFolderError, match="is not the file its manifest names"):
         load_head(damaged(saved("hash"), sha256="0" * 64))
-    with pytest.raises(JudgeFolderError, match=r"16 evidence names, but an array \(17,\)"):
+    with pytest.raises(ModelFolderError, match=r"16 evidence names, but an array \(17,\)"):
         load_head(damaged(saved("evidence"), evidence=list(NAMES[:-1])))
     few = json.loads((saved("lines") / MANIFEST).read_text())["lines"]
-    with pytest.raises(JudgeFolderError, match="planning has 1 questions, not 2"):
+    with pytest.raises(ModelFolderError, match="planning has 1 questions, not 2"):
         load_head(damaged(tmp_path / "lines", lines=few | {PLANNING: few[PLANNING][:1]}))
     with pytest.raises(ValueError, match=r"needs evidence .*clarity"):
         head.row({"something": 1.0})
     wide = Trees(np.full((1, 1), 99, np.int32), *(np.zeros((1, n), np.float32) for n in (1, 2, 1)), 0.0)
     bent = replace(head, questions={**head.questions, "clarity": (HeadQuestion(wide, 1.0, 0.0),)})
-    with pytest.raises(JudgeFolderError, match="trees of clarity do not fit 17 evidence names"):
+    with pytest.raises(ModelFolderError, match="trees of clarity do not fit 17 evidence names"):
         load_head(save_head(tmp_path / "trees", bent))

@@ -21,8 +21,6 @@ from mani_skill.utils.registration import register_env
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.environments.maniskill.backend import render_backend
 
-ROBOT_BASE_X_M = -0.615
-"""World x of the Panda's base; y and z are 0."""
 SIMULATION_HZ = 100
 TABLE_COLOUR = (0.78, 0.74, 0.66, 1.0)
 LINKS_NOT_DRAWN = tuple(f"panda_link{i}" for i in range(7))

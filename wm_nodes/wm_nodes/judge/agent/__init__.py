@@ -1,6 +1,6 @@
 """The reward agent: plans, gates, votes and reflects over one Judge (RA-1 to RA-16)."""
 
-from wm_nodes.judge.agent.contract import ADVANTAGE_CLIP, check_one_judge, pause_reason
+from wm_nodes.judge.agent.contract import check_one_judge, pause_reason
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import (
@@ -19,7 +19,6 @@ from wm_nodes.judge.agent.types import (
 )
 
 __all__ = [
-    "ADVANTAGE_CLIP",
     "Capabilities",
     "ClipRef",
     "Judge",

@@ -4,8 +4,6 @@ from collections.abc import Sequence
 
 from wm_nodes.judge.agent.types import Verdict
 
-ADVANTAGE_CLIP = 2.5
-"""Of group advantages; the paper lowered it from 5 because this reward varies more."""
 MAX_INVALID_SHARE = 0.1
 """A round with more invalid clips pauses training."""
 

@@ -15,8 +15,6 @@ from wm_nodes.judge.decisions import OVERALL, STAGES
 FORMAT = "audit-labels-1"
 HACK = "hack: "
 """In front of a pattern's name, because a pattern may be called like a component. It passes where it is absent."""
-PASS_LEVEL = 3
-"""From here on a level passes; 2 has p_fail 0.5, which is no pass (RA-5)."""
 
 Answer = bool | int | None
 """True: passes. False: fails. Of planning: the level. None: unsure."""

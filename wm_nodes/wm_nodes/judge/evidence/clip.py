@@ -16,7 +16,7 @@ def clip_evidence(
     segmenter: Segmenter, frames: UInt8Array, reference: UInt8Array, instruction: str,
     readers: Sequence[TemporalNetwork] = (),
 ) -> dict[str, float]:
-    """Return every number of definitions.EVIDENCE, and what the readers answer, each finite.
+    """Return every number of docs/embedded_judge_evidence.csv, and what the readers answer, each finite.
 
     Args:
         frames: uint8 (T, H, W, 3), T >= 2. reference: uint8 (H, W, 3), what the clip had to start from.

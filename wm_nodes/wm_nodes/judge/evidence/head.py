@@ -7,7 +7,6 @@ Shapes: N clips, F evidence.
 """
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,7 +19,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 from torch import nn
 
-from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import ModelFolderError, read_manifest, read_model_file, write_model_folder
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.judge.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING
 from wm_nodes.judge.evidence.segmentation import Segmenter
@@ -41,10 +40,6 @@ CLIP_AT = 6.0
 
 Floats = NDArray[np.float64]
 _Network = TypeVar("_Network", bound=nn.Module)
-
-
-class JudgeFolderError(ValueError):
-    """A judge's folder that is incomplete, damaged, or of another version."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,27 +204,17 @@ def save_head(folder: Path, head: JudgeHead) -> Path:
         "limit": known.limit, "size": list(head.size), "lengths": list(head.lengths), "readers": len(head.readers),
         **({} if head.window is None else {"window": asdict(head.window)}), **head.story,
     }
-    write_atomic(folder / TENSORS, data)
-    write_atomic(folder / MANIFEST, (json.dumps(manifest, indent=1) + "\n").encode())
-    return folder
+    return write_model_folder(folder, {TENSORS: data}, manifest, MANIFEST)
 
 
 def load_head(folder: Path) -> JudgeHead:
     """Load and verify a judge's folder.
 
     Raises:
-        JudgeFolderError: names the file, what is wrong, and the remedy.
+        ModelFolderError: names the file, what is wrong, and the remedy.
     """
-    try:
-        manifest = json.loads((folder / MANIFEST).read_text())
-        data = (folder / TENSORS).read_bytes()
-    except (OSError, ValueError) as error:
-        raise JudgeFolderError(f"{folder} holds no readable judge: {error}; train one, or copy it again") from error
-    if manifest.get("format") != FORMAT:
-        found = manifest.get("format")
-        raise JudgeFolderError(f"{folder / MANIFEST} has format {found!r}, not {FORMAT!r}; train it anew")
-    if hashlib.sha256(data).hexdigest() != manifest["sha256"]:
-        raise JudgeFolderError(f"{folder / TENSORS} is not the file its manifest names; copy the folder again")
+    manifest = read_manifest(folder, "judge", FORMAT, MANIFEST)
+    data = read_model_file(folder / TENSORS, manifest["sha256"])
     try:
         arrays = load(data)
         segmenter = _network(Segmenter(), "segmenter", arrays)
@@ -248,7 +233,7 @@ def load_head(folder: Path) -> JudgeHead:
         window = Window(**manifest["window"]) if "window" in manifest else None
         clean_low, clean_high = arrays["clean_low"], arrays["clean_high"]
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise JudgeFolderError(f"{folder} is of another architecture: {error}; train it anew") from error
+        raise ModelFolderError(f"{folder} is of another architecture: {error}; train it anew") from error
     _check(folder, names, questions, known, (clean_low, clean_high))
     own = {"format", "sha256", "evidence", "lines", "limit", "size", "lengths", "readers", "window"}
     story = {name: value for name, value in manifest.items() if name not in own}
@@ -277,16 +262,16 @@ def _check(
     count = len(names)
     for array in (known.centre, known.scale, *ranges):
         if array.shape != (count,):
-            raise JudgeFolderError(f"{folder}: {count} evidence names, but an array {array.shape}; train it anew")
+            raise ModelFolderError(f"{folder}: {count} evidence names, but an array {array.shape}; train it anew")
     if known.precision.shape != (count, count):
         shape = known.precision.shape
-        raise JudgeFolderError(f"{folder}: {count} evidence names, but precision {shape}; train it anew")
+        raise ModelFolderError(f"{folder}: {count} evidence names, but precision {shape}; train it anew")
     for target, asked in questions.items():
         if len(asked) != num_questions(target):
-            raise JudgeFolderError(f"{folder}: {target} has {len(asked)} questions, not {num_questions(target)}")
+            raise ModelFolderError(f"{folder}: {target} has {len(asked)} questions, not {num_questions(target)}")
         for question in asked:
             trees = question.trees
             fits = trees.leaves.shape == (len(trees.features), 2 ** trees.features.shape[1])
             fits = fits and trees.thresholds.shape == trees.gains.shape == trees.features.shape
             if not fits or not 0 <= trees.features.max() < count:
-                raise JudgeFolderError(f"{folder}: trees of {target} do not fit {count} evidence names; train it anew")
+                raise ModelFolderError(f"{folder}: trees of {target} do not fit {count} evidence names; train it anew")

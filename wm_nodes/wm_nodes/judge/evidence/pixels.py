@@ -1,7 +1,8 @@
 """Evidence that needs no model: how a clip differs from its reference frame and from itself (RA-17).
 
 Shapes: T frames, H W 3 image, G grid cells along each side, S tiles along each side. Every number is finite for any
-clip of T >= 2 frames; definitions.py says what each one is. No number adds reward: heads and triggers read them.
+clip of T >= 2 frames; docs/embedded_judge_evidence.csv says what each one is. No number adds reward: heads and
+triggers read them.
 """
 
 import cv2

@@ -24,10 +24,11 @@ from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.service import POLL_S, READS, ClipJob, JudgeService
 from wm_nodes.nodes.judge.verdict_message import verdict_msg
 from wm_nodes.ros import convert, diagnostics
-from wm_nodes.ros.actions import Work, WorkerAction
+from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.wire import WireError
+from wm_nodes.ros.worker import Work
 
 PARAMS = (
     Param("audit_dir", "", "Folder of the reward agent's audit log, relative to run_dir; empty: none is written",

@@ -18,10 +18,10 @@ from wm_nodes.nodes.learner.replay_assembler import ReplayAssembler
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.policy_rl.training_run import DroppedTransitions, Progress
 from wm_nodes.recording import BagReport, read_rollouts, topics
-from wm_nodes.ros.actions import Work
 from wm_nodes.ros.clients import Check, run_goal, same_process
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.worker import Work
 
 RETRY_S = 0.5
 MAX_GAP_RETRIES = 2

@@ -12,7 +12,7 @@ published network is all that is missing, beside its text encoder (last hidden s
 from wm_nodes.core.optional import MissingPackageError
 from wm_nodes.video_model.adapters.codec import VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity
-from wm_nodes.video_model.adapters.folder import ModelFolder, ModelFolderError
+from wm_nodes.video_model.adapters.folder import ModelFolder
 from wm_nodes.video_model.adapters.loading import LoadSettings, PublicVideoModel, load_public_model
 from wm_nodes.video_model.adapters.lora import add_lora, load_lora, save_lora
 from wm_nodes.video_model.adapters.text import TextEncoder
@@ -24,7 +24,6 @@ __all__ = [
     "LoadSettings",
     "MissingPackageError",
     "ModelFolder",
-    "ModelFolderError",
     "PublicVelocity",
     "PublicVideoModel",
     "TextEncoder",

@@ -5,20 +5,16 @@ transformer/ vae/ text_encoder/       config.json and *.safetensors
 tokenizer/  scheduler/                their configuration
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from wm_nodes.core.model_folder import ModelFolderError, read_json
 from wm_nodes.video_model.adapters.packages import package
 
 REMEDY = "download the whole model again in its diffusers layout (with safetensors), and name that folder"
 TEXT_ENCODERS = ("UMT5EncoderModel", "T5EncoderModel", "Qwen2_5_VLForConditionalGeneration")
-
-
-class ModelFolderError(ValueError):
-    """A model folder that is not there, incomplete, or not of a supported kind."""
 
 
 class ModelFolder:
@@ -105,13 +101,4 @@ class ModelFolder:
         return path
 
     def _json(self, name: str) -> dict[str, Any]:
-        path = self.folder / name
-        try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise ModelFolderError(f"{path} is missing; {REMEDY}") from None
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise ModelFolderError(f"{path} cannot be read ({error}); {REMEDY}") from error
-        if not isinstance(data, dict):
-            raise ModelFolderError(f"{path} holds no JSON object; {REMEDY}")
-        return data
+        return read_json(self.folder / name, REMEDY)

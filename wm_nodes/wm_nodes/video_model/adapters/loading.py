@@ -7,9 +7,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.video_model.adapters.codec import VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity, CosmosVersion
-from wm_nodes.video_model.adapters.folder import ModelFolder, ModelFolderError
+from wm_nodes.video_model.adapters.folder import ModelFolder
 from wm_nodes.video_model.adapters.packages import package
 from wm_nodes.video_model.adapters.text import MAX_TOKENS, TextEncoder, TextStyle
 from wm_nodes.video_model.adapters.velocity import PublicVelocity

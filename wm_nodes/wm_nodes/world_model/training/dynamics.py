@@ -93,10 +93,8 @@ def train_action_model(
     run_dir: Path | None,
     *,
     progress: bool = True,
-    max_seconds: float = 0.0,
     model: ActionModel | None = None,
     done_loss: str = "bce",
-    name: str = "action_model",
 ) -> tuple[ActionModel, dict[str, float]]:
     """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
 
@@ -113,23 +111,22 @@ def train_action_model(
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed)
 
     def loss(iteration: int) -> dict[str, Tensor]:
-        rows = numpy_stream(seed, f"{name}_batch", iteration).integers(0, len(data), settings.batch_size)
+        rows = numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
         steps = rollout_steps_at(iteration, settings.num_iterations, settings.rollout_steps)
         index = torch.from_numpy(rows)
         with compute_context(tokenizer.device):
-            terms = unroll(trained, tokenizer, data, index, steps, torch_stream(seed, f"{name}_noise", iteration))
+            terms = unroll(trained, tokenizer, data, index, steps, torch_stream(seed, "action_model_noise", iteration))
             losses = rollout_losses(terms, tokenizer, data, index, heads[index], config, done_loss)
             if settings.decoded_weight:
-                generator = torch_stream(seed, f"{name}_decoded", iteration)
+                generator = torch_stream(seed, "action_model_decoded", iteration)
                 losses |= decoded_losses(terms, tokenizer, data, index, config, generator)
                 losses["loss"] = losses["loss"] + settings.decoded_weight * sum(
                     losses[key] for key in ("pixel", "recoded", "recoded_state")
                 )
             return losses | {"rollout_steps": torch.tensor(float(steps))}
 
-    loop = TrainingLoop(
-        name, trained, LoopSettings(settings.num_iterations, settings.learning_rate, max_seconds=max_seconds), run_dir
-    )
+    loop_settings = LoopSettings(settings.num_iterations, settings.learning_rate)
+    loop = TrainingLoop("action_model", trained, loop_settings, run_dir)
     metrics = loop.run(loss, progress=progress)
     return trained, metrics
 

@@ -30,7 +30,6 @@ def train_token_model(
     run_dir: Path | None,
     *,
     progress: bool = True,
-    name: str = "action_model",
 ) -> tuple[TokenActionModel, dict[str, float]]:
     """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics."""
     settings = config.world_model
@@ -44,13 +43,13 @@ def train_token_model(
 
     def loss(iteration: int) -> dict[str, Tensor]:
         index = torch.from_numpy(
-            numpy_stream(seed, f"{name}_batch", iteration).integers(0, len(data), settings.batch_size)
+            numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
         )
-        generator = torch_stream(seed, f"{name}_mask", iteration)
+        generator = torch_stream(seed, "action_model_mask", iteration)
         with compute_context(tokenizer.device):
             return token_losses(model, data, index, heads[index], generator, settings.done_weight)
 
-    loop = TrainingLoop(name, model, LoopSettings(settings.num_iterations, settings.learning_rate), run_dir)
+    loop = TrainingLoop("action_model", model, LoopSettings(settings.num_iterations, settings.learning_rate), run_dir)
     metrics = loop.run(loss, progress=progress)
     return model, metrics
 

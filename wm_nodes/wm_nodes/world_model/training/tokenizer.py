@@ -31,8 +31,6 @@ def train_tokenizer(
     run_dir: Path | None,
     *,
     progress: bool = True,
-    max_seconds: float = 0.0,
-    tokenizer: Tokenizer | None = None,
 ) -> tuple[Tokenizer, dict[str, float]]:
     """Train on every recorded frame; returns the tokenizer (averaged weights) and its last metrics.
 
@@ -45,11 +43,9 @@ def train_tokenizer(
     frames = np.flatnonzero(episodes.frame_mask)
     images = episodes.images.reshape(-1, height, width, 3)
     truth = probe_targets(episodes.ground_truth.reshape(len(images), -1), episodes.tasks[0])
-    if tokenizer is None:
-        with initial_weights(seed, "tokenizer_init"):
-            tokenizer = Tokenizer(settings, height, width)
-        _set_statistics(tokenizer, images[frames], truth[frames], seed)
-    codec = tokenizer
+    with initial_weights(seed, "tokenizer_init"):
+        codec = Tokenizer(settings, height, width)
+    _set_statistics(codec, images[frames], truth[frames], seed)
 
     def loss(iteration: int) -> dict[str, Tensor]:
         rows = numpy_stream(seed, "tokenizer_batch", iteration).choice(frames, settings.batch_size)
@@ -79,7 +75,7 @@ def train_tokenizer(
         terms["psnr_db"] = -10 * error.detach().square().mean().log10()
         return terms
 
-    schedule = LoopSettings(settings.num_iterations, settings.learning_rate, max_seconds=max_seconds)
+    schedule = LoopSettings(settings.num_iterations, settings.learning_rate)
     loop = TrainingLoop("tokenizer", codec, schedule, run_dir)
     metrics = loop.run(loss, progress=progress)
     return codec, metrics

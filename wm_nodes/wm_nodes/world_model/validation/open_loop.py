@@ -146,23 +146,6 @@ def auc(scores: NDArray[np.floating[Any]], positive: BoolArray) -> float:
     return float((above > below).mean() + 0.5 * (above == below).mean())
 
 
-def format_rollouts(metrics: dict[str, float]) -> str:
-    """The metrics as a small text table, one line per step."""
-    labels = sorted({key.rsplit("_", 1)[1] for key in metrics if key.startswith("object_rollout_cm")})
-    lines = ["step   PSNR roll/recon/copy    object cm roll/floor/copy   moved roll/copy   tool cm roll/floor/copy"]
-    for label in labels:
-        m = {key.removesuffix(f"_{label}"): value for key, value in metrics.items() if key.endswith(label)}
-        lines.append(
-            f"{label}    {m['psnr_rollout_db']:5.1f} {m['psnr_recon_db']:5.1f} {m['psnr_copy_db']:5.1f}       "
-            f"{m['object_rollout_cm']:5.2f} {m['object_floor_cm']:5.2f} {m['object_copy_cm']:5.2f}          "
-            f"{m['object_moved_rollout_cm']:5.2f} {m['object_moved_copy_cm']:5.2f}      "
-            f"{m['tool_rollout_cm']:5.2f} {m['tool_floor_cm']:5.2f} {m['tool_copy_cm']:5.2f}"
-        )
-    for key in sorted(key for key in metrics if key.startswith("done_")):
-        lines.append(f"{key} {metrics[key]:.3f}")
-    return "\n".join(lines)
-
-
 def _position_metrics(
     estimates: dict[str, FloatArray], truth_EP: FloatArray, columns: list[int], rows: BoolArray, pattern: str
 ) -> dict[str, float]:

@@ -1,0 +1,124 @@
+"""What the learners of both loops share: an action that trains, the announcement of versions, ranks behind the node."""
+
+import signal
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from wm_msgs.msg import PolicyVersion
+from wm_nodes.judge.service import TrainingPaused
+from wm_nodes.ros import convert
+from wm_nodes.ros.actions import WorkerAction
+from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.params import COMMON, Param, read_parameters
+from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.worker import Work
+from wm_nodes.training.ranks import Ranks, join
+from wm_nodes.training.run_folder import TrainingRun
+
+
+class TrainingNode(ManagedNode):
+    """A learner: trains by an action and announces every version of its run folder.
+
+    A subclass makes the run in configure() and calls serve_training(); it says in train() how a goal is trained and in
+    fill() what a result holds. The Result of the action has the reasons FINISHED, FAILED, PEER_LOST, PAUSED.
+
+    Args:
+        ranks: this process is rank 0 of them.
+    """
+
+    inline_limit_bytes = 0
+    """Weights up to this size travel inside the announcement."""
+
+    def __init__(self, params: Sequence[Param], ranks: Ranks | None = None, **node_arguments: Any) -> None:
+        super().__init__("learner", params, **node_arguments)
+        self.ranks = ranks or Ranks()
+        self._run: TrainingRun | None = None
+        self._announced = -1
+
+    @abstractmethod
+    def train(self, work: Work, result: Any) -> None:
+        """Train as the goal asks; what it raises becomes the result's reason and message."""
+
+    @abstractmethod
+    def fill(self, result: Any) -> Any:
+        """Put the run's counts into a result, and return it."""
+
+    def serve_training(self, run: TrainingRun, action_type: type[Any], action: str, version_topic: str) -> None:
+        """Serve the action and announce versions, until cleanup."""
+        self._run, self._announced = run, -1
+        self._result_type = action_type.Result
+        self._versions = self.publish_on(version_topic)
+        self._action = WorkerAction(self, action_type, action, self._train_goal, self._describe)
+        self.own(self._action.destroy)
+
+    @property
+    def training(self) -> bool:
+        """Whether a goal is at work."""
+        return self._action.busy
+
+    def deactivate(self, reason: str) -> None:
+        self._action.stop(reason)
+
+    def announce(self, version: int | None = None) -> None:
+        """Publish a version, by default the newest; its files are written first. Raises OSError."""
+        run = self._run
+        assert run is not None  # serve_training sets it
+        run.ensure_saved()
+        newest = run.version
+        version = newest if version is None else version
+        packed = run.weights_of(version)
+        message = PolicyVersion(
+            version=version, train_step=run.updates - (version != newest), uri=run.files.uri(version),
+            sha256=packed.sha256, size_bytes=len(packed.data), format="safetensors", arch_hash=packed.arch_hash,
+        )
+        message.header.stamp = self.get_clock().now().to_msg()
+        if len(packed.data) <= self.inline_limit_bytes:
+            message.inline_data = convert.bytes_field(packed.data)
+        self._versions.publish(message)
+        self._announced = version
+
+    def _train_goal(self, work: Work) -> Any:
+        reasons, run = self._result_type, self._run
+        assert run is not None  # serve_training sets it
+        result = reasons(termination_reason=reasons.FINISHED)
+        try:
+            if self._announced != run.version:  # its files could not be written when it was made
+                self.announce()
+            self.train(work, result)
+        except PeerLost as error:
+            result.termination_reason, result.message = reasons.PEER_LOST, str(error)
+        except TrainingPaused as pause:
+            result.termination_reason, result.message = reasons.PAUSED, str(pause)
+        except (WireError, ValueError, OSError, FloatingPointError) as error:
+            result.termination_reason, result.message = reasons.FAILED, str(error)
+        if result.termination_reason in (reasons.PEER_LOST, reasons.FAILED, reasons.PAUSED):
+            self.say_failed_goal(f"training ended: {result.message}")
+        elif result.message:
+            self.get_logger().warning(f"training ended: {result.message}")
+        else:
+            self.get_logger().info(f"training ended after update {run.updates}")
+        return self.fill(result)
+
+    def _describe(self, reason: int, text: str) -> Any:
+        return self.fill(self._result_type(termination_reason=reason, message=text))
+
+
+def run_learner(
+    make_node: Callable[[Ranks], TrainingNode], params: Sequence[Param],
+    make_run: Callable[[Mapping[str, Any], Path, Ranks], TrainingRun],
+) -> int:
+    """One process, or under torchrun rank 0 as the node and the other ranks behind it; return the exit code.
+
+    Args:
+        make_run: the run of another rank, of the values of the node's parameters and the run folder.
+    """
+    ranks = join()
+    if ranks.rank == 0:
+        return run_node(lambda: make_node(ranks))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # rank 0 ends the others
+    values = read_parameters("learner", (*COMMON, *params))
+    make_run(values, Path(str(values["run_dir"])), ranks).follow()
+    return 0
