@@ -1,4 +1,4 @@
-"""Claim A on clips of recorded contexts: how far the videos of one context spread, and at which cost in quality.
+"""Diversity on clips of recorded contexts: how far the videos of one context spread, and at which cost in quality.
 
 Shapes: n videos of a context, F frames, H W 3 image. DD-19.
 """

@@ -1,4 +1,4 @@
-"""Claim B on clips of recorded contexts: what each sampler makes of the same number of model calls.
+"""Learning on clips of recorded contexts: what each sampler makes of the same number of model calls.
 
 The setting is the one of docs/dyndiff.md in which the shipped video model was seen to learn: contexts it has not been
 trained on, clips of few steps, only the weights that carry the condition, no KL.

@@ -1,4 +1,4 @@
-"""Claim A: how far the videos of one context spread, at which cost in quality. DD-19.
+"""Diversity: how far the videos of one context spread, at which cost in quality. DD-19.
 
 Shapes: N videos in groups of one scene, F frames, C channels, H W cells.
 """

@@ -1,4 +1,4 @@
-"""Claim B: what each sampler makes of the same number of model calls, on the moving disc.
+"""Learning: what each sampler makes of the same number of model calls, on the moving disc.
 
 Shapes: N videos of one iteration, in groups of one scene each.
 """

@@ -152,7 +152,7 @@ def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def family_of(arm: str) -> str:
-    """The family of an arm of claim A."""
+    """The family of a sampler of the diversity experiment."""
     if not arm.startswith("DynDiff"):
         return arm.split()[0]
     return f"DynDiff {arm.split()[2]} rms" if arm.endswith("rms") else "DynDiff literal"

@@ -35,7 +35,7 @@ def dyndiff(eta: float, combine: str = "gated", budget: str = "literal", **knobs
 
 
 def diversity_samplers() -> list[SamplerSetup]:
-    """Claim A: ODE, CPS at several noise levels, DynDiff as written, sparse, and at CPS's noise budget."""
+    """For diversity: ODE, CPS at several noise levels, DynDiff as written, sparse, and at CPS's noise budget."""
     arms = [sampler_setup("ODE", SamplerSettings("ode", 0.0))]
     arms += [sampler_setup(f"CPS {eta:g}", SamplerSettings("cps", eta)) for eta in (0.2, 0.4, 0.6)]
     arms += [sampler_setup(f"DynDiff {eta:g} gated", dyndiff(eta)) for eta in (0.6, 1.0)]
@@ -48,7 +48,7 @@ def diversity_samplers() -> list[SamplerSetup]:
 
 
 def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
-    """Claim B: every arm on one learner; `learner` holds what they share.
+    """Learning: every arm on one learner; `learner` holds what they share.
 
     Mix-GRPO and the arms "window" train all four steps of a window that moves, as many as the others do of their nine.
     """
