@@ -1,4 +1,4 @@
-"""The main job: a policy that improves in the real simulator by training inside a learned world model.
+"""The main job, `wm train-policy`: a policy that improves in the simulator by training inside a learned world model.
 
 python3 launch_scripts/online_rl.py [--preset P] [--task T] ...     # --help lists everything
 """
@@ -9,6 +9,6 @@ from setup.entry import ensure
 
 if __name__ == "__main__":
     ensure()
-    from wm_nodes.apps.train_policy import main
+    from wm_nodes.apps.cli import run_verb
 
-    raise SystemExit(main(sys.argv[1:]))
+    raise SystemExit(run_verb("train-policy", sys.argv[1:], "python3 launch_scripts/online_rl.py"))

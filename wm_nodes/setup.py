@@ -25,6 +25,7 @@ setup(
         "console_scripts": [
             *(f"{node}_node = wm_nodes.nodes.{node}_node:main" for node in NODES),
             "wm_compose = wm_nodes.nodes.compose:main",
+            "wm = wm_nodes.apps.cli:main",
         ]
     },
 )

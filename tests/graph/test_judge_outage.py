@@ -10,7 +10,7 @@ from judge_server import PickyServer, serving
 
 from wm_msgs.action import TrainVideo
 from wm_msgs.srv import StopRecording
-from wm_nodes.apps.train_video_model import main
+from wm_nodes.apps.cli import main
 from wm_nodes.launching.scenarios import VIDEO_TOPICS
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]

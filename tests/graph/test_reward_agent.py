@@ -20,7 +20,7 @@ from judge_server import PickyServer
 from wm_msgs.action import EvaluateClips, Train, TrainVideo
 from wm_msgs.msg import ClipScores, ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric, StartRecording, StopRecording
-from wm_nodes.apps.train_video_model import main
+from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent import load_rubric
 from wm_nodes.judge.audit import read_record, verify

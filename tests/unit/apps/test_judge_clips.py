@@ -10,7 +10,8 @@ import pytest
 from clip_folders import write_clips
 from judge_server import PickyServer, serving
 
-from wm_nodes.apps.judge_clips import VERDICTS, main
+from wm_nodes.apps.cli import main
+from wm_nodes.apps.judge_clips import VERDICTS
 from wm_nodes.judge.agent import clip_ref
 from wm_nodes.judge.audit import read_record
 
@@ -24,7 +25,7 @@ def test_a_servers_verdicts_are_kept_audited_and_gone_on_with(
 ) -> None:
     write_clips(tmp_path)
     with serving(PickyServer()) as server:
-        command = [str(tmp_path), "--judge", server.url, "--judge-model", "judge"]
+        command = ["judge-clips", str(tmp_path), "--judge", server.url, "--judge-model", "judge"]
         assert main([*command, "--audit", str(tmp_path / "audit")]) == 0
         assert "2 clips (2 OK), mean reward 0." in capsys.readouterr().out
         rows, asked = rows_of(tmp_path), len(server.requests)
@@ -47,7 +48,7 @@ def test_a_servers_verdicts_are_kept_audited_and_gone_on_with(
 
 def test_the_embedded_judge_abstains_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_clips(tmp_path)
-    assert main([str(tmp_path), "--judge", "embedded"]) == 0
+    assert main(["judge-clips", str(tmp_path), "--judge", "embedded"]) == 0
     out = capsys.readouterr().out
     foreign, unknown = "planning: unlike all training clips: distance", "task_completion: not trained on task ''"
     assert "2 clips (2 ABSTAIN)" in out and re.search(f"a: ABSTAIN, ({foreign}|{unknown})", out), out
@@ -69,18 +70,18 @@ def test_what_cannot_be_read_is_one_error_that_names_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], changed: dict[str, Any], said: str
 ) -> None:
     write_clips(tmp_path, **changed)
-    assert main([str(tmp_path), "--judge", "embedded"]) == 2
+    assert main(["judge-clips", str(tmp_path), "--judge", "embedded"]) == 2
     assert said in capsys.readouterr().err
 
 
 def test_a_folder_without_a_list_says_what_a_line_is_and_bad_frames_are_an_error_of_their_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([str(tmp_path), "--judge", "embedded"]) == 2
+    assert main(["judge-clips", str(tmp_path), "--judge", "embedded"]) == 2
     assert 'one line per clip, e.g. {"file": "a.mp4"' in capsys.readouterr().err
     bad = np.full((17, 96, 96, 3), np.nan, np.float32)
     np.save(tmp_path / "bad.npy", bad)
     line = {"file": "bad.npy", "instruction": "push", "sha256": clip_ref("", bad, 5.0).sha256}
     (tmp_path / "clips.jsonl").write_text(json.dumps(line) + "\n")
-    assert main([str(tmp_path), "--judge", "embedded"]) == 1
+    assert main(["judge-clips", str(tmp_path), "--judge", "embedded"]) == 1
     assert "pixels that are not finite" in capsys.readouterr().out

@@ -8,7 +8,7 @@ import pytest
 from evidence_table import EVIDENCE
 from pushed_box import push_clip, redrawn
 
-from wm_nodes.apps.train_judge import main
+from wm_nodes.apps.cli import main
 from wm_nodes.judge.dataset.edits import Division, LabelledClip, children, manifest_of, to_bytes
 from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 from wm_nodes.judge.evidence.segmentation import Segmenter
@@ -41,14 +41,14 @@ def toy_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_set_without_a_fault_of_some_kind_is_refused_and_finished_stages_are_kept(
     toy_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([str(tmp_path), str(toy_set), *SHORT]) == 2
+    assert main(["train-judge", str(tmp_path), str(toy_set), *SHORT]) == 2
     assert "error: training clips of clarity are all above level 0; build larger sets" in capsys.readouterr().err
     kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     assert {"segmenter.safetensors", "segmenter.json"} < kept.keys()
     assert len(kept) == 8, "two files of each part, and two readers"
     with np.load(next(tmp_path.glob("evidence-*.npz")), allow_pickle=False) as arrays:
         assert set(arrays["names"]) == set(EVIDENCE) and np.isfinite(arrays["values"]).all()
-    assert main([str(tmp_path), str(toy_set), *SHORT]) == 2
+    assert main(["train-judge", str(tmp_path), str(toy_set), *SHORT]) == 2
     assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == kept
 
 
@@ -56,7 +56,7 @@ def test_what_cannot_be_trained_or_measured_is_named(
     toy_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def error(*arguments: str) -> str:
-        assert main([*arguments, *SHORT]) == 2
+        assert main(["train-judge", *arguments, *SHORT]) == 2
         return capsys.readouterr().err
 
     assert "holds no judge.json" in error(str(tmp_path), str(toy_set), "--measure", "test")

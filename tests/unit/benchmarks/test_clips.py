@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from recording_samples import make_episode, make_spec
 
-from benchmarks.video_rl.cli import main
 from benchmarks.video_rl.clip_resolution import CODEC, COPY, ENLARGED, MODEL
+from wm_nodes.apps.cli import main
 from wm_nodes.recording import EpisodeBagWriter
 
 STEPS = 4
@@ -36,7 +36,8 @@ def test_clips_of_one_noise_by_ode_are_one_clip_and_arms_are_paired_within_their
     path = tmp_path / "clips.json"
     samplers = ["--samplers", "ODE", "CPS 0.2", "DynDiff 0.2 sparse, rms"]
     size = ["--contexts", "2", "--group-size", "2", "--features", "pixels"]
-    assert main(["clips", "--context-bags", str(bags[1]), *size, *samplers, "--json", str(path)]) == 0
+    call = ["clips", "--context-bags", str(bags[1]), *size, *samplers, "--json", str(path)]
+    assert main(["benchmark", "video-rl", *call]) == 0
     assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     found = json.loads(path.read_text())
     rows = {(row["sampler"], row["shared_noise"]): row for row in found["rows"]}
@@ -56,7 +57,7 @@ def learning(bags: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) 
     path = tmp_path_factory.mktemp("clip_learning") / "found.json"
     given = ["--context-bags", str(bags[0]), "--heldout-bags", str(bags[1]), "--eval-contexts", "3"]
     call = ["clip-learning", *given, "--seeds", "0", "1", "--samplers", CPS, DYNDIFF, "--json", str(path)]
-    assert main([*call, "--iterations", "1"]) == 0
+    assert main(["benchmark", "video-rl", *call, "--iterations", "1"]) == 0
     return call, path
 
 
@@ -86,10 +87,10 @@ def test_trainings_in_the_file_are_not_made_again_and_another_plan_is_refused(
 ) -> None:
     call, path = learning
     rows = json.loads(path.read_text())["rows"]
-    assert main([*call, "--iterations", "1"]) == 0
+    assert main(["benchmark", "video-rl", *call, "--iterations", "1"]) == 0
     assert json.loads(path.read_text())["rows"] == rows, "their seconds would differ"
-    assert main([*call, "--iterations", "2"]) == 2
-    assert "take another file" in " ".join(capsys.readouterr().out.split())
+    assert main(["benchmark", "video-rl", *call, "--iterations", "2"]) == 2
+    assert "take another file" in " ".join(capsys.readouterr().err.split())
 
 
 def test_sizes_are_shown_beside_the_own_one_enlarged_and_the_own_one_is_the_same_there(tmp_path: Path) -> None:
@@ -101,7 +102,8 @@ def test_sizes_are_shown_beside_the_own_one_enlarged_and_the_own_one_is_the_same
             episode = make_episode(spec, 0, STEPS)
             bag.write(replace(episode, ground_truth=np.full_like(episode.ground_truth, 0.1)))
     path = tmp_path / "found.json"
-    assert main(["resolution", "--context-bags", *map(str, paths), "--contexts", "1", "--json", str(path)]) == 0
+    call = ["resolution", "--context-bags", *map(str, paths), "--contexts", "1", "--json", str(path)]
+    assert main(["benchmark", "video-rl", *call]) == 0
     rows = {(row["side_px"], row["shown"]): row for row in json.loads(path.read_text())["rows"]}
     assert set(rows) == {(side, shown) for side in (64, 96) for shown in (MODEL, ENLARGED, CODEC, COPY)}
     assert rows[64, MODEL]["psnr_db"] == rows[64, ENLARGED]["psnr_db"]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from pushed_box import push_clip, redrawn
 
-from benchmarks.judge.fault_visibility import changed_px, main
+from benchmarks.judge.fault_visibility import changed_px
+from wm_nodes.apps.cli import main
 from wm_nodes.judge.dataset.edits import Division, children, manifest_of, to_bytes
 from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 
@@ -28,10 +29,10 @@ def test_a_fault_is_compared_with_its_own_recording_and_only_faults_of_states_ar
     row = next(row for row in manifest.rows if row.sha256 == jumped.sha256)
     differs = np.abs(jumped.clip.frames.astype(int) - root.clip.frames).max(-1) > 8
     assert changed_px(tmp_path, row) == max(frame.sum() for frame in differs) > 50
-    assert main([str(tmp_path)]) == 0
+    assert main(["benchmark", "judge", "fault-visibility", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
     kinds = [line.split()[:3] for line in lines[2:]]
     assert kinds == [["fail", "teleport", "1"], ["mild", "teleport", "1"]], "dark is no fault of states"
     assert lines[2].split()[3] == str(changed_px(tmp_path, row)) and lines[2].split()[-1] == "0"
-    assert main([str(tmp_path), "--part", "test"]) == 2
+    assert main(["benchmark", "judge", "fault-visibility", str(tmp_path), "--part", "test"]) == 2
     assert "no test clip has one edit of its states" in capsys.readouterr().err

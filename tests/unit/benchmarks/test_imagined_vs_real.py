@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.judge.imagined_vs_real import FIRST_SEED, episode_ends, main
+from benchmarks.judge.imagined_vs_real import FIRST_SEED, episode_ends
+from wm_nodes.apps.cli import main
 from wm_nodes.judge.backends.embedded import shipped_heads
 from wm_nodes.judge.evidence.head import load_head
 from wm_nodes.recording.episode_arrays import EpisodeArrays
@@ -32,7 +33,8 @@ def test_an_episode_ends_with_the_first_frame_of_success_or_when_it_is_over() ->
 @pytest.mark.rendering
 def test_the_command_judges_recordings_and_dreams_of_the_same_actions(tmp_path: Path) -> None:
     report = tmp_path / "dreams.json"
-    assert main([str(tmp_path), "--episodes", "6", "--json", str(report)]) == 0
+    given = [str(tmp_path), "--episodes", "6", "--json", str(report)]
+    assert main(["benchmark", "judge", "imagined-vs-real", *given]) == 0
     found = json.loads(report.read_text())
     shipped = load_head(shipped_heads()[1]).sha256[:12]
     assert found["judge"] == f"embedded:{shipped}" and found["first_seed"] == FIRST_SEED

@@ -1,5 +1,6 @@
 """The benchmark of the reward agent: truths, decisions, Table 2, resuming, the test split's ledger, its command."""
 
+import argparse
 import asyncio
 import json
 import re
@@ -13,7 +14,7 @@ from scripted_judge import BORDERLINE, POOR, WRONG, FaultyJudge, ScriptedJudge, 
 from toy_set import write_toy_set
 
 from benchmarks.judge.call_counter import CountingJudge
-from benchmarks.judge.cli import main, parser
+from benchmarks.judge.cli import add_options
 from benchmarks.judge.efficiency import measure_savings, trials
 from benchmarks.judge.judges import open_judge
 from benchmarks.judge.label_judge import LabelJudge, known_clips
@@ -21,6 +22,7 @@ from benchmarks.judge.labels import truth_of
 from benchmarks.judge.metrics import agreement, cost_row, missed_patterns, missed_targets, mistakes, pattern_rows
 from benchmarks.judge.run import JudgeTrial, OutcomeFile, judge_rows
 from benchmarks.judge.test_split_log import LOG_NAME, notice, read_evaluations, record_evaluation
+from wm_nodes.apps.cli import main
 from wm_nodes.judge.agent import RewardAgent, Verdict, load_rubric
 from wm_nodes.judge.agent.levels import first_vote, next_vote
 from wm_nodes.judge.agent.profiles import profile_media
@@ -326,14 +328,14 @@ def test_the_command_prints_and_writes_the_table(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "table.json"
-    assert main(["table", str(folder), "--judge", "simulator", "--json", str(target)]) == 0
+    assert main(["benchmark", "judge", "table", str(folder), "--judge", "simulator", "--json", str(target)]) == 0
     shown, found = capsys.readouterr().out, json.loads(target.read_text())
     assert "Table 2 of the paper" in shown and "the judge knows the labels" in shown and "fewer than 400" in shown
     for column in ("paper", "accuracy", "95 % Wilson", "fails", "balanced", "kappa", "ECE", "calls", "usd", "wall_s"):
         assert column in shown
     assert "flag: physics" in shown and "there, not flagged 0" in shown
     assert found["statuses"] == {"OK": found["clips"]} and found["machine"] and found["seed"] == 0
-    assert found["command"] == f"benchmark_reward.py table {folder} --judge simulator --json {target}"
+    assert found["command"] == f"wm benchmark judge table {folder} --judge simulator --json {target}"
     assert {row["name"]: row["paper"] for row in found["rows"]} == {name: PAPER[name] for name in row_names(RUBRIC)}
     assert {row["name"]: row["accuracy"] for row in found["rows"]}["overall"] == 1.0
     overall = [row for row in found["splits"]["new_scene"] if row["name"] == "overall"]
@@ -347,15 +349,18 @@ def test_the_command_prints_and_writes_the_table(
         (["table", str(folder), "--folder", str(tmp_path)], "holds no judge.json"),
         (["table", str(folder), "--judge", "simulator", "--error", "2"], "got 2.0"),
     ):
-        assert main(wrong) == 2
-        assert "error:" in (shown := capsys.readouterr().out) and complaint in shown
+        assert main(["benchmark", "judge", *wrong]) == 2
+        assert "error:" in (shown := capsys.readouterr().err) and complaint in shown
 
 
 def test_stages_of_the_embedded_judge_can_be_given_to_a_server(manifest: Manifest, tmp_path: Path) -> None:
     words = ["table", "set", "--stages", "TC", "PC", "--url", "http://127.0.0.1:1/v1", "--model", "m"]
 
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+
     async def opened() -> str:
-        async with open_judge(parser().parse_args(words), RUBRIC, manifest, tmp_path) as judge:
+        async with open_judge(parser.parse_args(words), RUBRIC, manifest, tmp_path) as judge:
             return judge.capabilities.model
 
     assert re.fullmatch(r"else: embedded:[0-9a-f]{12}; TC\+PC: openai-chat:m", asyncio.run(opened()))

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from pushed_box import push_clip, redrawn
 
-from benchmarks.judge.cli import main
 from benchmarks.judge.hacking import (
     Climb,
     Proxy,
@@ -23,6 +22,7 @@ from benchmarks.judge.hacking import (
     true_value,
 )
 from benchmarks.judge.label_judge import KnownClip, LabelJudge
+from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent import TaskSpec, load_rubric
 from wm_nodes.judge.dataset.build import HELD_OUT, SetPlan, build, draw_origin
@@ -128,8 +128,8 @@ def test_the_curves_are_drawn(tmp_path: Path) -> None:
 
 
 def test_a_missing_set_is_one_clear_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["hacking", str(tmp_path / "none"), "--judge", "simulator"]) == 2
-    assert "error:" in capsys.readouterr().out
+    assert main(["benchmark", "judge", "hacking", str(tmp_path / "none"), "--judge", "simulator"]) == 2
+    assert "error:" in capsys.readouterr().err
 
 
 @pytest.mark.rendering
@@ -140,7 +140,7 @@ def test_the_command_climbs_from_recorded_successes_and_draws_each_reward_beside
     build(tmp_path / "set", plan, load_config("cpu").simulation, progress=False)
     target = tmp_path / "hacking.json"
     options = ["--judge", "simulator", "--generations", "3", "--candidates", "2", "--json", str(target)]
-    assert main(["hacking", str(tmp_path / "set"), *options]) == 0
+    assert main(["benchmark", "judge", "hacking", str(tmp_path / "set"), *options]) == 0
     found = json.loads(target.read_text())
     (start,) = found["starts"]
     assert start in STATE_RECIPES

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from benchmarks.video_rl import cost
-from benchmarks.video_rl.cli import LEARNER, main
+from benchmarks.video_rl.cli import LEARNER
 from benchmarks.video_rl.clock import clocked
 from benchmarks.video_rl.comparison import compare_samplers, paired_interval, value
 from benchmarks.video_rl.cost import ANCHORS, toy_rollout
@@ -24,6 +24,7 @@ from benchmarks.video_rl.samplers import DiscPlan, SamplerSetup, dyndiff, learni
 from benchmarks.video_rl.sources import DiscSource, group_spread, sample_scenes
 from benchmarks.video_rl.tables import _last
 from benchmarks.video_rl.trials import ablation_trials, hacking_trials
+from wm_nodes.apps.cli import main
 from wm_nodes.config.shipped import PRETRAINED
 from wm_nodes.video_rl.toy_scene import BASE, draw_scenes, load_base
 
@@ -156,14 +157,14 @@ def test_ablations_go_on_where_their_file_stops_and_refuse_another_plan(
 ) -> None:
     path = tmp_path / "ablations.json"
     short = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--json", str(path)]
-    assert main(["ablations", "--seeds", "0", *short]) == 0
+    assert main(["benchmark", "video-rl", "ablations", "--seeds", "0", *short]) == 0
     first = json.loads(path.read_text())
-    assert main(["ablations", "--seeds", "0", "1", *short]) == 0
+    assert main(["benchmark", "video-rl", "ablations", "--seeds", "0", "1", *short]) == 0
     both = json.loads(path.read_text())
     assert both["rows"][: len(first["rows"])] == first["rows"] and len(both["rows"]) == 2 * len(first["rows"])
     assert [row["base"] for row in both["comparisons"]].count("base") == 3 and not first["comparisons"]
-    assert main(["ablations", "--seeds", "0", *short, "--iterations", "2"]) == 2
-    assert "take another file" in capsys.readouterr().out.replace("\n", " ")
+    assert main(["benchmark", "video-rl", "ablations", "--seeds", "0", *short, "--iterations", "2"]) == 2
+    assert "take another file" in capsys.readouterr().err
 
 
 SHORT_CALL = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--seeds", "0", "1"]
@@ -176,19 +177,20 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("claim", CALLS)
+@pytest.mark.parametrize("experiment", CALLS)
 def test_every_file_says_how_it_was_made_and_lies_beside_its_picture(
-    claim: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    experiment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cost, "SCENES", 1)
     monkeypatch.setattr(cost, "GROUP", 4)
-    path = tmp_path / f"{claim}.json"
-    assert main([claim, *CALLS[claim], "--json", str(path)]) == 0
+    path = tmp_path / f"{experiment}.json"
+    call = ["benchmark", "video-rl", experiment, *CALLS[experiment], "--json", str(path)]
+    assert main(call) == 0
     assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     found = json.loads(path.read_text())
-    assert found["command"] == shlex.join(["benchmark_dyndiff.py", claim, *CALLS[claim], "--json", str(path)])
+    assert found["command"] == shlex.join(["wm", *call])
     assert found["sha256"]["base"] == hashlib.sha256(BASE.read_bytes()).hexdigest()
-    if claim == "cost":
+    if experiment == "cost":
         assert {(row["model"], row["anchor"]) for row in found["rows"]} == {
             (model, anchor) for model in ("moving disc", "PushCube") for anchor in ANCHORS
         }
@@ -235,8 +237,8 @@ def test_a_rollout_reports_the_share_of_its_mask_and_of_its_caching() -> None:
 def test_a_file_of_an_earlier_version_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "learning.json"
     path.write_text(json.dumps({"rows": [{"arm": "CPS 0.6", "seed": 0, "plan": {"scenes": 6}}]}))
-    assert main(["learning", "--arms", "CPS 0.6", "--json", str(path)]) == 2
-    assert "is of an earlier version of this benchmark; take another file" in " ".join(capsys.readouterr().out.split())
+    assert main(["benchmark", "video-rl", "learning", "--arms", "CPS 0.6", "--json", str(path)]) == 2
+    assert "is of an earlier version of this benchmark; take another file" in capsys.readouterr().err
 
 
 def test_the_last_buffer_that_was_trained_on_is_shown_and_none_is_not_a_number() -> None:
@@ -244,14 +246,14 @@ def test_the_last_buffer_that_was_trained_on_is_shown_and_none_is_not_a_number()
 
 
 def test_an_unknown_arm_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["learning", "--samplers", "CPS 7"]) == 2
-    assert "unknown samplers CPS 7" in capsys.readouterr().out
+    assert main(["benchmark", "video-rl", "learning", "--samplers", "CPS 7"]) == 2
+    assert "unknown samplers CPS 7" in capsys.readouterr().err
 
 
 def test_a_base_of_another_architecture_and_a_count_of_zero_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     other = PRETRAINED / "table_top_cube" / "video_model" / "network.safetensors"
-    assert main(["diversity", "--base", str(other)]) == 2
-    assert "of another architecture" in " ".join(capsys.readouterr().out.split())
+    assert main(["benchmark", "video-rl", "diversity", "--base", str(other)]) == 2
+    assert "of another architecture" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main(["diversity", "--contexts", "0"])
+        main(["benchmark", "video-rl", "diversity", "--contexts", "0"])
     assert "'0' is no whole number from 1 on" in capsys.readouterr().err

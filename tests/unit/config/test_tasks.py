@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 
 import wm_nodes
-from wm_nodes.apps import train_policy
+from wm_nodes.apps import cli
 from wm_nodes.config.load import ConfigError, default_task, load_config
 from wm_nodes.config.tasks import VARIABLE, clip_rules, get_task, model_tasks, task_names
 from wm_nodes.core.specs import simulation_spec
 
 TASKS = ("pull_cube", "push_cube", "reach")
-NAMED_IN = {"launching/scenarios.py", "judge/dataset/build.py", "judge/clip_files.py", "apps/judge_clips.py"}
-"""The default task of launch files, the tasks of a fixed set of clips, and two examples of a line of clips.jsonl."""
+NAMED_IN = {"launching/scenarios.py", "judge/dataset/build.py", "judge/clip_files.py", "apps/judge_clips.py",
+            "policy_rl/train.py"}
+"""The default task of launch files, the tasks of a fixed set of clips, two lines of clips.jsonl, an example."""
 
 
 @pytest.mark.parametrize(
@@ -84,7 +85,7 @@ def test_the_command_line_and_the_settings_name_the_known_tasks(
     with pytest.raises(ConfigError, match="unknown task 'fly'; choose one of pull_cube, push_cube, reach, stir"):
         load_config("cpu", {"task": "fly"})
     with pytest.raises(SystemExit):
-        train_policy._parser().parse_args(["--task", "fly"])
+        cli.main(["train-policy", "--task", "fly"])
     assert "stir" in capsys.readouterr().err
 
 

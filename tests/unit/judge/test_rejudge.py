@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from recording_graph import NUM_ENVS, Graph, write
 from recording_samples import make_spec
 
-from wm_nodes.apps.judge_episodes import main
+from wm_nodes.apps.cli import main
 from wm_nodes.config.load import default_judge
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.judge.rejudge import JudgedBag, judge_bag
@@ -96,10 +96,10 @@ def test_the_command_writes_a_line_per_episode_and_names_what_is_wrong(
 ) -> None:
     bag, rows = recorded(tmp_path / "bag"), tmp_path / "rows.jsonl"
     given = [str(bag), "--judge", server.url, "--judge-model", "judge", "--json", str(rows)]
-    assert main(given) == 0
+    assert main(["rescore", *given]) == 0
     said = capsys.readouterr().out
-    lines = [json.loads(line) for line in rows.read_text().splitlines()]
+    lines = json.loads(rows.read_text())["episodes"]
     assert lines and all(line["status"] == "OK" and 0 < line["reward"] <= 1 for line in lines)
     assert f"{len(lines)} episodes judged ({len(lines)} OK)" in said and "0 recorded lock-steps" in said
-    assert main([str(bag), "--judge-model", "judge"]) == 2 and "needs a judge" in capsys.readouterr().err
-    assert main([str(tmp_path / "none"), *given[1:]]) == 2 and "none" in capsys.readouterr().err
+    assert main(["rescore", str(bag), "--judge-model", "judge"]) == 2 and "needs a judge" in capsys.readouterr().err
+    assert main(["rescore", str(tmp_path / "none"), *given[1:]]) == 2 and "none" in capsys.readouterr().err

@@ -18,8 +18,7 @@ from recording_samples import make_spec
 from rl_toys import toy_policy, toy_ppo, toy_rollout
 from scripted_judge import make_clip, make_task
 
-from wm_nodes.apps.train_policy import main as main_job
-from wm_nodes.apps.train_video_model import main
+from wm_nodes.apps.cli import main
 from wm_nodes.config.load import default_judge, dump_config, judge_overrides, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.judge.agent import Status, Verdict
@@ -277,8 +276,8 @@ def test_the_command_refuses_an_agent_without_a_judge_before_anything_is_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     nobody = ["--reward", "agent", "--judge-model", "judge"]
-    assert main(["--preset", "smoke", *nobody, "--run-dir", str(tmp_path / "run")]) == 2
-    assert "needs a judge" in capsys.readouterr().out and not (tmp_path / "run").exists()
+    assert main(["train-video-model", "--preset", "smoke", *nobody, "--run-dir", str(tmp_path / "run")]) == 2
+    assert "needs a judge" in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
 def test_the_command_refuses_an_embedded_judge_that_cannot_read_its_clips_before_a_model_is_made(
@@ -288,8 +287,8 @@ def test_the_command_refuses_an_embedded_judge_that_cannot_read_its_clips_before
     monkeypatch.setattr("wm_nodes.apps.train_video_model._data", lambda *given: (bags, bags))
     embedded = ["--reward", "agent", "--judge", str(shipped_head()), "--from-scratch"]
     run_dir = tmp_path / "run"
-    assert main(["--preset", "smoke", *embedded, "--run-dir", str(run_dir)]) == 2
-    said = " ".join(capsys.readouterr().out.split())
+    assert main(["train-video-model", "--preset", "smoke", *embedded, "--run-dir", str(run_dir)]) == 2
+    said = capsys.readouterr().err
     assert "cannot judge clips of 3 frames, 64 x 128 px" in said and "Name a server" in said
     assert not (run_dir / "video_model").exists()
 
@@ -310,8 +309,9 @@ def test_the_main_job_refuses_an_agent_that_could_not_judge_before_anything_is_m
     options: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run_dir = tmp_path / "run"
-    assert main_job(["--preset", "smoke", "--set", "ppo.num_steps=16", "--run-dir", str(run_dir), *options]) == 2
-    assert words in " ".join(capsys.readouterr().out.split()) and not run_dir.exists()
+    given = ["--preset", "smoke", "--set", "ppo.num_steps=16", "--run-dir", str(run_dir), *options]
+    assert main(["train-policy", *given]) == 2
+    assert words in capsys.readouterr().err and not run_dir.exists()
 
 
 def test_launch_arguments_bring_the_agent_into_both_loops(tmp_path: Path) -> None:

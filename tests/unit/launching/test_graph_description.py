@@ -26,6 +26,11 @@ from wm_nodes.launching.scenarios import (
 from wm_nodes.ros.middleware import PROFILE
 from wm_nodes.world_model import load_starts
 
+FILES: list[tuple[str, dict[str, str]]] = [
+    *((scenario, {}) for scenario in SCENARIOS), ("online_training", {"compose": "true"}),
+]
+"""Every launch file as it starts by default, and the one whose nodes may share a process."""
+
 
 @pytest.fixture
 def given(tmp_path: Path) -> dict[str, str]:
@@ -60,15 +65,17 @@ def test_each_scenario_has_the_nodes_that_its_summary_promises(given: dict[str, 
     assert labels("replay_offline", given) == ["wm/player", "wm/learner"]
     assert labels("evaluate", given) == [*simulator, "wm/recorder"]
     assert labels("world_model_rl", given) == ["wm/video_model", "wm/reward_evaluator", "wm/learner", "wm/recorder"]
-    assert labels("composed", given) == ["wm/composed", "wm/sim/environment"]
+    assert labels("online_training", given, compose="true") == ["wm/composed", "wm/sim/environment"]
     assert labels("evaluate", given, namespace="/lab/two", compose="false")[0] == "lab/two/sim/environment"
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS)
-def test_every_node_module_and_its_ros2_run_name_exist(scenario: str, given: dict[str, str], repository: Path) -> None:
+@pytest.mark.parametrize(("scenario", "compose"), FILES)
+def test_every_node_module_and_its_ros2_run_name_exist(
+    scenario: str, compose: dict[str, str], given: dict[str, str], repository: Path
+) -> None:
     setup = ast.parse((repository / "wm_nodes" / "setup.py").read_text())
     names = next(ast.literal_eval(n.value) for n in setup.body if isinstance(n, ast.Assign))
-    graph, _ = launch_arguments.prepare(scenario, of(scenario, given))
+    graph, _ = launch_arguments.prepare(scenario, of(scenario, given) | compose)
     for node in graph.nodes:
         assert importlib.util.find_spec(node.module) is not None, node.module
         assert node.name in (*names, "composed")
@@ -134,7 +141,7 @@ def test_learner_of_several_ranks_is_not_composed(given: dict[str, str]) -> None
 
 
 def test_graph_of_the_run_is_kept_as_json(given: dict[str, str]) -> None:
-    graph, values = launch_arguments.prepare("composed", of("composed", given))
+    graph, values = launch_arguments.prepare("online_training", of("online_training", given) | {"compose": "true"})
     kept = json.loads((Path(values["run_dir"]) / "graph.json").read_text())
     assert [node["name"] for node in kept["nodes"]] == [node.name for node in graph.nodes]
 
@@ -225,11 +232,11 @@ class StubLaunch:
         }
 
 
-@pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.parametrize(("scenario", "compose"), FILES)
 def test_both_faces_of_a_launch_file_start_the_same_processes(
-    scenario: str, given: dict[str, str], repository: Path, monkeypatch: pytest.MonkeyPatch
+    scenario: str, compose: dict[str, str], given: dict[str, str], repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    values = of(scenario, given)
+    values = of(scenario, given) | compose
     stub = StubLaunch(values)
     for name, module in stub.modules().items():
         monkeypatch.setitem(sys.modules, name, module)

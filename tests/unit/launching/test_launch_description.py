@@ -41,10 +41,11 @@ def test_the_launch_face_needs_nothing_but_the_standard_library(repository: Path
     assert int(done.stdout) > 20
 
 
-@pytest.mark.parametrize("scenario", ["online_training", "composed"])
-def test_the_graph_that_the_nodes_interpreter_makes_is_the_same(scenario: str, given: dict[str, str]) -> None:
-    graph, _ = launch_arguments.prepare(scenario, given)
-    assert prepare_graph(scenario, given, sys.executable) == graph
+@pytest.mark.parametrize("compose", ["false", "true"])
+def test_the_graph_that_the_nodes_interpreter_makes_is_the_same(compose: str, given: dict[str, str]) -> None:
+    given = {**given, "compose": compose}
+    graph, _ = launch_arguments.prepare("online_training", given)
+    assert prepare_graph("online_training", given, sys.executable) == graph
     assert Graph.from_json(graph.to_json()) == graph
 
 

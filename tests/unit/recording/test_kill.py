@@ -45,6 +45,8 @@ with EpisodeBagWriter(Path(sys.argv[1]), spec, run_id="killed", custom={"wm.git_
         time.sleep(0.01)
 """
 
+RECOVER = [sys.executable, "-c", "import sys; from wm_nodes.apps.cli import main; sys.exit(main())", "recover-bag"]
+
 MESSAGE_WRITER = """
 import sys, time
 from pathlib import Path
@@ -122,7 +124,7 @@ def test_every_episode_written_before_a_kill_is_recovered(tmp_path: Path) -> Non
     lines = kill_while_it_writes(EPISODE_WRITER, tmp_path / "bag", 0.7)
     last = int(lines[-1])
     assert not (tmp_path / "bag").exists()
-    with pytest.raises(BagError, match=r"never completed.*recover .*bag\.partial"):
+    with pytest.raises(BagError, match=r"never completed.*`wm recover-bag .*bag\.partial"):
         next(read_episodes(tmp_path / "bag"))
     report = recover(tmp_path / "bag.partial")
     found = list(read_episodes(report.bag))
@@ -204,10 +206,8 @@ def test_recover_says_why_when_there_is_nothing(tmp_path: Path) -> None:
     (tmp_path / "x.mcap").write_bytes(b"not a bag at all, but long enough")
     with pytest.raises(BagError, match=r"no complete message.*invalid magic"):
         recover(tmp_path / "x.mcap")
-    process = subprocess.run(
-        [sys.executable, "-m", "wm_nodes.recording.recover", str(tmp_path / "x.mcap")], capture_output=True, text=True
-    )
-    assert process.returncode == 1
+    process = subprocess.run([*RECOVER, str(tmp_path / "x.mcap")], capture_output=True, text=True)
+    assert process.returncode == 2
     assert process.stderr.startswith("error: ")
     assert "Traceback" not in process.stderr
 
@@ -215,9 +215,7 @@ def test_recover_says_why_when_there_is_nothing(tmp_path: Path) -> None:
 def test_the_recover_command_writes_a_bag(tmp_path: Path) -> None:
     path = write_episodes(tmp_path / "bag", 2)
     process = subprocess.run(
-        [sys.executable, "-m", "wm_nodes.recording.recover", str(path), "--output", str(tmp_path / "again")],
-        capture_output=True,
-        text=True,
+        [*RECOVER, str(path), "--output", str(tmp_path / "again")], capture_output=True, text=True
     )
     assert process.returncode == 0, process.stderr
     assert process.stderr == ""
@@ -232,7 +230,7 @@ def test_a_full_disk_is_one_clear_error_and_what_was_flushed_is_recoverable(tmp_
     try:
         writer = EpisodeBagWriter(tmp_path / "bag", spec, run_id="test")
         resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, hard))
-        with pytest.raises(RecordingError, match=r"free disk space and run .*recover .*bag\.partial"):
+        with pytest.raises(RecordingError, match=r"free disk space and run .*`wm recover-bag .*bag\.partial"):
             fill(writer)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -24,7 +24,7 @@ pytest.importorskip("peft")
 
 from video_toys import grpo_config, kl_config  # noqa: E402
 
-from wm_nodes.apps.check_video_model import main as doctor  # noqa: E402
+from wm_nodes.apps.cli import main  # noqa: E402
 from wm_nodes.core.model_folder import ModelFolderError  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
     Condition,
@@ -611,9 +611,9 @@ class TestFolder:
     ) -> None:
         small = ["--size", "32x32", "--frames", "5", "--set", "rollout.num_steps=3", "--set", "grpo.kl.anchor=buffer"]
         for more in ([], ["--lora-rank", "2"]):
-            assert doctor(["--public", str(folder), *small, *more]) == 0, capsys.readouterr().out
-        assert doctor(["--public", str(tmp_path), *small]) == 2
-        assert str(tmp_path) in capsys.readouterr().out.replace("\n", "")
+            assert main(["check-video-model", "--public", str(folder), *small, *more]) == 0, capsys.readouterr().out
+        assert main(["check-video-model", "--public", str(tmp_path), *small]) == 2
+        assert str(tmp_path) in capsys.readouterr().err
 
     def test_the_documented_training_runs_as_written_and_its_adapter_loads(self, folder: Path, tmp_path: Path) -> None:
         page = (Path(__file__).parents[3] / "wm_nodes" / "docs" / "public_video_models.md").read_text()

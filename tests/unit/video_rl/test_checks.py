@@ -12,7 +12,7 @@ from video_toys import (
     toy_condition,
 )
 
-from wm_nodes.apps.check_video_model import main
+from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import GrpoConfig
 from wm_nodes.video_model import Condition, RolloutSettings, SamplerSettings, Step, VideoNetwork
@@ -111,8 +111,8 @@ def size(model: VideoNetwork, parameters: Any) -> float:
 def test_settings_that_cannot_train_are_one_clear_error(
     setting: str, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["--set", setting]) == 2
-    assert words in " ".join(capsys.readouterr().out.split())
+    assert main(["check-video-model", "--set", setting]) == 2
+    assert words in capsys.readouterr().err
 
 
 def test_the_doctor_passes_the_shipped_toy_model_and_leaves_it_as_it_was() -> None:

@@ -4,15 +4,14 @@ climbing the reward climbs the truth (hacking); other papers' rewards on the sam
 
 import argparse
 import asyncio
-import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
 from tqdm import tqdm
 
+from benchmarks.judge import fault_visibility, imagined_vs_real, pai_bench, speed
 from benchmarks.judge.compared import PROTOCOLS, AnswerFile, ComparedRow, compared, comparison_table, num_answers
 from benchmarks.judge.efficiency import ARMS, measure_savings, savings_table, trials
 from benchmarks.judge.hacking import (
@@ -44,6 +43,7 @@ from benchmarks.judge.search_starts import hacking_starts
 from benchmarks.judge.tables import confusion_table, cost_table, curve_table, pattern_table, split_table, table2
 from benchmarks.judge.test_split_log import judge_name, notice, record_evaluation
 from benchmarks.speed.results import write_results
+from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent import Judge, Rubric, TaskSpec, load_rubric
 from wm_nodes.judge.agent.types import Stage
@@ -61,21 +61,72 @@ ROUTED = [stage for stage in Stage if stage is not Stage.REFLECT]
 console = Console()
 
 
-def main(argv: Sequence[str]) -> int:
-    """Return the exit code: 0 done, 2 a clear error, 130 interrupted (judged clips are kept)."""
-    arguments = parser().parse_args(argv)
-    arguments.command = shlex.join(["benchmark_reward.py", *argv])
+OTHERS = {
+    "imagined-vs-real": (imagined_vs_real, "the judge on imagined clips against what the simulator says"),
+    "speed": (speed, "clips that the embedded judge reads per second"),
+    "fault-visibility": (fault_visibility, "pixels by which a physical fault differs from its clean recording"),
+    "pai-bench": (pai_bench, "the robot protocol of PAI-Bench over a folder of videos"),
+}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    experiments = parser.add_subparsers(dest="experiment", required=True, metavar="EXPERIMENT")
+    raw = argparse.RawDescriptionHelpFormatter
+    for name, (measure, text) in EXPERIMENTS.items():
+        command = experiments.add_parser(name, help=text, description=text, parents=[_common()])
+        command.set_defaults(run=run, measure=measure)
+        if name == "hacking":
+            command.add_argument("--starts", type=int, default=12, help="clips with a defect to begin with")
+            command.add_argument("--generations", type=int, default=8)
+            command.add_argument(
+                "--severities", nargs="+", choices=SEVERITIES, default=list(SEVERITIES), help="of the edits"
+            )
+            command.add_argument("--candidates", type=int, default=6, help="edits tried per generation")
+        else:
+            command.add_argument(
+                "--clips", type=int, help="the first so many in the order of their hashes; default: all"
+            )
+        if name == "comparisons":
+            command.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
+    for name, (module, text) in OTHERS.items():
+        command = experiments.add_parser(name, help=text, description=module.__doc__, formatter_class=raw)
+        command.set_defaults(run=module.run)
+        module.add_options(command)
+
+
+def _common() -> argparse.ArgumentParser:
+    """Options of the experiments over a set of clips with known labels."""
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("set", type=Path, help="folder of a set, see wm build-judge-dataset")
+    common.add_argument("--judge", choices=NAMES, default="embedded", help="simulator: a control that knows the labels")
+    common.add_argument("--rubric", default="robot", help="a rubric pack, or a .yaml")
+    common.add_argument("--part", choices=("test", "validation", "train"), default="test")
+    common.add_argument(
+        "--again", default="", metavar="REASON", help="for a further evaluation on the test split"
+    )
+    add_json(common)
+    add_seed(common)
+    common.add_argument("--at-once", type=int, default=1, help="clips under way together, behind a server")
+    common.add_argument("--folder", type=Path, help="of the embedded judge; the shipped one by default")
+    common.add_argument(
+        "--conformal", type=float, default=0.0, metavar="COVERAGE",
+        help="the embedded judge abstains where it is not sure at this coverage, e.g. 0.9; 0: it always decides",
+    )
+    common.add_argument("--stages", nargs="+", choices=ROUTED, default=[], help="that --model reads in its place")
+    common.add_argument("--url", nargs="+", default=[], help="of chat servers, http://HOST:PORT/v1")
+    common.add_argument("--model", default="", help="that they serve")
+    common.add_argument("--api-key-env", default="", help="environment variable that holds their key")
+    common.add_argument("--price", nargs=2, type=float, default=[], metavar="USD", help="per million tokens in and out")
+    common.add_argument("--max-images", type=int, default=64, help="that it takes in one call")
+    common.add_argument("--error", type=float, default=0.0, help="of the control: share of reads that are wrong")
+    return common
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """One of EXPERIMENTS; judged clips are kept, so that it goes on where it was interrupted."""
     if not console.is_terminal:
         console.width = LOG_COLUMNS
-    claims = {"table": _table, "efficiency": _efficiency, "hacking": _hacking, "comparisons": _comparisons}
-    try:
-        asyncio.run(claims[arguments.claim](arguments))
-    except KeyboardInterrupt:
-        return 130
-    except (ValueError, OSError, ImportError) as error:
-        console.print("[bold red]error:[/]", escape(str(error)), highlight=False, soft_wrap=True)
-        return 2
-    return 0
+    asyncio.run(arguments.measure(arguments))
 
 
 async def _table(arguments: argparse.Namespace) -> None:
@@ -96,7 +147,7 @@ async def _table(arguments: argparse.Namespace) -> None:
     below = [*missed_targets(agreements), *missed_patterns(patterns)]
     _print_notes(arguments, len(rows), said, below, most_frequent(mistakes(rows, results, rubric)))
     write_results(arguments, {
-        "claim": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
+        "experiment": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "notice": said, "statuses": statuses(results), "cost": cost,
         "splits": {name: [asdict(row) for row in table] for name, table in splits.items()},
         "rows": [asdict(row) for row in agreements], "patterns": [asdict(row) for row in patterns],
@@ -116,7 +167,7 @@ async def _efficiency(arguments: argparse.Namespace) -> None:
     console.print(cost_table(costs), savings_table(compared, f"{who}; {arguments.part}, {len(rows)} clips"))
     _print_notes(arguments, len(rows), said, [], [])
     write_results(arguments, {
-        "claim": "efficiency", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
+        "experiment": "efficiency", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "notice": said, "per_clip": costs, "compared": [asdict(row) for row in compared],
     })
 
@@ -156,7 +207,7 @@ async def _hacking(arguments: argparse.Namespace) -> None:
     if arguments.json is not None:
         plot_curves(curves, arguments.json.with_suffix(".png"))
     write_results(arguments, {
-        "claim": "hacking", "judge": who, "rubric": rubric.version, "part": arguments.part, "notice": said,
+        "experiment": "hacking", "judge": who, "rubric": rubric.version, "part": arguments.part, "notice": said,
         "seed": arguments.seed, "plan": asdict(plan), "starts": [start.clip.recipe for start in starts],
         "curves": [asdict(one) for one in curves],
     })
@@ -179,7 +230,7 @@ async def _comparisons(arguments: argparse.Namespace) -> None:
     caption = f"{arguments.model}; {arguments.part}, {len(rows)} clips; wins: hacked scores >= its clean recording"
     console.print(comparison_table(results, caption))
     write_results(arguments, {
-        "claim": "comparisons", "model": arguments.model, "part": arguments.part, "clips": len(rows),
+        "experiment": "comparisons", "model": arguments.model, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "rows": [asdict(row) for row in results],
     })
 
@@ -234,44 +285,9 @@ def _print_notes(
         console.print(line, style="bold", highlight=False, soft_wrap=True)
 
 
-def parser() -> argparse.ArgumentParser:
-    """The command's arguments."""
-    common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("set", type=Path, help="folder of a set, see make_adversarial_set.py")
-    common.add_argument("--judge", choices=NAMES, default="embedded", help="simulator: a control that knows the labels")
-    common.add_argument("--rubric", default="robot", help="a rubric pack, or a .yaml")
-    common.add_argument("--part", choices=("test", "validation", "train"), default="test")
-    common.add_argument(
-        "--again", default="", metavar="REASON", help="for a further evaluation on the test split"
-    )
-    common.add_argument("--json", type=Path, metavar="FILE")
-    common.add_argument("--seed", type=int, default=0)
-    common.add_argument("--at-once", type=int, default=1, help="clips under way together, behind a server")
-    common.add_argument("--folder", type=Path, help="of the embedded judge; the shipped one by default")
-    common.add_argument(
-        "--conformal", type=float, default=0.0, metavar="COVERAGE",
-        help="the embedded judge abstains where it is not sure at this coverage, e.g. 0.9; 0: it always decides",
-    )
-    common.add_argument("--stages", nargs="+", choices=ROUTED, default=[], help="that --model reads in its place")
-    common.add_argument("--url", nargs="+", default=[], help="of chat servers, http://HOST:PORT/v1")
-    common.add_argument("--model", default="", help="that they serve")
-    common.add_argument("--api-key-env", default="", help="environment variable that holds their key")
-    common.add_argument("--price", nargs=2, type=float, default=[], metavar="USD", help="per million tokens in and out")
-    common.add_argument("--max-images", type=int, default=64, help="that it takes in one call")
-    common.add_argument("--error", type=float, default=0.0, help="of the control: share of reads that are wrong")
-    whole = argparse.ArgumentParser(prog="benchmark_reward.py", description=__doc__)
-    claims = whole.add_subparsers(dest="claim", required=True)
-    for name, text in (
-        ("table", "agreement with the labels in the layout of Table 2, hacking patterns, cost"),
-        ("efficiency", "calls, images, pixels and tokens against reading everything of every clip"),
-        ("comparisons", "other papers' rewards through a chat server: ranking, hacked clips that win"),
-    ):
-        command = claims.add_parser(name, help=text, parents=[common])
-        command.add_argument("--clips", type=int, help="the first so many in the order of their hashes; all by default")
-    command.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
-    hacking = claims.add_parser("hacking", help="climb the agent and single scores, truth beside", parents=[common])
-    hacking.add_argument("--starts", type=int, default=12, help="clips with a defect to begin with")
-    hacking.add_argument("--generations", type=int, default=8)
-    hacking.add_argument("--severities", nargs="+", choices=SEVERITIES, default=list(SEVERITIES), help="of the edits")
-    hacking.add_argument("--candidates", type=int, default=6, help="edits tried per generation")
-    return whole
+EXPERIMENTS = {
+    "table": (_table, "agreement with the labels in the layout of Table 2, hacking patterns, cost"),
+    "efficiency": (_efficiency, "calls, images, pixels and tokens against reading everything of every clip"),
+    "hacking": (_hacking, "climb the agent and single scores, truth beside"),
+    "comparisons": (_comparisons, "other papers' rewards through a chat server: ranking, hacked clips that win"),
+}

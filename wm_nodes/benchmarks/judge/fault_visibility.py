@@ -2,11 +2,10 @@
 
 Both lie in the set, so nothing is drawn again. Only clips with one edit, of the states: others change pixels anywhere.
 
-    python -m benchmarks.judge.fault_visibility SET [SET ...] --part train
+    wm benchmark judge fault-visibility SET [SET ...] --part train
 """
 
 import argparse
-import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -52,27 +51,19 @@ def _select_clips(sets: Sets, part: Part) -> Iterator[tuple[Path, ManifestRow]]:
                 yield folder, row
 
 
-def main(argv: Sequence[str]) -> int:
-    """Print a line per recipe. Return the exit code: 0 done, 2 a clear error."""
-    parser = argparse.ArgumentParser(prog="fault_visibility", description=__doc__.splitlines()[0])
-    parser.add_argument("sets", type=Path, nargs="+", help="folders made by adversarial_set, of one division")
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("sets", type=Path, nargs="+", help="folders made by build-judge-dataset, of one division")
     parser.add_argument("--part", choices=("train", "validation", "test"), default="train")
-    arguments = parser.parse_args(argv)
-    try:
-        counts = visibility(load_sets(arguments.sets), arguments.part)
-        if not counts:
-            raise ValueError(f"no {arguments.part} clip has one edit of its states; build larger sets")
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Print a line per recipe."""
+    counts = visibility(load_sets(arguments.sets), arguments.part)
+    if not counts:
+        raise ValueError(f"no {arguments.part} clip has one edit of its states; build larger sets")
     print(f"pixels changed by more than {SEEN_LEVELS} of 255 in the most changed frame")
     print(f"{'severity':8} {'recipe':14} {'n':>5} {'least':>6} {'5 %':>6} {'median':>6} {'faint':>6}")
     for (severity, recipe), values in counts.items():
         low, middle = np.quantile(values, (0.05, 0.5))
         faint = sum(value <= FAINT_PX for value in values)
         print(f"{severity:8} {recipe:14} {len(values):5} {min(values):6} {low:6.0f} {middle:6.0f} {faint:6}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

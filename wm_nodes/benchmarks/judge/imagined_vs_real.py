@@ -4,27 +4,28 @@ Held-out episodes are recorded in the simulator, and imagined by a world model f
 actions; the judge sees both kinds as an episode's clip, up to the step on which the real one succeeds. The label is the
 simulator's: whether it did. Beside the judge stands the model's own done signal on the same imagined frames.
 
-    python -m benchmarks.judge.imagined_vs_real FOLDER --task push_cube --json dreams.json
+    wm benchmark judge imagined-vs-real FOLDER --task push_cube --json FILE
 """
 
 import argparse
 import asyncio
 import json
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from benchmarks.speed.results import write_results
+from wm_nodes.apps.options import add_json
 from wm_nodes.config.load import default_task, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.core.allocator import keep_freed_memory
-from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import BoolArray
 from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.judge.agent import RewardAgent, TaskSpec, Verdict, clip_ref, load_rubric
@@ -35,7 +36,6 @@ from wm_nodes.judge.episode_reward import episode_judge
 from wm_nodes.judge.service import ClipJob
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.recording.episode_arrays import EpisodeArrays
-from wm_nodes.reports.machine import machine_facts
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.validation.open_loop import ImaginedEpisodes, auc, imagine_episodes
 
@@ -113,7 +113,7 @@ async def _judge_clips(agent: RewardAgent, asked: Sequence[ClipJob]) -> list[Ver
     return [await agent.evaluate(job.clip, job.task) for job in tqdm(asked, desc="judged", unit="clip")]
 
 
-def _measure(arguments: argparse.Namespace) -> dict[str, object]:
+def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     given = {"task": arguments.task, "judge.kind": "embedded", "judge.folder": str(arguments.judge or "")}
     config = load_config("cpu", given)
     models = load_model_folder(arguments.model_dir or shipped_model(config.task))
@@ -142,31 +142,21 @@ def _measure(arguments: argparse.Namespace) -> dict[str, object]:
             "balanced": float(np.mean([(fired == succeeded)[succeeded == real].mean() for real in (True, False)])),
         },
         "silent": [v.reason for v in verdicts if not v.valid],
-        "machine": machine_facts(),
     }
 
 
-def main(argv: Sequence[str]) -> int:
-    """Measure and print. Return the exit code: 0 done, 2 a clear error."""
-    parser = argparse.ArgumentParser(prog="judge_dreams", description=__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, help="of the recorded episodes; finished ones are taken up again")
     parser.add_argument("--task", choices=task_names(), default=default_task())
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--judge", type=Path, help="folder of a trained judge; default: the shipped one")
     parser.add_argument("--model-dir", type=Path, help="world model; default: the shipped one")
-    parser.add_argument("--json", type=Path, help="write what was found")
-    arguments = parser.parse_args(argv)
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measure, write --json and print it without the single clips."""
     keep_freed_memory()
-    try:
-        results = _measure(arguments)
-        if arguments.json:
-            write_atomic(arguments.json, (json.dumps(results, indent=1) + "\n").encode())
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(json.dumps({name: value for name, value in results.items() if name not in ("machine", "silent")}, indent=1))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    results = _measure(arguments)
+    write_results(arguments, results)
+    print(json.dumps({name: value for name, value in results.items() if name != "silent"}, indent=1))

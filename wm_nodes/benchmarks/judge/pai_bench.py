@@ -1,7 +1,7 @@
 """PAI-Bench's robot protocol over a folder of videos: domain questions through a chat server, consistency metrics from
 local backbones. What is public of the protocol and what is inferred: comparisons/pai_bench.py.
 
-    python -m benchmarks.judge.pai_bench VIDEOS --questions FOLDER --url http://127.0.0.1:8000/v1 --model NAME
+    wm benchmark judge pai-bench VIDEOS --questions FOLDER --url http://127.0.0.1:8000/v1 --model NAME
         --subject FOLDER --background FOLDER --images FOLDER --metrics others.json
 
 VIDEOS holds <video_id>.mp4; --images <video_id>.png or .jpg, the conditioning images. --subject and --background are
@@ -13,7 +13,6 @@ import argparse
 import asyncio
 import json
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,8 @@ from tqdm import tqdm
 
 from benchmarks.judge.comparisons import ChatComparison
 from benchmarks.judge.comparisons import pai_bench as pai
-from wm_nodes.core.files import write_atomic
+from benchmarks.speed.results import write_results
+from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent import ClipRef
 from wm_nodes.judge.backends import ChatTransport, Endpoint
@@ -93,9 +93,7 @@ def _image(folder: Path | None, name: str) -> UInt8Array | None:
     return read_picture(path)
 
 
-def main(argv: Sequence[str]) -> int:
-    """Print what could be measured. Return the exit code: 0 done, 2 a clear error."""
-    parser = argparse.ArgumentParser(prog="pai_bench", description=__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("videos", type=Path, help="folder of <video_id>.mp4")
     parser.add_argument("--questions", type=Path, help="the vqa folder of physical-ai-bench-predict")
     parser.add_argument("--url", nargs="+", default=[], help="of chat servers, http://HOST:PORT/v1")
@@ -105,23 +103,20 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--background", type=Path, help="folder of a vision model, e.g. CLIP's")
     parser.add_argument("--images", type=Path, help="folder of the conditioning images")
     parser.add_argument("--metrics", type=Path, help="JSON of the metrics that were measured elsewhere, percent")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    arguments = parser.parse_args(argv)
-    try:
-        results = _measure(arguments)
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    add_seed(parser)
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Print and write what could be measured."""
+    results = _measure(arguments)
     for name, value in results["scores"].items():
         print(f"{name:24} {value:7.2f}")
     if "answered" in results:
         print(f"questions answered: {results['answered']}, not answered and left out: {results['unanswered']}")
     if results["missing"]:
         print(f"no Quality and no Overall: {', '.join(results['missing'])} not given")
-    if arguments.json is not None:
-        write_atomic(arguments.json, (json.dumps(results, indent=1) + "\n").encode())
-    return 0
+    write_results(arguments, results)
 
 
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -148,7 +143,3 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.questions and not results["missing"]:
         results["scores"] |= pai.summary(score, metrics)
     return results
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

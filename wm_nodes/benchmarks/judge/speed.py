@@ -1,17 +1,13 @@
 """How many clips the embedded judge reads per second. The aim: 20 on 2 cores at 96 px and 25 frames.
 
-    python -m benchmarks.judge.speed [FOLDER] [--json FILE]
+    wm benchmark judge speed [FOLDER] [--json FILE]
 
 Each core works alone on its own clips; processor time is what a clip costs on an idle core, whatever else runs here.
 """
 
 import argparse
-import json
 import multiprocessing as mp
-import shlex
-import sys
 import time
-from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -19,8 +15,9 @@ import cv2
 import numpy as np
 import torch
 
+from benchmarks.speed.results import write_results
+from wm_nodes.apps.options import add_json, positive
 from wm_nodes.core.allocator import keep_freed_memory
-from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.backends.embedded import shipped_head
@@ -61,39 +58,26 @@ def read_clips(folder: Path, count: int, seed: int) -> tuple[float, float]:
     return (time.process_time() - started[0]) / count, (time.monotonic() - started[1]) / count
 
 
-def main(argv: Sequence[str]) -> int:
-    """Measure and print. Return the exit code: 0 done, 2 a clear error."""
-    parser = argparse.ArgumentParser(prog="judge_speed", description=__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, nargs="?", default=shipped_head(), help="a trained judge; the shipped one")
-    parser.add_argument("--cores", type=int, default=2)
-    parser.add_argument("--clips", type=int, default=40, help="per core")
-    parser.add_argument("--json", type=Path, help="write it here, too")
-    arguments = parser.parse_args(argv)
-    if min(arguments.cores, arguments.clips) < 1:
-        parser.error(f"--cores and --clips must be at least 1, got {arguments.cores} and {arguments.clips}")
-    try:
-        with ProcessPoolExecutor(arguments.cores, mp_context=mp.get_context("spawn")) as pool:
-            jobs = [pool.submit(read_clips, arguments.folder, arguments.clips, seed) for seed in range(arguments.cores)]
-            seconds = [job.result() for job in jobs]
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    parser.add_argument("--cores", type=positive, default=2)
+    parser.add_argument("--clips", type=positive, default=40, help="per core")
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measure, write --json and print."""
+    with ProcessPoolExecutor(arguments.cores, mp_context=mp.get_context("spawn")) as pool:
+        jobs = [pool.submit(read_clips, arguments.folder, arguments.clips, seed) for seed in range(arguments.cores)]
+        seconds = [job.result() for job in jobs]
     processor_s, wall_s = (float(np.mean(column)) for column in zip(*seconds))
     clips_per_s, clips_per_s_now = arguments.cores / processor_s, arguments.cores / wall_s
+    write_results(arguments, {
+        "judge": load_head(arguments.folder).sha256, "frames": FRAMES, "side_px": SIDE_PX,
+        "processes": arguments.cores, "clips_each": arguments.clips, "processor_s_per_clip": processor_s,
+        "wall_s_per_clip": wall_s, "clips_per_s": clips_per_s, "clips_per_s_by_the_clock": clips_per_s_now,
+    })
     facts = machine_facts()
-    if arguments.json:
-        measured = {
-            "command": shlex.join(["judge_speed", *argv]), "judge": load_head(arguments.folder).sha256,
-            "frames": FRAMES, "side_px": SIDE_PX, "processes": arguments.cores, "clips_each": arguments.clips,
-            "processor_s_per_clip": processor_s, "wall_s_per_clip": wall_s,
-            "clips_per_s": clips_per_s, "clips_per_s_by_the_clock": clips_per_s_now, "machine": facts,
-        }
-        write_atomic(arguments.json, (json.dumps(measured, indent=1) + "\n").encode())
     print(f"{FRAMES} frames of {SIDE_PX} px on {arguments.cores} processes, {facts['processor']}, {facts['date']}")
     print(f"processor {1000 * processor_s:.1f} ms a clip: {clips_per_s:.1f} clips/s on idle cores")
     print(f"wall      {1000 * wall_s:.1f} ms a clip: {clips_per_s_now:.1f} clips/s now")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

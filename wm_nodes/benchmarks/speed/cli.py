@@ -1,12 +1,10 @@
 """Speed, side by side in one run: DDS against one process, the world model against the simulator, stage by stage."""
 
 import argparse
-import json
 import os
 import platform
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,40 +12,44 @@ import torch
 
 from benchmarks.speed.graph import measure_graph
 from benchmarks.speed.inputs import Effort, console, prepare_model, random_model
+from benchmarks.speed.results import write_results
 from benchmarks.speed.simulator import IMAGINED_ENVS, measure_simulator
 from benchmarks.speed.stages import measure_stages
+from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.config.load import load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.allocator import keep_freed_memory
-from wm_nodes.core.files import write_atomic
 from wm_nodes.reports import machine_facts
 from wm_nodes.reports.console_table import make_table
-from wm_nodes.reports.summary import plain
 
 FULL, QUICK = Effort(60, 5000, 5, 30), Effort(3, 500, 2, 8)
 
 
-def main(argv: Sequence[str]) -> int:
-    """Measure, show the table, write --json. Return the exit code: 0 done, 2 a clear error."""
-    arguments = _parser().parse_args(argv)
-    effort = QUICK if arguments.quick else FULL
-    try:
-        untrained = None if arguments.untrained is None else dict(map(parse_override, arguments.untrained))
-        config = load_config(arguments.preset, {**(untrained or {}), "seed": arguments.seed})
-        with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as name:
-            folder, model = Path(name), arguments.model_dir
-            if untrained is not None:
-                model = random_model(config, folder / "model")
-            results = measure(config, effort, folder, model)
-    except (ValueError, OSError, RuntimeError) as error:
-        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
-        return 2
+def add_options(parser: argparse.ArgumentParser) -> None:
+    add_json(parser)
+    parser.add_argument("--quick", action="store_true", help="a tenth of the work, for a first look; less exact")
+    parser.add_argument("--preset", default="cpu", help=f"model size: one of {', '.join(preset_names())}, or a .yaml")
+    model = parser.add_mutually_exclusive_group()
+    model.add_argument("--model-dir", type=Path, help="world model to measure instead of the shipped one")
+    model.add_argument(
+        "--untrained", nargs="*", metavar="SECTION.KEY=VALUE",
+        help="measure a model with random weights, of the preset's size but for these settings",
+    )
+    add_seed(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measure, show the tables, write --json."""
+    untrained = None if arguments.untrained is None else dict(map(parse_override, arguments.untrained))
+    config = load_config(arguments.preset, {**(untrained or {}), "seed": arguments.seed})
+    with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as name:
+        folder, model = Path(name), arguments.model_dir
+        if untrained is not None:
+            model = random_model(config, folder / "model")
+        results = measure(config, QUICK if arguments.quick else FULL, folder, model)
     results |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
     show(results)
-    if arguments.json:
-        write_atomic(arguments.json, (json.dumps(plain(results), indent=1) + "\n").encode())
-        console.print(f"written {arguments.json}", highlight=False)
-    return 0
+    write_results(arguments, results)
 
 
 def measure(config: RunConfig, effort: Effort, folder: Path, model_dir: Path | None = None) -> dict[str, Any]:
@@ -97,18 +99,3 @@ def show(results: dict[str, Any]) -> None:
     console.print(make_table(title, columns, rows, left=left, caption=results["model"], no_wrap=("",)))
     stages = ((name, f"{v['ms']:.1f}", f"{v['peak_mib']:.1f}") for name, v in results["stages"].items())
     console.print(make_table(f"one batch of {IMAGINED_ENVS}", ("stage", "ms", "peak memory, MiB"), stages))
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="benchmark.py", description=__doc__)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the numbers there")
-    parser.add_argument("--quick", action="store_true", help="a tenth of the work, for a first look; less exact")
-    parser.add_argument("--preset", default="cpu", help=f"model size: one of {', '.join(preset_names())}, or a .yaml")
-    model = parser.add_mutually_exclusive_group()
-    model.add_argument("--model-dir", type=Path, help="world model to measure instead of the shipped one")
-    model.add_argument(
-        "--untrained", nargs="*", metavar="SECTION.KEY=VALUE",
-        help="measure a model with random weights, of the preset's size but for these settings",
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    return parser

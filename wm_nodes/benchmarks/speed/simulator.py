@@ -21,6 +21,7 @@ import torch
 from benchmarks.speed.inputs import Effort, actions_of, console, interleave, seeds_of
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import Environment
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_imagined_environment
 from wm_nodes.policy_rl.rollouts import reward_input
@@ -142,7 +143,7 @@ def rate_workers(workers: list[Connection], block: int) -> float:
     """Steps per second of all workers at once, each with scenes of its own.
 
     Raises:
-        RuntimeError: a worker ended or is silent for WORKER_TIMEOUT_S.
+        RunError: a worker ended or is silent for WORKER_TIMEOUT_S.
     """
     for index, worker in enumerate(workers):
         worker.send(block * len(workers) + index)
@@ -150,10 +151,10 @@ def rate_workers(workers: list[Connection], block: int) -> float:
     for worker in workers:
         try:
             if not worker.poll(WORKER_TIMEOUT_S):
-                raise RuntimeError(f"a simulator process gave no answer for {WORKER_TIMEOUT_S:g} s; is memory short?")
+                raise RunError(f"a simulator process gave no answer for {WORKER_TIMEOUT_S:g} s; is memory short?")
             total += worker.recv().steps_per_s
         except EOFError:
-            raise RuntimeError("a simulator process ended; its error is above") from None
+            raise RunError("a simulator process ended; its error is above") from None
     return total
 
 

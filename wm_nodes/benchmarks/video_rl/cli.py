@@ -1,6 +1,5 @@
-"""DynDiff-GRPO against its rivals on the moving disc: claims A (diversity), B (learning) and C (cost of the KL), the
-paper's ablations, and a reward that can be hacked; claims A and B on clips of recorded episodes, and their picture's
-size.
+"""DynDiff-GRPO against its rivals on the moving disc: diversity, learning, cost of the KL, ablations, and a reward that
+can be hacked; diversity and learning on clips of recorded episodes, and their picture's size.
 
 Every --json file holds the command, the settings of each sampler, and the sha256 of the weights that were measured; a
 picture is drawn beside it (of ablations from two seeds on).
@@ -9,8 +8,6 @@ picture is drawn beside it (of ablations from two seeds on).
 import argparse
 import json
 import math
-import os
-import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -37,9 +34,9 @@ from benchmarks.video_rl.samplers import (
 )
 from benchmarks.video_rl.sources import TASK, RecordedSource
 from benchmarks.video_rl.trials import Plan, SamplerTrial, ablation_trials, hacking_trials
+from wm_nodes.apps.options import add_json, add_seed, positive, prepare_torch
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
@@ -58,32 +55,76 @@ NEW_SEEDS = 250_000
 """First reset seed of contexts to train on that the shipped video model has not seen."""
 LEARNER = load_video_config("base").grpo.with_values(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
-LOG_COLUMNS = 180
-"""Width of tables that go to a file or a pipe."""
+LOG_COLUMNS = 180  # of tables that go to a file or a pipe
 T = TypeVar("T")
 console = Console()
 
 
-def main(argv: Sequence[str]) -> int:
-    """Return the exit code: 0 done, 2 a clear error, 130 interrupted (finished rows are kept)."""
-    arguments = _parser().parse_args(argv)
-    arguments.command = shlex.join(["benchmark_dyndiff.py", *argv])
+def add_options(parser: argparse.ArgumentParser) -> None:
+    experiments = parser.add_subparsers(dest="experiment", required=True, metavar="EXPERIMENT")
+    base = experiments.add_parser("base", help="train the base model (minutes on one core)")
+    base.add_argument("--iterations", type=positive, default=BASE_ITERATIONS)
+    base.add_argument("--out", type=Path, default=Path("runs/moving_disc"))
+    spread = experiments.add_parser("diversity", help="diversity at equal quality and noise budget")
+    learning = experiments.add_parser("learning", help="reward against model calls, every sampler on one learner")
+    ablations = experiments.add_parser("ablations", help="KL, advantage clip, guidance, resolution, in pairs")
+    hacking = experiments.add_parser("hacking", help="a reward that can be hacked, and what detects it")
+    for experiment, iterations in ((learning, 40), (ablations, 12), (hacking, 25)):
+        experiment.add_argument("--iterations", type=positive, default=iterations)
+        experiment.add_argument("--scenes", type=positive, default=6, help="contexts per iteration, 8 videos each")
+        experiment.add_argument("--eval-scenes", type=positive, default=100, help="held-out scenes per evaluation")
+    cost = experiments.add_parser("cost", help="seconds and bytes of the KL anchors, and of the mask")
+    cost.add_argument("--repeats", type=positive, default=7)
+    clips = experiments.add_parser("clips", help="diversity on a video model of recorded episodes")
+    training = experiments.add_parser("clip-learning", help="learning on a video model of recorded episodes")
+    training.add_argument("--iterations", type=positive, default=LearningPlan.iterations)
+    training.add_argument("--eval-contexts", type=positive, default=LearningPlan.eval_contexts)
+    training.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and held-out ones")
+    for experiment in (clips, training):
+        experiment.add_argument(
+            "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
+            help=f"episodes to take contexts from (default: new ones in {EPISODES}, of seeds that no model has seen)",
+        )
+    resolution = experiments.add_parser("resolution", help="a video model on larger pictures than it was trained on")
+    resolution.add_argument("--sizes", type=positive, nargs="+", default=[80, 96, 128], help="sides of a picture, px")
+    resolution.add_argument(
+        "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
+        help="the same episodes in several sizes, a bag of each, the model's own size first (default: new ones)",
+    )
+    for experiment in (clips, training, resolution):
+        experiment.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model")
+    for experiment, contexts in ((spread, 100), (clips, 100), (training, 400), (resolution, 100)):
+        experiment.add_argument("--contexts", type=positive, default=contexts, help="scenes or recorded episodes")
+    for experiment in (spread, clips):
+        experiment.add_argument("--group-size", type=positive, default=8)
+    for experiment in (clips, resolution):
+        experiment.add_argument("--preset", default="recommended", help="of loop 2: rewards, sampler steps, task")
+    clips.add_argument(
+        "--features", default="tokenizer",
+        help="tokenizer, pixels, random, or the folder of a vision backbone, e.g. DINOv3 (default: tokenizer)",
+    )
+    for experiment in (learning, ablations, hacking, training):
+        experiment.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    for experiment in (base, spread, cost, clips, resolution):
+        add_seed(experiment)
+    for experiment in (spread, learning, ablations, hacking, clips, training):
+        experiment.add_argument("--samplers", "--arms", nargs="+", metavar="NAME")
+    for experiment in (spread, learning, ablations, hacking, cost):
+        experiment.add_argument("--base", type=Path, help="weights of another base model than the shipped experiment")
+    for experiment in (spread, learning, ablations, hacking, cost, clips, training, resolution):
+        add_json(experiment, "write every row here; trainings go on where the file stops")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """One experiment; finished rows of --json are kept, so that it goes on where it was interrupted."""
     if not console.is_terminal:
         console.width = LOG_COLUMNS
-    keep_freed_memory()
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-    claims = {
+    prepare_torch()
+    experiments = {
         "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,
         "cost": _cost, "clips": _clips, "clip-learning": _clip_learning, "resolution": _resolution,
     }
-    try:
-        claims[arguments.claim](arguments)
-    except KeyboardInterrupt:
-        return 130
-    except (ValueError, OSError) as error:
-        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
-        return 2
-    return 0
+    experiments[arguments.experiment](arguments)
 
 
 def _base(arguments: argparse.Namespace) -> None:
@@ -94,7 +135,7 @@ def _base(arguments: argparse.Namespace) -> None:
         load_video_config("base").model.training.with_values(num_iterations=arguments.iterations),
         seed=arguments.seed, run_dir=arguments.out,
     )
-    command = f"benchmark_dyndiff.py base --seed {arguments.seed} --iterations {arguments.iterations}"
+    command = f"wm benchmark video-rl base --seed {arguments.seed} --iterations {arguments.iterations}"
     path = arguments.out / "video_model.safetensors"
     write_atomic(path, pack_weights(model, {"command": command}).data)
     console.print(f"written {path}", highlight=False)
@@ -241,7 +282,7 @@ def _train(
     done = {(row["sampler"], row["seed"]) for row in rows}
     wanted = _named({trial.sampler.name: trial for trial in trials}, arguments.samplers)
     todo = [(trial, seed) for seed in arguments.seeds for trial in wanted if (trial.sampler.name, seed) not in done]
-    with tqdm(total=sum(trial.plan.iterations for trial, _ in todo), desc=arguments.claim, unit="buffer") as bar:
+    with tqdm(total=sum(trial.plan.iterations for trial, _ in todo), desc=arguments.experiment, unit="buffer") as bar:
         for trial, seed in todo:
             bar.set_postfix_str(f"{trial.sampler.name}, seed {seed}")
             rows.append(train(trial, seed, bar.update))
@@ -327,67 +368,3 @@ def _draw(arguments: argparse.Namespace, plot: Callable[..., None], what: Sequen
     """The picture beside the --json file, where there is one."""
     if arguments.json is not None:
         plot(what, arguments.json.with_suffix(".png"), *more)
-
-
-def _positive(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 1 on")
-    return int(text)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="benchmark_dyndiff.py", description=__doc__)
-    claims = parser.add_subparsers(dest="claim", required=True)
-    base = claims.add_parser("base", help="train the base model (minutes on one core)")
-    base.add_argument("--iterations", type=_positive, default=BASE_ITERATIONS)
-    base.add_argument("--out", type=Path, default=Path("runs/moving_disc"))
-    spread = claims.add_parser("diversity", help="claim A: diversity at equal quality and noise budget")
-    spread.add_argument("--contexts", type=_positive, default=100)
-    spread.add_argument("--group-size", type=_positive, default=8)
-    learning = claims.add_parser("learning", help="claim B: reward against model calls, every sampler on one learner")
-    ablations = claims.add_parser("ablations", help="in pairs: KL, advantage clip, guidance, resolution")
-    hacking = claims.add_parser("hacking", help="a reward that can be hacked, and the detector of DD-2 on both")
-    for claim, iterations in ((learning, 40), (ablations, 12), (hacking, 25)):
-        claim.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-        claim.add_argument("--iterations", type=_positive, default=iterations)
-        claim.add_argument("--scenes", type=_positive, default=6, help="contexts per iteration, 8 videos each")
-        claim.add_argument("--eval-scenes", type=_positive, default=100, help="held-out scenes per evaluation")
-    cost = claims.add_parser("cost", help="claim C: seconds and bytes of the KL anchors, and of the mask")
-    cost.add_argument("--repeats", type=_positive, default=7)
-    clips = claims.add_parser("clips", help="claim A on a video model of recorded episodes")
-    training = claims.add_parser("clip-learning", help="claim B on a video model of recorded episodes")
-    training.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    training.add_argument("--iterations", type=_positive, default=LearningPlan.iterations)
-    training.add_argument("--contexts", type=_positive, default=400, help="recorded episodes to draw contexts from")
-    training.add_argument("--eval-contexts", type=_positive, default=LearningPlan.eval_contexts)
-    training.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and held-out ones")
-    for claim in (clips, training):
-        claim.add_argument(
-            "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
-            help=f"episodes to take contexts from (default: new ones in {EPISODES}, of seeds that no model has seen)",
-        )
-    resolution = claims.add_parser("resolution", help="the same video model on larger pictures than it was trained on")
-    resolution.add_argument("--sizes", type=_positive, nargs="+", default=[80, 96, 128], help="sides of a picture, px")
-    resolution.add_argument(
-        "--context-bags", type=Path, nargs="+", default=[], metavar="BAG",
-        help="the same episodes in several sizes, a bag of each, the model's own size first (default: new ones)",
-    )
-    for claim in (clips, training, resolution):
-        claim.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model")
-    for claim in (clips, resolution):
-        claim.add_argument("--contexts", type=_positive, default=100)
-        claim.add_argument("--preset", default="recommended", help="settings of loop 2: rewards, sampler steps, task")
-    clips.add_argument("--group-size", type=_positive, default=8)
-    clips.add_argument(
-        "--features", default="tokenizer",
-        help="tokenizer, pixels, random, or the folder of a vision backbone, e.g. DINOv3 (default: tokenizer)",
-    )
-    for claim in (base, spread, cost, clips, resolution):
-        claim.add_argument("--seed", type=int, default=0)
-    for claim in (spread, learning, ablations, hacking, clips, training):
-        claim.add_argument("--samplers", "--arms", nargs="+", metavar="NAME")
-    for claim in (spread, learning, ablations, hacking, cost):
-        claim.add_argument("--base", type=Path, help="weights of another base model than the shipped one")
-    for claim in (spread, learning, ablations, hacking, cost, clips, training, resolution):
-        claim.add_argument("--json", type=Path, help="write every row here; trainings go on where the file stops")
-    return parser

@@ -1,4 +1,4 @@
-"""Claim C: what each KL anchor costs in seconds and bytes, side by side on the same buffers, and what the mask and
+"""Cost: what each KL anchor costs in seconds and bytes, side by side on the same buffers, and what the mask and
 caching add to a rollout. DD-20.
 """
 

@@ -1,4 +1,4 @@
-"""Claim A: how far the videos of one context spread, at which cost in quality. DD-19.
+"""Diversity: how far the videos of one context spread, at which cost in quality. DD-19.
 
 Shapes: n videos of a context, F frames, C channels, H W cells or pixels.
 """

@@ -1,4 +1,4 @@
-"""Claim B: what each sampler makes of the same number of model calls.."""
+"""Learning: what each sampler makes of the same number of model calls."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict

@@ -151,7 +151,7 @@ def plot_hacking(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def family_of(sampler: str) -> str:
-    """The family of a sampler of claim A."""
+    """The family of a sampler of the diversity experiment."""
     if not sampler.startswith("DynDiff"):
         return sampler.split()[0]
     return f"DynDiff {sampler.split()[2]} rms" if sampler.endswith("rms") else "DynDiff literal"

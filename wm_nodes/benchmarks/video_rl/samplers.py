@@ -71,7 +71,7 @@ def dyndiff(eta: float, combine: str = "gated", budget: str = "literal", **knobs
 
 
 def diversity_samplers() -> list[SamplerSetup]:
-    """Claim A: ODE, CPS at several noise levels, DynDiff as written, sparse, and at CPS's noise budget."""
+    """For diversity: ODE, CPS at several noise levels, DynDiff as written, sparse, and at CPS's noise budget."""
     samplers = [sampler_setup("ODE", SamplerSettings("ode", 0.0))]
     samplers += [sampler_setup(f"CPS {eta:g}", SamplerSettings("cps", eta)) for eta in (0.2, 0.4, 0.6)]
     samplers += [sampler_setup(f"DynDiff {eta:g} gated", dyndiff(eta)) for eta in (0.6, 1.0)]
@@ -84,7 +84,7 @@ def diversity_samplers() -> list[SamplerSetup]:
 
 
 def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
-    """Claim B: every sampler on one learner; `learner` holds what they share.
+    """Learning: every sampler on one learner; `learner` holds what they share.
 
     Mix-GRPO and the samplers "window" train all four steps of a window that moves, as many as the others of their nine.
     """

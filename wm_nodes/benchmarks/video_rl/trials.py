@@ -14,7 +14,7 @@ from wm_nodes.video_model import SamplerSettings
 GUIDANCE = 2.0
 HIGH_SIDE = 20
 SHORT_RATE = 2e-4
-"""Learning rate of these short trainings, twice that of claim B: 12 buffers go as far as 24."""
+"""Learning rate of these short trainings, twice that of the learning experiment: 12 buffers go as far as 24."""
 PAPER_GROUP = 16
 """Videos per context of Table 5: a clip of 2.5 can act from groups of 8 on, one of 5 only from 27 on."""
 

@@ -1,8 +1,9 @@
-"""Checks a video model before GRPO trains it: one line per check, exit code 1 where one fails."""
+"""Check a video model before GRPO trains it: ratio, KL, ODE step, mask, buffer and memory, a line each.
+
+    wm check-video-model [--video-model FOLDER --context-bags BAG ... | --public FOLDER]
+"""
 
 import argparse
-import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from wm_nodes.config.load import VIDEO, load_video_config, parse_override, preset_names
+from wm_nodes.apps.options import add_preset, settings
+from wm_nodes.config.load import VIDEO, load_video_config, preset_names
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.video_model import Condition
@@ -23,24 +25,32 @@ from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
 
 VIDEOS = 4
-console = Console()
 
 
-def main(argv: Sequence[str]) -> int:
-    """Return the exit code: 0 all passed, 1 a check failed, 2 a clear error."""
-    arguments = _parser().parse_args(argv)
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", str(torch.get_num_threads()))))
-    try:
-        config = load_video_config(arguments.preset, dict(parse_override(text) for text in arguments.set))
-        model, condition, shape, config = _patient(arguments, config)
-        videos = config.groups.contexts * config.groups.group_size
-        findings = examine(
-            model, condition, shape, rollout_settings(config.rollout), config.grpo, seed=config.seed,
-            buffer_videos=videos,
-        )
-    except (ValueError, OSError, ImportError, FloatingPointError) as error:
-        console.print(f"[bold red]error:[/] {error}", highlight=False, soft_wrap=True)
-        return 2
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--video-model", type=Path, help="folder of an embedded video model; default: the shipped toy")
+    parser.add_argument("--context-bags", type=Path, nargs="+", help="bags to take first frames and actions from")
+    parser.add_argument("--public", type=Path, help="folder of a public model, diffusers format (Wan, Cosmos-Predict)")
+    parser.add_argument("--prompt", default="a robot arm pushes a cube across the table", help="for a public model")
+    parser.add_argument("--text-only", action="store_true", help="give a public model no first frame")
+    parser.add_argument("--picture", type=Path, help="first frame for a public model; default: a test card")
+    parser.add_argument("--size", type=_size, default=(480, 832), metavar="HxW", help="pixels; default 480x832")
+    parser.add_argument("--frames", type=int, default=9, help="frames of a clip; 4 n + 1 for Wan's VAE")
+    parser.add_argument("--dtype", choices=("float32", "bfloat16", "float16"), default="float32")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--offload", action="store_true", help="VAE and text encoder rest on the CPU")
+    parser.add_argument("--lora-rank", type=int, default=0, help="check with a LoRA adapter of this rank")
+    add_preset(parser, "recommended", preset_names(VIDEO))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print a line per check; return 1 where one failed."""
+    config = load_video_config(arguments.preset, settings(arguments))
+    model, condition, shape, config = _model_to_check(arguments, config)
+    videos = config.groups.contexts * config.groups.group_size
+    findings = examine(
+        model, condition, shape, rollout_settings(config.rollout), config.grpo, seed=config.seed, buffer_videos=videos
+    )
     title = f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)"
     columns = ("check", "", "found", "where it failed")
     rows = (
@@ -48,11 +58,11 @@ def main(argv: Sequence[str]) -> int:
                          else ("[red]FAILED", finding.value, finding.remedy)))
         for finding in findings
     )
-    console.print(make_table(title, columns, rows, left=columns))
+    Console().print(make_table(title, columns, rows, left=columns))
     return int(not all(finding.passed for finding in findings))
 
 
-def _patient(
+def _model_to_check(
     arguments: argparse.Namespace, config: VideoRlConfig
 ) -> tuple[nn.Module, Condition, tuple[int, int, int, int], VideoRlConfig]:
     if arguments.public:
@@ -76,10 +86,10 @@ def _public(
 ) -> tuple[nn.Module, Condition, tuple[int, int, int, int], VideoRlConfig]:
     from wm_nodes.video_model.adapters import LoadSettings, add_lora, load_public_model
 
-    settings = LoadSettings(dtype=arguments.dtype, device=arguments.device, offload=arguments.offload)
-    public = load_public_model(arguments.public, settings)
+    loading = LoadSettings(dtype=arguments.dtype, device=arguments.device, offload=arguments.offload)
+    public = load_public_model(arguments.public, loading)
     if public.text is None:
-        raise ValueError(f"{arguments.public} has no text encoder; the doctor needs one to embed the prompt")
+        raise ValueError(f"{arguments.public} has no text encoder; one is needed to embed the prompt")
     frames = torch.from_numpy(np.stack([_picture(arguments)] * arguments.frames))[None]
     latents = public.codec.encode(frames)
     C, F, H, W = latents.shape[1:]
@@ -114,22 +124,3 @@ def _size(text: str) -> tuple[int, int]:
     if not (height.isdigit() and width.isdigit()):
         raise argparse.ArgumentTypeError(f"{text!r} is no HEIGHTxWIDTH, e.g. 480x832")
     return int(height), int(width)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="doctor.py", description=__doc__)
-    parser.add_argument("--video-model", type=Path, help="folder of an embedded video model; default: the shipped toy")
-    parser.add_argument("--context-bags", type=Path, nargs="+", help="bags to take first frames and actions from")
-    parser.add_argument("--public", type=Path, help="folder of a public model, diffusers format (Wan, Cosmos-Predict)")
-    parser.add_argument("--prompt", default="a robot arm pushes a cube across the table", help="for a public model")
-    parser.add_argument("--text-only", action="store_true", help="give a public model no first frame")
-    parser.add_argument("--picture", type=Path, help="first frame for a public model; default: a test card")
-    parser.add_argument("--size", type=_size, default=(480, 832), metavar="HxW", help="pixels; default 480x832")
-    parser.add_argument("--frames", type=int, default=9, help="frames of a clip; 4 n + 1 for Wan's VAE")
-    parser.add_argument("--dtype", choices=("float32", "bfloat16", "float16"), default="float32")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--offload", action="store_true", help="VAE and text encoder rest on the CPU")
-    parser.add_argument("--lora-rank", type=int, default=0, help="check with a LoRA adapter of this rank")
-    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(preset_names(VIDEO))}, or a .yaml")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
-    return parser

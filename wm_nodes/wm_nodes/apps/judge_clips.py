@@ -1,18 +1,17 @@
 """Judge clips of your own by the reward agent: videos in a folder, with a clips.jsonl that says what each should show.
 
-    python -m wm_nodes.apps.judge_clips CLIPS --judge http://host:8000/v1 --judge-model NAME --audit CLIPS/audit
-    python -m wm_nodes.apps.judge_clips CLIPS --judge embedded
+    wm judge-clips CLIPS --judge http://host:8000/v1 --judge-model NAME --audit CLIPS/audit
+    wm judge-clips CLIPS --judge embedded
 
 A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red cube into the green target", "task_id":
 "push_cube"}; also clip_id, robot, fps (of a .npy), reference (the picture that the clip had to start from), goal, and
 sha256, which is checked.
 Verdicts are appended to CLIPS/verdicts.jsonl; started again, it goes on with the clips that this judge, rubric and mode
-have not judged. Exit code: 0 done, 1 a clip has no verdict because the judge failed, 2 a clear error.
+have not judged. The exit code is 1 where a clip has no verdict because the judge failed.
 """
 
 import argparse
 import json
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
@@ -22,7 +21,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from wm_nodes.apps.policy_run import add_judge_options, judge_options
+from wm_nodes.apps.options import add_json, add_judge, judge_settings
 from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.judge.agent import Status, Verdict
 from wm_nodes.judge.backends.factory import for_clips
@@ -32,31 +31,19 @@ from wm_nodes.judge.service import ClipJob, JudgeService
 VERDICTS = "verdicts.jsonl"
 
 
-def main(argv: Sequence[str]) -> int:
-    """Print the verdicts' summary; see the module."""
-    parser = argparse.ArgumentParser(
-        prog="judge_clips", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("clips", type=Path, help="folder of clips.jsonl and its files")
     parser.add_argument("--config", default="cpu", help="a preset or .yaml with a judge section (default: cpu)")
-    add_judge_options(parser)
+    add_judge(parser)
     parser.add_argument("--mode", choices=("reward", "benchmark"), help="benchmark: every component is read")
     parser.add_argument("--audit", type=Path, help="folder of an audit log to write, for the viewer and for people")
     parser.add_argument("--reads", type=Path, help="folder that keeps a server's answers")
-    parser.add_argument("--json", type=Path, metavar="FILE", help=f"default: {VERDICTS} beside the clips")
-    arguments = parser.parse_args(argv)
-    try:
-        return _judge(arguments)
-    except (ValueError, OSError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; started again it goes on", file=sys.stderr)
-        return 130
+    add_json(parser, f"default: {VERDICTS} beside the clips")
 
 
-def _judge(arguments: argparse.Namespace) -> int:
-    overrides = judge_options(arguments) | ({"judge.mode": arguments.mode} if arguments.mode else {})
+def run(arguments: argparse.Namespace) -> int:
+    """Judge what is not judged yet and print a summary; return 1 where the judge failed on a clip."""
+    overrides = judge_settings(arguments) | ({"judge.mode": arguments.mode} if arguments.mode else {})
     config, lines = load_config(arguments.config, overrides), read_list(arguments.clips)
     path = arguments.json or arguments.clips / VERDICTS
     settings = judge_or_embedded(config.judge)
@@ -131,7 +118,3 @@ def _summarise(rows: Sequence[dict[str, Any]], path: Path) -> None:
     for row in [row for row in rows if row["status"] != Status.OK][:5]:
         print(f"  {row['clip_id']}: {row['status']}, {row['reason']}")
     print(f"wrote {path}")
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -4,7 +4,6 @@ Whatever took long is kept as a file with the identity of what it was measured o
 goes on where it stopped, and never takes a trained policy for the one it began with.
 """
 
-import argparse
 import json
 import os
 import sys
@@ -19,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from tqdm import tqdm
 
-from wm_nodes.config.load import ConfigError, dump_config, judge_overrides, with_current_names
+from wm_nodes.config.load import ConfigError, dump_config, with_current_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.statistics import wilson_interval
@@ -57,21 +56,6 @@ def open_run_dir(given: Path | None, name: str, config_text: str, *, begun_with:
         )
     saved.write_text(config_text)
     return run_dir
-
-
-def add_judge_options(parser: argparse.ArgumentParser) -> None:
-    """Who judges where the reward is the agent's; judge_options reads them."""
-    parser.add_argument("--judge", default="", metavar="URL[,URL]|embedded|FOLDER",
-                        help="the judge's servers, e.g. http://host:8000/v1; or a judge without one. "
-                        "Default: embedded")
-    parser.add_argument("--judge-model", default="", metavar="NAME", help="its name on the server")
-    parser.add_argument("--judge-key-env", default="", metavar="VARIABLE", help="environment variable with its key")
-    parser.add_argument("--rubric", default="", help="rubric pack: a name, or a .yaml file")
-
-
-def judge_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The dotted settings that the options of add_judge_options stand for."""
-    return judge_overrides(arguments.judge, arguments.judge_model, arguments.judge_key_env, arguments.rubric)
 
 
 class Stages:

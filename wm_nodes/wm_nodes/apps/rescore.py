@@ -1,4 +1,13 @@
-"""Loop 2 without a graph: score a run's recorded clips again, or train on them again."""
+"""Score a recording again, and say whether the scores are the recorded ones, bit by bit.
+
+    wm rescore runs/RUN              # the clips of a run of train-video-model, from their pictures
+    wm rescore runs/RUN/bags/BAG     # the rewards of a run of train-policy, from its pictures
+    wm rescore BAG --judge embedded  # the episodes of a recording with images, by the reward agent
+
+The judge's answers that the run kept (judge.keep_reads) are taken again, so that nobody is asked twice. With --reward
+or --judge another reward than the recorded one may score; what is not of one reward is not compared. The exit code is 1
+where something differs.
+"""
 
 import argparse
 import json
@@ -11,55 +20,123 @@ from rich.table import Table
 from torch import Tensor
 from tqdm import tqdm
 
-from wm_nodes.apps.policy_run import Stages, console, judge_options, open_run_dir
-from wm_nodes.apps.video_results import Finished, conclude
-from wm_nodes.config.load import dump_config, judge_or_embedded, load_video_config, parse_override, reward_overrides
+from wm_nodes.apps.options import add_json, add_judge, judge_settings, prepare_torch
+from wm_nodes.apps.policy_run import console
+from wm_nodes.config.load import REWARDS, judge_or_embedded, load_config, reward_overrides
 from wm_nodes.config.schema import AGENT
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.files import write_atomic
-from wm_nodes.judge.agent import Verdict
+from wm_nodes.judge.agent import Status, Verdict
 from wm_nodes.judge.backends.factory import for_clips
+from wm_nodes.judge.episode_reward import episode_judge
 from wm_nodes.judge.evidence_of_clip import ClipEvidence
+from wm_nodes.judge.rejudge import judge_bag
 from wm_nodes.judge.service import READS, JudgeService, agent_scores, buffer_jobs, clip_fps
-from wm_nodes.recording.raw import PARTIAL_SUFFIX
+from wm_nodes.policy_rl.rescoring import recorded_model, rescore_bag
+from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 from wm_nodes.video_model.clips import Clips, load_clips
-from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.recorded_buffers import (
     BufferJudge,
     JudgedBuffer,
     RecordedClips,
     Rescored,
     read_clips,
-    recorded_buffer,
+    read_run,
+    recorded_bags,
+    recorded_episodes,
     rescore,
-    trained_clips,
 )
 from wm_nodes.video_rl.reference_reward import load_probe
-from wm_nodes.video_rl.training_run import VideoRun, progress
-from wm_nodes.video_rl.validation import validation_scores
 
 RESCORED = "rescored.json"
+SHOWN = 10
 
 
-def rescore_run(arguments: argparse.Namespace) -> int:
-    """Score every recorded picture again; 0 where all bits are the recorded ones, else 1."""
-    run_dir, config = _source(arguments.run, chosen_judge(arguments))
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", type=Path, help="run folder of train-video-model, or a bag of train-policy")
+    parser.add_argument(
+        "--reward", choices=REWARDS,
+        help="agent: a judge's verdicts; reference: how well clips follow their recordings (default: as recorded)",
+    )
+    add_judge(parser)
+    add_json(parser, f"every score (default of a run folder: <run>/{RESCORED})")
+    more = parser.add_argument_group("for a bag of train-policy")
+    more.add_argument("--config", help="a preset or .yaml (default: config.yaml of the run that the bag lies in)")
+    more.add_argument("--model-dir", type=Path, help="world model (default: <run>/model, else the shipped one)")
+    more.add_argument("--namespace", help="of the environment, where the bag holds several")
+    more.add_argument("--reads", type=Path, help=f"the judge's kept answers (default: {READS} beside --config)")
+    more.add_argument("--audit", type=Path, help="folder of an audit log to write, where the agent judges")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Return 0 where all that could be compared is equal, else 1."""
+    prepare_torch()
+    bag: Path = arguments.recording
+    if bag.suffix != ".mcap" and not any(bag.glob("*.mcap")):
+        equal, content, path = _rescore_clips(arguments)
+    else:
+        path = arguments.json
+        judged = AGENT in (arguments.reward, recorded_reward_name(bag, namespace=arguments.namespace))
+        rescored = _judge_episodes if judged or judge_settings(arguments) else _rescore_rewards
+        equal, content = rescored(arguments, bag)
+    if path is not None:
+        write_atomic(path, (json.dumps(plain({"equal": equal, **content}), indent=1) + "\n").encode())
+    return int(not equal)
+
+
+def _rescore_rewards(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dict[str, Any]]:
+    """The endogenous or rule rewards of a bag of loop 1."""
+    if arguments.reward is not None:
+        raise ValueError(f"--reward {arguments.reward} is of clips; {bag} holds a policy's episodes")
+    model = recorded_model(bag, arguments.config, arguments.model_dir)
+    report = rescore_bag(bag, model, namespace=arguments.namespace)
+    print("\n".join([*report.different[:SHOWN], report.text()]))
+    return report.equal, {"compared": report.compared, "different": report.different}
+
+
+def _judge_episodes(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dict[str, Any]]:
+    """The episodes of a bag of loop 1 by the reward agent; rewards that it gave live must come out again."""
+    run_dir = bag.absolute().parent.parent
+    saved = run_dir / "config.yaml"
+    file = arguments.config or (str(saved) if saved.is_file() else "cpu")
+    config = load_config(file, judge_settings(arguments))
+    own, kept = run_dir / "model", Path(file).parent / READS
+    evidence = ClipEvidence(arguments.model_dir or (own if own.is_dir() else shipped_model(config.task)))
+    judge = JudgeService(
+        episode_judge(config), seed=config.seed, reads=arguments.reads or (kept if kept.is_dir() else None),
+        audit=arguments.audit, evidence=evidence,
+    )
+    with closing(judge):
+        found = judge_bag(bag, judge, namespace=arguments.namespace)
+    counts = {status: sum(verdict.status is status for verdict in found.verdicts) for status in Status}
+    words = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+    print(f"{len(found.verdicts)} episodes judged ({words or 'none'}), {len(found.unseen)} not seen whole")
+    print(*(f"  {reason}\n" for reason in found.unseen[:SHOWN]), sep="", end="")
+    print(
+        f"{found.compared} recorded lock-steps are of this judge and rubric, {len(found.different)} of them differ; "
+        f"not compared: {found.unanswered} rewards that were not given then"
+    )
+    return not found.different, {"compared": found.compared, "episodes": [verdict_row(v) for v in found.verdicts]}
+
+
+def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any], Path]:
+    """Every recorded picture of a run of loop 2."""
+    chosen = {**reward_overrides(arguments.reward), **judge_settings(arguments)}
+    run_dir, config = read_run(arguments.recording, chosen)
     probe = load_probe(shipped_model(config.task))
-    bags = _shards(run_dir, "train")
+    bags = recorded_episodes(run_dir, "train")
     contexts = load_clips(bags, config.model.stride)
-    with _judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
+    with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
         clips = (recorded for bag in recorded_bags(run_dir) for recorded in read_clips(bag, pictures=True))
         rows = [
             rescore(recorded, contexts, probe, config.rewards, config.model.num_conditioning, judge)
             for recorded in tqdm(clips, desc="rescoring", unit="buffer")
         ]
     equal = all(not row.different for row in rows)
-    content = {"equal": equal, "rewards": config.rewards, "buffers": [_row(row) for row in rows]}
     path = arguments.json or run_dir / RESCORED
-    write_atomic(path, (json.dumps(plain(content), indent=1) + "\n").encode())
     console.print(_table(rows))
     words = "every score is the recorded one, bit for bit" if equal else "[bold red]scores differ from the bag's[/]"
     if not all(row.same_reward for row in rows):
@@ -67,65 +144,11 @@ def rescore_run(arguments: argparse.Namespace) -> int:
     if silent := sum(row.recorded.audit_ids.count("") for row in rows if row.verdicts):
         words += f"; {silent} clips that got no answer then are not compared"
     console.print(f"{words}: {path}", highlight=False)
-    return 0 if equal else 1
-
-
-def retrain_run(arguments: argparse.Namespace, command: str) -> int:
-    """Train on a run's kept buffers and recorded scores, without sampling, in a new run folder."""
-    stage = Stages()
-    source, live = _source(arguments.run)
-    config = load_video_config(str(source / "config.yaml"), dict(parse_override(text) for text in arguments.set))
-    if config.seed != live.seed:
-        raise ValueError(f"the clips of {source} were drawn with seed {live.seed}, not {config.seed}; do not set it")
-    run_dir = open_run_dir(arguments.run_dir, "world_model_retrain", dump_config(config))
-    if run_dir == source:
-        raise ValueError(f"{run_dir} is the run to train again from; name a new folder with --run-dir")
-    _, iterations = progress(source)
-    if not iterations:
-        raise ValueError(f"{source} has no checkpoint of a learner: nothing was trained there to train again")
-    clips = trained_clips(recorded_bags(source), iterations)
-    stage(f"training on {len(clips)} buffers of {source} in {run_dir}")
-    base, heldout, judge = source / "video_model", _shards(source, "heldout"), shipped_model(config.task)
-    folder = load_video_folder(base)
-    run = VideoRun(
-        folder.network, config, run_dir, tensorboard=arguments.tensorboard,
-        heldout=validation_scores(folder, heldout, judge, config) if config.evaluation.every else None,
-    )
-    rewards = None if config.rewards == live.rewards else config.rewards
-    try:
-        for recorded in tqdm(clips[run.iterations :], desc="GRPO", unit="buffer"):
-            run.train(recorded_buffer(source, recorded, rewards))
-    finally:
-        run.close()
-    conclude(
-        Finished(
-            config, run_dir, base, run.iterations, run.version, load_clips(heldout, folder.clip["stride"]),
-            load_probe(judge), f"as in {source.name}", "", command, stage.minutes,
-        )
-    )
-    return 0
-
-
-def recorded_bags(run_dir: Path) -> list[Path]:
-    """The bags of a run, oldest first: one for each time it was started, those of killed recorders by their final name.
-
-    Raises:
-        ValueError: there is none.
-    """
-    folders = (path for path in (run_dir / "bags").glob("*") if path.is_dir())
-    bags = sorted({path.with_name(path.name.removesuffix(PARTIAL_SUFFIX)) for path in folders})
-    if not bags:
-        raise ValueError(f"{run_dir} holds no recorded bag; name the run folder of a world_model_rl.py that trained")
-    return bags
-
-
-def chosen_judge(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The settings that the options --reward, --judge, --judge-model, --judge-key-env and --rubric stand for."""
-    return {**reward_overrides(arguments.reward), **judge_options(arguments)}
+    return equal, {"rewards": config.rewards, "buffers": [_row(row) for row in rows]}, path
 
 
 @contextmanager
-def _judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: float) -> Iterator[BufferJudge | None]:
+def _clip_judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: float) -> Iterator[BufferJudge | None]:
     """The run's reward agent with the answers that it kept; a round is judged by the judge that did it, where the run
     still has that one. None where the agent is not among the rewards."""
     if not config.rewards.get(AGENT):
@@ -134,12 +157,7 @@ def _judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: float) ->
 
     def verdicts(recorded: RecordedClips, frames: Tensor, references: Clips) -> JudgedBuffer:
         jobs = buffer_jobs(
-            frames,
-            references,
-            recorded.sha256,
-            given=config.model.num_conditioning,
-            fps=fps,
-            task=config.task,
+            frames, references, recorded.sha256, given=config.model.num_conditioning, fps=fps, task=config.task,
             robot=config.judge.robot,
         )
         found = judge.judge(jobs, by=recorded.judge_id if recorded.judge_id in judge.judge_ids else "")
@@ -151,19 +169,8 @@ def _judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: float) ->
         yield verdicts
 
 
-def _source(run_dir: Path, overrides: dict[str, Any] | None = None) -> tuple[Path, VideoRlConfig]:
-    folder = run_dir.expanduser().absolute()
-    saved = folder / "config.yaml"
-    if not saved.is_file():
-        raise ValueError(f"{folder} holds no config.yaml; name the run folder of a world_model_rl.py")
-    return folder, load_video_config(str(saved), overrides)
-
-
-def _shards(run_dir: Path, name: str) -> list[Path]:
-    shards = sorted((run_dir / "data" / name).glob("shard_????????"))
-    if not shards:
-        raise ValueError(f"{run_dir / 'data' / name} holds no episodes; name the run folder that recorded the clips")
-    return shards
+def verdict_row(verdict: Verdict) -> dict[str, object]:
+    return {name: getattr(verdict, name) for name in ("clip_id", "status", "reward", "level", "reason", "audit_id")}
 
 
 def _row(row: Rescored) -> dict[str, object]:
@@ -173,10 +180,6 @@ def _row(row: Rescored) -> dict[str, object]:
         "recorded": recorded.total.tolist(), "again": row.total.tolist(), "different": list(row.different),
         "verdicts": list(row.verdicts),
     }
-
-
-def verdict_row(verdict: Verdict) -> dict[str, object]:
-    return {name: getattr(verdict, name) for name in ("clip_id", "status", "reward", "level", "reason", "audit_id")}
 
 
 def _table(rows: Sequence[Rescored]) -> Table:

@@ -1,4 +1,4 @@
-"""The evidence behind the README: several seeds and tasks, RL in the world model against RL in the simulator.
+"""Compare RL in the world model with RL in the simulator, over several seeds and tasks, with intervals.
 
 By policy_rl/train.py, in one process: the updates are bit-equal to those of the graph, without its start-up.
 Each (task, seed, arm) is one line of results.jsonl; finished lines are not run again.
@@ -12,16 +12,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
 from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from wm_nodes.config.load import default_task, dump_config, load_config, parse_override, preset_names
+from wm_nodes.apps.options import add_preset, add_threads, prepare_torch, settings
+from wm_nodes.config.load import default_task, dump_config, load_config, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import model_tasks
-from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.statistics import paired_difference, wilson_interval
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.record import acceptance_plan, collect_plan
@@ -44,16 +43,24 @@ SIMULATOR_ENVS = 8
 IMAGINED_EPISODES = 256
 
 
-def main(argv: Sequence[str]) -> int:
-    arguments = _parser().parse_args(argv)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--tasks", nargs="+", default=model_tasks(default_task()))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
+    add_preset(parser, "cpu", preset_names())
+    parser.add_argument("--model-dir", type=Path, help="world model; default: the shipped one")
+    add_threads(parser)
+    parser.add_argument("--out", type=Path, default=Path("runs/study"), help="folder; finished runs in it are kept")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Run what is not in the folder yet, and print a line per run."""
     folder = arguments.out.expanduser().absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    keep_freed_memory()
-    torch.set_num_threads(arguments.threads)
+    prepare_torch(arguments.threads)
     for task in arguments.tasks:
         for seed in arguments.seeds:
-            overrides = {"task": task, "seed": seed, **dict(parse_override(text) for text in arguments.set)}
-            config = load_config(arguments.preset, overrides)
+            config = load_config(arguments.preset, {"task": task, "seed": seed, **settings(arguments)})
             for arm in arguments.arms:
                 if not _done(folder, task, seed, arm):
                     _run(config, arm, arguments.model_dir or shipped_model(task), folder)
@@ -61,7 +68,6 @@ def main(argv: Sequence[str]) -> int:
     Console().print(table(rows))
     if (gain := gain_over_simulator(rows)) is not None:
         print(f"RL in the world model less RL in the simulator, mean over the tasks: {gain:+.1f} points")
-    return 0
 
 
 def read_results(folder: Path) -> list[dict[str, Any]]:
@@ -109,19 +115,6 @@ def gain_over_simulator(rows: Sequence[dict[str, Any]]) -> float | None:
             successes, episodes = (sum(rate[name] for rate in found) for name in ("successes", "episodes"))
             rates["image policy", arm, task] = 100 * successes / episodes
     return mean_gain(rates, *ARMS) if rates else None
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="study.py", description=__doc__.split("\n")[0])
-    parser.add_argument("--tasks", nargs="+", default=model_tasks(default_task()))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
-    parser.add_argument("--preset", default="cpu", help=f"one of {', '.join(preset_names())}, or a .yaml of overrides")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
-    parser.add_argument("--model-dir", type=Path, help="world model; default: the shipped one")
-    parser.add_argument("--threads", type=int, default=1, help="torch threads")
-    parser.add_argument("--out", type=Path, default=Path("runs/study"), help="folder; finished runs in it are kept")
-    return parser
 
 
 def _done(folder: Path, task: str, seed: int, arm: str) -> bool:

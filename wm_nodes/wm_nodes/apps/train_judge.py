@@ -1,23 +1,20 @@
-"""Train the embedded judge from adversarial sets, or measure a trained one (RA-17 to RA-20).
+"""Train the embedded judge on sets of clips with known labels, or measure a trained one (RA-17 to RA-20).
 
 The sets' own division says which episodes train, which calibrate, and which nobody has seen. Started again, it takes up
 finished stages that lie in OUT.
 
-    python -m wm_nodes.apps.train_judge OUT SET [SET ...] --seed 0
-    python -m wm_nodes.apps.train_judge OUT SET [SET ...] --measure test
+    wm train-judge OUT SET [SET ...] --seed 0
+    wm train-judge OUT SET [SET ...] --measure test
 """
 
 import argparse
 import json
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.apps.options import add_seed, add_threads, positive, prepare_torch
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.dataset.build import SIDE_PX
 from wm_nodes.judge.dataset.policy_camera import policy_models, policy_window
@@ -30,53 +27,45 @@ from wm_nodes.reports.machine import machine_facts
 from wm_nodes.world_model import load_model_folder
 
 
-def main(argv: Sequence[str]) -> int:
-    """Train or measure. Return the exit code: 0 done, 2 a clear error."""
-    parser = argparse.ArgumentParser(prog="train_judge", description=__doc__.splitlines()[0])
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="folder of the judge, and of finished stages")
-    parser.add_argument("sets", type=Path, nargs="+", help="folders made by adversarial_set, of one division")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("sets", type=Path, nargs="+", help="folders made by build-judge-dataset, of one division")
+    add_seed(parser)
     parser.add_argument("--segmenter-steps", type=int, default=JudgePlan.segmenter_steps, help="batches of 16 pictures")
     parser.add_argument(
         "--readers", type=int, default=JudgePlan.readers, help="networks over time per half of the recordings; 0: none"
     )
-    parser.add_argument("--reader-epochs", type=int, default=JudgePlan.reader_epochs, help="times that each sees it")
+    parser.add_argument("--reader-epochs", type=positive, default=JudgePlan.reader_epochs, help="times each sees it")
     parser.add_argument("--trees", type=int, default=TreeSettings.num_trees, help="per question")
-    parser.add_argument("--threads", type=int, default=1, help="cores; other numbers give other last bits")
+    add_threads(parser)
     parser.add_argument(
         "--policy-view", nargs="?", type=Path, const=Path(), metavar="MODEL_DIR",
         help="the sets were made with this option; the judge reads what the loops of this world model show",
     )
     parser.add_argument("--measure", choices=("train", "validation", "test"), help="train nothing, measure this part")
-    arguments = parser.parse_args(argv)
-    if arguments.readers < 0 or arguments.reader_epochs < 1:
-        parser.error(f"--readers {arguments.readers}, --reader-epochs {arguments.reader_epochs}: at least 0 and 1")
-    keep_freed_memory()
-    torch.set_num_threads(arguments.threads)
-    try:
-        if arguments.measure:
-            report = _measured(arguments)
-        else:
-            window = None
-            if arguments.policy_view is not None:
-                models = load_model_folder(policy_models(arguments.policy_view))
-                window = policy_window(models.simulation, SIDE_PX)
-            plan = JudgePlan(
-                tuple(arguments.sets), arguments.segmenter_steps, arguments.readers, arguments.reader_epochs,
-                TreeSettings(arguments.trees), arguments.seed, window,
-            )
-            made = {
-                "command": "python -m wm_nodes.apps.train_judge " + " ".join(argv), "machine": machine_facts(),
-            }
-            head = make_judge(arguments.out, plan)
-            head = replace(head, story={"made": made, **head.story})
-            save_head(arguments.out, head)
-            report = dict(head.story["validation"])
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(table(report))
-    return 0
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Train or measure, and print a line per target."""
+    if arguments.readers < 0:
+        raise ValueError(f"--readers must be at least 0, got {arguments.readers}")
+    prepare_torch(arguments.threads)
+    print(table(_measured(arguments) if arguments.measure else _trained(arguments)))
+
+
+def _trained(arguments: argparse.Namespace) -> dict[str, Any]:
+    window = None
+    if arguments.policy_view is not None:
+        models = load_model_folder(policy_models(arguments.policy_view))
+        window = policy_window(models.simulation, SIDE_PX)
+    plan = JudgePlan(
+        tuple(arguments.sets), arguments.segmenter_steps, arguments.readers, arguments.reader_epochs,
+        TreeSettings(arguments.trees), arguments.seed, window,
+    )
+    head = make_judge(arguments.out, plan)
+    head = replace(head, story={"made": {"command": arguments.command, "machine": machine_facts()}, **head.story})
+    save_head(arguments.out, head)
+    return dict(head.story["validation"])
 
 
 def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -129,7 +118,3 @@ def table(report: Mapping[str, Any]) -> str:
                 lines.append(f"  {name:16} silent {100 * of['silent']:.1f} %; {'; '.join(errors)}")
     lines += [f"too foreign to judge, {split}: {a} of {n}" for split, (a, n) in report.get("foreign", {}).items()]
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

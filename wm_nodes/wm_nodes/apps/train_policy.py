@@ -1,49 +1,48 @@
-"""The main job: collect, judge the world model, clone a weak policy, train it in the world model, measure it for real.
+"""Train a robot policy by RL inside a learned world model, as a ROS 2 graph, and measure it in the simulator before and
+after.
 
 Every stage leaves its files in the run folder and is skipped when they are there, so a run can be resumed by naming it.
 """
 
 import argparse
 import json
-import os
-import sys
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from wm_nodes.apps.model_refresh_loop import round_start, run_rounds
+from wm_nodes.apps.options import (
+    add_graph,
+    add_judge,
+    add_preset,
+    add_run_dir,
+    add_seed,
+    judge_settings,
+    prepare_torch,
+    settings,
+)
 from wm_nodes.apps.policy_pictures import write_pictures
 from wm_nodes.apps.policy_run import (
     RunContext,
     Stages,
-    add_judge_options,
     console,
     is_trained,
-    judge_options,
     open_run_dir,
     rate,
     start_graph,
 )
-from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, parse_override, preset_names
+from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import task_names
-from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.errors import ModelNotAcceptedError
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
 from wm_nodes.environments.record import HELDOUT_SEEDS, acceptance_plan, collect_plan
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
-from wm_nodes.launching.domain_lock import DomainInUseError
-from wm_nodes.launching.graph import GraphError
-from wm_nodes.launching.graph_client import GoalFailed, PeerLost
-from wm_nodes.launching.readiness import NotReadyError
-from wm_nodes.launching.runner import NodeDiedError
 from wm_nodes.policy_rl.factories import load_policy
 from wm_nodes.policy_rl.initial_policy import prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import load_arrays, make_model
@@ -51,43 +50,38 @@ from wm_nodes.reports import Summary, machine_facts, results_table, rounds_table
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
-EXPECTED = (
-    ConfigError, GraphError, DomainInUseError, NodeDiedError, NotReadyError, GoalFailed, PeerLost, ValueError, OSError,
-)
-"""Errors whose text says what to do; anything else is a fault of ours and shows its traceback."""
-
-
 ENDOGENOUS = "endogenous"
 ACCEPTANCE, FORMER_ACCEPTANCE = "acceptance.json", "gate.json"
 """Report of accept_world_model in the run folder, and its name in older ones."""
 
 
-class ModelNotAcceptedError(RuntimeError):
-    """The world model does not pass acceptance."""
+def add_options(parser: argparse.ArgumentParser) -> None:
+    add_preset(parser, "cpu", preset_names())
+    parser.add_argument("--task", choices=task_names(), help="default: the preset's")
+    add_seed(parser, None)
+    add_run_dir(parser)
+    parser.add_argument("--model-dir", type=Path, help="world model to use instead of the shipped one")
+    parser.add_argument("--from-scratch", action="store_true", help="collect data and train the world model too")
+    parser.add_argument("--force", action="store_true", help="train even in a model that does not pass acceptance")
+    parser.add_argument(
+        "--rounds", type=int, metavar="N",
+        help="train, collect with the policy in the simulator, refresh the world model, N times; default: the preset's "
+        "(1: never refresh). The policy updates are split over the rounds",
+    )
+    parser.add_argument(
+        "--reward", choices=(ENDOGENOUS, AGENT), default=ENDOGENOUS,
+        help="what the policy is paid for in the world model. endogenous: the model's own signal; agent: a judge's "
+        "verdict on each whole episode; name the judge below, or in section judge of the settings. Default: endogenous",
+    )
+    add_judge(parser)
+    parser.add_argument("--compose", action="store_true", help="all nodes in one process")
+    add_graph(parser)
 
 
-def main(argv: Sequence[str]) -> int:
-    """Return the exit code: 0 done, 2 a clear error, 3 the model does not pass acceptance, 130 Ctrl-C."""
-    arguments = _parser().parse_args(argv)
-    try:
-        run(arguments)
-    except ModelNotAcceptedError as refusal:
-        console.print(f"[bold red]acceptance:[/] {refusal}")
-        return 3
-    except KeyboardInterrupt:
-        console.print("stopped; name the run folder with --run-dir to go on")
-        return 130
-    except EXPECTED as error:
-        console.print(f"[bold red]error:[/] {error}", highlight=False)
-        return 2
-    return 0
-
-
-def run(arguments: argparse.Namespace) -> Summary:
-    """The whole job; see main."""
+def run(arguments: argparse.Namespace) -> None:
+    """Collect, check the world model, clone a weak policy, train it in the world model, measure it in the simulator."""
     stage = Stages()
-    keep_freed_memory()
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+    prepare_torch()
     config, run_dir = _open_run(arguments)
     stage(f"run folder {run_dir}")
     model_dir = _model(arguments, config, run_dir, stage)
@@ -112,7 +106,7 @@ def run(arguments: argparse.Namespace) -> Summary:
         paired=asdict(paired_difference(found.real_before.tolist(), found.real_after.tolist())),
         imagined_paired=asdict(paired_difference(found.imagined_before.tolist(), found.imagined_after.tolist())),
         acceptance=_read_acceptance(run_dir), samples=found.samples, minutes=stage.minutes,
-        command=_command(), machine=machine_facts(), rounds=found.table, reward=arguments.reward,
+        command=arguments.command, machine=machine_facts(), rounds=found.table, reward=arguments.reward,
         judge=judge_name(episode_judge(config)) if arguments.reward == AGENT else "",
     )
     write_summary(run_dir, summary)
@@ -123,55 +117,15 @@ def run(arguments: argparse.Namespace) -> Summary:
         console.print(rounds_table(summary))
     console.print(results_table(summary))
     console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
-    return summary
-
-
-def _command() -> str:
-    return "python3 launch_scripts/online_rl.py " + " ".join(sys.argv[1:])
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="online_rl.py",
-        description="Train a robot policy by RL inside a learned world model, as a ROS 2 graph, and measure it in the "
-        "real simulator before and after.",
-    )
-    parser.add_argument("--preset", default="cpu", help=f"one of {', '.join(preset_names())}, or a .yaml of overrides")
-    parser.add_argument("--task", choices=task_names(), help="default: the preset's")
-    parser.add_argument("--seed", type=int, help="root seed of every random number; default: the preset's")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
-    parser.add_argument(
-        "--run-dir", type=Path, help="run folder; an existing one is resumed. Default: runs/<time>-<task>"
-    )
-    parser.add_argument("--model-dir", type=Path, help="world model to use instead of the shipped one")
-    parser.add_argument("--from-scratch", action="store_true", help="collect data and train the world model too")
-    parser.add_argument("--force", action="store_true", help="train even in a model that does not pass acceptance")
-    parser.add_argument(
-        "--rounds", type=int, metavar="N",
-        help="train, collect with the policy in the simulator, refresh the world model, N times; default: the preset's "
-        "(1: never refresh). The policy updates are split over the rounds",
-    )
-    parser.add_argument(
-        "--reward", choices=(ENDOGENOUS, AGENT), default=ENDOGENOUS,
-        help="what the policy is paid for in the world model. endogenous: the model's own signal; agent: a judge's "
-        "verdict on each whole episode; name the judge below, or in section judge of the settings. Default: endogenous",
-    )
-    add_judge_options(parser)
-    parser.add_argument("--compose", action="store_true", help="all nodes in one process")
-    parser.add_argument("--domain-id", default="", help="ROS domain 0 to 101; default: $ROS_DOMAIN_ID, else 0")
-    parser.add_argument("--verbose", action="store_true", help="show the nodes' logs (they are in <run>/logs anyway)")
-    return parser
 
 
 def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
-    overrides: dict[str, Any] = dict(parse_override(text) for text in arguments.set)
+    overrides = settings(arguments)
     if arguments.task:
         overrides["task"] = arguments.task
-    if arguments.seed is not None:
-        overrides["seed"] = arguments.seed
     if arguments.rounds is not None:
-        overrides["model_refresh.num_rounds"] = arguments.rounds
-    judge = judge_options(arguments)
+        overrides["rounds.num_rounds"] = arguments.rounds
+    judge = judge_settings(arguments)
     if judge and arguments.reward != AGENT:
         raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")
     config = load_config(arguments.preset, {**overrides, **judge})
@@ -186,7 +140,7 @@ def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: Stages) -> Path:
     if arguments.from_scratch:
         stage(f"world model from scratch: {config.data.num_episodes} simulator episodes, tokenizer, dynamics")
-        return make_model(config, run_dir, command=_command())
+        return make_model(config, run_dir, command=arguments.command)
     model_dir = arguments.model_dir or shipped_model(config.task)
     stage(f"world model {model_dir}")
     return Path(model_dir).expanduser().absolute()

@@ -1,6 +1,8 @@
-"""Loop 2 as a job: bags in, a video model, GRPO over the graph, held-out scores before and after, a report.
+"""Post-train a flow-matching video world model by DynDiff-GRPO, as a ROS 2 graph, and measure it on held-out contexts
+before and after.
 
-Resumable: collected bags, the trained model, finished evaluations and the learner's checkpoint stay in the run folder.
+Collected bags, the trained model, finished evaluations and the learner's checkpoint stay in the run folder, so a run
+can be resumed by naming it. Its clips can be scored again (wm rescore RUN) and trained on again (wm retrain RUN).
 """
 
 import argparse
@@ -11,70 +13,79 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
-from wm_nodes.apps.policy_run import READY_S, Stages, add_judge_options, console, open_run_dir
-from wm_nodes.apps.rescore import chosen_judge, recorded_bags, rescore_run, retrain_run
+from wm_nodes.apps.options import (
+    add_graph,
+    add_judge,
+    add_preset,
+    add_run_dir,
+    add_seed,
+    add_tensorboard,
+    judge_settings,
+    prepare_torch,
+    settings,
+)
+from wm_nodes.apps.policy_run import READY_S, Stages, open_run_dir
 from wm_nodes.apps.video_results import Finished, conclude
 from wm_nodes.config.load import (
     REWARDS,
     VIDEO,
-    ConfigError,
     dump_config,
     judge_or_embedded,
     load_config,
     load_video_config,
-    parse_override,
     preset_names,
+    reward_overrides,
 )
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
-from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
 from wm_nodes.judge.backends.factory import check_clips, check_judge
 from wm_nodes.launching import arguments as launch_arguments
-from wm_nodes.launching.domain_lock import DomainInUseError
-from wm_nodes.launching.graph import GraphError
-from wm_nodes.launching.graph_client import GoalFailed, GraphClient, PeerLost
-from wm_nodes.launching.readiness import NotReadyError
-from wm_nodes.launching.runner import NodeDiedError, Runner
-from wm_nodes.reports import ClipSummary
+from wm_nodes.launching.graph_client import GraphClient
+from wm_nodes.launching.runner import Runner
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_rl.pretraining import make_video_model, shipped_video_model
+from wm_nodes.video_rl.recorded_buffers import recorded_bags
 from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.video_rl.training_run import progress
 
-EXPECTED = (
-    ConfigError, DomainInUseError, GraphError, NodeDiedError, NotReadyError, GoalFailed, PeerLost, ValueError, OSError,
-)
 HELDOUT_EPISODES = 100
 
 
-def main(argv: Sequence[str]) -> int:
-    """Return the exit code: 0 done, 1 recorded scores differ, 2 a clear error, 130 interrupted (start again with
-    --run-dir to go on)."""
-    arguments = _parser().parse_args(argv)
-    keep_freed_memory()
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-    try:
-        if arguments.action == "rescore":
-            return rescore_run(arguments)
-        if arguments.action == "retrain":
-            return retrain_run(arguments, _command())
-        run(arguments)
-    except KeyboardInterrupt:
-        console.print("interrupted; --run-dir goes on from here", highlight=False)
-        return 130
-    except EXPECTED as error:
-        console.print(f"[bold red]error:[/] {error}", highlight=False)
-        return 2
-    return 0
+def add_options(parser: argparse.ArgumentParser) -> None:
+    add_preset(parser, "recommended", preset_names(VIDEO))
+    add_seed(parser, None)
+    add_run_dir(parser)
+    parser.add_argument(
+        "--from-scratch", action="store_true",
+        help="train a video model of your own even where one with these settings is shipped (half an hour on one core)",
+    )
+    parser.add_argument(
+        "--bags", type=Path, nargs="+", default=[], metavar="BAG",
+        help="recorded simulator episodes to train on and to draw contexts from in place of new ones, e.g. those of a "
+        "run of online_rl.py: RUN/bags/heldout/shard_*",
+    )
+    parser.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and those held out")
+    parser.add_argument(
+        "--keep-buffers", type=int, default=4, metavar="N",
+        help="rollout buffers kept on disk; as many as iterations if `retrain` shall be possible. Default: 4",
+    )
+    parser.add_argument(
+        "--reward", choices=REWARDS,
+        help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording. Default: what "
+        "the preset weighs",
+    )
+    add_judge(parser)
+    add_tensorboard(parser)
+    add_graph(parser)
 
 
-def run(arguments: argparse.Namespace) -> ClipSummary:
-    """The whole job; see main."""
+def run(arguments: argparse.Namespace) -> None:
+    """Take or record episodes, take or train a video model, run GRPO over the graph, measure, report."""
+    prepare_torch()
     stage = Stages()
     config, run_dir = _open_run(arguments)
     stage(f"run folder {run_dir}")
@@ -92,15 +103,15 @@ def run(arguments: argparse.Namespace) -> ClipSummary:
     clips = load_clips(bags, config.model.stride)
     if config.rewards.get(AGENT):
         check_clips(config.judge, clips.frames.shape[1:])
-    make_video_model(config, clips, heldout, probe, run_dir, shipped=shipped, command=_command())
+    make_video_model(config, clips, heldout, probe, run_dir, shipped=shipped, command=arguments.command)
     version, done = progress(run_dir)
     if done < config.iterations:
         _post_train(arguments, config, (bags, heldout_bags), run_dir, stage)
         version, done = progress(run_dir)
-    return conclude(
+    conclude(
         Finished(
             config, run_dir, run_dir / "video_model", done, version, heldout, probe, arguments.preset,
-            str(recorded_bags(run_dir)[-1]), _command(), stage.minutes,
+            str(recorded_bags(run_dir)[-1]), arguments.command, stage.minutes,
         )
     )
 
@@ -170,10 +181,8 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
         raise ValueError("--bags and --heldout-bags go together: what is trained on, and what is held out")
     if twice := {bag.resolve() for bag in arguments.bags} & {bag.resolve() for bag in arguments.heldout_bags}:
         raise ValueError(f"{min(twice)} cannot be trained on and held out; name other --heldout-bags")
-    overrides: dict[str, Any] = dict(parse_override(text) for text in arguments.set)
-    if arguments.seed is not None:
-        overrides["seed"] = arguments.seed
-    config = load_video_config(arguments.preset, {**overrides, **chosen_judge(arguments)})
+    chosen = {**settings(arguments), **reward_overrides(arguments.reward), **judge_settings(arguments)}
+    config = load_video_config(arguments.preset, chosen)
     if config.rewards.get(AGENT):
         config = config.with_values(judge=judge_or_embedded(config.judge))
         check_judge(config.judge)
@@ -191,71 +200,3 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
         ],
     )
     return config, run_dir
-
-
-def _command() -> str:
-    return "python3 launch_scripts/world_model_rl.py " + " ".join(sys.argv[1:])
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="world_model_rl.py",
-        description="Post-train a flow-matching video world model by DynDiff-GRPO, as a ROS 2 graph, and measure it on "
-        "held-out contexts before and after.",
-    )
-    parser.add_argument("--preset", default="recommended", help=f"one of {', '.join(preset_names(VIDEO))}, or a .yaml")
-    parser.add_argument("--seed", type=int, help="root seed of every random number; default: the preset's")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="override one setting")
-    parser.add_argument("--run-dir", type=Path, help="run folder; an existing one is resumed. Default: runs/<time>-...")
-    parser.add_argument(
-        "--from-scratch", action="store_true",
-        help="train a video model of your own even where one with these settings is shipped (half an hour on one core)",
-    )
-    parser.add_argument(
-        "--bags", type=Path, nargs="+", default=[], metavar="BAG",
-        help="recorded simulator episodes to train on and to draw contexts from in place of new ones, e.g. those of a "
-        "run of online_rl.py: RUN/bags/heldout/shard_*",
-    )
-    parser.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and those held out")
-    parser.add_argument(
-        "--keep-buffers", type=int, default=4, metavar="N",
-        help="rollout buffers kept on disk; as many as iterations if `retrain` shall be possible. Default: 4",
-    )
-    _add_judge(parser)
-    _add_tensorboard(parser)
-    parser.add_argument("--domain-id", default="", help="ROS domain 0 to 101; default: $ROS_DOMAIN_ID, else 0")
-    parser.add_argument("--verbose", action="store_true", help="show the nodes' logs (they are in <run>/logs anyway)")
-    actions = parser.add_subparsers(dest="action", title="on a finished run, without a graph")
-    again = actions.add_parser(
-        "rescore", help="score the recorded clips again and compare bit for bit; exit code 1 where they differ. With "
-        "--reward they may be scored by another reward than the recorded one"
-    )
-    again.add_argument("run", type=Path, help="run folder whose bags hold the clips")
-    again.add_argument("--json", type=Path, help="file for every score; default: <run>/rescored.json")
-    _add_judge(again)
-    again = actions.add_parser(
-        "retrain", help="train on the recorded clips and scores, without sampling: the same weights, file for file"
-    )
-    again.add_argument("run", type=Path, help="run folder with all of its rollout buffers (--keep-buffers)")
-    again.add_argument("--run-dir", type=Path, help="folder of the new run. Default: runs/<time>-...")
-    again.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE",
-        help="override one of the run's settings, e.g. rewards.scenery=-10 (the recorded scores are mixed anew)",
-    )
-    _add_tensorboard(again)
-    return parser
-
-
-def _add_judge(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--reward", choices=REWARDS,
-        help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording. Default: what "
-        "the preset or the run weighs",
-    )
-    add_judge_options(parser)
-
-
-def _add_tensorboard(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--tensorboard", action=argparse.BooleanOptionalAction, default=True, help="also write <run>/tensorboard"
-    )

@@ -123,7 +123,7 @@ def prepare(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, s
     """Return the graph to start and its resolved arguments; graph.json in the run folder keeps a copy for people."""
     values = resolve(scenario, given)
     graph = build_graph(scenario, values)
-    if values.get("compose") == "true" or scenario == "composed":
+    if values.get("compose") == "true":
         graph = compose(graph, str(Path(values["run_dir"]) / "composed.params.yaml"))
         for node in graph.nodes:
             if node.inside:

@@ -6,10 +6,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
 
+from wm_nodes.core.errors import RunError
+
 LOCK_FOLDER = Path("/tmp/wm_nodes_domains")
 
 
-class DomainInUseError(RuntimeError):
+class DomainInUseError(RunError):
     """Another graph of ours runs on this domain; the text says which, and what to do."""
 
 

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from wm_msgs.action import Evaluate, Train, TrainVideo
+from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray
 from wm_nodes.ros.clients import run_goal
 from wm_nodes.ros.spin import make_executor, spin
@@ -21,7 +22,7 @@ from wm_nodes.ros.wire import PeerLost
 ACCEPT_S = 30.0
 
 
-class GoalFailed(RuntimeError):
+class GoalFailed(RunError):
     """A goal ended otherwise than finished; the text is the node's own."""
 
 

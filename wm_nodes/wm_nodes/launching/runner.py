@@ -16,6 +16,7 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import TextIO
 
+from wm_nodes.core.errors import RunError
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
@@ -33,7 +34,7 @@ GRACE_S = 5.0
 """Time for an orderly end after SIGINT, and again after SIGTERM."""
 
 
-class NodeDiedError(RuntimeError):
+class NodeDiedError(RunError):
     """A required node ended; the text names it, its exit code and its log."""
 
 

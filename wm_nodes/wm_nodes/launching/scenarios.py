@@ -320,7 +320,6 @@ SCENARIOS: dict[str, Scenario] = {
                   "record", "bag_uri", "reward", *_JUDGE), _world_model_rl),
         Scenario("judge_clips", "Have the reward agent judge folders of clips (action reward/judge_clips)",
                  (*(name for name in _COMMON if name != "compose"), "model_dir", *_JUDGE), _judge_clips),
-        Scenario("composed", "online_training with all nodes in one process", _TRAINING, _online_training),
     )
 }
 

@@ -27,7 +27,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        recover = "run `python -m wm_nodes.recording.recover {}` and read the bag that it writes"
+        recover = "run `wm recover-bag {}` and read the bag that it writes"
         partial = self.path.with_name(self.path.name + PARTIAL_SUFFIX)
         if not self.path.exists():
             if partial.exists():

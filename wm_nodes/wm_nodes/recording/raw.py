@@ -53,7 +53,7 @@ class RawBagWriter:
         if self.partial_path.exists():
             raise BagError(
                 f"{self.partial_path} holds an unfinished recording; recover it with "
-                f"`python -m wm_nodes.recording.recover {self.partial_path}`, or remove it"
+                f"`wm recover-bag {self.partial_path}`, or remove it"
             )
         self.custom: dict[str, str] = dict(custom or {})
         self.files: list[FileInfo] = []
@@ -237,7 +237,7 @@ class RawBagWriter:
         return RecordingError(
             error.errno,
             f"writing to {self.partial_path} failed after {self.messages} messages: {error.strerror or error}; "
-            f"free disk space and run `python -m wm_nodes.recording.recover {self.partial_path}` to keep what is there",
+            f"free disk space and run `wm recover-bag {self.partial_path}` to keep what is there",
         )
 
 

@@ -1,14 +1,10 @@
 """Bring back a recording whose process was killed: every complete message into a new, proper bag.
 
-    python -m wm_nodes.recording.recover runs/x/bag.partial [--output runs/x/bag]
-
-The original stays as it is.
+As a command: wm recover-bag. The original stays as it is.
 """
 
-import argparse
 import json
 import struct
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,16 +141,3 @@ def _default_output(path: Path) -> Path:
 def _file_number(file: Path) -> tuple[int, str]:
     tail = file.stem.rpartition("_")[2]
     return (int(tail) if tail.isdigit() else 0), file.name
-
-
-def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="bag_recover", description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("bag", type=Path, help="the .partial folder, a bag folder or an .mcap file")
-    parser.add_argument("--output", type=Path, default=None, help="the new bag (default: <name>_recovered)")
-    options = parser.parse_args(arguments)
-    try:
-        print(recover(options.bag, output=options.output).text())
-    except BagError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    return 0

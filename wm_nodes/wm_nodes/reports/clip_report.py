@@ -175,7 +175,7 @@ def _again(run_dir: Path, summary: ClipSummary) -> Iterable[str]:
         f"<code>{bag}</code></p><p>The command behind this page:</p><pre>{escape(summary.command)}</pre>"
     )
     if summary.bag:
-        script = "python3 launch_scripts/world_model_rl.py"
+        script = "python3 launch_scripts/wm.py"
         again = f"{script} rescore {run_dir}\n{script} retrain {run_dir}"
         yield (
             "<p>Score the recorded pictures again and compare bit for bit; train again from the kept buffers (all of "

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array, UInt64Array
 
 
@@ -19,7 +20,7 @@ class WireError(Exception):
         self.code = code
 
 
-class PeerLost(Exception):
+class PeerLost(RunError):
     """A peer did not answer before the deadline, or was restarted in between."""
 
 

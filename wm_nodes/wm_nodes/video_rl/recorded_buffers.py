@@ -8,17 +8,20 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from wm_nodes.config.load import load_video_config
 from wm_nodes.config.schema import AGENT
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.recording import Bag, BagError, topics
 from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.messages import stamp_ns
+from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_rl.reference_reward import mixed, rewarded, score_clips
@@ -91,6 +94,44 @@ BufferJudge = Callable[[RecordedClips, Tensor, Clips], JudgedBuffer]
 """Judges a buffer's clips, uint8 (N, F, H, W, 3), given the recordings of their contexts."""
 
 
+def read_run(run_dir: Path, overrides: dict[str, Any] | None = None) -> tuple[Path, VideoRlConfig]:
+    """The full path of a run folder, and its settings with some overridden.
+
+    Raises:
+        ValueError: it holds no settings.
+    """
+    folder = run_dir.expanduser().absolute()
+    saved = folder / "config.yaml"
+    if not saved.is_file():
+        raise ValueError(f"{folder} holds no config.yaml; name the run folder of a train-video-model, or a bag")
+    return folder, load_video_config(str(saved), overrides)
+
+
+def recorded_bags(run_dir: Path) -> list[Path]:
+    """The bags of a run, oldest first: one for each time it was started, those of killed recorders by their final name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    folders = (path for path in (run_dir / "bags").glob("*") if path.is_dir())
+    bags = sorted({path.with_name(path.name.removesuffix(PARTIAL_SUFFIX)) for path in folders})
+    if not bags:
+        raise ValueError(f"{run_dir} holds no recorded bag; name the run folder of a train-video-model that trained")
+    return bags
+
+
+def recorded_episodes(run_dir: Path, part: Literal["train", "heldout"]) -> list[Path]:
+    """The bags of simulator episodes that a run took its contexts from.
+
+    Raises:
+        ValueError: there is none.
+    """
+    shards = sorted((run_dir / "data" / part).glob("shard_????????"))
+    if not shards:
+        raise ValueError(f"{run_dir / 'data' / part} holds no episodes; name the run folder that recorded the clips")
+    return shards
+
+
 def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
     """Yield the scored clips of a live recording, in the order of their scores; unscored ones are left out.
 
@@ -104,7 +145,7 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
         verdicts = _verdicts(opened)
         for name in rows:
             if not opened.count(name):
-                raise BagError(f"bag {bag} has no message on {name}; name a run of world_model_rl.py that was recorded")
+                raise BagError(f"bag {bag} has no message on {name}; name a recorded run of train-video-model")
         clips, shown = dict[str, Any](), dict[int, UInt8Array]()
         for name, _, data in opened.messages(list(rows)):
             topic, message = rows[name], opened.decode(data, rows[name].msgtype)

@@ -81,7 +81,7 @@ def test_a_torn_last_line_is_told_cut_off_and_kept(folder: Path, cut: int) -> No
     path.write_bytes(whole[:-cut])
     (fault,) = faults(folder)
     assert (fault.number, fault.torn) == (5, True)
-    with pytest.raises(AuditError, match="torn line; run `python"):
+    with pytest.raises(AuditError, match="torn line; run `wm audit recover "):
         AuditLog(folder)
     said = recover(folder)
     assert "of line 5" in said

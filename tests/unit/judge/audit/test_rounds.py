@@ -12,6 +12,7 @@ import pytest
 from audit_logs import Job, JudgeByClip, clips, judge_all
 from scripted_judge import CLEAN, FLAWED, WRONG, ScriptedJudge, clean_table
 
+from wm_nodes.apps.cli import main
 from wm_nodes.core.statistics import wilson_interval
 from wm_nodes.judge.agent import RewardAgent
 from wm_nodes.judge.agent.levels import next_vote
@@ -19,7 +20,6 @@ from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Profile, Read, ReadRequest, Stage, Status
 from wm_nodes.judge.audit.adoption import Registry, RubricComparison, compare, decide
 from wm_nodes.judge.audit.agreement import AgreementRow, join_labels, report
-from wm_nodes.judge.audit.commands import main
 from wm_nodes.judge.audit.labels import FORMAT, read_labels
 from wm_nodes.judge.audit.log import AuditError
 from wm_nodes.judge.audit.people import HumanJudge
@@ -165,7 +165,8 @@ def test_the_command_names_the_clips_that_are_paid_more_than_people_would(
     evaluations = judged(tmp_path / "log", [{}, {}, {}, {}])
     rows: list[Mapping[str, Any]] = [everything(), everything(task_completion=False), {"planning": 3, "clarity": True}]
     labels = write_labels(tmp_path / "ada.json", evaluations, rows)
-    assert main(["people", str(tmp_path / "log"), "--labels", str(labels), "--output", str(tmp_path / "people")]) == 0
+    given = ["people", str(tmp_path / "log"), "--labels", str(labels)]
+    assert main(["audit", *given, "--output", str(tmp_path / "people")]) == 0
     out = capsys.readouterr().out
     assert "3 clips, 2 with a reward by people, 2 by both" in out and "people would: 1 of 2" in out
     by_people = read_record(tmp_path / "people").judged()
@@ -173,9 +174,10 @@ def test_the_command_names_the_clips_that_are_paid_more_than_people_would(
     assert paid[0] == 1.0 and paid[1] < 0.6 and math.isnan(paid[2])
     assert f"clip1: judge 1.000, people {paid[1]:.3f}" in out
     assert by_people[2].verdict and "nobody labelled" in by_people[2].verdict.reason
-    assert main(["verify", str(tmp_path / "people")]) == 0 and main(["replay", str(tmp_path / "people")]) == 0
+    assert main(["audit", "verify", str(tmp_path / "people")]) == 0
+    assert main(["audit", "replay", str(tmp_path / "people")]) == 0
     with pytest.raises(SystemExit):
-        main(["people", str(tmp_path / "log"), "--labels", str(labels)])
+        main(["audit", *given])
 
 
 # --- agreement --------------------------------------------------------------------------------------------------
@@ -339,7 +341,7 @@ def test_the_loop_as_commands_puts_the_better_version_in_force(
     def adopt(*sets: tuple[Path, Path, Path]) -> int:
         (a, b, c), (d, e, f) = sets
         options = ["--frozen", a, b, "--frozen-labels", c, "--newest", d, e, "--newest-labels", f]
-        return main(["adopt", str(registry), *map(str, options)])
+        return main(["audit", "adopt", str(registry), *map(str, options)])
 
     assert adopt(frozen, frozen) == 1
     assert Registry(registry).current == RUBRIC.version
@@ -347,7 +349,7 @@ def test_the_loop_as_commands_puts_the_better_version_in_force(
     out = capsys.readouterr().out
     assert "NOT ADOPTED" in out and f"ADOPTED {NEWER.version}: no worse on the frozen set" in out
     assert load_rubric(str(registry / "current.yaml")).version == NEWER.version
-    assert main(["verify", str(registry)]) == 0
+    assert main(["audit", "verify", str(registry)]) == 0
     assert adopt(frozen, newest) == 2  # the old version is not the one in force any more
     assert f"has {NEWER.version} in force" in capsys.readouterr().err
     with pytest.raises(AuditError, match="share no clip that is labelled"):
@@ -358,19 +360,20 @@ def test_other_numbers_are_judged_from_the_old_log_by_a_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     judged(tmp_path / "old", [{}, {"clarity": FLAWED}, {"robot": WRONG}])
-    assert main(["replay", str(tmp_path / "old")]) == 0
+    assert main(["audit", "replay", str(tmp_path / "old")]) == 0
     assert "3 of 3 verdicts equal bit for bit" in capsys.readouterr().out
     pack = tmp_path / "strict.yaml"
     pack.write_text("extends: robot\nrevision: 3\nstages: {VQ: {threshold: 0.99}}\n")
-    assert main(["replay", str(tmp_path / "old"), "--rubric", str(pack)]) == 2
-    assert main(["replay", str(tmp_path / "old"), "--rubric", str(pack), "--output", str(tmp_path / "new")]) == 0
+    other = ["audit", "replay", str(tmp_path / "old"), "--rubric", str(pack)]
+    assert main(other) == 2
+    assert main([*other, "--output", str(tmp_path / "new")]) == 0
     assert "3 verdicts under robot-3-" in capsys.readouterr().out
     passed = [e.verdict.stages[0].passed for e in read_record(tmp_path / "new").judged() if e.verdict]
     assert passed == [True, False, True]
-    assert main(["verify", str(tmp_path / "new")]) == 0
-    assert main(["sample", str(tmp_path / "new"), "--output", str(tmp_path / "s.json")]) == 0
+    assert main(["audit", "verify", str(tmp_path / "new")]) == 0
+    assert main(["audit", "sample", str(tmp_path / "new"), "--output", str(tmp_path / "s.json")]) == 0
     assert read_sample(tmp_path / "s.json").population == 3
-    assert main(["agree", str(tmp_path / "nothing"), "--labels", "x"]) == 2
+    assert main(["audit", "agree", str(tmp_path / "nothing"), "--labels", "x"]) == 2
     assert "name the folder of an audit log" in capsys.readouterr().err
 
 
@@ -394,7 +397,7 @@ def test_the_round_of_the_document_runs_as_it_is_written(tmp_path: Path, monkeyp
     assert [command[0] for command in commands] == [
         "verify", "sample", "view", "agree", "people", "replay", "replay", "replay", "adopt",
     ]
-    codes = [main(command) for command in commands]
+    codes = [main(["audit", *command]) for command in commands]
     assert codes == [0, 0, 0, 0, 0, 0, 0, 0, 1]  # the new numbers decide these clips no better
     assert Path("audit/view.html").is_file() and Path("rubrics/current.yaml").is_file()
     assert len(read_record(Path("audit-people")).judged()) == 6
@@ -403,5 +406,5 @@ def test_the_round_of_the_document_runs_as_it_is_written(tmp_path: Path, monkeyp
 def test_every_command_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:
     for command in ("verify", "recover", "sample", "view", "agree", "people", "replay", "adopt"):
         with pytest.raises(SystemExit, match="0"):
-            main([command, "--help"])
+            main(["audit", command, "--help"])
     assert "frozen" in capsys.readouterr().out

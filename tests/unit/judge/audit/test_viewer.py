@@ -15,9 +15,9 @@ from browser import Page, browser
 from scripted_judge import BORDERLINE, CLEAN, POOR, UNUSABLE, WRONG, FaultyJudge, ScriptedJudge, clean_table
 
 from setup.system import find_browser
+from wm_nodes.apps.cli import main
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import Read, ReadRequest
-from wm_nodes.judge.audit.commands import main
 from wm_nodes.judge.audit.labels import read_labels
 from wm_nodes.judge.audit.reading import read_record
 from wm_nodes.judge.audit.viewer import page as page_text
@@ -69,8 +69,8 @@ def test_two_clips_are_labelled_with_keys_exported_and_compared(
 ) -> None:
     log = tmp_path / "log"
     make_log(log, 3)
-    assert main(["sample", str(log), "--round", "2"]) == 0
-    assert main(["view", str(log), "--sample", str(log / "sample-2.json")]) == 0
+    assert main(["audit", "sample", str(log), "--round", "2"]) == 0
+    assert main(["audit", "view", str(log), "--sample", str(log / "sample-2.json")]) == 0
     page.open(log / "view.html")
     page.until("document.querySelector('.strip img').naturalWidth === 96")
     page.press("a", "ArrowDown", "a", "e", "ArrowDown", "d", "ArrowDown", "u")  # planning, clarity, brightness, color
@@ -100,7 +100,7 @@ def test_two_clips_are_labelled_with_keys_exported_and_compared(
     }
     capsys.readouterr()
     arguments = ["agree", str(log), "--labels", str(path), "--json", str(tmp_path / "agree.json")]
-    assert main(arguments) == 0
+    assert main(["audit", *arguments]) == 0
     assert "agreement with people, round 2, 2 clips" in capsys.readouterr().out
     (found,) = json.loads((tmp_path / "agree.json").read_text())
     rows = {row["name"]: row for row in found["rows"]}
@@ -120,7 +120,7 @@ def test_texts_of_a_judge_stay_texts(tmp_path: Path, page: Page) -> None:
     ((clip, task),) = moving_squares(1)
     job = (replace(clip, clip_id=HOSTILE), replace(task, instruction=HOSTILE, robot=HOSTILE))
     judge_all(log, Hostile(clean_table(RUBRIC, occlusion=UNUSABLE)), [job])
-    assert main(["view", str(log)]) == 0
+    assert main(["audit", "view", str(log)]) == 0
     page.open(log / "view.html")
     page.press("ArrowDown", "ArrowDown")
     assert page.js("window.hacked") is None
@@ -140,7 +140,7 @@ def test_clips_without_a_verdict_or_without_pictures_are_shown_as_such(tmp_path:
     jobs = moving_squares(2)
     broken = replace(jobs[1][0], frames=np.full((4, 8, 8, 3), np.nan, np.float32))
     judge_all(log, FaultyJudge(clean_table(RUBRIC), "robot", "error"), [jobs[0], (broken, jobs[1][1])])
-    assert main(["view", str(log)]) == 0
+    assert main(["audit", "view", str(log)]) == 0
     page.open(log / "view.html")
     assert "ERROR: robot: finish_reason length" in page.js("document.querySelector('main').textContent")
     page.press("ArrowDown", "a", *["ArrowDown"] * 6, "a")  # clarity has an answer, the robot has none
@@ -190,10 +190,10 @@ def test_the_page_asks_for_nothing_from_outside() -> None:
 def test_a_page_may_stand_elsewhere_and_a_log_elsewhere(tmp_path: Path) -> None:
     make_log(tmp_path / "a log", 1)
     out = tmp_path / "pages" / "one.html"
-    assert main(["view", str(tmp_path / "a log"), "--output", str(out)]) == 0
+    assert main(["audit", "view", str(tmp_path / "a log"), "--output", str(out)]) == 0
     data = json.loads(out.read_text().split('id="data">')[1].split("</script>")[0])
     assert data["media"] == "../a%20log/media"
     picture = out.parent / data["media"].replace("%20", " ") / data["clips"][0]["frames"][0]
     assert picture.is_file()
     shutil.rmtree(tmp_path / "a log" / "media")
-    assert main(["verify", str(tmp_path / "a log")]) == 1
+    assert main(["audit", "verify", str(tmp_path / "a log")]) == 1

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import clip_rules, success, task_names
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.judge.dataset import rendering
-from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, SetPlan, build, main, scene_states
+from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, SetPlan, build, scene_states
 from wm_nodes.judge.dataset.edits import (
     BACKGROUND,
     DISTRACTOR,
@@ -139,7 +140,7 @@ def test_one_command_builds_a_set_that_can_be_made_again(source: ClipSource, tmp
     with pytest.raises(ManifestError, match="holds another clip than its name says"):
         check_set(tmp_path)
     first.write_bytes(second.read_bytes()[:900])
-    assert main([str(tmp_path), "--check"]) == 2
+    assert main(["build-judge-dataset", str(tmp_path), "--check"]) == 2
     first.unlink()
     with pytest.raises(ManifestError, match=r"cannot be read: .*; build the set again"):
         check_set(tmp_path)

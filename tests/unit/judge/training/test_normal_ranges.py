@@ -12,6 +12,7 @@ from judge_server import PickyServer
 from recording_samples import make_episode, make_spec
 from scripted_judge import make_clip, make_task
 
+from wm_nodes.apps.cli import main
 from wm_nodes.config.load import default_judge
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.config.shipped import shipped_model
@@ -22,7 +23,7 @@ from wm_nodes.judge.audit import read_record
 from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.judge.training import normal_ranges
-from wm_nodes.judge.training.normal_ranges import SIGNALS, bands_of, count_outside, main
+from wm_nodes.judge.training.normal_ranges import SIGNALS, bands_of, count_outside
 from wm_nodes.recording import EpisodeBagWriter
 
 MODEL_DIR = shipped_model("push_cube")
@@ -135,11 +136,11 @@ def test_the_command_writes_a_pack_that_the_agent_reads(
             bag.write(replace(episode, success=np.arange(5) >= (2 if index else 9)))
     output = tmp_path / "push.yaml"
     given = [str(MODEL_DIR), str(tmp_path / "bag"), "--check", str(tmp_path / "bag"), "--output", str(output)]
-    assert main([*given, "--stride", str(stride)]) == 0
+    assert main(["normal-ranges", *given, "--stride", str(stride)]) == 0
     said = capsys.readouterr().out
     rubric = load_rubric(str(output))
     assert set(rubric.evidence) == set(SIGNALS) and rubric.version in said and "any of them" in said
     ClipEvidence(MODEL_DIR).check(rubric)
-    assert main([*given, "--stride", "0"]) == 2 and "--stride must be >= 1" in capsys.readouterr().err
+    assert main(["normal-ranges", *given, "--stride", "0"]) == 2 and "--stride must be >= 1" in capsys.readouterr().err
     monkeypatch.setattr(normal_ranges, "LEAST", 9)
-    assert main(given) == 2 and "name more bags" in capsys.readouterr().err
+    assert main(["normal-ranges", *given]) == 2 and "name more bags" in capsys.readouterr().err

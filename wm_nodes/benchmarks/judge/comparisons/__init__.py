@@ -8,7 +8,7 @@
   two scores that sum to 10 each, a winner, as JSON. Its models are chat models: serve their folder and name it.
 - One number: the plainest prompt there is, ours.
 - PAI-Bench's robot protocol (arXiv 2512.01989, SHI-Labs/physical-ai-bench): pai_bench says what is known of it;
-  `python -m benchmarks.judge.pai_bench` runs it over a folder of videos, with local vision backbones.
+  `wm benchmark judge pai-bench` runs it over a folder of videos, with local vision backbones.
 
 Criteria, scales and answer forms are the public ones, the wording is ours: no prompt is copied. Numbers may differ from
 the authors' by that; quote them as "VideoAlign-style". Every failure is a reason, never a number.

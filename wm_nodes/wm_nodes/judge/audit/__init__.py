@@ -4,7 +4,7 @@ with AuditLog(folder) as log:
     agent = AuditedAgent(judge, rubric, log, round_number=3)    # in place of RewardAgent(judge, rubric)
     verdict = await agent.evaluate(clip, task)
 
-python -m wm_nodes.judge.audit --help
+As a command: wm audit --help
 """
 
 from wm_nodes.judge.audit.log import AuditError, AuditLog

@@ -324,6 +324,6 @@ def _read_tail(path: Path) -> tuple[int, str]:
             block = file.read(step) + block
     last: Sequence[bytes] = block.splitlines(keepends=True)
     if not last or not _is_whole(last[-1]):
-        raise AuditError(f"{path} ends in a torn line; run `python -m wm_nodes.judge.audit recover {path.parent}`")
+        raise AuditError(f"{path} ends in a torn line; run `wm audit recover {path.parent}`")
     line = json.loads(last[-1])
     return int(line["line"]), str(line["hash"])

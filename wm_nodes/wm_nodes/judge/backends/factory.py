@@ -74,7 +74,7 @@ def _check_one(settings: JudgeConfig) -> None:
         if settings.folder and not Path(settings.folder).is_dir():
             raise ValueError(
                 f"judge.folder {settings.folder!r} is no folder; name that of a trained judge (make one with "
-                "python -m wm_nodes.apps.train_judge), or leave it empty for the shipped one"
+                "wm train-judge), or leave it empty for the shipped one"
             )
         if settings.conformal:
             load_head(_folder(settings)).conformal(settings.conformal)
@@ -123,7 +123,7 @@ def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
         raise ValueError(
             f"the embedded judge {_folder(judge)} cannot judge clips of {shape[0]} frames, {shape[1]} x {shape[2]} "
             f"px: {reason}. Name a server (judge.kind openai, judge.endpoints, judge.model), or in judge.folder a "
-            "judge that was trained on such clips (python -m wm_nodes.apps.train_judge)"
+            "judge that was trained on such clips (wm train-judge)"
         )
 
 

@@ -2,22 +2,10 @@
 
 A folder holds manifest.jsonl and one compressed .npz per clip (frames, masks, fps), named by its hash. The manifest is
 written last: a folder without one is unfinished. Equal arguments give equal bytes.
-
-    python3 launch_scripts/make_adversarial_set.py FOLDER --tasks push_cube --episodes 8
-    python3 launch_scripts/make_adversarial_set.py FOLDER --benchmark
-    python3 launch_scripts/make_adversarial_set.py FOLDER --diverse --episodes 40 --edits 26 --seed 20000
-    python3 launch_scripts/make_adversarial_set.py FOLDER --policy-view --development --episodes 40 --edits 26
-
---benchmark is the set that judges are compared on: three tasks, shapes that no judge was trained on, and seeds of its
-own; its test split is fixed by the manifest (rows.select_rows) and has 400 clips or more.
---development leaves out the episodes of the test part, which training does not read; --diverse does so too, and draws
-cameras, colours, light and push directions from ranges that exclude what is held out (domain_randomization.py).
---policy-view draws the policy's scene and camera, most through a world model (policy_camera.py).
+As a command: wm build-judge-dataset.
 """
 
-import argparse
 import itertools
-import sys
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from wm_nodes.config.load import default_task, load_config
+from wm_nodes.config.load import default_task
 from wm_nodes.config.schema import SimulationConfig
-from wm_nodes.config.tasks import clip_rules, get_task, task_names
+from wm_nodes.config.tasks import clip_rules, get_task
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
@@ -50,7 +38,7 @@ from wm_nodes.judge.dataset.edits import (
     to_bytes,
 )
 from wm_nodes.judge.dataset.edits.manifest import Part
-from wm_nodes.judge.dataset.policy_camera import IMAGINED, PolicyCamera, policy_models
+from wm_nodes.judge.dataset.policy_camera import IMAGINED, PolicyCamera
 from wm_nodes.judge.dataset.rendering import (
     CAMERAS,
     ClipStage,
@@ -61,8 +49,7 @@ from wm_nodes.judge.dataset.rendering import (
     cube_half_sizes,
     record_states,
 )
-from wm_nodes.judge.dataset.set_files import MANIFEST, check_set, clip_path, to_file
-from wm_nodes.world_model import load_model_folder
+from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 
 SIDE_PX = 96
 OBJECT_COLOURS = {
@@ -293,66 +280,3 @@ def build(
     manifest = manifest_of(make_clips(), plan.held_out)
     write_atomic(folder / MANIFEST, to_bytes(manifest))
     return manifest, skipped
-
-
-def main(argv: Sequence[str]) -> int:
-    """Build a set and print its prevalence. Return the exit code: 0 done, 2 a clear error."""
-    parser = argparse.ArgumentParser(prog="adversarial_set", description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, help="new folder of the set")
-    parser.add_argument("--tasks", nargs="+", choices=task_names(), default=[default_task()])
-    parser.add_argument("--episodes", type=int, default=8, help="recorded episodes per task")
-    parser.add_argument("--edits", type=int, help="edits tried on each; all by default")
-    parser.add_argument(
-        "--stacks", type=int, default=0, help="clips of up to three mild edits, every other one on a physical defect"
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--shapes", nargs="+", choices=sorted(SHAPES), default=[], help="besides the cube, held out")
-    parser.add_argument("--recipes", nargs="+", choices=sorted(RECIPES), default=tuple(RECIPES), help="all by default")
-    parser.add_argument("--development", action="store_true", help="only episodes of the training and validation parts")
-    parser.add_argument("--diverse", action="store_true", help="the same, with cameras, colours, light, ways at random")
-    parser.add_argument(
-        "--policy-view", nargs="?", type=Path, const=Path(), metavar="MODEL_DIR",
-        help="the loops' own scene and camera, most as a world model draws them; default: the shipped one",
-    )
-    parser.add_argument("--stride", type=int, default=1, help="of --policy-view: steps between two frames of a clip")
-    parser.add_argument("--benchmark", action="store_true", help="the set that judges are compared on; nothing else")
-    parser.add_argument("--check", action="store_true", help="build nothing, verify the set that is there")
-    arguments = parser.parse_args(argv)
-    try:
-        if arguments.check:
-            manifest, skipped = check_set(arguments.folder), Counter[str]()
-        else:
-            shapes = tuple(arguments.shapes)
-            plan = SetPlan(
-                tuple(arguments.tasks), arguments.episodes, arguments.edits, arguments.seed, shapes=shapes,
-                development=arguments.development or arguments.diverse, diverse=arguments.diverse,
-                recipes=tuple(arguments.recipes), policy=arguments.policy_view is not None,
-                stacks_per_clip=arguments.stacks,
-            )
-            if arguments.stride < 1 or (arguments.stride > 1 and not plan.policy):
-                raise ValueError(f"--stride is of --policy-view and at least 1, got {arguments.stride}")
-            plan = BENCHMARK if arguments.benchmark else plan
-            policy = None
-            if plan.policy:
-                policy = PolicyCamera(
-                    load_model_folder(policy_models(arguments.policy_view)), SIDE_PX, arguments.stride
-                )
-            manifest, skipped = build(arguments.folder, plan, load_config("cpu").simulation, policy)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    splits = Counter(row.split for row in manifest.rows)
-    parts = Counter(row.part for row in manifest.rows)
-    print(f"{len(manifest.rows)} clips in {arguments.folder}: " + ", ".join(f"{n} {s}" for s, n in splits.items()))
-    print(", ".join(f"{count} {part}" for part, count in sorted(parts.items())))
-    print(f"{'label':16} {'pass':>6} {'fail':>6} {'unknown':>8}  fails")
-    for name, counts in manifest.prevalence["all"].items():
-        share = counts["fail"] / max(1, counts["pass"] + counts["fail"])
-        print(f"{name:16} {counts['pass']:6} {counts['fail']:6} {counts['unknown']:8}  {share:5.1%}")
-    for reason, count in skipped.most_common(10):
-        print(f"left out {count} times: {reason}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

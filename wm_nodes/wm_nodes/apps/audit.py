@@ -1,4 +1,4 @@
-"""The commands over audit logs: verify, recover, sample, view, agree, people, replay, adopt."""
+"""Work on audit logs of the judge: verify, recover, sample, view, agree, people, replay, adopt; see docs/audit.md."""
 
 import argparse
 import asyncio
@@ -6,7 +6,7 @@ import hashlib
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
@@ -14,6 +14,7 @@ from statistics import fmean
 from rich.console import Console
 from tqdm import tqdm
 
+from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.audit.adoption import MARGIN, Registry, compare, decide
@@ -27,21 +28,57 @@ from wm_nodes.judge.audit.replay import judge_again, reaggregate, replay_evaluat
 from wm_nodes.judge.audit.sampling import draw, read_sample, write_sample
 from wm_nodes.judge.audit.viewer import FILE_NAME, write_view
 
-OK, FOUND, ERROR = 0, 1, 2
-"""Exit codes: all well; something was found (a fault, a differing verdict, a rubric not adopted); a clear error."""
 OVERPAID, SHOWN = 0.1, 10
 """`people` names so many clips whose reward is higher by more than this."""
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run one command. Return the exit code."""
-    arguments = _parser().parse_args(argv)
-    run: Callable[[argparse.Namespace], int] = arguments.run
-    try:
-        return run(arguments)
-    except (AuditError, ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return ERROR
+def add_options(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name: str, run: Callable[[argparse.Namespace], int | None], about: str) -> argparse.ArgumentParser:
+        one = commands.add_parser(name, help=about, description=about)
+        one.set_defaults(run=run)
+        return one
+
+    def of_log(name: str, run: Callable[[argparse.Namespace], int | None], about: str) -> argparse.ArgumentParser:
+        one = command(name, run, about)
+        one.add_argument("log", type=Path, help="folder of the audit log")
+        return one
+
+    one = of_log("verify", _verify, "check every line, verdict and picture; name what was changed")
+    one.add_argument("--no-pictures", action="store_true", help="check the lines and verdicts only")
+    one.add_argument("--head", default="", help="a head noted earlier: fail where the log has lost it")
+    of_log("recover", _recover, "cut off a last line that a crash has torn, and keep it beside the log")
+    one = of_log("sample", _sample, "choose the clips of a round that a person should look at")
+    one.add_argument("--round", type=int, default=0)
+    add_seed(one)
+    one.add_argument("--size", type=int, help="another number of clips than 200 + 400 (1 - mean reward)")
+    one.add_argument("--output", type=Path, help="default: sample-ROUND.json in the log's folder")
+    one = of_log("view", _view, "write the page on which people look at clips and label them")
+    one.add_argument("--round", type=int, help="only this round")
+    one.add_argument("--sample", type=Path, help="only the clips that `sample` chose")
+    one.add_argument("--second", action="store_true", help="only those for a second annotator")
+    one.add_argument("--output", type=Path, help=f"default: {FILE_NAME} in the log's folder; pictures stay there")
+    one = of_log("agree", _agree, "compare the verdicts with exported labels, row by row of the paper's Table 2")
+    one.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
+    one.add_argument("--sample", type=Path, nargs="*", default=[], help="weight labels to the rounds drawn from")
+    add_json(one)
+    one = of_log("people", _people, "what labelled clips earn with people as the judge, and which ones are overpaid")
+    one.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
+    one.add_argument("--output", type=Path, required=True, help="folder of the new log")
+    one = of_log("replay", _replay, "work verdicts out again, equal bit for bit or under a rubric with other numbers")
+    one.add_argument("--round", type=int, help="only this round")
+    one.add_argument("--rubric", help="pack or .yaml file with the same questions and other numbers")
+    one.add_argument("--output", type=Path, help="with --rubric: folder of the new log")
+    one = command("adopt", _adopt, "put a new rubric in force if it is no worse on the frozen set and better now")
+    pair = ("OLD_LOG", "NEW_LOG")
+    one.add_argument("registry", type=Path, help="folder of the rubric in force and of the decisions")
+    one.add_argument("--frozen", nargs=2, type=Path, required=True, metavar=pair, help="both on the frozen set")
+    one.add_argument("--frozen-labels", type=Path, nargs="+", required=True)
+    one.add_argument("--newest", nargs=2, type=Path, required=True, metavar=pair, help="the same on the newest round")
+    one.add_argument("--newest-labels", type=Path, nargs="+", required=True)
+    one.add_argument("--margin", type=float, default=MARGIN, help="loss on the frozen set that may be chance")
+    add_seed(one)
 
 
 def _verify(arguments: argparse.Namespace) -> int:
@@ -53,15 +90,14 @@ def _verify(arguments: argparse.Namespace) -> int:
         print(f"head     {checked.head}")
         print(f"verdicts {checked.verdicts}")
     print("sound" if not checked.problems else f"{len(checked.problems)} faults")
-    return FOUND if checked.problems else OK
+    return int(bool(checked.problems))
 
 
-def _recover(arguments: argparse.Namespace) -> int:
+def _recover(arguments: argparse.Namespace) -> None:
     print(recover(arguments.log))
-    return OK
 
 
-def _sample(arguments: argparse.Namespace) -> int:
+def _sample(arguments: argparse.Namespace) -> None:
     sample = draw(read_record(arguments.log), arguments.round, seed=arguments.seed, size=arguments.size)
     path = arguments.output or arguments.log / f"sample-{arguments.round}.json"
     write_sample(path, sample)
@@ -70,20 +106,18 @@ def _sample(arguments: argparse.Namespace) -> int:
     print(f"{len(sample.chosen)} of {sample.population} clips of round {sample.round_number}, mean reward "
           f"{sample.mean_reward:.3f}: {by}; {sum(clip.second for clip in sample.chosen)} for two people")
     print(f"wrote {path}")
-    return OK
 
 
-def _view(arguments: argparse.Namespace) -> int:
+def _view(arguments: argparse.Namespace) -> None:
     record = read_record(arguments.log)
     sample = read_sample(arguments.sample) if arguments.sample else None
     wanted = {clip.evaluation for clip in sample.chosen if clip.second or not arguments.second} if sample else None
     chosen = [e for e in record.judged(arguments.round) if wanted is None or e.number in wanted]
     path = write_view(arguments.output or arguments.log / FILE_NAME, record, chosen, sample)
     print(f"wrote {path} with {len(chosen)} clips; open it in a browser, press ? for its keys")
-    return OK
 
 
-def _agree(arguments: argparse.Namespace) -> int:
+def _agree(arguments: argparse.Namespace) -> None:
     samples = [read_sample(path) for path in arguments.sample]
     judged = join_labels(read_record(arguments.log), load_all(arguments.labels), samples)
     rounds = sorted({clip.evaluation.round_number for clip in judged})
@@ -96,10 +130,9 @@ def _agree(arguments: argparse.Namespace) -> int:
         text = json.dumps([plain(asdict(numbers)) for numbers in reports], indent=1, allow_nan=False)
         write_atomic(arguments.json, (text + "\n").encode())
         print(f"wrote {arguments.json}")
-    return OK
 
 
-def _people(arguments: argparse.Namespace) -> int:
+def _people(arguments: argparse.Namespace) -> None:
     record, labels = read_record(arguments.log), load_all(arguments.labels)
     chosen = [clip.evaluation for clip in join_labels(record, labels)]
     judge, progress = HumanJudge(labels), tqdm(chosen, desc="people", disable=None)
@@ -117,7 +150,6 @@ def _people(arguments: argparse.Namespace) -> int:
         for _, clip_id, old, new in overpaid[:SHOWN]:
             print(f"  {clip_id}: judge {old:.3f}, people {new:.3f}")
     print(f"wrote {arguments.output}; view and verify it as any log")
-    return OK
 
 
 def _replay(arguments: argparse.Namespace) -> int:
@@ -132,7 +164,7 @@ def _replay(arguments: argparse.Namespace) -> int:
             verdicts = asyncio.run(reaggregate(record, progress, rubric, log))
         open_ones = sum(not verdict.valid for verdict in verdicts)
         print(f"{len(verdicts)} verdicts under {rubric.version} in {arguments.output}, {open_ones} without a number")
-        return OK
+        return 0
     results = [asyncio.run(replay_evaluation(record, evaluation)) for evaluation in progress]
     for result in results:
         if result.after is not None and not result.equal:
@@ -140,7 +172,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     lost = sum(result.after is None for result in results)
     equal = sum(result.equal for result in results)
     print(f"{equal} of {len(results)} verdicts equal bit for bit, {lost} ran out of time then and cannot be repeated")
-    return OK if equal + lost == len(results) else FOUND
+    return int(equal + lost != len(results))
 
 
 def _adopt(arguments: argparse.Namespace) -> int:
@@ -166,58 +198,4 @@ def _adopt(arguments: argparse.Namespace) -> int:
         print(f"{name:16} balanced accuracy, frozen {100 * before:.1f} -> {100 * after:.1f}, newest {text}")
     print(f"{'ADOPTED' if decided.adopted else 'NOT ADOPTED'} {new}: {decided.reason}")
     print(f"in force: {registry.current}, in {registry.folder}")
-    return OK if decided.adopted else FOUND
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m wm_nodes.judge.audit", description=__doc__,
-        epilog="exit codes: 0 all well; 1 a fault, another verdict or a rubric not adopted; 2 an error",
-    )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def command(name: str, run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
-        sub = commands.add_parser(name, help=about, description=about)
-        sub.set_defaults(run=run)
-        return sub
-
-    def of_log(name: str, run: Callable[[argparse.Namespace], int], about: str) -> argparse.ArgumentParser:
-        sub = command(name, run, about)
-        sub.add_argument("log", type=Path, help="folder of the audit log")
-        return sub
-
-    sub = of_log("verify", _verify, "check every line, verdict and picture; name what was changed")
-    sub.add_argument("--no-pictures", action="store_true", help="check the lines and verdicts only")
-    sub.add_argument("--head", default="", help="a head noted earlier: fail where the log has lost it")
-    of_log("recover", _recover, "cut off a last line that a crash has torn, and keep it beside the log")
-    sub = of_log("sample", _sample, "choose the clips of a round that a person should look at")
-    sub.add_argument("--round", type=int, default=0)
-    sub.add_argument("--seed", type=int, default=0)
-    sub.add_argument("--size", type=int, help="another number of clips than 200 + 400 (1 - mean reward)")
-    sub.add_argument("--output", type=Path, help="default: sample-ROUND.json in the log's folder")
-    sub = of_log("view", _view, "write the page on which people look at clips and label them")
-    sub.add_argument("--round", type=int, help="only this round")
-    sub.add_argument("--sample", type=Path, help="only the clips that `sample` chose")
-    sub.add_argument("--second", action="store_true", help="only those for a second annotator")
-    sub.add_argument("--output", type=Path, help=f"default: {FILE_NAME} in the log's folder; pictures stay there")
-    sub = of_log("agree", _agree, "compare the verdicts with exported labels, row by row of the paper's Table 2")
-    sub.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
-    sub.add_argument("--sample", type=Path, nargs="*", default=[], help="weight labels to the rounds drawn from")
-    sub.add_argument("--json", type=Path, help="also write the numbers to this file")
-    sub = of_log("people", _people, "what labelled clips earn with people as the judge, and which ones are overpaid")
-    sub.add_argument("--labels", type=Path, nargs="+", required=True, help="files exported by the page")
-    sub.add_argument("--output", type=Path, required=True, help="folder of the new log")
-    sub = of_log("replay", _replay, "work verdicts out again, equal bit for bit or under a rubric with other numbers")
-    sub.add_argument("--round", type=int, help="only this round")
-    sub.add_argument("--rubric", help="pack or .yaml file with the same questions and other numbers")
-    sub.add_argument("--output", type=Path, help="with --rubric: folder of the new log")
-    sub = command("adopt", _adopt, "put a new rubric in force if it is no worse on the frozen set and better now")
-    pair = ("OLD_LOG", "NEW_LOG")
-    sub.add_argument("registry", type=Path, help="folder of the rubric in force and of the decisions")
-    sub.add_argument("--frozen", nargs=2, type=Path, required=True, metavar=pair, help="both on the frozen set")
-    sub.add_argument("--frozen-labels", type=Path, nargs="+", required=True)
-    sub.add_argument("--newest", nargs=2, type=Path, required=True, metavar=pair, help="the same on the newest round")
-    sub.add_argument("--newest-labels", type=Path, nargs="+", required=True)
-    sub.add_argument("--margin", type=float, default=MARGIN, help="loss on the frozen set that may be chance")
-    sub.add_argument("--seed", type=int, default=0)
-    return parser
+    return int(not decided.adopted)

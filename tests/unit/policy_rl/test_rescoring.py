@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from recording_graph import NUM_ENVS, Graph, write
 from recording_samples import make_spec
 
-from wm_nodes.apps.rescore_rewards import main, rescore_bag
+from wm_nodes.apps.cli import main
 from wm_nodes.config.load import dump_config, load_config
+from wm_nodes.policy_rl.rescoring import rescore_bag
 from wm_nodes.recording import BagError, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.recording.layout import Tiles
@@ -96,11 +97,11 @@ def test_the_command_builds_the_runs_reward_model_and_says_whether_the_bits_are_
     config = load_config("smoke")
     (tmp_path / "config.yaml").write_text(dump_config(config))
     model = RuleReward(config.reward.sparse_weight)
-    assert main([str(recorded_run(tmp_path / "bags" / "run", model))]) == 0
+    assert main(["rescore", str(recorded_run(tmp_path / "bags" / "run", model))]) == 0
     assert capsys.readouterr().out.startswith("40 lock-steps evaluated again, 0 differ")
-    assert main([str(recorded_run(tmp_path / "bags" / "tampered", model, tamper=7))]) == 1
+    assert main(["rescore", str(recorded_run(tmp_path / "bags" / "tampered", model, tamper=7))]) == 1
     assert capsys.readouterr().out.startswith("step_id 7: total\n40 lock-steps")
-    assert main([str(recorded_run(tmp_path / "bags" / "other", RuleReward(3.0)))]) == 2
+    assert main(["rescore", str(recorded_run(tmp_path / "bags" / "other", RuleReward(3.0)))]) == 2
     assert "build it with the weights and thresholds of the run's configuration" in capsys.readouterr().err
-    assert main([str(tmp_path / "nothing")]) == 2
+    assert main(["rescore", str(tmp_path / "nothing")]) == 2
     assert capsys.readouterr().err.startswith("error: ")

@@ -1,7 +1,5 @@
-"""Score a recorded run again with a reward model, and say whether the rewards are the recorded ones, bit by bit."""
+"""Evaluate the rewards of a recorded run again with its reward model, and compare them bit by bit."""
 
-import argparse
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -86,6 +84,27 @@ def reward_input(step: RecordedStep) -> RewardInput:
     )
 
 
+def recorded_model(bag: Path, config_file: str | None = None, model_dir: Path | None = None) -> RewardModel:
+    """The reward model of the run that a bag lies in.
+
+    Args:
+        config_file: default: config.yaml two folders above the bag.
+        model_dir: its world model; default: `model` beside that file, else the shipped one.
+
+    Raises:
+        BagError: the bag holds rewards that no reward model gives.
+    """
+    name = recorded_reward_name(bag)
+    run_dir = bag.absolute().parent.parent
+    config = load_config(config_file or str(run_dir / "config.yaml"))
+    if name == "rule":
+        return RuleReward(config.reward.sparse_weight)
+    if name != "endogenous":
+        raise BagError(f"{bag} holds rewards of {name or 'nobody'}; endogenous, rule and agent can be scored again")
+    own = run_dir / "model"
+    return make_endogenous_reward(config, model_dir or (own if own.is_dir() else shipped_model(config.task)))
+
+
 def _differences(recorded: RecordedReward, result: RewardResult) -> list[str]:
     pairs = {name: (getattr(recorded, name), getattr(result, name)) for name in ("total", "dense", "sparse", "success")}
     pairs["valid"] = recorded.valid, result.valid
@@ -96,37 +115,3 @@ def _differences(recorded: RecordedReward, result: RewardResult) -> list[str]:
 
 def _bit_equal(theirs: NDArray[np.generic], ours: NDArray[np.generic]) -> bool:
     return theirs.dtype == ours.dtype and theirs.tobytes() == ours.tobytes()
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Return 0 where every reward is bit-equal, 1 where one differs, 2 after a clear error."""
-    parser = argparse.ArgumentParser(
-        prog="bag_rescore", description="Evaluate the rewards of a recorded training again and compare them bit by bit."
-    )
-    parser.add_argument("bag", type=Path, help="a bag of a run folder, e.g. runs/x/bags/training_120000")
-    parser.add_argument("--config", type=Path, help="the run's configuration; default: config.yaml two folders above")
-    parser.add_argument("--model-dir", type=Path, help="its world model; default: <run>/model, else the shipped one")
-    options = parser.parse_args(arguments)
-    try:
-        report = rescore_bag(options.bag, _recorded_model(options.bag, options.config, options.model_dir))
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print("\n".join([*report.different[:10], report.text()]))
-    return int(not report.equal)
-
-
-def _recorded_model(bag: Path, config_file: Path | None, model_dir: Path | None) -> RewardModel:
-    """The reward model of the run that a bag belongs to. Raises BagError for rewards that are a judge's."""
-    name = recorded_reward_name(bag)
-    run_dir = bag.absolute().parent.parent
-    config = load_config(str(config_file or run_dir / "config.yaml"))
-    if name == "rule":
-        return RuleReward(config.reward.sparse_weight)
-    if name != "endogenous":
-        raise BagError(
-            f"{bag} holds rewards of {name or 'nobody'}; endogenous and rule ones can be evaluated again here, "
-            "an agent's by python -m wm_nodes.apps.judge_episodes"
-        )
-    own = run_dir / "model"
-    return make_endogenous_reward(config, model_dir or (own if own.is_dir() else shipped_model(config.task)))

@@ -1,0 +1,15 @@
+"""Everything that a person does here but the main job and the tests: python3 launch_scripts/wm.py VERB ...
+
+python3 launch_scripts/wm.py --help          # lists the verbs
+python3 launch_scripts/wm.py VERB --help     # explains one
+"""
+
+import sys
+
+from setup.entry import ensure
+
+if __name__ == "__main__":
+    ensure()
+    from wm_nodes.apps.cli import main
+
+    raise SystemExit(main(sys.argv[1:], "python3 launch_scripts/wm.py"))

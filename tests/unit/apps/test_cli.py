@@ -1,0 +1,158 @@
+"""The command `wm`: every verb explains itself, and errors are one line with one set of exit codes."""
+
+import argparse
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from wm_nodes.apps import cli
+from wm_nodes.core.errors import ModelNotAcceptedError, RunError
+
+OPTIONS = {
+    "train-policy": "--preset --set --task --seed --run-dir --model-dir --from-scratch --force --rounds --reward "
+    "--judge --judge-model --judge-key-env --rubric --compose --domain-id --verbose",
+    "train-video-model": "--preset --set --seed --run-dir --from-scratch --bags --heldout-bags --keep-buffers --reward "
+    "--judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",
+    "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset --set",
+    "seed-study": "--tasks --seeds --arms --preset --set --model-dir --threads --out",
+    "rescore": "recording --reward --judge --judge-model --judge-key-env --rubric --json --config --model-dir "
+    "--namespace --reads --audit",
+    "retrain": "run --run-dir --set --tensorboard",
+    "recover-bag": "bag --output",
+    "judge-clips": "clips --config --judge --judge-model --judge-key-env --rubric --mode --audit --reads --json",
+    "audit": "verify recover sample view agree people replay adopt",
+    "build-judge-dataset": "folder --tasks --episodes --edits --stacks --seed --shapes --recipes --development "
+    "--diverse --policy-view --stride --benchmark --check",
+    "train-judge": "out sets --seed --segmenter-steps --readers --reader-epochs --trees --threads --policy-view "
+    "--measure",
+    "normal-ranges": "model_dir bags --check --output --rubric --stride --tail",
+    "benchmark speed": "--json --quick --preset --model-dir --untrained --seed",
+    "benchmark video-rl": "base diversity learning ablations hacking cost clips clip-learning resolution",
+    "benchmark judge": "table efficiency hacking comparisons imagined-vs-real speed fault-visibility pai-bench",
+}
+
+
+def shown(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as end:
+        cli.main([*words, "--help"])
+    assert end.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_every_verb_is_listed_with_what_it_does(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ([], ["--help"], ["-h"]):
+        assert cli.main(words, "wm.py") == 0
+        listed = capsys.readouterr().out
+        assert listed.startswith("usage: wm.py VERB") and "130 interrupted" in listed
+        assert all(f"  {verb.name} " in listed and verb.about in listed for verb in cli.VERBS.values())
+    assert set(OPTIONS) == set(cli.VERBS)
+    for words in (["benchmark"], ["benchmark", "--help"]):
+        assert cli.main(words) == 0
+        listed = capsys.readouterr().out
+        assert "benchmark video-rl" in listed and "train-policy" not in listed
+
+
+@pytest.mark.parametrize("verb", OPTIONS)
+def test_every_verb_explains_itself_and_names_its_options(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    text = shown(verb.split(), capsys)
+    assert text.startswith(f"usage: wm {verb} ") and "exit codes: 0 done" in text
+    for option in OPTIONS[verb].split():
+        assert re.search(rf"(^|[\s,{{|\[]){re.escape(option)}($|[\s,}}|\]])", text), f"{option} is not in\n{text}"
+
+
+@pytest.mark.parametrize("suite", ["video-rl", "judge"])
+def test_every_experiment_explains_itself(suite: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in OPTIONS[f"benchmark {suite}"].split():
+        assert f"usage: wm benchmark {suite} {name}" in shown(["benchmark", suite, name], capsys)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["train-polcy"], "unknown verb 'train-polcy'; did you mean 'train-policy'? wm --help lists the verbs"),
+        (["doctor"], "unknown verb 'doctor'; wm --help lists the verbs"),
+        (["benchmark", "vido-rl"], "unknown verb 'benchmark vido-rl'; did you mean 'benchmark video-rl'?"),
+        (["recover-bag", "nothing-here"], "no .mcap file at nothing-here"),
+        (["rescore", "nothing-here"], "nothing-here holds no config.yaml; name the run folder"),
+        (["train-policy", "--set", "ppo.updates=many"], "ppo.updates"),
+        (["train-policy", "--preset", "nosuch"], "nosuch"),
+        (["train-video-model", "--set", "width"], "section.key=value"),
+    ],
+)
+def test_an_error_is_one_line_and_code_2(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == 2
+    text = capsys.readouterr().err
+    assert text.startswith("error: ") and text.count("\n") == 1 and said in text
+
+
+def test_a_wrong_option_is_one_line_and_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["recover-bag"], ["audit", "verify"], ["audit", "sing"], ["retrain", "run", "--seed", "1"]):
+        with pytest.raises(SystemExit, match="2"):
+            cli.main(words)
+        text = capsys.readouterr().err
+        assert text.startswith("error: ") and text.count("\n") == 1 and f"see wm {words[0]}" in text
+
+
+def verb_that(does: Callable[[argparse.Namespace], int | None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the verb `retrain` do this instead."""
+    module = SimpleNamespace(__doc__="Something else.", add_options=lambda parser: None, run=does)
+    monkeypatch.setattr(cli, "import_module", lambda name: module)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (ModelNotAcceptedError("tool error failed"), 3, "error: tool error failed\n"),
+        (RunError("a node ended"), 2, "error: a node ended\n"),
+        (ValueError("two\nlines"), 2, "error: two lines\n"),
+        (OSError("disk full"), 2, "error: disk full\n"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+    ],
+)
+def test_each_kind_of_end_has_its_code(
+    error: BaseException, code: int, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(arguments: argparse.Namespace) -> None:
+        raise error
+
+    verb_that(fail, monkeypatch)
+    assert cli.main(["retrain"]) == code
+    assert capsys.readouterr().err == said
+
+
+def test_the_command_is_kept_as_typed_and_a_fault_of_ours_shows_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = []
+    verb_that(lambda arguments: commands.append(arguments.command), monkeypatch)
+    assert cli.main(["retrain"]) == 0
+    assert cli.run_verb("train-policy", [], "python3 launch_scripts/online_rl.py") == 0
+    assert commands == ["wm retrain", "python3 launch_scripts/online_rl.py"]
+    verb_that(lambda arguments: 1, monkeypatch)
+    assert cli.main(["retrain"]) == 1
+    verb_that(lambda arguments: {}["missing"], monkeypatch)
+    with pytest.raises(KeyError, match="missing"):
+        cli.main(["retrain"])
+
+
+def test_without_the_repository_a_benchmark_says_where_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def missing(name: str) -> ModuleType:
+        raise ModuleNotFoundError(f"No module named {name!r}", name="benchmarks")
+
+    monkeypatch.setattr(cli, "import_module", missing)
+    assert cli.main(["benchmark", "speed"]) == 2
+    assert "the benchmarks come with the repository" in capsys.readouterr().err
+
+
+def test_the_list_of_verbs_is_there_at_once_and_the_scripts_start_the_command(repository: Path) -> None:
+    loaded = "import sys; from wm_nodes.apps.cli import main; main(['--help']); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.endswith("False\n"), "wm --help imports torch"
+    for name in ("wm", "online_rl"):
+        assert "wm_nodes.apps.cli import" in (repository / "launch_scripts" / f"{name}.py").read_text()
+    assert '"wm = wm_nodes.apps.cli:main"' in (repository / "wm_nodes" / "setup.py").read_text()

@@ -1,0 +1,135 @@
+"""The command `wm VERB ...`: the table of verbs, and one style of errors and exit codes for all of them.
+
+The module of a verb has `add_options(parser)` and `run(arguments)`, which returns an exit code, or None for 0; its
+docstring is the text of `wm VERB --help`. Only the chosen module is imported.
+"""
+
+import argparse
+import difflib
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import NamedTuple, NoReturn
+
+from wm_nodes.core.errors import ModelNotAcceptedError, RunError
+
+DONE, DIFFERENT, ERROR, NOT_ACCEPTED, INTERRUPTED = 0, 1, 2, 3, 130
+EXIT_CODES = (
+    "exit codes: 0 done; 1 checked, and something failed or differs; 2 an error, in one line;\n"
+    "3 the world model does not pass acceptance; 130 interrupted"
+)
+EXPECTED = (RunError, ValueError, OSError, ImportError, FloatingPointError)
+"""Errors whose text says what to do; anything else is a fault of this program and shows its traceback."""
+BENCHMARKS = "benchmarks"
+"""Package beside this one in the repository, not installed with it."""
+
+
+class Verb(NamedTuple):
+    """A line of `wm --help`. name: as typed. module: what is imported when the verb is chosen."""
+
+    name: str
+    module: str
+    about: str
+
+
+GROUPS: dict[str, tuple[Verb, ...]] = {
+    "train": (
+        Verb("train-policy", "wm_nodes.apps.train_policy", "a policy in the world model, measured in the simulator"),
+        Verb("train-video-model", "wm_nodes.apps.train_video_model", "the video world model by GRPO on its own clips"),
+        Verb("check-video-model", "wm_nodes.apps.check_video_model", "whether a video model is fit to be trained so"),
+        Verb("seed-study", "wm_nodes.apps.seed_study", "several seeds and tasks: world model against simulator"),
+    ),
+    "recordings": (
+        Verb("rescore", "wm_nodes.apps.rescore", "score a recording again, compare bit for bit"),
+        Verb("retrain", "wm_nodes.apps.retrain", "train a video model again on a run's recorded clips and scores"),
+        Verb("recover-bag", "wm_nodes.apps.recover_bag", "bring back a recording whose process was killed"),
+    ),
+    "judge": (
+        Verb("judge-clips", "wm_nodes.apps.judge_clips", "judge videos of your own"),
+        Verb("audit", "wm_nodes.apps.audit", "verify, label, replay and compare the judge's logs"),
+        Verb("build-judge-dataset", "wm_nodes.apps.build_judge_dataset", "clips with known labels, from the simulator"),
+        Verb("train-judge", "wm_nodes.apps.train_judge", "the embedded judge, from such clips; or measure it"),
+        Verb("normal-ranges", "wm_nodes.apps.normal_ranges", "of the world model's evidence, for a rubric"),
+    ),
+    "benchmarks, where the repository is": (
+        Verb("benchmark speed", "benchmarks.speed.cli", "graph against one process, world model against simulator"),
+        Verb("benchmark video-rl", "benchmarks.video_rl.cli", "DynDiff-GRPO against its rivals"),
+        Verb("benchmark judge", "benchmarks.judge.cli", "the reward agent against labels, and its speed"),
+    ),
+}
+VERBS = {verb.name: verb for verbs in GROUPS.values() for verb in verbs}
+
+
+class Parser(argparse.ArgumentParser):
+    """An ArgumentParser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(ERROR, f"error: {message}; see {self.prog} --help\n")
+
+
+def main(argv: Sequence[str] | None = None, program: str = "wm") -> int:
+    """Run the verb that the arguments begin with and return the exit code. program: how this command was started.
+
+    Raises:
+        SystemExit: after --help, and where a verb has no such option.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    for count in (1, 2):
+        if (name := " ".join(words[:count])) in VERBS:
+            return run_verb(name, words[count:], f"{program} {name}")
+    begun = [verb for verb in VERBS if words and verb.startswith(f"{words[0]} ")]
+    if (words[1:] if begun else words)[:1] in ([], ["-h"], ["--help"]):
+        print(overview(program, begun))
+        return DONE
+    typed = " ".join(words[: 2 if begun else 1])
+    close = difflib.get_close_matches(typed, VERBS, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    return _fail(f"unknown verb {typed!r}; {hint}{program} --help lists the verbs")
+
+
+def run_verb(name: str, argv: Sequence[str], program: str) -> int:
+    """Run one verb and return its exit code. program: the words before the options, as they were typed.
+
+    Raises:
+        SystemExit: after --help, and where the verb has no such option.
+    """
+    try:
+        module = import_module(VERBS[name].module)
+    except ModuleNotFoundError as error:
+        if error.name != BENCHMARKS:
+            raise
+        return _fail("the benchmarks come with the repository and are not installed; start launch_scripts/wm.py there")
+    parser = Parser(
+        prog=program, description=module.__doc__, epilog=EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.add_options(parser)
+    arguments = parser.parse_args(argv, argparse.Namespace(run=getattr(module, "run", None)))
+    arguments.command = shlex.join([*program.split(), *argv])
+    run: Callable[[argparse.Namespace], int | None] = arguments.run
+    try:
+        return run(arguments) or DONE
+    except ModelNotAcceptedError as refusal:
+        return _fail(str(refusal), NOT_ACCEPTED)
+    except EXPECTED as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        resume = "; name the run folder with --run-dir to go on" if "run_dir" in arguments else ""
+        print(f"interrupted{resume}", file=sys.stderr)
+        return INTERRUPTED
+
+
+def overview(program: str, names: Sequence[str] = ()) -> str:
+    """The verbs in groups, a line each. names: only these; none: all."""
+    lines = [f"usage: {program} VERB [options]; {program} VERB --help explains one"]
+    width = max(map(len, VERBS))
+    for title, verbs in GROUPS.items():
+        if shown := [verb for verb in verbs if not names or verb.name in names]:
+            lines += ["", f"{title}:", *(f"  {verb.name:{width}}  {verb.about}" for verb in shown)]
+    return "\n".join([*lines, "", EXIT_CODES])
+
+
+def _fail(text: str, code: int = ERROR) -> int:
+    print("error:", " ".join(text.splitlines()), file=sys.stderr)
+    return code
