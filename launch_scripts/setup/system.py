@@ -107,12 +107,7 @@ def mesa_version(text: str) -> tuple[int, int] | None:
 
 
 def make_plan(
-    *,
-    missing_tools: list[str],
-    mesa: str,
-    loader: bool,
-    gpu_renderer: bool,
-    os_release: dict[str, str],
+    *, missing_tools: list[str], mesa: str, loader: bool, gpu_renderer: bool, os_release: dict[str, str],
     sources: list[AptSource],
 ) -> AptPlan:
     """Decide what to install.
@@ -151,12 +146,8 @@ def current_plan(gpu_renderer: bool) -> AptPlan:
     if not _library("libX11.so.6"):
         missing.append("libx11-6")
     return make_plan(
-        missing_tools=missing,
-        mesa=_installed("mesa-vulkan-drivers"),
-        loader=_library("libvulkan.so.1"),
-        gpu_renderer=gpu_renderer,
-        os_release=read_os_release(),
-        sources=read_sources(),
+        missing_tools=missing, mesa=_installed("mesa-vulkan-drivers"), loader=_library("libvulkan.so.1"),
+        gpu_renderer=gpu_renderer, os_release=read_os_release(), sources=read_sources(),
     )
 
 
@@ -266,10 +257,8 @@ def _parse_stanza(stanza: dict[str, str]) -> AptSource | None:
     # A key written out in the entry spans lines; only a file name can be repeated in another entry.
     key = stanza.get("signed-by", "")
     return AptSource(
-        uri=uris[0],
-        suites=tuple(stanza.get("suites", "").split()),
-        components=tuple(stanza.get("components", "").split()),
-        signed_by="" if "\n" in key else key,
+        uri=uris[0], suites=tuple(stanza.get("suites", "").split()),
+        components=tuple(stanza.get("components", "").split()), signed_by="" if "\n" in key else key,
     )
 
 

@@ -138,13 +138,8 @@ def _integer(arguments: Mapping[str, str], name: str, low: int, high: int = 2**3
 
 
 def _node(
-    arguments: Mapping[str, str],
-    name: str,
-    parameters: Mapping[str, ParameterValue],
-    *,
-    below: str = "",
-    ranks: int = 1,
-    module: str = "",
+    arguments: Mapping[str, str], name: str, parameters: Mapping[str, ParameterValue], *, below: str = "",
+    ranks: int = 1, module: str = "",
 ) -> NodeSpec:
     """module: of wm_nodes.nodes; empty: the one of the node's name."""
     namespace = "/" + "/".join(part for part in (arguments["namespace"].strip("/"), below) if part)
@@ -209,13 +204,8 @@ def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[
     return [
         _environment(arguments, backend),
         _node(
-            arguments,
-            "reward_evaluator",
-            {
-                "reward": reward,
-                "reward_factory": arguments["reward_factory"],
-                "model_dir": arguments["model_dir"],
-            },
+            arguments, "reward_evaluator",
+            {"reward": reward, "reward_factory": arguments["reward_factory"], "model_dir": arguments["model_dir"]},
         ),
         _node(arguments, "policy", {**policy, "await_nodes": awaited}),
         *recorder,
@@ -227,10 +217,7 @@ def _online_training(arguments: Mapping[str, str]) -> Graph:
     learner = _weights(arguments)
     if arguments["reward"] == "agent":
         learner["join_timeout_s"] = AGENT_JOIN_S
-    nodes = [
-        *_rollout_nodes(arguments, "world_model", ("learner",)),
-        _node(arguments, "learner", learner, ranks=ranks),
-    ]
+    nodes = [*_rollout_nodes(arguments, "world_model", ("learner",)), _node(arguments, "learner", learner, ranks=ranks)]
     if arguments["simulator"] == "true":
         nodes += _simulator_and_evaluation(arguments)
     return Graph("online_training", tuple(nodes))
@@ -300,9 +287,7 @@ _ROLLOUT = (
     "model_dir", "starts_file", "initial_policy", "backend", "mode", "reward", "num_envs", "seed", "record", "bag_uri",
     "backend_factory", "policy_factory", "reward_factory", *_JUDGE,
 )
-_EVALUATE = (
-    *_COMMON, "model_dir", "initial_policy", "policy_factory", "simulator_envs", "seed", "record", "bag_uri",
-)
+_EVALUATE = (*_COMMON, "model_dir", "initial_policy", "policy_factory", "simulator_envs", "seed", "record", "bag_uri")
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario

@@ -227,14 +227,9 @@ class LearnerNode(TrainingNode):
         self._report.updated(progress, metrics, samples_per_s)
         work.feedback(
             Train.Feedback(
-                update=update + 1,
-                samples=progress.samples,
-                mean_return=progress.mean_return,
-                success_rate=progress.success_rate,
-                loss=metrics.get("loss_policy", float("nan")),
-                samples_per_s=samples_per_s,
-                policy_version=progress.version,
-                progress=(update + 1) / goal.updates,
+                update=update + 1, samples=progress.samples, mean_return=progress.mean_return,
+                success_rate=progress.success_rate, loss=metrics.get("loss_policy", float("nan")),
+                samples_per_s=samples_per_s, policy_version=progress.version, progress=(update + 1) / goal.updates,
             )
         )
 

@@ -97,9 +97,8 @@ class VideoModelNode(ManagedNode):
             self._forget_old()
             message = ClipBatch(
                 iteration=goal.iteration, policy_version=goal.policy_version, contexts=list(request.contexts),
-                group_size=request.group_size, num_frames=buffer.rollout.latents.shape[2],
-                buffer_uri=result.buffer_uri, sha256=result.sha256, sample_s=time.perf_counter() - began,
-                noise_share=buffer.rollout.spent_noise,
+                group_size=request.group_size, num_frames=buffer.rollout.latents.shape[2], buffer_uri=result.buffer_uri,
+                sha256=result.sha256, sample_s=time.perf_counter() - began, noise_share=buffer.rollout.spent_noise,
             )
             self._publish(message, film_strip(self._generator.folder.codec.decode(buffer.rollout.latents)))
             self.diagnostics.latency("sample", message.sample_s)

@@ -77,21 +77,11 @@ class EpisodeDataset:
         """Episode `index` as views of the arrays."""
         a, b = int(self.first_frame[index]), int(self.first_frame[index + 1])
         return Episode(
-            images=self.images[a:b],
-            states=self.states[a:b],
-            actions=self.actions[a : b - 1],
-            ground_truth=self.ground_truth[a:b],
-            success=self.success[a:b],
-            rewards=self.rewards[a : b - 1],
-            terminated=bool(self.terminated[index]),
-            truncated=bool(self.truncated[index]),
-            task=self.tasks[index],
-            instruction=self.instructions[index],
-            behaviour=self.behaviours[index],
-            seed=self.seeds[index],
-            episode_id=self.episode_ids[index],
-            source=self.sources[index],
-            policy_version=self.policy_versions[index],
+            images=self.images[a:b], states=self.states[a:b], actions=self.actions[a : b - 1],
+            ground_truth=self.ground_truth[a:b], success=self.success[a:b], rewards=self.rewards[a : b - 1],
+            terminated=bool(self.terminated[index]), truncated=bool(self.truncated[index]), task=self.tasks[index],
+            instruction=self.instructions[index], behaviour=self.behaviours[index], seed=self.seeds[index],
+            episode_id=self.episode_ids[index], source=self.sources[index], policy_version=self.policy_versions[index],
             extra=self.extras[index],
         )
 
@@ -124,34 +114,22 @@ def dataset_of(episodes: Iterable[Episode], spec: EnvironmentSpec, *, frames_hin
         actions[start : stop - 1] = episode.actions
         rewards[start : stop - 1] = episode.rewards
     return EpisodeDataset(
-        spec=spec,
-        images=images[:total],
-        states=_concatenate([e.states for e in waiting], (0, spec.state_dim), np.float32),
-        actions=actions,
+        spec=spec, images=images[:total],
+        states=_concatenate([e.states for e in waiting], (0, spec.state_dim), np.float32), actions=actions,
         ground_truth=_concatenate([e.ground_truth for e in waiting], (0, spec.ground_truth_dim), np.float32),
-        success=_concatenate([e.success for e in waiting], (0,), np.bool_),
-        rewards=rewards,
-        first_frame=np.array(first_frame, np.int64),
-        terminated=np.array([e.terminated for e in waiting], bool),
-        truncated=np.array([e.truncated for e in waiting], bool),
-        tasks=tuple(e.task for e in waiting),
-        instructions=tuple(e.instruction for e in waiting),
-        behaviours=tuple(e.behaviour for e in waiting),
-        seeds=tuple(e.seed for e in waiting),
-        episode_ids=tuple(e.episode_id for e in waiting),
-        sources=tuple(e.source for e in waiting),
-        policy_versions=tuple(e.policy_version for e in waiting),
+        success=_concatenate([e.success for e in waiting], (0,), np.bool_), rewards=rewards,
+        first_frame=np.array(first_frame, np.int64), terminated=np.array([e.terminated for e in waiting], bool),
+        truncated=np.array([e.truncated for e in waiting], bool), tasks=tuple(e.task for e in waiting),
+        instructions=tuple(e.instruction for e in waiting), behaviours=tuple(e.behaviour for e in waiting),
+        seeds=tuple(e.seed for e in waiting), episode_ids=tuple(e.episode_id for e in waiting),
+        sources=tuple(e.source for e in waiting), policy_versions=tuple(e.policy_version for e in waiting),
         extras=tuple(e.extra for e in waiting),
     )
 
 
 def load_dataset(
-    paths: Iterable[Path],
-    *,
-    behaviours: Collection[str] | None = None,
-    expected: EnvironmentSpec | None = None,
-    max_episodes: int | None = None,
-    report: BagReport | None = None,
+    paths: Iterable[Path], *, behaviours: Collection[str] | None = None, expected: EnvironmentSpec | None = None,
+    max_episodes: int | None = None, report: BagReport | None = None,
 ) -> EpisodeDataset:
     """Read all episodes of several bags into memory, in the order of the paths.
 

@@ -64,8 +64,7 @@ class EpisodeArrays:
             raise ValueError(f"parts differ in tasks or steps: {[(part.tasks, part.num_steps) for part in parts]}")
         arrays = ("images", "states", "actions", "ground_truth", "success", "lengths")
         return cls(
-            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays},
-            tasks=parts[0].tasks,
+            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}, tasks=parts[0].tasks,
             instructions=tuple(text for part in parts for text in part.instructions),
             behaviours=tuple(text for part in parts for text in part.behaviours),
         )
@@ -94,12 +93,8 @@ def stack_episodes(
     truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
     return EpisodeArrays(
         images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
-        states=np.stack([e.states[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
-        actions=actions,
-        ground_truth=truth,
-        success=np.stack([np.asarray(labels(task, truth), bool) for task in tasks], -1),
-        lengths=lengths,
-        tasks=tuple(tasks),
-        instructions=tuple(e.instruction for e in listed),
+        states=np.stack([e.states[rows] for e, rows in zip(listed, frame_rows, strict=True)]), actions=actions,
+        ground_truth=truth, success=np.stack([np.asarray(labels(task, truth), bool) for task in tasks], -1),
+        lengths=lengths, tasks=tuple(tasks), instructions=tuple(e.instruction for e in listed),
         behaviours=tuple(e.behaviour for e in listed),
     )

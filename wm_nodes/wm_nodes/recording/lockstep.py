@@ -165,14 +165,9 @@ class LockSteps:
         key = (int(message.transition_session), int(message.step_id), stamp_ns(message.header.stamp))
         num_envs = int(message.num_envs)
         reward = RecordedReward(
-            total=message.total,
-            dense=message.dense,
-            sparse=message.sparse,
-            components=message.components.reshape(num_envs, -1),
-            component_names=tuple(message.component_names),
-            success=message.success,
-            valid=message.valid.astype(bool),
-            reward_name=message.reward_name,
+            total=message.total, dense=message.dense, sparse=message.sparse,
+            components=message.components.reshape(num_envs, -1), component_names=tuple(message.component_names),
+            success=message.success, valid=message.valid.astype(bool), reward_name=message.reward_name,
             reward_version=int(message.reward_version),
         )
         self._rewards.setdefault(key, reward)
@@ -206,30 +201,16 @@ class LockSteps:
             truth = np.full(num_envs * spec.ground_truth_dim, np.nan, np.float32)
         goals = [self._goals.get(int(episode)) for episode in message.episode_id]
         step = RecordedStep(
-            session=int(message.session),
-            seq=int(message.seq),
-            step_id=int(message.step_id),
-            stamp_ns=now_ns,
-            next_stamp_ns=next_ns,
-            images=self._images.get(now_ns),
-            next_images=self._images.get(next_ns),
+            session=int(message.session), seq=int(message.seq), step_id=int(message.step_id), stamp_ns=now_ns,
+            next_stamp_ns=next_ns, images=self._images.get(now_ns), next_images=self._images.get(next_ns),
             goals=self._stack_goals(goals) if any(goal is not None for goal in goals) else None,
-            actions=message.action.reshape(num_envs, -1),
-            states=message.state.reshape(num_envs, -1),
-            next_states=message.next_state.reshape(num_envs, -1),
-            logprobs=message.log_prob,
-            values=message.value,
-            terminated=message.terminated.astype(bool),
-            truncated=message.truncated.astype(bool),
-            valid=message.valid.astype(bool),
-            episode_id=message.episode_id,
-            episode_step=message.episode_step,
-            policy_version=message.policy_version,
-            success_probability=message.success_probability,
-            uncertainty=message.model_uncertainty,
-            ground_truth=truth.reshape(num_envs, spec.ground_truth_dim),
-            source=int(message.source),
-            reward=self._rewards.pop(_reward_key(message), None),
+            actions=message.action.reshape(num_envs, -1), states=message.state.reshape(num_envs, -1),
+            next_states=message.next_state.reshape(num_envs, -1), logprobs=message.log_prob, values=message.value,
+            terminated=message.terminated.astype(bool), truncated=message.truncated.astype(bool),
+            valid=message.valid.astype(bool), episode_id=message.episode_id, episode_step=message.episode_step,
+            policy_version=message.policy_version, success_probability=message.success_probability,
+            uncertainty=message.model_uncertainty, ground_truth=truth.reshape(num_envs, spec.ground_truth_dim),
+            source=int(message.source), reward=self._rewards.pop(_reward_key(message), None),
         )
         self._drop_images([stamp for stamp in self._images if stamp < now_ns])
         return step

@@ -51,13 +51,8 @@ def image_message(mosaic: UInt8Array, time_ns: int, *, encoding: str = "rgb8") -
     """sensor_msgs/Image of an uint8 (H, W, 3) mosaic."""
     height, width, channels = mosaic.shape
     return message_type("sensor_msgs/msg/Image")(
-        header=header(time_ns, CAMERA_FRAME),
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=0,
-        step=width * channels,
-        data=np.ascontiguousarray(mosaic).reshape(-1),
+        header=header(time_ns, CAMERA_FRAME), height=height, width=width, encoding=encoding, is_bigendian=0,
+        step=width * channels, data=np.ascontiguousarray(mosaic).reshape(-1),
     )
 
 
@@ -84,63 +79,32 @@ def spec_message(spec: EnvironmentSpec, time_ns: int, session: int) -> Any:
         rows=tiles.rows, cols=tiles.cols, tile_height=spec.height, tile_width=spec.width
     )
     return message_type("wm_msgs/msg/EnvSpec")(
-        header=header(time_ns, BASE_FRAME),
-        session=session,
-        seq=0,
-        env_id=spec.env_id,
-        task=spec.task,
-        instruction=spec.instruction,
-        source=spec.source,
-        num_envs=spec.num_envs,
-        height=spec.height,
-        width=spec.width,
-        channels=spec.channels,
-        encoding=spec.encoding,
-        cameras=list(spec.cameras),
-        tile=layout,
-        action_dim=spec.action_dim,
-        action_names=list(spec.action_names),
-        action_units=list(spec.action_units),
-        action_low=np.full(spec.action_dim, -1, np.float32),
-        action_high=np.full(spec.action_dim, 1, np.float32),
-        action_scale=np.asarray(spec.action_scale, np.float32),
-        state_dim=spec.state_dim,
-        state_names=list(spec.state_names),
-        state_units=list(spec.state_units),
-        state_low=np.asarray(spec.state_low, np.float32),
-        state_high=np.asarray(spec.state_high, np.float32),
-        ground_truth_names=list(spec.ground_truth_names),
-        control_period=spec.control_period_s,
-        max_episode_steps=spec.max_episode_steps,
-        world_model_sha256=spec.world_model_sha256,
-        spec_hash=spec.spec_hash,
+        header=header(time_ns, BASE_FRAME), session=session, seq=0, env_id=spec.env_id, task=spec.task,
+        instruction=spec.instruction, source=spec.source, num_envs=spec.num_envs, height=spec.height, width=spec.width,
+        channels=spec.channels, encoding=spec.encoding, cameras=list(spec.cameras), tile=layout,
+        action_dim=spec.action_dim, action_names=list(spec.action_names), action_units=list(spec.action_units),
+        action_low=np.full(spec.action_dim, -1, np.float32), action_high=np.full(spec.action_dim, 1, np.float32),
+        action_scale=np.asarray(spec.action_scale, np.float32), state_dim=spec.state_dim,
+        state_names=list(spec.state_names), state_units=list(spec.state_units),
+        state_low=np.asarray(spec.state_low, np.float32), state_high=np.asarray(spec.state_high, np.float32),
+        ground_truth_names=list(spec.ground_truth_names), control_period=spec.control_period_s,
+        max_episode_steps=spec.max_episode_steps, world_model_sha256=spec.world_model_sha256, spec_hash=spec.spec_hash,
     )
 
 
 def spec_of(message: Any) -> tuple[EnvironmentSpec, Tiles]:
     """Rebuild the spec from wm_msgs/EnvSpec. float32 numbers take their shortest decimal (0.1, not 0.10000000149)."""
     spec = EnvironmentSpec(
-        env_id=message.env_id,
-        task=message.task,
-        instruction=message.instruction,
-        source=int(message.source),
-        num_envs=int(message.num_envs),
-        height=int(message.height),
-        width=int(message.width),
-        cameras=tuple(message.cameras),
-        action_names=tuple(message.action_names),
-        action_units=tuple(message.action_units),
-        action_scale=tuple(as_sent(value) for value in message.action_scale),
-        state_names=tuple(message.state_names),
-        state_units=tuple(message.state_units),
+        env_id=message.env_id, task=message.task, instruction=message.instruction, source=int(message.source),
+        num_envs=int(message.num_envs), height=int(message.height), width=int(message.width),
+        cameras=tuple(message.cameras), action_names=tuple(message.action_names),
+        action_units=tuple(message.action_units), action_scale=tuple(as_sent(value) for value in message.action_scale),
+        state_names=tuple(message.state_names), state_units=tuple(message.state_units),
         state_low=tuple(as_sent(value) for value in message.state_low),
         state_high=tuple(as_sent(value) for value in message.state_high),
-        ground_truth_names=tuple(message.ground_truth_names),
-        control_period_s=as_sent(message.control_period),
-        max_episode_steps=int(message.max_episode_steps),
-        world_model_sha256=message.world_model_sha256,
-        channels=int(message.channels),
-        encoding=message.encoding,
+        ground_truth_names=tuple(message.ground_truth_names), control_period_s=as_sent(message.control_period),
+        max_episode_steps=int(message.max_episode_steps), world_model_sha256=message.world_model_sha256,
+        channels=int(message.channels), encoding=message.encoding,
     )
     tile = message.tile
     tiles = Tiles(int(tile.rows), int(tile.cols), int(tile.tile_height), int(tile.tile_width))

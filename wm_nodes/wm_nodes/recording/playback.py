@@ -28,14 +28,8 @@ class Playback:
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        names: Sequence[str] = (),
-        rate: float = 1.0,
-        start_offset_s: float = 0.0,
-        loop: bool = False,
-        paused: bool = False,
+        self, path: Path, *, names: Sequence[str] = (), rate: float = 1.0, start_offset_s: float = 0.0,
+        loop: bool = False, paused: bool = False,
     ) -> None:
         self._path, self._names, self._loop = path, list(names), loop
         with Bag(path) as bag:

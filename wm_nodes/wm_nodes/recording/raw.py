@@ -33,15 +33,8 @@ class RawBagWriter:
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        custom: Mapping[str, str] | None = None,
-        chunk_bytes: int = 2**20,
-        flush_s: float = 0.5,
-        split_bytes: int = 2**28,
-        split_s: float = 0.0,
-        discard_partial: bool = False,
+        self, path: Path, *, custom: Mapping[str, str] | None = None, chunk_bytes: int = 2**20, flush_s: float = 0.5,
+        split_bytes: int = 2**28, split_s: float = 0.0, discard_partial: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path = Path(path)

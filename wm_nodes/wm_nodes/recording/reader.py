@@ -59,12 +59,8 @@ def read_spec(path: Path, *, namespace: str | None = None) -> EnvironmentSpec:
 
 
 def read_episodes(
-    path: Path,
-    *,
-    behaviours: Collection[str] | None = None,
-    expected: EnvironmentSpec | None = None,
-    namespace: str | None = None,
-    report: BagReport | None = None,
+    path: Path, *, behaviours: Collection[str] | None = None, expected: EnvironmentSpec | None = None,
+    namespace: str | None = None, report: BagReport | None = None,
 ) -> Iterator[Episode]:
     """Yield the complete episodes of a bag in the order in which they ended.
 
@@ -217,20 +213,12 @@ class _EpisodeJoiner:
             reason = int(event.termination_reason) if event is not None else 0
             extra = {"env_index": index, "session": builder.session, "termination_reason": reason}
         return Episode(
-            images=np.stack(builder.images),
-            states=np.stack(builder.states),
-            actions=np.stack(builder.actions),
-            ground_truth=np.stack(builder.truth),
-            success=np.array(builder.success),
-            rewards=rewards,
-            terminated=bool(last.terminated[index]),
-            truncated=bool(last.truncated[index]),
+            images=np.stack(builder.images), states=np.stack(builder.states), actions=np.stack(builder.actions),
+            ground_truth=np.stack(builder.truth), success=np.array(builder.success), rewards=rewards,
+            terminated=bool(last.terminated[index]), truncated=bool(last.truncated[index]),
             task=event.task if event is not None else spec.task,
             instruction=event.instruction if event is not None else spec.instruction,
-            behaviour=event.behaviour if event is not None else "",
-            seed=int(event.seed) if event is not None else 0,
-            episode_id=builder.episode_id,
-            source=last.source,
-            policy_version=int(last.policy_version[index]),
+            behaviour=event.behaviour if event is not None else "", seed=int(event.seed) if event is not None else 0,
+            episode_id=builder.episode_id, source=last.source, policy_version=int(last.policy_version[index]),
             extra=extra,
         )

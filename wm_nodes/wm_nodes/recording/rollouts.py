@@ -17,11 +17,7 @@ from wm_nodes.recording.reader import BagReport, check_spec
 
 
 def read_rollouts(
-    path: Path,
-    *,
-    num_steps: int | None = None,
-    expected: EnvironmentSpec | None = None,
-    namespace: str | None = None,
+    path: Path, *, num_steps: int | None = None, expected: EnvironmentSpec | None = None, namespace: str | None = None,
     report: BagReport | None = None,
 ) -> Iterator[Rollout]:
     """Yield the rollouts of a live recording of training, in order: the lock-steps between two env/reset calls or
@@ -107,16 +103,9 @@ def _rollout(group: list[RecordedStep]) -> Rollout:
     rewards = [step.reward.total if step.reward is not None else blank for step in group]
     reward_valid = [step.reward.valid if step.reward is not None else blank.astype(bool) for step in group]
     return Rollout(
-        images_TN=stack("images"),
-        states_TN=stack("states"),
-        next_images_TN=stack("next_images"),
-        next_states_TN=stack("next_states"),
-        actions_TN=stack("actions"),
-        logprobs_TN=stack("logprobs"),
-        values_TN=stack("values"),
-        rewards_TN=np.stack(rewards),
-        terminated_TN=stack("terminated"),
-        truncated_TN=stack("truncated"),
-        valid_TN=stack("valid") & np.stack(reward_valid),
+        images_TN=stack("images"), states_TN=stack("states"), next_images_TN=stack("next_images"),
+        next_states_TN=stack("next_states"), actions_TN=stack("actions"), logprobs_TN=stack("logprobs"),
+        values_TN=stack("values"), rewards_TN=np.stack(rewards), terminated_TN=stack("terminated"),
+        truncated_TN=stack("truncated"), valid_TN=stack("valid") & np.stack(reward_valid),
         policy_version=_version(group[0]),
     )

@@ -4,14 +4,7 @@ seen yet."""
 
 from dataclasses import dataclass
 
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 CREDIT_WINDOW = 16
 """Messages that a keep-all stream may be ahead of its slowest consumer."""
@@ -28,15 +21,9 @@ _UNSET = QosTime(0, 0)
 def _qos(*, depth: int = 0, latched: bool = False, lease_s: int = 0) -> Qos:
     """depth 0: keep all."""
     return Qos(
-        QosHistory.KEEP_LAST if depth else QosHistory.KEEP_ALL,
-        depth,
-        QosReliability.RELIABLE,
-        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
-        _UNSET,
-        _UNSET,
-        QosLiveliness.AUTOMATIC,
-        QosTime(lease_s, 0),
-        False,
+        QosHistory.KEEP_LAST if depth else QosHistory.KEEP_ALL, depth, QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE, _UNSET, _UNSET, QosLiveliness.AUTOMATIC,
+        QosTime(lease_s, 0), False,
     )
 
 

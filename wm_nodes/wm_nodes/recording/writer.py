@@ -52,17 +52,9 @@ class EpisodeBagWriter:
     """
 
     def __init__(
-        self,
-        path: Path,
-        spec: EnvironmentSpec,
-        *,
-        run_id: str,
-        custom: Mapping[str, str] | None = None,
-        namespace: str = topics.DEFAULT_NAMESPACE,
-        reward_name: str = "recorded",
-        split_bytes: int = 2**28,
-        start_ns: int | None = None,
-        discard_partial: bool = False,
+        self, path: Path, spec: EnvironmentSpec, *, run_id: str, custom: Mapping[str, str] | None = None,
+        namespace: str = topics.DEFAULT_NAMESPACE, reward_name: str = "recorded", split_bytes: int = 2**28,
+        start_ns: int | None = None, discard_partial: bool = False,
     ) -> None:
         self.spec = m.single(spec)
         self.path = Path(path)
@@ -156,50 +148,27 @@ class EpisodeBagWriter:
         truth = episode.ground_truth[frame]
         unknown = np.full(1, np.nan, np.float32)
         return m.message_type(topics.TRANSITION.msgtype)(
-            header=m.header(now_ns, m.BASE_FRAME),
-            session=self._session,
-            seq=self._seq(topics.TRANSITION),
-            next_stamp=m.stamp(next_ns),
-            step_id=self._next_step_id - 1 if is_reset else self._next_step_id,
-            num_envs=1,
+            header=m.header(now_ns, m.BASE_FRAME), session=self._session, seq=self._seq(topics.TRANSITION),
+            next_stamp=m.stamp(next_ns), step_id=self._next_step_id - 1 if is_reset else self._next_step_id, num_envs=1,
             action=np.zeros(self.spec.action_dim, np.float32) if is_reset else m.floats(episode.actions[step]),
-            state=m.floats(episode.states[max(step, 0)]),
-            next_state=m.floats(episode.states[frame]),
-            log_prob=unknown,
-            value=unknown,
-            terminated=_flag(is_last and episode.terminated),
-            truncated=_flag(is_last and episode.truncated),
-            valid=_flag(not is_reset),
-            episode_id=np.array([episode.episode_id], np.uint64),
-            episode_step=np.array([max(step, 0)], np.uint32),
+            state=m.floats(episode.states[max(step, 0)]), next_state=m.floats(episode.states[frame]), log_prob=unknown,
+            value=unknown, terminated=_flag(is_last and episode.terminated),
+            truncated=_flag(is_last and episode.truncated), valid=_flag(not is_reset),
+            episode_id=np.array([episode.episode_id], np.uint64), episode_step=np.array([max(step, 0)], np.uint32),
             policy_version=np.array([episode.policy_version], np.uint64),
             success_probability=np.array([episode.success[frame]], np.float32),
-            model_uncertainty=np.zeros(1, np.float32),
-            ground_truth=m.floats([] if np.isnan(truth).all() else truth),
+            model_uncertainty=np.zeros(1, np.float32), ground_truth=m.floats([] if np.isnan(truth).all() else truth),
             source=episode.source,
         )
 
     def _reward(self, episode: Episode, step: int, now_ns: int) -> Any:
         reward = m.floats(episode.rewards[step])
         return m.message_type(topics.REWARD.msgtype)(
-            header=m.header(now_ns, m.BASE_FRAME),
-            session=self._session,
-            seq=self._seq(topics.REWARD),
-            transition_session=self._session,
-            step_id=self._next_step_id,
-            num_envs=1,
-            total=reward,
-            dense=np.zeros(1, np.float32),
-            sparse=np.zeros(1, np.float32),
-            component_names=["total"],
-            components=reward,
-            weights=np.ones(1, np.float32),
-            success=_flag(episode.success[step + 1]),
-            valid=_flag(True),
-            invalid_reason="",
-            reward_version=0,
-            reward_name=self._reward_name,
-            eval_ms=0.0,
+            header=m.header(now_ns, m.BASE_FRAME), session=self._session, seq=self._seq(topics.REWARD),
+            transition_session=self._session, step_id=self._next_step_id, num_envs=1, total=reward,
+            dense=np.zeros(1, np.float32), sparse=np.zeros(1, np.float32), component_names=["total"], components=reward,
+            weights=np.ones(1, np.float32), success=_flag(episode.success[step + 1]), valid=_flag(True),
+            invalid_reason="", reward_version=0, reward_name=self._reward_name, eval_ms=0.0,
         )
 
     def _event(self, episode: Episode, kind: int, now_ns: int) -> Any:
@@ -209,21 +178,11 @@ class EpisodeBagWriter:
             reason = m.REASON_RESET
         outcome = m.OUTCOME_SUCCESS if episode.success[-1] else m.OUTCOME_FAILURE
         return m.message_type(topics.EPISODE.msgtype)(
-            header=m.header(now_ns, m.BASE_FRAME),
-            session=self._session,
-            seq=self._seq(topics.EPISODE),
-            kind=kind,
-            env_index=0,
-            episode_id=episode.episode_id,
-            seed=episode.seed,
-            task=episode.task,
-            instruction=episode.instruction,
-            behaviour=episode.behaviour,
-            length=episode.num_steps if is_end else 0,
-            outcome=outcome if is_end else m.OUTCOME_UNKNOWN,
-            termination_reason=reason if is_end else m.REASON_NONE,
-            policy_version_first=episode.policy_version,
-            policy_version_last=episode.policy_version,
+            header=m.header(now_ns, m.BASE_FRAME), session=self._session, seq=self._seq(topics.EPISODE), kind=kind,
+            env_index=0, episode_id=episode.episode_id, seed=episode.seed, task=episode.task,
+            instruction=episode.instruction, behaviour=episode.behaviour, length=episode.num_steps if is_end else 0,
+            outcome=outcome if is_end else m.OUTCOME_UNKNOWN, termination_reason=reason if is_end else m.REASON_NONE,
+            policy_version_first=episode.policy_version, policy_version_last=episode.policy_version,
             source=episode.source,
         )
 

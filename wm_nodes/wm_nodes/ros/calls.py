@@ -40,11 +40,8 @@ def step_command(request: StepBatch.Request, spec: EnvironmentSpec) -> StepComma
     """Raises WireError(BAD_SHAPE) where an array has another length than the spec says."""
     count = spec.num_envs
     return StepCommand(
-        session=request.session,
-        step_id=request.step_id,
-        spec_hash=request.spec_hash,
-        actions=floats(request.action, (count * spec.action_dim,), "action"),
-        policy_version=request.policy_version,
+        session=request.session, step_id=request.step_id, spec_hash=request.spec_hash,
+        actions=floats(request.action, (count * spec.action_dim,), "action"), policy_version=request.policy_version,
         logprobs=floats(request.log_prob, (count,), "log_prob") if len(request.log_prob) else None,
         values=floats(request.value, (count,), "value") if len(request.value) else None,
         reset_mask=flags(request.reset_mask, count, "reset_mask") if len(request.reset_mask) else None,
@@ -62,9 +59,7 @@ def reset_request(command: ResetCommand) -> ResetBatch.Request:
 def reset_command(request: ResetBatch.Request, spec: EnvironmentSpec) -> ResetCommand:
     return ResetCommand(
         mask=flags(request.mask, spec.num_envs, "mask") if len(request.mask) else None,
-        seeds=_seeds(request.seed, spec.num_envs, "seed"),
-        task=request.task,
-        behaviour=request.behaviour,
+        seeds=_seeds(request.seed, spec.num_envs, "seed"), task=request.task, behaviour=request.behaviour,
         with_image=request.observation == StepBatch.Request.OBSERVATION_MOSAIC,
     )
 
@@ -105,17 +100,14 @@ def step_reply(response: StepBatch.Response, spec: EnvironmentSpec, session: int
     _raise_for(response)
     count = spec.num_envs
     return Reply(
-        session=session,
-        step_id=response.step_id,
-        stamp_ns=time_ns(response.stamp),
+        session=session, step_id=response.step_id, stamp_ns=time_ns(response.stamp),
         images=images_of(response.observation, spec) if len(response.observation.data) else None,
         states=floats(response.state, (count, spec.state_dim), "state"),
         terminated=flags(response.terminated, count, "terminated"),
         truncated=flags(response.truncated, count, "truncated"),
         episode_ids=reshape_field(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
         success_probability=floats(response.success_probability, (count,), "success_probability"),
-        uncertainty=floats(response.model_uncertainty, (count,), "model_uncertainty"),
-        step_s=response.step_ms / 1e3,
+        uncertainty=floats(response.model_uncertainty, (count,), "model_uncertainty"), step_s=response.step_ms / 1e3,
     )
 
 
@@ -125,16 +117,11 @@ def reset_reply(response: ResetBatch.Response, spec: EnvironmentSpec) -> Reply:
     count = spec.num_envs
     zeros = np.zeros(count, np.float32)
     return Reply(
-        session=response.session,
-        step_id=response.next_step_id - 1,
-        stamp_ns=time_ns(response.stamp),
+        session=response.session, step_id=response.next_step_id - 1, stamp_ns=time_ns(response.stamp),
         images=images_of(response.observation, spec) if len(response.observation.data) else None,
-        states=floats(response.state, (count, spec.state_dim), "state"),
-        terminated=zeros != 0,
-        truncated=zeros != 0,
+        states=floats(response.state, (count, spec.state_dim), "state"), terminated=zeros != 0, truncated=zeros != 0,
         episode_ids=reshape_field(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
-        success_probability=zeros,
-        uncertainty=zeros,
+        success_probability=zeros, uncertainty=zeros,
     )
 
 

@@ -218,24 +218,19 @@ def transition_of(message: TransitionBatch, spec: EnvironmentSpec) -> Transition
             f"transition of {message.num_envs} environments, env/spec says {count}; send a row for each",
         )
     return Transition(
-        stamp_ns=time_ns(message.header.stamp),
-        next_stamp_ns=time_ns(message.next_stamp),
-        step_id=message.step_id,
+        stamp_ns=time_ns(message.header.stamp), next_stamp_ns=time_ns(message.next_stamp), step_id=message.step_id,
         actions=floats(message.action, (count, spec.action_dim), "action"),
         states=floats(message.state, (count, spec.state_dim), "state"),
         next_states=floats(message.next_state, (count, spec.state_dim), "next_state"),
-        logprobs=floats(message.log_prob, (count,), "log_prob"),
-        values=floats(message.value, (count,), "value"),
+        logprobs=floats(message.log_prob, (count,), "log_prob"), values=floats(message.value, (count,), "value"),
         terminated=flags(message.terminated, count, "terminated"),
-        truncated=flags(message.truncated, count, "truncated"),
-        valid=flags(message.valid, count, "valid"),
+        truncated=flags(message.truncated, count, "truncated"), valid=flags(message.valid, count, "valid"),
         episode_ids=reshape_field(from_field(message.episode_id, np.uint64), (count,), "episode_id"),
         episode_steps=reshape_field(from_field(message.episode_step, np.uint32), (count,), "episode_step"),
         policy_versions=reshape_field(from_field(message.policy_version, np.uint64), (count,), "policy_version"),
         success_probability=floats(message.success_probability, (count,), "success_probability"),
         uncertainty=floats(message.model_uncertainty, (count,), "model_uncertainty"),
-        ground_truth=from_field(message.ground_truth, np.float32).reshape(count, -1),
-        source=message.source,
+        ground_truth=from_field(message.ground_truth, np.float32).reshape(count, -1), source=message.source,
         session=message.session,
     )
 
@@ -246,8 +241,7 @@ def action_of(message: ActionBatch, spec: EnvironmentSpec) -> TimedAction:
     if message.chunk_length > 1:
         raise WireError(ErrorCode.BAD_SHAPE, f"action is a chunk of {message.chunk_length}; send one at a time")
     return TimedAction(
-        actions=floats(message.action, (count * spec.action_dim,), "action"),
-        stamp_ns=time_ns(message.header.stamp),
+        actions=floats(message.action, (count * spec.action_dim,), "action"), stamp_ns=time_ns(message.header.stamp),
         policy_version=message.policy_version,
         logprobs=floats(message.log_prob, (count,), "log_prob") if len(message.log_prob) else None,
         values=floats(message.value, (count,), "value") if len(message.value) else None,
@@ -302,10 +296,8 @@ def rewards_of(message: RewardBatch) -> Rewards:
     """Raises WireError(BAD_SHAPE) where arrays differ in length from num_envs."""
     count = message.num_envs
     return Rewards(
-        transition_session=message.transition_session,
-        step_id=message.step_id,
-        total=floats(message.total, (count,), "total"),
-        valid=flags(message.valid, count, "valid"),
+        transition_session=message.transition_session, step_id=message.step_id,
+        total=floats(message.total, (count,), "total"), valid=flags(message.valid, count, "valid"),
         success=reshape_field(from_field(message.success, np.uint8), (count,), "success"),
         invalid_reason=message.invalid_reason,
     )

@@ -106,9 +106,8 @@ class ConsumerCredits:
         if not (self.withheld and self._granted is not None and self._granted[0] == session):
             self._granted = session, self._tracker.last_seq + self._window
         message = Credit(
-            consumer=self._node.get_fully_qualified_name(), topic=self._topic_name,
-            stream_session=session, received_seq=self._tracker.last_seq, granted_seq=self._granted[1],
-            lost_total=self._tracker.lost,
+            consumer=self._node.get_fully_qualified_name(), topic=self._topic_name, stream_session=session,
+            received_seq=self._tracker.last_seq, granted_seq=self._granted[1], lost_total=self._tracker.lost,
         )
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)

@@ -38,8 +38,7 @@ class Param:
 
     def descriptor(self) -> ParameterDescriptor:
         described = ParameterDescriptor(
-            name=self.name,
-            description=f"{self.description} [{self.unit}]" if self.unit else self.description,
+            name=self.name, description=f"{self.description} [{self.unit}]" if self.unit else self.description,
             additional_constraints=f"one of: {', '.join(self.choices)}" if self.choices else "",
             read_only=self.read_only,
         )

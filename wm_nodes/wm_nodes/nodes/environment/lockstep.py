@@ -18,15 +18,7 @@ from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, Environment, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
-from wm_nodes.ros.wire import (
-    EpisodeNote,
-    Goals,
-    Reply,
-    ResetCommand,
-    StepCommand,
-    Transition,
-    WireError,
-)
+from wm_nodes.ros.wire import EpisodeNote, Goals, Reply, ResetCommand, StepCommand, Transition, WireError
 
 UNIT_TOLERANCE = 1e-6
 
@@ -192,11 +184,8 @@ class LockstepEnvironment:
         success = np.where(valid, result.success_probability, 0).astype(np.float32)
         truth = np.where(valid[:, None], result.ground_truth, self._truth()).astype(np.float32)
         reply = replace(
-            self._reply(stamp, command.with_image),
-            terminated=result.terminated & valid,
-            truncated=result.truncated & valid | aborted,
-            success_probability=success,
-            uncertainty=result.uncertainty,
+            self._reply(stamp, command.with_image), terminated=result.terminated & valid,
+            truncated=result.truncated & valid | aborted, success_probability=success, uncertainty=result.uncertainty,
             step_s=time.perf_counter() - started,
         )
         self._publish_observation(stamp, goals_changed=mask is not None and bool(mask.any()))
@@ -204,23 +193,13 @@ class LockstepEnvironment:
         unknown = np.full(count, np.nan, np.float32)
         self._sink.transition(
             Transition(
-                stamp_ns=before_stamp,
-                next_stamp_ns=stamp,
-                step_id=command.step_id,
-                actions=actions,
-                states=before.state,
-                next_states=observation.state,
+                stamp_ns=before_stamp, next_stamp_ns=stamp, step_id=command.step_id, actions=actions,
+                states=before.state, next_states=observation.state,
                 logprobs=unknown if command.logprobs is None else command.logprobs,
-                values=unknown if command.values is None else command.values,
-                terminated=reply.terminated,
-                truncated=result.truncated & valid,
-                valid=valid,
-                episode_ids=before.episode_id,
-                episode_steps=before.episode_step,
-                policy_versions=np.full(count, command.policy_version, np.uint64),
-                success_probability=success,
-                uncertainty=result.uncertainty,
-                ground_truth=truth,
+                values=unknown if command.values is None else command.values, terminated=reply.terminated,
+                truncated=result.truncated & valid, valid=valid, episode_ids=before.episode_id,
+                episode_steps=before.episode_step, policy_versions=np.full(count, command.policy_version, np.uint64),
+                success_probability=success, uncertainty=result.uncertainty, ground_truth=truth,
                 source=self.spec.source,
             )
         )

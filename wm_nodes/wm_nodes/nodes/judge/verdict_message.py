@@ -26,8 +26,8 @@ def verdict_msg(verdict: Verdict) -> ClipVerdict:
         stage_scores=_doubles(stage.s for stage in verdict.stages),
         stage_status=_bytes(STATUS[stage.status] for stage in verdict.stages),
         stage_passed=_bytes(stage.passed for stage in verdict.stages),
-        stage_vetoed_by=[stage.vetoed_by for stage in verdict.stages],
-        components=[part.component for _, part in parts], component_stages=[str(stage.stage) for stage, _ in parts],
+        stage_vetoed_by=[stage.vetoed_by for stage in verdict.stages], components=[part.component for _, part in parts],
+        component_stages=[str(stage.stage) for stage, _ in parts],
         component_scores=_doubles(part.s for _, part in parts),
         component_p_fail=_doubles(part.p_fail for _, part in parts),
         component_status=_bytes(STATUS[part.status] for _, part in parts),
@@ -39,10 +39,9 @@ def verdict_msg(verdict: Verdict) -> ClipVerdict:
         reflections=[line for reflection in verdict.reflections for line in _lines(reflection)],
         num_reads=verdict.num_reads, calls=cost.calls, prompt_tokens=cost.prompt_tokens,
         cached_tokens=cost.cached_tokens, completion_tokens=cost.completion_tokens, images=cost.images,
-        retries=cost.retries, usd=math.nan if cost.usd is None else cost.usd, wall_s=cost.wall_s,
-        judge_id=by.judge_id, transport=by.transport, model=by.model, server_version=by.server_version,
-        rubric_version=by.rubric_version, prompt_sha=by.prompt_sha, media_sha=by.media_sha, judge_seed=by.seed,
-        audit_id=verdict.audit_id,
+        retries=cost.retries, usd=math.nan if cost.usd is None else cost.usd, wall_s=cost.wall_s, judge_id=by.judge_id,
+        transport=by.transport, model=by.model, server_version=by.server_version, rubric_version=by.rubric_version,
+        prompt_sha=by.prompt_sha, media_sha=by.media_sha, judge_seed=by.seed, audit_id=verdict.audit_id,
     )
 
 

@@ -17,14 +17,9 @@ def recorded_qos(profile: QoSProfile) -> Qos:
         return QosTime(*divmod(duration.nanoseconds, NS_PER_S))
 
     return Qos(
-        QosHistory[profile.history.name],
-        profile.depth,
-        QosReliability[profile.reliability.name],
-        QosDurability[profile.durability.name],
-        time_of(profile.deadline),
-        time_of(profile.lifespan),
-        QosLiveliness[profile.liveliness.name],
-        time_of(profile.liveliness_lease_duration),
+        QosHistory[profile.history.name], profile.depth, QosReliability[profile.reliability.name],
+        QosDurability[profile.durability.name], time_of(profile.deadline), time_of(profile.lifespan),
+        QosLiveliness[profile.liveliness.name], time_of(profile.liveliness_lease_duration),
         profile.avoid_ros_namespace_conventions,
     )
 
@@ -42,8 +37,7 @@ def offered_qos(recorded: list[Qos]) -> QoSProfile:
         return kind[name] if name not in ("UNKNOWN", "SYSTEM_DEFAULT", "BEST_AVAILABLE") else fallback
 
     return QoSProfile(
-        history=known(HistoryPolicy, first.history.name, HistoryPolicy.KEEP_ALL),
-        depth=first.depth,
+        history=known(HistoryPolicy, first.history.name, HistoryPolicy.KEEP_ALL), depth=first.depth,
         reliability=known(ReliabilityPolicy, first.reliability.name, ReliabilityPolicy.RELIABLE),
         durability=known(DurabilityPolicy, first.durability.name, DurabilityPolicy.VOLATILE),
         liveliness=LivelinessPolicy.AUTOMATIC,
