@@ -11,7 +11,7 @@ from sensor_msgs.msg import Image
 
 from wm_msgs.srv import GetEnvSpec
 from wm_nodes.ros import convert
-from wm_nodes.ros.introspection import EVENTS
+from wm_nodes.ros.lifecycle import SERVICE_EVENTS
 from wm_nodes.ros.qos import VIEW
 
 pytestmark = pytest.mark.graph
@@ -53,7 +53,7 @@ def test_service_events_are_published_while_the_parameter_says_so(graph: Graph, 
     graph.start_environment(num_envs=N, service_introspection="contents")
     client = Client(probe)
     events: list[GetEnvSpec.Event] = []
-    probe.node.create_subscription(GetEnvSpec.Event, "env/get_spec/_service_event", events.append, EVENTS)
+    probe.node.create_subscription(GetEnvSpec.Event, "env/get_spec/_service_event", events.append, SERVICE_EVENTS)
     wait_until("matching", lambda: probe.node.count_publishers("/wm/env/get_spec/_service_event"))
 
     def asked_and_answered() -> bool:

@@ -70,8 +70,7 @@ class ClipEvaluatorNode(ManagedNode):
             check_clips(judge, shape)
             self._agent = JudgeServices(self, judge, self._config.seed, lambda: self._action.busy)
         self._scores = self.publish_on("clips/scores")
-        self._action = WorkerAction(self, EvaluateClips, "clips/evaluate", self._evaluate, self._describe)
-        self.own(self._action.destroy)
+        self._action = WorkerAction(self, EvaluateClips, "clips/evaluate", self._evaluate)
 
     def deactivate(self, reason: str) -> None:
         self._action.stop(reason)
@@ -142,10 +141,6 @@ class ClipEvaluatorNode(ManagedNode):
         message.weights = convert.to_field(np.array([self._config.rewards.get(name, 0.0) for name in found]))
         message.valid = convert.to_field(valid.numpy())
         return message
-
-    @staticmethod
-    def _describe(reason: int, text: str) -> EvaluateClips.Result:
-        return EvaluateClips.Result(termination_reason=reason, message=text)
 
 
 def _why_invalid(verdicts: Sequence[Verdict]) -> str:

@@ -17,7 +17,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool
 
-from wm_msgs.msg import ActionBatch, Credit, EpisodeEvent, ErrorCode
+from wm_msgs.msg import ActionBatch, EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import UInt8Array
@@ -30,7 +30,6 @@ from wm_nodes.ros import calls, convert, diagnostics
 from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
-from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import EpisodeNote, Goals, Transition, WireError
 
@@ -89,16 +88,14 @@ class EnvironmentNode(ManagedNode):
         self.served.before_step = self._require_credit
         self._spec = environment.spec
         self._shown: Image | None = None
-        row = topic("env/image")
-        self._images = self.create_publisher(Image, row.name, row.qos)
-        self.own(self.destroy_publisher, self._images)
+        self._images = self.publish_unnumbered("env/image")
         self._views = ImageViews(self)
         self._clock_publisher = self._make_clock()
         self._transitions = self.publish_on("env/transition")
         self._episodes = self.publish_on("episode")
         self._goals = self.publish_on("env/goal")
         self._ledger = ProducerCredits("env/transition", self.session)
-        self.listen("flow/credit", self._on_credit)
+        self.listen("flow/credit", self._ledger.note)
         self.listen("safety/estop", self._on_estop)
         self.serve(StepBatch, "env/step", self._on_step)
         self.serve(ResetBatch, "env/reset", self._on_reset)
@@ -238,9 +235,6 @@ class EnvironmentNode(ManagedNode):
         if spent > self._period_s:
             self.diagnostics.count("overruns", text=f"a step took {spent:.3f} s, the control period is less")
 
-    def _on_credit(self, message: Credit) -> None:
-        self._ledger.note(message)
-
     def _on_estop(self, message: Bool) -> None:
         if self.served is None or message.data == self.served.estop:
             return
@@ -280,10 +274,7 @@ class EnvironmentNode(ManagedNode):
             return None
         if self.param("use_sim_time"):
             raise ValueError("use_sim_time with publish_clock: the node would wait for its own clock; unset one")
-        row = topic("/clock")
-        publisher = self.create_publisher(row.type, row.name, row.qos)
-        self.own(self.destroy_publisher, publisher)
-        return publisher
+        return self.publish_unnumbered("/clock")
 
     def _refusal(self, response: Any, error: WireError, what: str) -> Any:
         self._count_refusal(error, what)

@@ -48,8 +48,7 @@ class EvaluationNode(ManagedNode):
             self, str(self.param("env_namespace")), float(self.param("step_timeout_s"))
         )
         self.listen("policy/version", self._on_version, while_inactive=True)
-        self._action = WorkerAction(self, Evaluate, "evaluate", self._evaluate, self._describe)
-        self.own(self._action.destroy)
+        self._action = WorkerAction(self, Evaluate, "evaluate", self._evaluate)
 
     def deactivate(self, reason: str) -> None:
         self._action.stop(reason)
@@ -107,10 +106,6 @@ class EvaluationNode(ManagedNode):
         result.mean_return, result.mean_length = sparse_weight * found.success_rate, found.mean_length
         result.success = convert.to_field(found.success)
         result.length = convert.to_field(found.length)
-
-    @staticmethod
-    def _describe(reason: int, text: str) -> Evaluate.Result:
-        return Evaluate.Result(termination_reason=reason, message=text)
 
 
 def main() -> int:

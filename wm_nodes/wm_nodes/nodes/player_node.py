@@ -4,6 +4,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,6 @@ from wm_nodes.ros.convert import time_msg
 from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
-from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import Cancelled
 from wm_nodes.ros.worker import Work
@@ -65,18 +65,15 @@ class PlayerNode(ManagedNode):
         self._lock = threading.Lock()
 
     def configure(self) -> None:
-        row = topic("/clock")
-        self._clock_publisher = self.create_publisher(Clock, row.name, row.qos)
-        self.own(self.destroy_publisher, self._clock_publisher)
+        self._clock_publisher = self.publish_unnumbered("/clock")
         self._ledgers: dict[int, ProducerCredits] = {}
         self.listen("flow/credit", self._on_credit)
-        self.serve(Trigger, "player/pause", self._on_pause)
-        self.serve(Trigger, "player/resume", self._on_resume)
+        for name, act in (("pause", Playback.pause), ("resume", Playback.resume)):
+            self.serve(Trigger, f"player/{name}", partial(self._on_trigger, act))
         self.serve(SetRate, "player/set_rate", self._on_set_rate)
         self.serve(Seek, "player/seek", self._on_seek)
         self.serve(PlayNext, "player/play_next", self._on_play_next)
-        self._action = WorkerAction(self, Replay, "replay", self._replay, _describe)
-        self.own(self._action.destroy)
+        self._action = WorkerAction(self, Replay, "replay", self._replay)
 
     def activate(self) -> None:
         uri = str(self.param("bag_uri"))
@@ -194,7 +191,7 @@ class PlayerNode(ManagedNode):
             self._play(playback, work.request, work)
         except (BagError, ValueError) as error:
             self.say_failed_goal(f"replay failed: {error}")
-            return _describe(Replay.Result.FAILED, str(error))
+            return Replay.Result(termination_reason=Replay.Result.FAILED, message=str(error))
         if not self.active:
             raise Cancelled("deactivated")
         return Replay.Result(
@@ -218,13 +215,9 @@ class PlayerNode(ManagedNode):
 
     # Services.
 
-    def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._trigger(response, lambda playback: playback.pause())
-
-    def _on_resume(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._trigger(response, lambda playback: playback.resume())
-
-    def _trigger(self, response: Trigger.Response, act: Any) -> Trigger.Response:
+    def _on_trigger(
+        self, act: Callable[[Playback], None], request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         playback = self._playback
         if playback is None:
             response.message = "not playing; send a replay goal"
@@ -256,10 +249,6 @@ class PlayerNode(ManagedNode):
             response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
             self.diagnostics.count("refused_requests", text=f"player request refused: {error}")
         return response
-
-
-def _describe(reason: int, message: str) -> Replay.Result:
-    return Replay.Result(termination_reason=reason, message=message)
 
 
 def main() -> None:

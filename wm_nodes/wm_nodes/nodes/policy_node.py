@@ -93,8 +93,7 @@ class PolicyNode(ManagedNode):
         self.listen("policy/version", self._on_version, while_inactive=True)
         self.serve(InferAction, "policy/infer", self._on_infer)
         self.serve(LoadPolicy, "policy/load", self._on_load)
-        self._rollouts = WorkerAction(self, Rollout, "rollout", self._rollout, self._describe)
-        self.own(self._rollouts.destroy)
+        self._rollouts = WorkerAction(self, Rollout, "rollout", self._rollout)
 
     def activate(self) -> None:
         if self._pilot is not None:
@@ -233,10 +232,6 @@ class PolicyNode(ManagedNode):
         message.log_prob = convert.to_field(output.logprobs)
         message.value = convert.to_field(output.values)
         return message
-
-    @staticmethod
-    def _describe(reason: int, text: str) -> Rollout.Result:
-        return Rollout.Result(termination_reason=reason, message=text)
 
     # Callbacks.
 

@@ -19,7 +19,6 @@ from wm_nodes.ros import convert
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
-from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
@@ -55,12 +54,9 @@ class VideoModelNode(ManagedNode):
         self._loaded = (0, "")  # version and, unless it is the folder's own, sha256
         self._announced = dict[int, PolicyVersion]()
         self._clips = self.publish_on("clips")
-        row = topic("clips/image")
-        self._images = self.create_publisher(row.type, row.name, row.qos)
-        self.own(self.destroy_publisher, self._images)
+        self._images = self.publish_unnumbered("clips/image")
         self.listen("video/version", self._on_version, while_inactive=True)
-        self._action = WorkerAction(self, GenerateClips, "video/generate", self._generate, self._describe)
-        self.own(self._action.destroy)
+        self._action = WorkerAction(self, GenerateClips, "video/generate", self._generate)
 
     def deactivate(self, reason: str) -> None:
         self._action.stop(reason)
@@ -136,10 +132,6 @@ class VideoModelNode(ManagedNode):
         kept = sorted(written, key=lambda path: path.stat().st_mtime_ns)
         for path in kept[: -int(self.param("keep_buffers"))]:
             path.unlink(missing_ok=True)
-
-    @staticmethod
-    def _describe(reason: int, text: str) -> GenerateClips.Result:
-        return GenerateClips.Result(termination_reason=reason, message=text)
 
 
 def film_strip(frames: torch.Tensor) -> UInt8Array:

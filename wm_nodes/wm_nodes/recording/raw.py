@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from io import BufferedWriter
 from pathlib import Path
-from types import TracebackType
 
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos
@@ -163,9 +162,7 @@ class RawBagWriter:
     def __enter__(self) -> "RawBagWriter":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.close()
         else:

@@ -29,22 +29,22 @@ class _ThreadedServer(ActionServer):  # type: ignore[misc]
 
 
 class WorkerAction:
-    """One action, one goal at a time.
+    """One action, one goal at a time, until the node's cleanup.
 
     Args:
         node: goals are refused while it is not active.
         action_type: e.g. wm_msgs.action.Train.
         name: relative action name.
         run: does the work in its own thread and returns a Result; raises Cancelled when told to stop.
-        describe: makes a Result for a goal that ended early, from (termination_reason, message). The reason is one of
-            the Result's constants CANCELED, DEACTIVATED, FAILED.
+        fill: completes the Result of a goal that ended early; it has termination_reason (one of the Result's constants
+            CANCELED, DEACTIVATED, FAILED) and message.
     """
 
     def __init__(
         self, node: WorkerNode, action_type: type[Any], name: str, run: Callable[[Work], Any],
-        describe: Callable[[int, str], Any],
+        fill: Callable[[Any], Any] = lambda result: result,
     ) -> None:
-        self._node, self._type, self._name, self._run, self._describe = node, action_type, name, run, describe
+        self._node, self._type, self._name, self._run, self._fill = node, action_type, name, run, fill
         self._lock = threading.Lock()
         self._work: Work | None = None
         self._thread: threading.Thread | None = None
@@ -53,6 +53,7 @@ class WorkerAction:
             cancel_callback=self._on_cancel,
         )
         self._server.begin = self._begin
+        node.own(self.destroy)
 
     @property
     def busy(self) -> bool:
@@ -97,6 +98,9 @@ class WorkerAction:
         self._thread = threading.Thread(target=self._thread_main, args=(goal_handle, work), name=self._name)
         self._thread.start()
 
+    def _end_early(self, reason: int, text: str) -> Any:
+        return self._fill(self._type.Result(termination_reason=reason, message=text))
+
     def _thread_main(self, goal_handle: ServerGoalHandle, work: Work) -> None:
         reasons = self._type.Result
         try:
@@ -106,12 +110,12 @@ class WorkerAction:
         except Cancelled as stop:
             cancelled = str(stop) == "cancelled"
             code = reasons.CANCELED if cancelled else reasons.DEACTIVATED
-            result, state = self._describe(code, str(stop)), "canceled" if cancelled else "abort"
+            result, state = self._end_early(code, str(stop)), "canceled" if cancelled else "abort"
         except Exception as error:
             self._node.get_logger().error(traceback.format_exc())
             text = f"{type(error).__name__}: {error}"
             self._node.say_failed_goal(f"{self._name} failed: {text}")
-            result, state = self._describe(reasons.FAILED, text), "abort"
+            result, state = self._end_early(reasons.FAILED, text), "abort"
 
         def conclude(handle: ServerGoalHandle) -> Any:
             if state == "canceled" and not handle.is_cancel_requested:

@@ -1,7 +1,6 @@
 """Back-pressure for keep-all streams: a consumer grants sequence numbers, the producer does not run ahead of them."""
 
 import time
-from dataclasses import dataclass
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -16,14 +15,6 @@ SILENT_S = 5.0
 REPEAT_S = 1.0
 
 
-@dataclass
-class _Consumer:
-    granted_seq: int
-    received_seq: int
-    lost_total: int
-    heard: float
-
-
 class ProducerCredits:
     """The producer's side for one stream: who may be waited for, and whether the next message may go out.
 
@@ -32,28 +23,26 @@ class ProducerCredits:
 
     def __init__(self, topic_name: str, session: int) -> None:
         self._topic_name, self._session = topic_name, session
-        self._consumers: dict[str, _Consumer] = {}
+        self._consumers: dict[str, tuple[Credit, float]] = {}
+        """The newest message of each, and when it came."""
 
     def note(self, message: Credit, now: float | None = None) -> None:
         """Take in a Credit message; those of other streams or sessions are ignored."""
         if message.topic != self._topic_name or message.stream_session != self._session:
             return
-        now = time.monotonic() if now is None else now
-        self._consumers[message.consumer] = _Consumer(
-            message.granted_seq, message.received_seq, message.lost_total, now
-        )
+        self._consumers[message.consumer] = message, time.monotonic() if now is None else now
 
     def remove(self, consumer: str) -> None:
         self._consumers.pop(consumer, None)
 
-    def blocking_consumers(self, next_seq: int, now: float | None = None) -> list[str]:
+    def blocking_consumers(self, next_seq: int) -> list[str]:
         """Return the consumers that have not granted `next_seq` yet; empty: publish."""
-        return [name for name, consumer in self._consumers.items() if consumer.granted_seq < next_seq]
+        return [name for name, (credit, _) in self._consumers.items() if credit.granted_seq < next_seq]
 
     def drop_silent(self, next_seq: int, now: float | None = None) -> list[str]:
         """Drop and return the consumers that hold the producer up and were silent for SILENT_S."""
         now = time.monotonic() if now is None else now
-        gone = [name for name in self.blocking_consumers(next_seq) if now - self._consumers[name].heard > SILENT_S]
+        gone = [name for name in self.blocking_consumers(next_seq) if now - self._consumers[name][1] > SILENT_S]
         for name in gone:
             del self._consumers[name]
         return gone
@@ -61,7 +50,7 @@ class ProducerCredits:
     @property
     def consumers(self) -> dict[str, int]:
         """Name to lost_total as the consumer reports it."""
-        return {name: consumer.lost_total for name, consumer in self._consumers.items()}
+        return {name: credit.lost_total for name, (credit, _) in self._consumers.items()}
 
 
 class ConsumerCredits:
@@ -77,7 +66,7 @@ class ConsumerCredits:
         self._node, self._topic_name, self._window = node, topic_name, window
         row = topic("flow/credit")
         self._publisher = node.create_publisher(Credit, below + row.name, row.qos)
-        self._timer = node.create_timer(REPEAT_S, self._repeat, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer = node.create_timer(REPEAT_S, self.grant, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._tracker: GapTracker | None = None
         self._since_grant = 0
         self._granted: tuple[int, int] | None = None
@@ -115,6 +104,3 @@ class ConsumerCredits:
     def close(self) -> None:
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
-
-    def _repeat(self) -> None:
-        self.grant()

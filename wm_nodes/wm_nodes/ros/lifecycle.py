@@ -15,7 +15,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.service_introspection import ServiceIntrospectionState
 
 from wm_msgs.msg import RunState
 from wm_nodes.config.load import ConfigError, load_config
@@ -24,7 +26,6 @@ from wm_nodes.ros import diagnostics
 from wm_nodes.ros.diagnostics import Diagnostics
 from wm_nodes.ros.endpoint_matching import Links
 from wm_nodes.ros.flow_control import ConsumerCredits
-from wm_nodes.ros.introspection import introspect
 from wm_nodes.ros.liveliness import HEARTBEAT_S, PeerWatch
 from wm_nodes.ros.params import COMMON, Param, declare, refusal
 from wm_nodes.ros.publishing import StampedPublisher
@@ -33,6 +34,9 @@ from wm_nodes.ros.sequence_numbers import GapTracker, new_session
 
 REFUSALS = (ConfigError, ValueError, OSError, KeyError, ImportError)
 """What a bad setting raises: reported as one line, the node stays where it was. Anything else is a bug: with trace."""
+
+SERVICE_EVENTS = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=10)
+"""Of the topics <service>/_service_event (REP 2012)."""
 
 
 class ManagedNode(LifecycleNode):  # type: ignore[misc]
@@ -134,7 +138,14 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     def publish_on(self, name: str, qos: QoSProfile | None = None) -> StampedPublisher:
         """A numbering publisher for a row of the QoS table (or another profile), destroyed at cleanup."""
         publisher = StampedPublisher(self, name, self.session, qos)
-        self._entities.append(lambda: self.destroy_publisher(publisher.publisher))
+        self.own(self.destroy_publisher, publisher.publisher)
+        return publisher
+
+    def publish_unnumbered(self, name: str) -> Publisher:
+        """A publisher for a row of the QoS table whose messages have no (session, seq), destroyed at cleanup."""
+        row = topic(name)
+        publisher = self.create_publisher(row.type, row.name, row.qos)
+        self.own(self.destroy_publisher, publisher)
         return publisher
 
     def watch(self, prefix: str) -> None:
@@ -166,17 +177,17 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
                 grantor.record_consumed(tracker)
 
         subscription = self.create_subscription(row.type, row.name, observe, row.reader_qos)
-        self._entities.append(lambda: self.destroy_subscription(subscription))
+        self.own(self.destroy_subscription, subscription)
         if grantor is not None:
-            self._entities.append(grantor.close)
+            self.own(grantor.close)
         return grantor
 
     def serve(self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service until cleanup."""
         service = self.create_service(service_type, name, callback)
-        introspect(self, service, str(self.param("service_introspection")))
+        self._introspect(service, str(self.param("service_introspection")))
         self._introspected.append(service)
-        self._entities.append(lambda: self.destroy_service(service))
+        self.own(self.destroy_service, service)
 
     def own(self, destroy: Callable[..., object], *arguments: Any) -> None:
         """Call destroy(*arguments) at cleanup."""
@@ -322,7 +333,12 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         for change in changes:
             if change.name == "service_introspection":
                 for service in self._introspected:
-                    introspect(self, service, change.value)
+                    self._introspect(service, change.value)
+
+    def _introspect(self, service: Any, state: str) -> None:
+        """Publish a service's events: none (off), who and when (metadata), or everything (contents)."""
+        chosen = ServiceIntrospectionState[state.upper()]
+        service.configure_introspection(self.get_clock(), SERVICE_EVENTS, chosen)
 
     def _on_diagnostics(self) -> None:
         self.links.announce(again=True)

@@ -6,7 +6,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.sequence_numbers import Stamper
 
 
 class StampedPublisher:
@@ -19,14 +18,9 @@ class StampedPublisher:
     def __init__(self, node: Node, name: str, session: int, qos: QoSProfile | None = None) -> None:
         row = topic(name)
         self.publisher = node.create_publisher(row.type, row.name, qos or row.qos)
-        self._stamper = Stamper(session)
+        self._session, self.next_seq = session, 0
 
-    @property
-    def next_seq(self) -> int:
-        return self._stamper.next_seq
-
-    def publish(self, message: Any) -> int:
-        """Number and publish a message; return its seq."""
-        seq = self._stamper.stamp(message)
+    def publish(self, message: Any) -> None:
+        message.session, message.seq = self._session, self.next_seq
+        self.next_seq += 1
         self.publisher.publish(message)
-        return seq

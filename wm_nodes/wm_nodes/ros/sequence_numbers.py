@@ -10,21 +10,6 @@ def new_session() -> int:
 
 
 @dataclass
-class Stamper:
-    """Numbers the messages of one topic: (session, 0), (session, 1), ..."""
-
-    session: int
-    next_seq: int = 0
-
-    def stamp(self, message: object) -> int:
-        """Set `session` and `seq` of a message; return the seq."""
-        seq = self.next_seq
-        message.session, message.seq = self.session, seq  # type: ignore[attr-defined]
-        self.next_seq += 1
-        return seq
-
-
-@dataclass
 class GapTracker:
     """Counts the sequence numbers that one consumer of one topic missed.
 

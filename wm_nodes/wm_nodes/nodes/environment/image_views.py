@@ -12,7 +12,7 @@ from wm_nodes.recording.messages import CAMERA_FRAME
 from wm_nodes.ros import convert
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
-from wm_nodes.ros.qos import VIEW, topic
+from wm_nodes.ros.qos import VIEW
 
 PARAMS = (
     Param("view_env", -1, "Also publish this environment's image alone on env/image/view while someone looks; -1: none",
@@ -40,11 +40,9 @@ class ImageViews:
 
     def __init__(self, node: ManagedNode) -> None:
         self._node = node
-        row = topic("env/image/compressed")
         self._view = node.create_publisher(Image, "env/image/view", VIEW)
-        self._compressed = node.create_publisher(row.type, row.name, row.qos)
-        for publisher in (self._view, self._compressed):
-            node.own(node.destroy_publisher, publisher)
+        node.own(node.destroy_publisher, self._view)
+        self._compressed = node.publish_unnumbered("env/image/compressed")
         self._last_s: dict[str, float] = {}
 
     def show(self, images: UInt8Array, mosaic: Image) -> None:

@@ -60,8 +60,7 @@ class JudgeServices:
         self._verdicts = node.publish_on("reward/verdict")
         node.serve(SetRubric, "reward/set_rubric", self._on_set_rubric)
         self._turn = threading.Lock()
-        self._action = WorkerAction(node, JudgeClips, "reward/judge_clips", self._judge_folder, _describe)
-        node.own(self._action.destroy)
+        self._action = WorkerAction(node, JudgeClips, "reward/judge_clips", self._judge_folder)
         self.judge.refresh_health()
 
     def stop(self, reason: str) -> None:
@@ -216,7 +215,3 @@ def deadline_of(seconds: float) -> float | None:
     if not 0 <= seconds < math.inf:
         raise ValueError(f"deadline_s must be 0 (no limit) or a number of seconds, got {seconds:g}")
     return time.monotonic() + seconds if seconds else None
-
-
-def _describe(reason: int, text: str) -> JudgeClips.Result:
-    return JudgeClips.Result(termination_reason=reason, message=text)

@@ -51,8 +51,7 @@ class TrainingNode(ManagedNode):
         self._run, self._announced = run, -1
         self._result_type = action_type.Result
         self._versions = self.publish_on(version_topic)
-        self._action = WorkerAction(self, action_type, action, self._train_goal, self._describe)
-        self.own(self._action.destroy)
+        self._action = WorkerAction(self, action_type, action, self._train_goal, self.fill)
 
     @property
     def training(self) -> bool:
@@ -101,9 +100,6 @@ class TrainingNode(ManagedNode):
         else:
             self.get_logger().info(f"training ended after update {run.updates}")
         return self.fill(result)
-
-    def _describe(self, reason: int, text: str) -> Any:
-        return self.fill(self._result_type(termination_reason=reason, message=text))
 
 
 def run_learner(
