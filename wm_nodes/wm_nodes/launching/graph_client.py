@@ -16,7 +16,6 @@ from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray
 from wm_nodes.ros.clients import run_goal
 from wm_nodes.ros.spin import make_executor, spin
-from wm_nodes.ros.wire import PeerLost
 
 ACCEPT_S = 30.0
 
@@ -34,15 +33,6 @@ class EvaluationOutcome:
     high: float
     mean_length: float
     policy_version: int
-
-
-@dataclass(frozen=True)
-class Training:
-    policy_version: int
-    updates: int
-    samples: int
-    success_rate: float
-    checkpoint: str
 
 
 class GraphClient:
@@ -86,16 +76,13 @@ class GraphClient:
             result.policy_version,
         )
 
-    def train(self, updates: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> Training:
+    def train(self, updates: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> Train.Result:
         """Make policy updates; on_progress gets Train.Feedback messages.
 
         Raises:
             GoalFailed: the training ended early. PeerLost: no learner.
         """
-        result = self._run(self._train, Train.Goal(updates=updates), lambda message: on_progress(message.feedback))
-        return Training(
-            result.policy_version, result.updates, result.samples, result.success_rate, result.checkpoint_uri
-        )
+        return self._run(self._train, Train.Goal(updates=updates), lambda message: on_progress(message.feedback))
 
     def train_video(self, iterations: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> int:
         """Post-train the video model on so many buffers; on_progress gets TrainVideo.Feedback. Return the new version.
@@ -104,8 +91,7 @@ class GraphClient:
             GoalFailed: the training ended early. PeerLost: no learner.
         """
         goal = TrainVideo.Goal(iterations=iterations)
-        result = self._run(self._train_video, goal, lambda message: on_progress(message.feedback))
-        return int(result.policy_version)
+        return int(self._run(self._train_video, goal, lambda message: on_progress(message.feedback)).policy_version)
 
     def close(self) -> None:
         self._stop.set()
@@ -127,6 +113,3 @@ class GraphClient:
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-
-__all__ = ["EvaluationOutcome", "GoalFailed", "GraphClient", "PeerLost", "Training"]

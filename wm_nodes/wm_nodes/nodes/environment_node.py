@@ -137,7 +137,7 @@ class EnvironmentNode(ManagedNode):
     def update_diagnostics(self) -> None:
         if self.served is not None:
             self.diagnostics.gauge("step_id", self.served.next_step_id - 1)
-            self.diagnostics.gauge("credit_consumers", ", ".join(sorted(self._ledger.consumers)) or "none")
+            self.diagnostics.gauge("credit_consumers", ", ".join(self._ledger.consumers) or "none")
 
     # Sink of the lock-step environment.
 

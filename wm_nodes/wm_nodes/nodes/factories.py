@@ -53,15 +53,13 @@ def make_environment(
         from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
         return ManiSkillEnvironment(config.task, config.simulation, num_envs=num_envs, seed=seed)
-    environment: Environment
     if backend == "factory":
-        environment = load_factory(factory)(config, num_envs, seed)
+        environment: Environment = load_factory(factory)(config, num_envs, seed)
         return environment
     model, starts = existing(model_dir, "model_dir"), existing(starts_file, "starts_file")
     from wm_nodes.policy_rl.factories import make_imagined_environment
 
-    environment = make_imagined_environment(config, model, starts, num_envs=num_envs, seed=seed)
-    return environment
+    return make_imagined_environment(config, model, starts, num_envs=num_envs, seed=seed)
 
 
 def make_reward(kind: str, config: RunConfig, model_dir: str, factory: str = "") -> RewardModel:
@@ -76,21 +74,18 @@ def make_reward(kind: str, config: RunConfig, model_dir: str, factory: str = "")
     folder = existing(model_dir, "model_dir")
     from wm_nodes.policy_rl.factories import make_endogenous_reward
 
-    model: RewardModel = make_endogenous_reward(config, folder)
-    return model
+    return make_endogenous_reward(config, folder)
 
 
 def make_policy(config: RunConfig, model_dir: str, factory: str = "") -> ImagePolicy:
     """Build a policy with fresh weights."""
-    policy: ImagePolicy
     if factory:
-        policy = load_factory(factory)(config)
+        policy: ImagePolicy = load_factory(factory)(config)
         return policy
     folder = existing(model_dir, "model_dir")
     from wm_nodes.policy_rl.factories import make_policy as make_model_policy
 
-    policy = make_model_policy(config, folder)
-    return policy
+    return make_model_policy(config, folder)
 
 
 def expected_spec(config: RunConfig, model_dir: str, policy_factory: str) -> EnvironmentSpec | None:
@@ -112,14 +107,12 @@ def refuse_other(found: EnvironmentSpec, expected: EnvironmentSpec, whose: str) 
 
 def make_learner(policy: ImagePolicy, config: RunConfig, factory: str = "", ranks: Ranks | None = None) -> Learner:
     """Build the algorithm that trains `policy` in place; its present weights are the reference it stays close to."""
-    learner: Learner
     if factory:
-        learner = load_factory(factory)(policy, config)
+        learner: Learner = load_factory(factory)(policy, config)
         return learner
     from wm_nodes.policy_rl.ppo import PpoLearner
 
-    learner = PpoLearner(policy, config.ppo, seed=config.seed, ranks=ranks)
-    return learner
+    return PpoLearner(policy, config.ppo, seed=config.seed, ranks=ranks)
 
 
 def existing(path: str, parameter: str) -> Path:

@@ -14,6 +14,7 @@ from std_srvs.srv import Trigger
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import StartRecording, StopRecording
+from wm_nodes.core.files import write_atomic
 from wm_nodes.nodes.recorder.qos import recorded_qos
 from wm_nodes.recording import BagError, RawBagWriter, RecordingError, topics
 from wm_nodes.recording import messages as m
@@ -75,7 +76,7 @@ class RecorderNode(ManagedNode):
         self.serve(StartRecording, "recorder/start", self._on_start)
         self.serve(StopRecording, "recorder/stop", self._on_stop)
         for name in ("pause", "resume", "split"):
-            self.serve(Trigger, f"recorder/{name}", getattr(self, f"_on_{name}"))
+            self.serve(Trigger, f"recorder/{name}", partial(self._on_trigger, name))
         timer = self.create_timer(FLUSH_S, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.own(self.destroy_timer, timer)
 
@@ -200,9 +201,7 @@ class RecorderNode(ManagedNode):
         rows = json.loads(index.read_text()) if index.is_file() else []
         uri = str(path.relative_to(self.run_dir)) if path.is_relative_to(self.run_dir) else str(path)
         rows.append({"bag": uri, "messages": messages, "lost": lost})
-        partial_file = index.with_suffix(".json.partial")
-        partial_file.write_text(json.dumps(rows, indent=1))
-        partial_file.replace(index)
+        write_atomic(index, json.dumps(rows, indent=1).encode())
 
     def _on_timer(self) -> None:
         if self._bag is None:
@@ -260,21 +259,15 @@ class RecorderNode(ManagedNode):
         response.bag_uri = str(path)
         return response
 
-    def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._trigger(response, lambda: setattr(self, "_paused", True))
-
-    def _on_resume(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._trigger(response, lambda: setattr(self, "_paused", False))
-
-    def _on_split(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._trigger(response, lambda: self._bag.split() if self._bag is not None else None)
-
-    def _trigger(self, response: Trigger.Response, act: Any) -> Trigger.Response:
+    def _on_trigger(self, name: str, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._bag is None:
             response.message = "not recording; call recorder/start"
             return response
         try:
-            act()
+            if name == "split":
+                self._bag.split()
+            else:
+                self._paused = name == "pause"
             response.success = True
         except RecordingError as error:
             self._fail(error)

@@ -1,28 +1,15 @@
 """Record episodes and live graphs into rosbag2 (MCAP) bags, read them back, recover killed recordings."""
 
 from wm_nodes.recording.bag import Bag
-from wm_nodes.recording.dataset import EpisodeDataset, dataset_of, load_dataset
+from wm_nodes.recording.dataset import load_dataset
 from wm_nodes.recording.errors import BagError, RecordingError
 from wm_nodes.recording.raw import RawBagWriter
 from wm_nodes.recording.reader import BagReport, check_spec, read_episodes, read_spec
-from wm_nodes.recording.recovery import RecoverReport, recover
+from wm_nodes.recording.recovery import recover
 from wm_nodes.recording.rollouts import read_rollouts
 from wm_nodes.recording.writer import EpisodeBagWriter
 
 __all__ = [
-    "Bag",
-    "BagError",
-    "BagReport",
-    "EpisodeBagWriter",
-    "EpisodeDataset",
-    "RawBagWriter",
-    "RecordingError",
-    "RecoverReport",
-    "check_spec",
-    "dataset_of",
-    "load_dataset",
-    "read_episodes",
-    "read_rollouts",
-    "read_spec",
-    "recover",
+    "Bag", "BagError", "BagReport", "EpisodeBagWriter", "RawBagWriter", "RecordingError", "check_spec", "load_dataset",
+    "read_episodes", "read_rollouts", "read_spec", "recover",
 ]

@@ -72,23 +72,24 @@ def mosaic_of(message: Any, spec: EnvironmentSpec, tiles: Tiles, *, where: str) 
     return np.asarray(message.data, np.uint8).reshape(height, width, spec.channels)
 
 
+def spec_fields(spec: EnvironmentSpec) -> dict[str, Any]:
+    """The fields of wm_msgs/EnvSpec but header, session, seq and tile; numbers per action or state as arrays."""
+    values = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(spec).items()}
+    del values["control_period_s"]
+    ones = np.ones(spec.action_dim, np.float32)
+    return values | {
+        "action_dim": spec.action_dim, "action_low": -ones, "action_high": ones,
+        "action_scale": np.asarray(spec.action_scale, np.float32), "state_dim": spec.state_dim,
+        "state_low": np.asarray(spec.state_low, np.float32), "state_high": np.asarray(spec.state_high, np.float32),
+        "control_period": float(np.float32(spec.control_period_s)), "spec_hash": spec.spec_hash,
+    }
+
+
 def spec_message(spec: EnvironmentSpec, time_ns: int, session: int) -> Any:
     """wm_msgs/EnvSpec of a spec."""
-    tiles = Tiles.of(spec.num_envs, spec.height, spec.width)
-    layout = message_type("wm_msgs/msg/TileLayout")(
-        rows=tiles.rows, cols=tiles.cols, tile_height=spec.height, tile_width=spec.width
-    )
+    layout = message_type("wm_msgs/msg/TileLayout")(**asdict(Tiles.of(spec.num_envs, spec.height, spec.width)))
     return message_type("wm_msgs/msg/EnvSpec")(
-        header=header(time_ns, BASE_FRAME), session=session, seq=0, env_id=spec.env_id, task=spec.task,
-        instruction=spec.instruction, source=spec.source, num_envs=spec.num_envs, height=spec.height, width=spec.width,
-        channels=spec.channels, encoding=spec.encoding, cameras=list(spec.cameras), tile=layout,
-        action_dim=spec.action_dim, action_names=list(spec.action_names), action_units=list(spec.action_units),
-        action_low=np.full(spec.action_dim, -1, np.float32), action_high=np.full(spec.action_dim, 1, np.float32),
-        action_scale=np.asarray(spec.action_scale, np.float32), state_dim=spec.state_dim,
-        state_names=list(spec.state_names), state_units=list(spec.state_units),
-        state_low=np.asarray(spec.state_low, np.float32), state_high=np.asarray(spec.state_high, np.float32),
-        ground_truth_names=list(spec.ground_truth_names), control_period=spec.control_period_s,
-        max_episode_steps=spec.max_episode_steps, world_model_sha256=spec.world_model_sha256, spec_hash=spec.spec_hash,
+        header=header(time_ns, BASE_FRAME), session=session, seq=0, tile=layout, **spec_fields(spec)
     )
 
 

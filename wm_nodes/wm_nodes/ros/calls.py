@@ -1,6 +1,7 @@
 """The services env/step and env/reset: commands and replies as numpy, to requests and responses and back. Shapes: N
 environments, A action, S state, H W 3 image."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -99,13 +100,10 @@ def step_reply(response: StepBatch.Response, spec: EnvironmentSpec, session: int
     """Raises WireError with the response's error code, or BAD_SHAPE."""
     _raise_for(response)
     count = spec.num_envs
-    return Reply(
-        session=session, step_id=response.step_id, stamp_ns=time_ns(response.stamp),
-        images=images_of(response.observation, spec) if len(response.observation.data) else None,
-        states=floats(response.state, (count, spec.state_dim), "state"),
+    return replace(
+        _common_reply(response, spec, session, response.step_id),
         terminated=flags(response.terminated, count, "terminated"),
         truncated=flags(response.truncated, count, "truncated"),
-        episode_ids=reshape_field(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
         success_probability=floats(response.success_probability, (count,), "success_probability"),
         uncertainty=floats(response.model_uncertainty, (count,), "model_uncertainty"), step_s=response.step_ms / 1e3,
     )
@@ -114,10 +112,14 @@ def step_reply(response: StepBatch.Response, spec: EnvironmentSpec, session: int
 def reset_reply(response: ResetBatch.Response, spec: EnvironmentSpec) -> Reply:
     """Raises WireError with the response's error code, or BAD_SHAPE."""
     _raise_for(response)
-    count = spec.num_envs
-    zeros = np.zeros(count, np.float32)
+    return _common_reply(response, spec, response.session, response.next_step_id - 1)
+
+
+def _common_reply(response: Any, spec: EnvironmentSpec, session: int, step_id: int) -> Reply:
+    """What both answers have; nothing ended, succeeded or is uncertain."""
+    count, zeros = spec.num_envs, np.zeros(spec.num_envs, np.float32)
     return Reply(
-        session=response.session, step_id=response.next_step_id - 1, stamp_ns=time_ns(response.stamp),
+        session=session, step_id=step_id, stamp_ns=time_ns(response.stamp),
         images=images_of(response.observation, spec) if len(response.observation.data) else None,
         states=floats(response.state, (count, spec.state_dim), "state"), terminated=zeros != 0, truncated=zeros != 0,
         episode_ids=reshape_field(from_field(response.episode_id, np.uint64), (count,), "episode_id"),

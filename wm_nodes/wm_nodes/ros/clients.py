@@ -3,7 +3,8 @@
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
@@ -78,23 +79,6 @@ def call(client: Client, request: Any, timeout_s: float, check: Check = lambda: 
             client.remove_pending_request(future)
 
 
-class EnvironmentClient(Protocol):
-    """An environment that is stepped, wherever it lives."""
-
-    @property
-    def session(self) -> int:
-        """Session of the environment as of the last handshake."""
-        ...
-
-    def handshake(self, timeout_s: float, check: Check) -> EnvironmentSpec:
-        """Fetch the spec and the session; needed at first and after each PeerLost."""
-        ...
-
-    def reset(self, command: ResetCommand, check: Check) -> Reply: ...
-
-    def step(self, command: StepCommand, check: Check) -> Reply: ...
-
-
 class RosEnvironmentClient:
     """env/step, env/reset and env/get_spec of one environment node.
 
@@ -144,41 +128,18 @@ class RosEnvironmentClient:
         return self._spec
 
     def reset(self, command: ResetCommand, check: Check) -> Reply:
-        spec = self._require_spec()
-        request = calls.reset_request(command)
-
-        def attempt(left_s: float) -> Reply:
-            # Twice the same reset gives the same observation; a server that has not matched this client's reader yet
-            # loses its first answer (rmw_fastrtps 556).
-            try:
-                response = self._call(self._reset, request, min(left_s, self._timeout_s / 2), check)
-            except PeerLost:
-                if left_s <= self._timeout_s / 2 or self._is_silent:
-                    raise
-                raise WireError(ErrorCode.BUSY, "sent again") from None
-            return calls.reset_reply(response, spec)
-
-        reply = self._retry(attempt, check)
+        # Twice the same reset gives the same observation; a server that has not matched this client's reader yet loses
+        # its first answer (rmw_fastrtps 556).
+        read = partial(calls.reset_reply, spec=self._require_spec())
+        reply = self._ask(self._reset, calls.reset_request(command), read, self._timeout_s / 2, check)
         if reply.session != self._session:
             raise PeerLost(f"the environment was restarted (session {reply.session}, not {self.session})")
         return reply
 
     def step(self, command: StepCommand, check: Check) -> Reply:
-        spec = self._require_spec()
-        request = calls.step_request(command)
-
-        def attempt(left_s: float) -> Reply:
-            try:
-                response = self._call(self._step, request, min(left_s, ATTEMPT_S), check)
-            except PeerLost:
-                if left_s <= ATTEMPT_S or self._is_silent:
-                    raise
-                self._node.diagnostics.count("step_retries", level=0)
-                raise WireError(ErrorCode.BUSY, "sent again") from None
-            return calls.step_reply(response, spec, self._session)
-
+        read = partial(calls.step_reply, spec=self._require_spec(), session=self._session)
         try:
-            return self._retry(attempt, check)
+            return self._ask(self._step, calls.step_request(command), read, ATTEMPT_S, check)
         except WireError as error:
             if error.code == ErrorCode.SPEC_MISMATCH:
                 raise PeerLost(f"the environment was restarted: {error}") from None
@@ -189,26 +150,33 @@ class RosEnvironmentClient:
             raise PeerLost("no handshake with the environment yet")
         return self._spec
 
-    def _retry(self, attempt: Callable[[float], Reply], check: Check) -> Reply:
-        deadline = time.monotonic() + self._timeout_s
-        while True:
-            try:
-                return attempt(max(0.0, deadline - time.monotonic()))
-            except WireError as error:
-                if error.code != ErrorCode.BUSY:
-                    raise
-                if time.monotonic() >= deadline:
-                    raise PeerLost(f"busy for {self._timeout_s:g} s: {error}") from None
-            check()
-            time.sleep(BUSY_WAIT_S)
+    def _ask(
+        self, client: Client, request: Any, read: Callable[[Any], Reply], attempt_s: float, check: Check
+    ) -> Reply:
+        """Ask until the environment is not busy, and again where no answer has come after attempt_s."""
 
-    def _call(self, client: Client, request: Any, timeout_s: float, check: Check) -> Any:
-        def alive() -> None:
+        def check_alive() -> None:
             check()
             if self._is_silent:
                 raise PeerLost(f"{self._peer} is silent")
 
-        return call(client, request, timeout_s, alive)
+        def attempt(left_s: float) -> Reply:
+            try:
+                response = call(client, request, min(left_s, attempt_s), check_alive)
+            except PeerLost:
+                if left_s <= attempt_s or self._is_silent:
+                    raise
+                if client is self._step:
+                    self._node.diagnostics.count("step_retries", level=0)
+                raise WireError(ErrorCode.BUSY, "sent again") from None
+            return read(response)
+
+        try:
+            return retry_while_busy(attempt, self._timeout_s, check)
+        except WireError as error:
+            if error.code == ErrorCode.BUSY:
+                raise PeerLost(f"busy for {self._timeout_s:g} s: {error}") from None
+            raise
 
     @property
     def _is_silent(self) -> bool:
@@ -238,10 +206,10 @@ class LocalEnvironmentClient:
         return spec
 
     def reset(self, command: ResetCommand, check: Check) -> Reply:
-        return self._retry(lambda: self._get_environment().reset(command), check)
+        return retry_while_busy(lambda _: self._get_environment().reset(command), self._timeout_s, check)
 
     def step(self, command: StepCommand, check: Check) -> Reply:
-        return self._retry(lambda: self._get_environment().step(command), check)
+        return retry_while_busy(lambda _: self._get_environment().step(command), self._timeout_s, check)
 
     def _get_environment(self) -> Any:
         served = self._get_served()
@@ -249,16 +217,23 @@ class LocalEnvironmentClient:
             raise PeerLost("the local environment was cleaned up")
         return served
 
-    def _retry(self, attempt: Callable[[], Reply], check: Check) -> Reply:
-        deadline = time.monotonic() + self._timeout_s
-        while True:
-            try:
-                return attempt()
-            except WireError as error:
-                if error.code != ErrorCode.BUSY or time.monotonic() >= deadline:
-                    raise
-            check()
-            time.sleep(BUSY_WAIT_S)
+
+EnvironmentClient = RosEnvironmentClient | LocalEnvironmentClient
+"""An environment that is stepped, wherever it lives. handshake() fetches the spec and the session; it is needed at
+first and after each PeerLost."""
+
+
+def retry_while_busy(attempt: Callable[[float], Reply], timeout_s: float, check: Check) -> Reply:
+    """Return attempt(seconds left), repeated while it raises WireError(BUSY), which is raised after timeout_s."""
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            return attempt(max(0.0, deadline - time.monotonic()))
+        except WireError as error:
+            if error.code != ErrorCode.BUSY or time.monotonic() >= deadline:
+                raise
+        check()
+        time.sleep(BUSY_WAIT_S)
 
 
 def call_in_executor(node: "ManagedNode", send: Callable[[], Future], timeout_s: float, check: Check) -> Any:

@@ -7,6 +7,7 @@ array.array takes 10 us and is right in both modes. Reading back is np.frombuffe
 
 from array import array
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,13 +29,12 @@ from wm_msgs.msg import (
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.recording.layout import Tiles
-from wm_nodes.recording.messages import BASE_FRAME, CAMERA_FRAME, spec_of
+from wm_nodes.recording.messages import BASE_FRAME, CAMERA_FRAME, NS_PER_S, spec_fields, spec_of, stamp_ns
 from wm_nodes.ros.wire import EpisodeNote, Goals, Rewards, TimedAction, Transition, WireError
 
 if TYPE_CHECKING:  # a player needs no torch
     from wm_nodes.reward.base import RewardResult
 
-NS_PER_S = 1_000_000_000
 _TYPECODES = {"float32": "f", "float64": "d", "uint8": "B", "uint32": "I", "uint64": "Q", "bool": "B"}
 
 
@@ -94,8 +94,7 @@ def time_msg(stamp_ns: int) -> Time:
     return Time(sec=stamp_ns // NS_PER_S, nanosec=stamp_ns % NS_PER_S)
 
 
-def time_ns(stamp: Time) -> int:
-    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+time_ns = stamp_ns
 
 
 def header(stamp_ns: int, frame_id: str = BASE_FRAME) -> Header:
@@ -148,29 +147,15 @@ def tiles_of(spec: EnvironmentSpec) -> Tiles:
 
 
 def tile_msg(spec: EnvironmentSpec) -> TileLayout:
-    tiles = tiles_of(spec)
-    return TileLayout(rows=tiles.rows, cols=tiles.cols, tile_height=tiles.tile_height, tile_width=tiles.tile_width)
+    return TileLayout(**asdict(tiles_of(spec)))
 
 
 # EnvSpec
 
 
 def spec_msg(spec: EnvironmentSpec, stamp_ns: int) -> EnvSpec:
-    ones = np.ones(spec.action_dim, np.float32)
-    message = EnvSpec(
-        header=header(stamp_ns), env_id=spec.env_id, task=spec.task, instruction=spec.instruction, source=spec.source,
-        num_envs=spec.num_envs, height=spec.height, width=spec.width, channels=spec.channels, encoding=spec.encoding,
-        cameras=list(spec.cameras), tile=tile_msg(spec), action_dim=spec.action_dim,
-        action_names=list(spec.action_names), action_units=list(spec.action_units), state_dim=spec.state_dim,
-        state_names=list(spec.state_names), state_units=list(spec.state_units),
-        ground_truth_names=list(spec.ground_truth_names), control_period=float(np.float32(spec.control_period_s)),
-        max_episode_steps=spec.max_episode_steps, world_model_sha256=spec.world_model_sha256, spec_hash=spec.spec_hash,
-    )
-    message.action_low, message.action_high = to_field(-ones), to_field(ones)
-    message.action_scale = to_field(np.asarray(spec.action_scale, np.float32))
-    message.state_low = to_field(np.asarray(spec.state_low, np.float32))
-    message.state_high = to_field(np.asarray(spec.state_high, np.float32))
-    return message
+    values = {k: to_field(v) if isinstance(v, np.ndarray) else v for k, v in spec_fields(spec).items()}
+    return EnvSpec(header=header(stamp_ns), tile=tile_msg(spec), **values)
 
 
 def spec_from_msg(message: EnvSpec) -> EnvironmentSpec:

@@ -48,9 +48,8 @@ class ProducerCredits:
         return gone
 
     @property
-    def consumers(self) -> dict[str, int]:
-        """Name to lost_total as the consumer reports it."""
-        return {name: credit.lost_total for name, (credit, _) in self._consumers.items()}
+    def consumers(self) -> list[str]:
+        return sorted(self._consumers)
 
 
 class ConsumerCredits:

@@ -337,7 +337,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def _introspect(self, service: Any, state: str) -> None:
         """Publish a service's events: none (off), who and when (metadata), or everything (contents)."""
-        chosen = ServiceIntrospectionState[state.upper()]
+        chosen = getattr(ServiceIntrospectionState, state.upper())
         service.configure_introspection(self.get_clock(), SERVICE_EVENTS, chosen)
 
     def _on_diagnostics(self) -> None:
