@@ -7,13 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-DROPPED = {
-    "PYTHONHOME",
-    "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
-    "AMENT_PREFIX_PATH",
-    "CMAKE_PREFIX_PATH",
-    "COLCON_PREFIX_PATH",
-}
+BOOTSTRAPPED = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
+DROPPED = {"PYTHONHOME", BOOTSTRAPPED, "AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH"}
 
 
 class SetupError(RuntimeError):
@@ -24,21 +19,24 @@ def say(text: str) -> None:
     print(f"[set-up] {text}", file=sys.stderr, flush=True)
 
 
-def run(command: list[str], *, log: Path, why: str, env: dict[str, str] | None = None, cwd: Path | None = None) -> None:
-    """Run a command with its output in `log` (appended).
+def output_of(command: list[str], env: dict[str, str] | None = None) -> str:
+    """What a command prints; nothing where it does not exist, fails, or takes more than 30 s."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, env=env, timeout=30, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return "" if done.returncode else done.stdout
 
-    Raises:
-        SetupError: names the command, its last lines of output and the log file.
-    """
+
+def run(command: list[str], *, log: Path, why: str, env: dict[str, str] | None = None, cwd: Path | None = None) -> None:
+    """Run a command; append its output to `log`. Raises SetupError with its last lines and the log file."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as sink:
         sink.write(f"\n$ {' '.join(command)}\n".encode())
         sink.flush()
         start = sink.tell()
         try:
-            code = subprocess.run(
-                command, stdout=sink, stderr=subprocess.STDOUT, env=env, cwd=cwd, check=False
-            ).returncode
+            code = subprocess.call(command, stdout=sink, stderr=subprocess.STDOUT, env=env, cwd=cwd)
         except FileNotFoundError as error:
             raise SetupError(f"{why}: {error.filename} is not installed") from None
     if code:
@@ -50,9 +48,8 @@ def run(command: list[str], *, log: Path, why: str, env: dict[str, str] | None =
 def isolated_environment(venv: Path) -> dict[str, str]:
     """Return the environment in which the virtual environment's programs run, free of any other ROS or Python set-up.
 
-    A sourced ROS 2 under /opt/ros, another virtual environment or colcon workspace, and the guard variable by which
-    the wheels mark that another interpreter has found its libraries, are left out: two sets of ROS libraries in one
-    process crash.
+    Left out, because two sets of ROS libraries in one process crash: a sourced ROS 2 under /opt/ros, another virtual
+    environment or colcon workspace, and the variable by which the wheels mark that libraries have been found.
     """
     env = {k: v for k, v in os.environ.items() if k not in DROPPED}
     for name in ("PYTHONPATH", "LD_LIBRARY_PATH"):

@@ -27,7 +27,6 @@ MISSING = ":missing"
 """Suffix of the renderer's stamp where this user may not install system packages."""
 
 
-
 def venv_folder():
     """The virtual environment: $WM_VENV, else <repository>/.venv."""
     return Path(os.environ.get("WM_VENV") or ROOT / ".venv").expanduser().absolute()
@@ -68,11 +67,9 @@ def pending(venv):
     present = {
         "packages": (venv / "bin" / "python").exists(),
         "messages": (WORKSPACE / "install" / "wm_msgs" / "share" / "wm_msgs" / "package.xml").exists(),
-        "wm_nodes": True,
-        "renderer": True,
     }
     done = {step: stamp.get(step, "").split(":")[0] for step in wanted}
-    return [step for step in wanted if not present[step] or done[step] != wanted[step]]
+    return [step for step in wanted if not present.get(step, True) or done[step] != wanted[step]]
 
 
 def _wanted(venv):
@@ -97,7 +94,7 @@ def _set_up(venv):
     log, stamp, wanted = venv.parent / (venv.name + "_setup.log"), read_stamp(_stamp_file(venv)), _wanted(venv)
     say(f"setting up {', '.join(steps)}; output of the commands is in {log}")
     if "renderer" in steps or "packages" in steps:
-        ready = system.install(system.current_plan(system.nvidia_vulkan()), log)
+        ready = system.install(system.current_plan(), log)
         stamp["renderer"] = wanted["renderer"] + ("" if ready else MISSING)
     actions = {
         "packages": lambda: (packages.create_venv(venv, log), packages.install_packages(venv, REQUIREMENTS, log)),
@@ -117,7 +114,7 @@ def _recheck_renderer(venv):
     """The last set-up could not install system packages: look whether they have arrived, and say so if not."""
     from setup import system
 
-    plan = system.current_plan(system.nvidia_vulkan())
+    plan = system.current_plan()
     if plan.packages:
         say(f"still without {', '.join(plan.packages)}; `python3 launch_scripts/setup --system` says what to do")
         return
@@ -154,8 +151,7 @@ def main():
     if arguments.system:
         from setup import system
 
-        log = ROOT / ".venv_setup.log"
-        return int(not system.install(system.current_plan(system.nvidia_vulkan()), log))
+        return int(not system.install(system.current_plan(), ROOT / ".venv_setup.log"))
     ensure()
     import rclpy
     import torch

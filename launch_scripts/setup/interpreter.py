@@ -5,8 +5,9 @@ from __future__ import annotations
 import glob
 import os
 import shutil
-import subprocess
 import sys
+
+from setup.console import output_of
 
 SUPPORTED = ((3, 11), (3, 12))
 
@@ -37,9 +38,4 @@ def unsupported_message(version: tuple[int, ...]) -> str:
 
 def _works(path: str) -> bool:
     """A pyenv shim exists on PATH even where its version is not selected: ask the interpreter itself."""
-    code = "import sys; print(*sys.version_info[:2])"
-    try:
-        done = subprocess.run([path, "-c", code], capture_output=True, text=True, timeout=20, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return False
-    return done.returncode == 0 and supported(tuple(map(int, done.stdout.split()[:2])))
+    return supported(tuple(map(int, output_of([path, "-c", "import sys; print(*sys.version_info[:2])"]).split())))

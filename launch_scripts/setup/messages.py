@@ -34,11 +34,7 @@ def repair_cmake(share: Path, include: str, numpy_include: str) -> int:
 
 
 def build_messages(venv: Path, workspace: Path, log: Path) -> None:
-    """Build ros2_ws/src/wm_msgs and make it visible to the virtual environment's Python.
-
-    Raises:
-        SetupError: with the compiler's last lines.
-    """
+    """Build ros2_ws/src/wm_msgs for the environment's Python. Raises SetupError with the compiler's last lines."""
     python, env = venv / "bin" / "python", isolated_environment(venv)
     answer = subprocess.run([str(python), "-c", WHERE], capture_output=True, text=True, env=env, check=False)
     if answer.returncode:
@@ -61,11 +57,8 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
 
 
 def link_messages(venv: Path, install: Path) -> None:
-    """Make an installed wm_msgs part of the virtual environment's ament prefix.
-
-    The wheels' loader looks for libraries in <venv>/lib and for packages in <venv>/share; a .pth file names the Python
-    modules. So `<venv>/bin/python -c "import wm_msgs.msg"` works with no sourcing.
-    """
+    """Make wm_msgs part of the virtual environment, to be imported without sourcing: the wheels' loader looks for
+    libraries in <venv>/lib and for packages in <venv>/share; a .pth file names the Python modules."""
     for library in sorted((install / "lib").glob("lib*.so")):
         _link(venv / "lib" / library.name, library)
     _link(venv / "share" / "wm_msgs", install / "share" / "wm_msgs")
@@ -89,6 +82,5 @@ def _built_here(workspace: Path, python: Path) -> bool:
 
 def _link(link: Path, target: Path) -> None:
     link.parent.mkdir(parents=True, exist_ok=True)
-    if link.is_symlink() or link.exists():
-        link.unlink()
+    link.unlink(missing_ok=True)
     link.symlink_to(target)

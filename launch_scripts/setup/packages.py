@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
-from setup.console import SetupError, isolated_environment, run, say
+from setup.console import BOOTSTRAPPED, SetupError, isolated_environment, output_of, run, say
 from setup.interpreter import supported
 from setup.stamp import python_version
 
@@ -23,24 +22,14 @@ TORCH_VERSION = "import importlib.metadata as m; print(m.version('torch'))"
 
 def gpu_present() -> bool:
     """True where an NVIDIA driver answers."""
-    tool = shutil.which("nvidia-smi")
-    if not tool:
-        return False
-    try:
-        done = subprocess.run([tool, "-L"], capture_output=True, text=True, timeout=30, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return False
-    return done.returncode == 0 and "GPU" in done.stdout
+    return "GPU" in output_of(["nvidia-smi", "-L"])
 
 
 def torch_version(python: str) -> tuple[int, int] | None:
     """Return (major, minor) of the torch that an interpreter has installed, or None."""
-    env = {k: v for k, v in os.environ.items() if k not in {"PYTHONPATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}}
-    try:
-        done = subprocess.run([python, "-c", TORCH_VERSION], capture_output=True, text=True, env=env, check=False)
-    except OSError:
-        return None
-    return parse_version(done.stdout) if done.returncode == 0 else None
+    env = {k: v for k, v in os.environ.items() if k not in {"PYTHONPATH", BOOTSTRAPPED}}
+    text = output_of([python, "-c", TORCH_VERSION], env)
+    return parse_version(text) if text else None
 
 
 def parse_version(text: str) -> tuple[int, int]:
@@ -53,9 +42,8 @@ def create_venv(venv: Path, log: Path) -> None:
     if (venv / "bin" / "python").exists():
         version = python_version(venv)
         if not supported(tuple(int(part) for part in version.split(".")[:2])):
-            raise SetupError(
-                f"{venv} has Python {version}; 3.11 or 3.12 is needed: delete it or set WM_VENV, then start again"
-            )
+            text = f"{venv} has Python {version}; 3.11 or 3.12 is needed: delete it or set WM_VENV, then start again"
+            raise SetupError(text)
         return
     arguments = []
     version = torch_version(sys.executable) if gpu_present() else None
@@ -71,11 +59,7 @@ def create_venv(venv: Path, log: Path) -> None:
 
 
 def install_packages(venv: Path, requirements: Path, log: Path) -> None:
-    """Install torch, then every package of lock.txt.
-
-    Raises:
-        SetupError: with the last lines of output.
-    """
+    """Install torch, then every package of lock.txt. Raises SetupError with the last lines of output."""
     python = str(venv / "bin" / "python")
     pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", UV]
     run(pip, log=log, why="installing uv", env=isolated_environment(venv))
@@ -114,11 +98,10 @@ def _uv_install(venv: Path, arguments: list[str], log: Path, why: str, **variabl
 
 def _indexes(python: str) -> dict[str, str]:
     """The package indexes and certificates that pip is configured with, as variables of uv, which reads none of it."""
-    done = subprocess.run([python, "-m", "pip", "config", "list"], capture_output=True, text=True, check=False)
     settings = {}
-    for line in done.stdout.splitlines():
+    for line in output_of([python, "-m", "pip", "config", "list"]).splitlines():
         name, _, value = line.partition("=")
         settings[name.rpartition(".")[2]] = value.strip("'\"").replace("\\n", " ").split()
-    found = {variable: ("," if variable == "UV_FIND_LINKS" else " ").join(settings[option])
+    given = {variable: ("," if variable == "UV_FIND_LINKS" else " ").join(settings[option])
             for option, variable in PIP_TO_UV.items() if settings.get(option) and variable not in os.environ}
-    return {"UV_INDEX_STRATEGY": "unsafe-best-match", **found}  # pip's strategy: the newest of all indexes
+    return {"UV_INDEX_STRATEGY": "unsafe-best-match", **given}  # pip's strategy: the newest of all indexes

@@ -36,9 +36,7 @@ def read_stamp(path: Path) -> dict[str, str]:
         values = json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
-    if not isinstance(values, dict):
-        return {}
-    return {str(k): str(v) for k, v in values.items()}
+    return {str(k): str(v) for k, v in values.items()} if isinstance(values, dict) else {}
 
 
 def write_stamp(path: Path, stamp: dict[str, str]) -> None:

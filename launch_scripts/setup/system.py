@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import shutil
@@ -9,9 +10,10 @@ import subprocess
 import sys
 import sysconfig
 from dataclasses import dataclass, field
+from email import message_from_string
 from pathlib import Path
 
-from setup.console import SetupError, run, say
+from setup.console import SetupError, output_of, run, say
 
 MIN_MESA = (24, 3)
 """The first Mesa whose software renderer (lavapipe) has VK_KHR_external_memory_fd, which SAPIEN needs."""
@@ -27,8 +29,7 @@ class AptSource:
 
     uri: str
     suites: tuple[str, ...]
-    components: tuple[str, ...]
-    signed_by: str = ""
+    signed_by: str
 
 
 @dataclass
@@ -42,29 +43,29 @@ class AptPlan:
     target: str = ""
     """Value of apt-get's -t, for the renderer only."""
 
+    def add(self, package: str, why: str) -> None:
+        self.packages.append(package)
+        self.reasons.append(f"{package}{why}")
+
     def commands(self) -> list[str]:
         """The shell commands, as root would type them."""
-        lines = []
-        if self.backports:
-            body = self.backports.replace("\n", "\\n")
-            lines.append(f"printf '{body}' > {BACKPORTS_FILE}")
+        body = self.backports.replace("\n", "\\n")
+        lines = [f"printf '{body}' > {BACKPORTS_FILE}"] if body else []
         lines.append("apt-get update")
         renderer = [name for name in self.packages if name in RENDERER]
         others = [name for name in self.packages if name not in RENDERER]
-        if others:
-            lines.append("apt-get install -y --no-install-recommends " + " ".join(others))
-        if renderer:
-            target = f"-t {self.target} " if self.target else ""
-            lines.append(f"apt-get install -y --no-install-recommends {target}" + " ".join(renderer))
+        for names, target in ((others, ""), (renderer, f"-t {self.target} " if self.target else "")):
+            if names:
+                lines.append(f"apt-get install -y --no-install-recommends {target}" + " ".join(names))
         return lines
 
 
 def parse_sources(text: str) -> list[AptSource]:
     """Read `.sources` (deb822) or `.list` (one-line) text; disabled and source-code entries are left out."""
-    one_line = [line for line in text.splitlines() if re.match(r"\s*deb\s", line)]
-    return (
-        [_parse_line(line) for line in one_line] if one_line else list(filter(None, map(_parse_stanza, _stanzas(text))))
-    )
+    if one_line := [line for line in text.splitlines() if re.match(r"\s*deb\s", line)]:
+        return [_parse_line(line) for line in one_line]
+    stanzas = re.split(r"\n\s*\n", re.sub(r"(?m)^#.*\n?", "", text))
+    return [source for source in map(_parse_stanza, stanzas) if source]
 
 
 def backports_source(sources: list[AptSource], codename: str) -> str:
@@ -122,13 +123,11 @@ def make_plan(
     if missing_tools:
         plan.reasons.append(f"{', '.join(missing_tools)}: to build the ROS 2 message types")
     if not loader:
-        plan.packages.append("libvulkan1")
-        plan.reasons.append("libvulkan1: the simulator renders through Vulkan")
+        plan.add("libvulkan1", ": the simulator renders through Vulkan")
     version = mesa_version(mesa)
     if not gpu_renderer and (version is None or version < MIN_MESA):
-        plan.packages.append("mesa-vulkan-drivers")
-        found = f"{mesa} is too old" if mesa else "none is installed"
-        plan.reasons.append(f"mesa-vulkan-drivers >= 24.3: draws the simulator's images without a GPU ({found})")
+        present = f"{mesa} is too old" if mesa else "none is installed"
+        plan.add("mesa-vulkan-drivers", f" >= 24.3: draws the simulator's images without a GPU ({present})")
         if os_release.get("VERSION_CODENAME") == "bookworm" and os_release.get("ID") == "debian":
             plan.backports = backports_source(sources, "bookworm")
             plan.target = "bookworm-backports"
@@ -136,18 +135,17 @@ def make_plan(
     return plan
 
 
-def current_plan(gpu_renderer: bool) -> AptPlan:
+def current_plan() -> AptPlan:
     """make_plan for this machine."""
-    missing = [package for tool, package in (("cc", "gcc"), ("c++", "g++"), ("make", "make")) if not shutil.which(tool)]
-    if not shutil.which("cmake"):
-        missing.append("cmake")
+    tools = {"cc": "gcc", "c++": "g++", "make": "make", "cmake": "cmake"}
+    missing = [package for tool, package in tools.items() if not shutil.which(tool)]
     if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
         missing.append(f"python{sys.version_info[0]}.{sys.version_info[1]}-dev")
     if not _library("libX11.so.6"):
         missing.append("libx11-6")
     return make_plan(
         missing_tools=missing, mesa=_installed("mesa-vulkan-drivers"), loader=_library("libvulkan.so.1"),
-        gpu_renderer=gpu_renderer, os_release=read_os_release(), sources=read_sources(),
+        gpu_renderer=_has_nvidia_vulkan(), os_release=read_os_release(), sources=read_sources(),
     )
 
 
@@ -161,8 +159,7 @@ def browser_plan(browser: str | None, os_release: dict[str, str]) -> AptPlan:
     """What the tests of pages need, and nothing else does: a browser. Ubuntu's package is a snap: none there."""
     plan = AptPlan()
     if browser is None and os_release.get("ID") == "debian":
-        plan.packages.append("chromium-headless-shell")
-        plan.reasons.append("chromium-headless-shell: opens pages in the tests (64 MB)")
+        plan.add("chromium-headless-shell", ": opens pages in the tests (64 MB)")
     return plan
 
 
@@ -188,13 +185,13 @@ def install(plan: AptPlan, log: Path) -> bool:
         say(str(error))
         say("continuing without them")
         return False
-    left = current_plan(nvidia_vulkan()).packages
+    left = current_plan().packages
     if left:
         say(f"{', '.join(left)}: this system's package sources hold no version that is new enough; continuing without")
     return not left
 
 
-def nvidia_vulkan() -> bool:
+def _has_nvidia_vulkan() -> bool:
     """True where NVIDIA's own Vulkan driver is registered."""
     folders = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
     return any(path.is_file() for folder in folders for path in Path(folder).glob("nvidia_icd*.json"))
@@ -216,14 +213,11 @@ def _installed(package: str) -> str:
         icd = any(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
         return f"{MIN_MESA[0]}.{MIN_MESA[1]} (assumed)" if icd else ""
     command = ["dpkg-query", "-W", "-f", "${db:Status-Status} ${Version}", package]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    status, _, version = done.stdout.partition(" ")
-    return version if done.returncode == 0 and status == "installed" else ""
+    status, _, version = output_of(command).partition(" ")
+    return version if status == "installed" else ""
 
 
 def _library(name: str) -> bool:
-    import ctypes
-
     try:
         ctypes.CDLL(name)
     except OSError:
@@ -231,42 +225,21 @@ def _library(name: str) -> bool:
     return True
 
 
-def _stanzas(text: str) -> list[dict[str, str]]:
-    stanzas: list[dict[str, str]] = [{}]
-    last = ""
-    for line in text.splitlines():
-        if line.startswith("#"):
-            continue
-        if not line.strip():
-            stanzas.append({})
-        elif line[0] in " \t":
-            stanzas[-1][last] = f"{stanzas[-1].get(last, '')}\n{line.strip()}"
-        else:
-            last, _, value = line.partition(":")
-            last = last.strip().lower()
-            stanzas[-1][last] = value.strip()
-    return [stanza for stanza in stanzas if stanza]
-
-
-def _parse_stanza(stanza: dict[str, str]) -> AptSource | None:
-    if "deb" not in stanza.get("types", "").split() or stanza.get("enabled", "yes").lower() in {"no", "false", "0"}:
-        return None
-    uris = stanza.get("uris", "").split()
-    if not uris:
+def _parse_stanza(text: str) -> AptSource | None:
+    """One entry of deb822, whose fields are written as those of a mail."""
+    fields = message_from_string(text)
+    enabled = fields.get("enabled", "yes").strip().lower() not in {"no", "false", "0"}
+    uris = fields.get("uris", "").split()
+    if not uris or not enabled or "deb" not in fields.get("types", "").split():
         return None
     # A key written out in the entry spans lines; only a file name can be repeated in another entry.
-    key = stanza.get("signed-by", "")
-    return AptSource(
-        uri=uris[0], suites=tuple(stanza.get("suites", "").split()),
-        components=tuple(stanza.get("components", "").split()), signed_by="" if "\n" in key else key,
-    )
+    key = fields.get("signed-by", "")
+    return AptSource(uris[0], tuple(fields.get("suites", "").split()), "" if "\n" in key else key.strip())
 
 
 def _parse_line(line: str) -> AptSource:
-    match = re.match(r"\s*deb\s+(?:\[([^\]]*)\]\s+)?(\S+)\s+(\S+)\s*([^#]*)", line)
+    match = re.match(r"\s*deb\s+(?:\[([^\]]*)\]\s+)?(\S+)\s+(\S+)", line)
     if match is None:
         raise SetupError(f"cannot read the package source {line!r}; see `man sources.list`")
     options = dict(option.partition("=")[::2] for option in (match[1] or "").split())
-    return AptSource(
-        uri=match[2], suites=(match[3],), components=tuple(match[4].split()), signed_by=options.get("signed-by", "")
-    )
+    return AptSource(match[2], (match[3],), options.get("signed-by", ""))

@@ -267,31 +267,24 @@ class LearnerNode(TrainingNode):
         joiner = self._collecting
         if self._spec is None or joiner is None:
             return
-        try:
-            images = convert.images_of(message, self._spec)
-        except WireError as error:
-            self.diagnostics.count("refused_images", text=str(error))
-            return
-        joiner.put_image(convert.time_ns(message.header.stamp), images)
+        images = self.read_message("image", convert.images_of, message, self._spec)
+        if images is not None:
+            joiner.put_image(convert.time_ns(message.header.stamp), images)
 
     def _on_transition(self, message: TransitionBatch) -> None:
         joiner = self._collecting
         if self._spec is None or joiner is None:
             return
-        try:
-            joiner.put_transition(convert.transition_of(message, self._spec))
-        except WireError as error:
-            self.diagnostics.count("refused_transitions", text=str(error))
+        transition = self.read_message("transition", convert.transition_of, message, self._spec)
+        if transition is not None:
+            joiner.put_transition(transition)
 
     def _on_reward(self, message: RewardBatch) -> None:
         joiner = self._collecting
-        if joiner is None:
-            return
-        try:
-            joiner.put_rewards(convert.rewards_of(message))
+        rewards = None if joiner is None else self.read_message("reward", convert.rewards_of, message)
+        if joiner is not None and rewards is not None:
+            joiner.put_rewards(rewards)
             self._reward_name = message.reward_name
-        except WireError as error:
-            self.diagnostics.count("refused_rewards", text=str(error))
 
     def _on_save(self, request: SaveCheckpoint.Request, response: SaveCheckpoint.Response) -> SaveCheckpoint.Response:
         try:

@@ -79,16 +79,16 @@ class PolicyNode(ManagedNode):
         self._spec: EnvironmentSpec | None = None
         self._announced: PolicyVersion | None = None
         self._last_reply: Reply | None = None
-        self._first_messages = StartBarrier(self, self.links.book)
+        self._start_barrier = StartBarrier(self, self.links.book)
         timeout_s = float(self.param("step_timeout_s"))
         self._environment: EnvironmentClient = (
             RosEnvironmentClient(self, timeout_s=timeout_s) if self._local_environment is None
             else LocalEnvironmentClient(self._local_environment, timeout_s)
         )
-        self._pilot: AsynchronousPolicy | None = None
+        self._asynchronous: AsynchronousPolicy | None = None
         if self.param("mode") == "asynchronous":
-            self._pilot = AsynchronousPolicy(self, self._holder, self._publish_actions)
-        self._actions = self.publish_on("action", LIVE_ACTION if self._pilot else None)
+            self._asynchronous = AsynchronousPolicy(self, self._holder, self._publish_actions)
+        self._actions = self.publish_on("action", LIVE_ACTION if self._asynchronous else None)
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("policy/version", self._on_version, while_inactive=True)
         self.serve(InferAction, "policy/infer", self._on_infer)
@@ -96,21 +96,21 @@ class PolicyNode(ManagedNode):
         self._rollouts = WorkerAction(self, Rollout, "rollout", self._rollout)
 
     def activate(self) -> None:
-        if self._pilot is not None:
-            self._pilot.start()
+        if self._asynchronous is not None:
+            self._asynchronous.start()
 
     def deactivate(self, reason: str) -> None:
         self._rollouts.stop(reason)
-        if self._pilot is not None:
-            self._pilot.stop()
+        if self._asynchronous is not None:
+            self._asynchronous.stop()
             self._actions.publish(ActionBatch(mode=ActionBatch.MODE_HOLD))
             self._actions.publisher.wait_for_all_acked(HOLD_ARRIVES)  # a publisher that is gone delivers nothing
 
     def update_diagnostics(self) -> None:
         if hasattr(self, "_holder"):
             self.diagnostics.gauge("policy_version", self._holder.version)
-            if self._pilot is not None:
-                self.diagnostics.gauge("skipped_observations", self._pilot.skipped)
+            if self._asynchronous is not None:
+                self.diagnostics.gauge("skipped_observations", self._asynchronous.skipped)
 
     # The rollout, in a worker thread.
 
@@ -131,14 +131,14 @@ class PolicyNode(ManagedNode):
 
     def _act(self, work: Work, result: Rollout.Result) -> None:
         goal: Rollout.Goal = work.request
-        if self._pilot is not None:
+        if self._asynchronous is not None:
             raise ValueError("in mode asynchronous the policy acts on what it sees; start it with mode:=lockstep")
         if goal.steps < 1:
             raise ValueError(f"steps must be at least 1, got {goal.steps}")
         spec = self._environment.handshake(float(self.param("handshake_timeout_s")), work.check)
         self._check_spec(spec)
         self._await_version(goal.policy_version, work)
-        self._first_messages.wait(work)
+        self._start_barrier.wait(work)
         version = self._holder.version
         reply = self._first_observation(goal, spec, version, work)
         result.policy_version, result.env_session = version, reply.session
@@ -238,8 +238,8 @@ class PolicyNode(ManagedNode):
     def _on_spec(self, message: EnvSpec) -> None:
         try:
             self._spec = convert.spec_from_msg(message)
-            if self._pilot is not None:
-                self._pilot.spec = self._spec
+            if self._asynchronous is not None:
+                self._asynchronous.spec = self._spec
         except WireError as error:
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
 

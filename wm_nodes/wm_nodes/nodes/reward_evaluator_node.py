@@ -123,20 +123,16 @@ class RewardEvaluatorNode(ManagedNode):
     def _on_image(self, message: Image) -> None:
         if self._spec is None:
             return
-        try:
-            self._images.put(convert.time_ns(message.header.stamp), convert.images_of(message, self._spec))
-        except WireError as error:
-            self._count_refused("image", error)
-            return
-        self._judge_waiting()
+        images = self.read_message("image", convert.images_of, message, self._spec)
+        if images is not None:
+            self._images.put(convert.time_ns(message.header.stamp), images)
+            self._judge_waiting()
 
     def _on_goal(self, message: TaskGoal) -> None:
         if self._spec is None:
             return
-        try:
-            goals = convert.goals_of(message, self._spec)
-        except WireError as error:
-            self._count_refused("goal", error)
+        goals = self.read_message("goal", convert.goals_of, message, self._spec)
+        if goals is None:
             return
         self._enter_session(message.session)
         for i, episode_id in enumerate(goals.episode_ids):
@@ -149,10 +145,8 @@ class RewardEvaluatorNode(ManagedNode):
         if self._spec is None:
             self.diagnostics.count("before_spec", text="a transition came before env/spec; it gets no reward")
             return
-        try:
-            transition = convert.transition_of(message, self._spec)
-        except WireError as error:
-            self._count_refused("transition", error)
+        transition = self.read_message("transition", convert.transition_of, message, self._spec)
+        if transition is None:
             return
         self._enter_session(message.session)
         if not transition.is_reset and transition.valid.any():
@@ -266,10 +260,6 @@ class RewardEvaluatorNode(ManagedNode):
             message.header = convert.header(self._window.last_stamp_ns)
             self._summaries.publish(message)
 
-    def _count_refused(self, what: str, error: WireError) -> None:
-        self.get_logger().error(f"{what} refused: {error}", throttle_duration_sec=1.0)
-        self.diagnostics.count(f"refused_{what}s", text=f"{what} refused: {error}")
-
     # Service.
 
     def _on_evaluate(
@@ -285,7 +275,7 @@ class RewardEvaluatorNode(ManagedNode):
             next_images = convert.images_of(request.next_observation, self._spec)
             goals = convert.images_of(request.goal, self._spec) if len(request.goal.data) else None
         except WireError as error:
-            self._count_refused("evaluation", error)
+            self.count_refused("evaluation", error)
             return convert.fill_error(response, error)
         began = time.perf_counter()
         result = self._judge(transition, images, next_images, goals, None)

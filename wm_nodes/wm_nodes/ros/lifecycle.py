@@ -7,7 +7,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
@@ -31,6 +31,9 @@ from wm_nodes.ros.params import COMMON, Param, declare, refusal
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.sequence_numbers import GapTracker, new_session
+from wm_nodes.ros.wire import WireError
+
+T = TypeVar("T")
 
 REFUSALS = (ConfigError, ValueError, OSError, KeyError, ImportError)
 """What a bad setting raises: reported as one line, the node stays where it was. Anything else is a bug: with trace."""
@@ -129,6 +132,19 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         if not result.successful:
             self.diagnostics.count("refused_parameters", text=f"parameter refused: {result.reason}")
         return result
+
+    def read_message(self, what: str, read: Callable[..., T], *arguments: Any) -> T | None:
+        """Return read(*arguments), or None for a message that does not fit (WireError), which is counted."""
+        try:
+            return read(*arguments)
+        except WireError as error:
+            self.count_refused(what, error)
+            return None
+
+    def count_refused(self, what: str, error: WireError) -> None:
+        """Log a refused message or request and count it in diagnostics."""
+        self.get_logger().error(f"{what} refused: {error}", throttle_duration_sec=1.0)
+        self.diagnostics.count(f"refused_{what}s", text=f"{what} refused: {error}")
 
     def say_failed_goal(self, text: str) -> None:
         """In the log, and counted in diagnostics."""

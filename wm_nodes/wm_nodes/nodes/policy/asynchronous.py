@@ -19,7 +19,6 @@ from wm_nodes.nodes.policy.weights import PolicyHolder
 from wm_nodes.policy_rl.image_policy import PolicyOutput
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.wire import WireError
 
 CAPACITY = 8
 
@@ -54,21 +53,21 @@ class AsynchronousPolicy:
         self._states: dict[int, tuple[int, FloatArray]] = {}
         self._next: SyncedObservation | None = None
         self._thread: threading.Thread | None = None
-        self._flying = False
+        self._running = False
         self.skipped = 0
         """Observations that a newer one replaced before they were acted upon."""
         node.listen("env/image", self._on_image)
         node.listen("env/transition", self._on_transition)
 
     def start(self) -> None:
-        self._flying = True
-        self._thread = threading.Thread(target=self._fly, name="pilot")
+        self._running = True
+        self._thread = threading.Thread(target=self._run, name="asynchronous policy")
         self._thread.start()
 
     def stop(self) -> None:
         """End the thread; what was seen is forgotten."""
         with self._changed:
-            self._flying, self._next = False, None
+            self._running, self._next = False, None
             self._changed.notify_all()
         if self._thread is not None:
             self._thread.join(5.0)
@@ -79,10 +78,8 @@ class AsynchronousPolicy:
     def _on_image(self, message: Image) -> None:
         if self.spec is None:
             return
-        try:
-            images = convert.images_of(message, self.spec)
-        except WireError as error:
-            self._node.diagnostics.count("refused_images", text=str(error))
+        images = self._node.read_message("image", convert.images_of, message, self.spec)
+        if images is None:
             return
         stamp_ns = convert.time_ns(message.header.stamp)
         with self._changed:
@@ -92,10 +89,9 @@ class AsynchronousPolicy:
     def _on_transition(self, message: TransitionBatch) -> None:
         if self.spec is None:
             return
-        try:
-            states = convert.floats(message.next_state, (self.spec.num_envs, self.spec.state_dim), "next_state")
-        except WireError as error:
-            self._node.diagnostics.count("refused_transitions", text=str(error))
+        shape = (self.spec.num_envs, self.spec.state_dim)
+        states = self._node.read_message("transition", convert.floats, message.next_state, shape, "next_state")
+        if states is None:
             return
         stamp_ns = convert.time_ns(message.next_stamp)
         with self._changed:
@@ -112,29 +108,29 @@ class AsynchronousPolicy:
         self._next = SyncedObservation(stamp_ns, states[0], images, states[1])
         self._changed.notify_all()
 
-    def _fly(self) -> None:
+    def _run(self) -> None:
         while True:
             with self._changed:
-                while self._flying and self._next is None:
+                while self._running and self._next is None:
                     self._changed.wait()
-                if not self._flying:
+                if not self._running:
                     return
-                sight, self._next = self._next, None
-            assert sight is not None
+                observation, self._next = self._next, None
+            assert observation is not None
             try:
-                self._act(sight)
+                self._act(observation)
             except Exception as error:
                 text = f"cannot act on an observation: {type(error).__name__}: {error}"
                 self._node.get_logger().error(text, throttle_duration_sec=1.0)
                 self._node.diagnostics.count("failed_flights", level=diagnostics.ERROR, text=text)
 
-    def _act(self, sight: SyncedObservation) -> None:
+    def _act(self, observation: SyncedObservation) -> None:
         noise = None
         if not self._node.param("deterministic"):
-            shape = (len(sight.states), self._holder.action_dim)
+            shape = (len(observation.states), self._holder.action_dim)
             noise = np.random.default_rng().standard_normal(shape, np.float32)
         began = time.perf_counter()
-        output, version = self._holder.act(sight.images, sight.states, noise)
+        output, version = self._holder.act(observation.images, observation.states, noise)
         infer_s = time.perf_counter() - began
         self._node.diagnostics.latency("infer", infer_s)
-        self._publish(sight.stamp_ns, sight.step_id, output, version, infer_s)
+        self._publish(observation.stamp_ns, observation.step_id, output, version, infer_s)
