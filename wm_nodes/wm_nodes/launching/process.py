@@ -96,7 +96,7 @@ class NodeProcess:
         return "".join(list(self._lines))
 
     def exit_summary(self) -> str:
-        """One line for people: who ended, how, its last words, where the rest is."""
+        """One line for people: who ended, how, its last output, where the rest is."""
         self.close()
         code = self.wait(0.0)
         how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"

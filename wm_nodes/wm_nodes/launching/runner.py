@@ -105,7 +105,7 @@ class Runner:
 
         Raises:
             NodeDiedError: a required node ended meanwhile.
-            NotReadyError: after timeout_s; names the nodes, their states and their last words.
+            NotReadyError: after timeout_s; names the nodes, their states and their last output.
         """
         try:
             wait_ready(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
@@ -117,7 +117,7 @@ class Runner:
 
         Raises:
             NodeDiedError: a required node ended meanwhile.
-            NotReadyError: a node refused, or did not answer within timeout_s; with the nodes' last words.
+            NotReadyError: a node refused, or did not answer within timeout_s; with the nodes' last output.
         """
         try:
             activate(self.graph.nodes, domain=self.domain, timeout_s=timeout_s, check=self.check)
@@ -126,11 +126,11 @@ class Runner:
 
     def _add_last_output(self, error: NotReadyError) -> NotReadyError:
         time.sleep(LAST_OUTPUT_S)
-        words = [
+        outputs = [
             process.last_output_line() for process in self._processes.values()
             if {node.full_name for node in process.spec.carried()} & {*error.nodes}
         ]
-        return NotReadyError(f"{error}: {'; '.join(words)}", error.nodes)
+        return NotReadyError(f"{error}: {'; '.join(outputs)}", error.nodes)
 
     def check(self) -> None:
         """Raise NodeDiedError if a required node has ended without having been told to."""

@@ -90,7 +90,7 @@ class ClipEvaluatorNode(ManagedNode):
             frames = self._generator.folder.codec.decode(buffer.rollout.latents)
             verdicts: list[Verdict] = []
             if self._agent is not None:
-                verdicts, result.verdicts = self._judged(self._agent, work, buffer, frames)
+                verdicts, result.verdicts = self._judge_clips(self._agent, work, buffer, frames)
             result.scores = self._score(buffer, frames, verdicts, goal.sha256)
             work.check()
             result.scores.eval_s = time.perf_counter() - began
@@ -101,7 +101,7 @@ class ClipEvaluatorNode(ManagedNode):
             self.say_failed_goal(f"{goal.buffer_uri} not judged: {error}")
         return result
 
-    def _judged(
+    def _judge_clips(
         self, agent: JudgeServices, work: Work, buffer: RolloutBuffer, frames: torch.Tensor
     ) -> tuple[list[Verdict], list[ClipVerdict]]:
         """The verdict of every clip, published as it is given; all by one judge and rubric."""
@@ -111,43 +111,43 @@ class ClipEvaluatorNode(ManagedNode):
             frames, references, goal.sha256, given=self._config.model.num_conditioning, fps=self._fps,
             task=self._config.task, robot=self._config.judge.robot,
         )
-        verdicts, told = agent.judge_round(
+        verdicts, messages = agent.judge_round(
             work, jobs, EvaluateClips.Feedback(stages_passed=[0] * len(GATED)), of=len(jobs), sha256=goal.sha256,
             deadline=deadline_of(goal.deadline_s), iteration=buffer.iteration,
         )
         check_one_judge(verdicts, buffer.group_ids.tolist())
-        return verdicts, told
+        return verdicts, messages
 
     def _score(
         self, buffer: RolloutBuffer, frames: torch.Tensor, verdicts: Sequence[Verdict], sha256: str
     ) -> ClipScores:
         request = self._generator.request(buffer.iteration, buffer.policy_version)
-        found = score_clips(
+        scores = score_clips(
             frames, self._generator.references(request), self._probe, buffer.condition.num_conditioning
         ).named()
         if self._agent is not None:
-            found |= agent_scores(verdicts)
-        total = mixed(found, self._config.rewards)
+            scores |= agent_scores(verdicts)
+        total = mixed(scores, self._config.rewards)
         valid = torch.isfinite(total)
         message = ClipScores(
-            iteration=buffer.iteration, buffer_sha256=sha256, num_clips=len(buffer), names=list(found),
+            iteration=buffer.iteration, buffer_sha256=sha256, num_clips=len(buffer), names=list(scores),
             reward_name=REWARD_NAME if self._agent is None else AGENT,
             invalid_reason="" if bool(valid.all()) else _why_invalid(verdicts),
             pause_reason="" if self._agent is None else self._agent.pause(verdicts),
         )
         message.header = convert.header(self.get_clock().now().nanoseconds, "")
         message.total = convert.to_field(np.where(valid.numpy(), total.numpy(), np.nan))
-        message.values = convert.to_field(torch.stack(list(found.values())).double().numpy())
-        message.weights = convert.to_field(np.array([self._config.rewards.get(name, 0.0) for name in found]))
+        message.values = convert.to_field(torch.stack(list(scores.values())).double().numpy())
+        message.weights = convert.to_field(np.array([self._config.rewards.get(name, 0.0) for name in scores]))
         message.valid = convert.to_field(valid.numpy())
         return message
 
 
 def _why_invalid(verdicts: Sequence[Verdict]) -> str:
-    unsaid = [verdict for verdict in verdicts if not verdict.valid]
-    if not unsaid:
+    invalid = [verdict for verdict in verdicts if not verdict.valid]
+    if not invalid:
         return "a score is not finite"
-    return f"{len(unsaid)} clips without a verdict; {unsaid[0].clip_id}: {unsaid[0].status} {unsaid[0].reason}"
+    return f"{len(invalid)} clips without a verdict; {invalid[0].clip_id}: {invalid[0].status} {invalid[0].reason}"
 
 
 def read_buffer(path: Path, sha256: str) -> RolloutBuffer:
@@ -163,9 +163,9 @@ def read_buffer(path: Path, sha256: str) -> RolloutBuffer:
         data = path.read_bytes()
     except OSError as error:
         raise RolloutBufferError(f"cannot read {path}: {error.strerror}; sample again, or raise keep_buffers") from None
-    found = hashlib.sha256(data).hexdigest()
-    if sha256 and found != sha256:
-        raise RolloutBufferError(f"{path} is not the announced buffer (sha256 {found[:12]}, not {sha256[:12]})")
+    digest = hashlib.sha256(data).hexdigest()
+    if sha256 and digest != sha256:
+        raise RolloutBufferError(f"{path} is not the announced buffer (sha256 {digest[:12]}, not {sha256[:12]})")
     return RolloutBuffer.from_bytes(data)
 
 

@@ -94,8 +94,8 @@ class EnvironmentNode(ManagedNode):
         self._transitions = self.publish_on("env/transition")
         self._episodes = self.publish_on("episode")
         self._goals = self.publish_on("env/goal")
-        self._ledger = ProducerCredits("env/transition", self.session)
-        self.listen("flow/credit", self._ledger.note)
+        self._credits = ProducerCredits("env/transition", self.session)
+        self.listen("flow/credit", self._credits.note)
         self.listen("safety/estop", self._on_estop)
         self.serve(StepBatch, "env/step", self._on_step)
         self.serve(ResetBatch, "env/reset", self._on_reset)
@@ -132,12 +132,12 @@ class EnvironmentNode(ManagedNode):
 
     def on_peer_lost(self, name: str) -> None:
         if self.served is not None:
-            self._ledger.remove(name)
+            self._credits.remove(name)
 
     def update_diagnostics(self) -> None:
         if self.served is not None:
             self.diagnostics.gauge("step_id", self.served.next_step_id - 1)
-            self.diagnostics.gauge("credit_consumers", ", ".join(self._ledger.consumers) or "none")
+            self.diagnostics.gauge("credit_consumers", ", ".join(self._credits.consumers) or "none")
 
     # Sink of the lock-step environment.
 
@@ -258,10 +258,10 @@ class EnvironmentNode(ManagedNode):
         if not self.active:
             raise self._not_active()
         next_seq = self._transitions.next_seq
-        blocking = self._ledger.blocking_consumers(next_seq)
+        blocking = self._credits.blocking_consumers(next_seq)
         if not blocking:
             return
-        for name in self._ledger.drop_silent(next_seq):
+        for name in self._credits.drop_silent(next_seq):
             self.diagnostics.count("dropped_consumers", text=f"{name} gave no credit for 5 s; not waited for")
             blocking.remove(name)
         if blocking:

@@ -69,11 +69,11 @@ class EvaluationNode(ManagedNode):
             def report(done: int, successes: int) -> None:
                 work.feedback(Evaluate.Feedback(episodes_done=done, success_rate=successes / max(done, 1)))
 
-            found = evaluate(
+            evaluation = evaluate(
                 self._holder.policy, environment, int(goal.episodes), int(goal.seed), goal.deterministic,
                 on_progress=report,
             )
-            self._fill(result, found, self._config.reward.sparse_weight)
+            self._fill(result, evaluation, self._config.reward.sparse_weight)
         except PeerLost as error:
             result.termination_reason, result.message = Evaluate.Result.PEER_LOST, f"the environment is lost: {error}"
         except (WireError, ValueError) as error:
@@ -99,13 +99,14 @@ class EvaluationNode(ManagedNode):
         return self._holder.version
 
     @staticmethod
-    def _fill(result: Evaluate.Result, found: EvaluationResult, sparse_weight: float) -> None:
+    def _fill(result: Evaluate.Result, evaluation: EvaluationResult, sparse_weight: float) -> None:
         """mean_return: of the rule reward, which pays sparse_weight once, at the success that ends an episode."""
-        result.episodes, result.successes = found.episodes, found.successes
-        result.success_rate, result.success_low, result.success_high = found.success_rate, found.low, found.high
-        result.mean_return, result.mean_length = sparse_weight * found.success_rate, found.mean_length
-        result.success = convert.to_field(found.success)
-        result.length = convert.to_field(found.length)
+        result.episodes, result.successes = evaluation.episodes, evaluation.successes
+        result.success_rate, result.mean_length = evaluation.success_rate, evaluation.mean_length
+        result.success_low, result.success_high = evaluation.low, evaluation.high
+        result.mean_return = sparse_weight * evaluation.success_rate
+        result.success = convert.to_field(evaluation.success)
+        result.length = convert.to_field(evaluation.length)
 
 
 def main() -> int:

@@ -95,13 +95,13 @@ def expected_spec(config: RunConfig, model_dir: str, policy_factory: str) -> Env
     return simulation_spec(config.task, config.simulation, 1)
 
 
-def refuse_other(found: EnvironmentSpec, expected: EnvironmentSpec, whose: str) -> None:
+def refuse_other(served: EnvironmentSpec, expected: EnvironmentSpec, whose: str) -> None:
     """Raise WireError(SPEC_MISMATCH) unless both agree on cameras, sizes, actions and state."""
-    wrong = differences(found, expected)
+    wrong = differences(served, expected)
     if wrong:
         text = "; ".join(f"{name} {is_!r}, {whose} {should!r}" for name, is_, should in wrong)
         raise WireError(
-            ErrorCode.SPEC_MISMATCH, f"environment {found.env_id} has {text}; start both with the same config_file"
+            ErrorCode.SPEC_MISMATCH, f"environment {served.env_id} has {text}; start both with the same config_file"
         )
 
 

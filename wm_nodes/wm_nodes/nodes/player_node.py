@@ -66,7 +66,7 @@ class PlayerNode(ManagedNode):
 
     def configure(self) -> None:
         self._clock_publisher = self.publish_unnumbered("/clock")
-        self._ledgers: dict[int, ProducerCredits] = {}
+        self._credits: dict[int, ProducerCredits] = {}
         self.listen("flow/credit", self._on_credit)
         for name, act in (("pause", Playback.pause), ("resume", Playback.resume)):
             self.serve(Trigger, f"player/{name}", partial(self._on_trigger, act))
@@ -171,7 +171,7 @@ class PlayerNode(ManagedNode):
         """Wait until the outlets' subscribers have found them; a paused player lets the user wait instead."""
         began = time.monotonic()
         while not playback.paused and (waited_s := time.monotonic() - began) < LINKS_S:
-            if waited_s > MATCH_S and not self.links.book.missing():
+            if waited_s > MATCH_S and not self.links.table.missing():
                 return
             check()
             time.sleep(0.02)
@@ -201,17 +201,17 @@ class PlayerNode(ManagedNode):
     def _wait_for_credit(self, playback: Playback, data: bytes, check: Callable[[], None]) -> None:
         """Hold a transition back until every consumer has granted it, as the environment does."""
         session, seq = session_and_seq(data)
-        ledger = self._ledgers.setdefault(session, ProducerCredits(CREDITED, session))
-        while ledger.blocking_consumers(seq):
-            for name in ledger.drop_silent(seq):
+        credits = self._credits.setdefault(session, ProducerCredits(CREDITED, session))
+        while credits.blocking_consumers(seq):
+            for name in credits.drop_silent(seq):
                 self.diagnostics.count("silent_consumers", text=f"{name} granted nothing for 5 s and is not waited for")
             check()
             time.sleep(0.002)
 
     def _on_credit(self, message: Credit) -> None:
-        ledger = self._ledgers.get(message.stream_session)
-        if ledger is not None:
-            ledger.note(message)
+        credits = self._credits.get(message.stream_session)
+        if credits is not None:
+            credits.note(message)
 
     # Services.
 

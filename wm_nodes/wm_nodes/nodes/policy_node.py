@@ -79,7 +79,7 @@ class PolicyNode(ManagedNode):
         self._spec: EnvironmentSpec | None = None
         self._announced: PolicyVersion | None = None
         self._last_reply: Reply | None = None
-        self._start_barrier = StartBarrier(self, self.links.book)
+        self._start_barrier = StartBarrier(self, self.links.table)
         timeout_s = float(self.param("step_timeout_s"))
         self._environment: EnvironmentClient = (
             RosEnvironmentClient(self, timeout_s=timeout_s) if self._local_environment is None
@@ -191,11 +191,11 @@ class PolicyNode(ManagedNode):
         return self._environment.reset(ResetCommand(seeds=seeds, behaviour=goal.behaviour), work.check)
 
     def _check_spec(self, spec: EnvironmentSpec) -> None:
-        found, expected = (spec.state_dim, spec.action_dim), (self._holder.state_dim, self._holder.action_dim)
-        if found != expected:
+        dims, expected = (spec.state_dim, spec.action_dim), (self._holder.state_dim, self._holder.action_dim)
+        if dims != expected:
             raise WireError(
                 ErrorCode.SPEC_MISMATCH,
-                f"environment {spec.env_id} has {found} state and action values, the policy {expected}; "
+                f"environment {spec.env_id} has {dims} state and action values, the policy {expected}; "
                 "start both with the same config_file",
             )
         if self._expected_spec is not None:

@@ -63,13 +63,13 @@ class RecorderNode(ManagedNode):
         self._names: dict[str, str] = {}
         self._latched = {}
         for name, row in self._rows.items():
-            grantor = None
+            credits = None
             if row.qos.history == HistoryPolicy.KEEP_ALL:
                 base = _base(name)
-                grantor = ConsumerCredits(self, base, below=name.removesuffix(base))
-                self.own(grantor.close)
+                credits = ConsumerCredits(self, base, below=name.removesuffix(base))
+                self.own(credits.close)
             subscription = self.create_subscription(
-                row.type, name, partial(self._on_message, name, grantor), _lossless(row.qos), raw=True
+                row.type, name, partial(self._on_message, name, credits), _lossless(row.qos), raw=True
             )
             self._names[name] = subscription.topic_name
             self.own(self.destroy_subscription, subscription)
@@ -102,7 +102,7 @@ class RecorderNode(ManagedNode):
 
     # Recording.
 
-    def _on_message(self, name: str, grantor: ConsumerCredits | None, data: bytes) -> None:
+    def _on_message(self, name: str, credits: ConsumerCredits | None, data: bytes) -> None:
         self._last_message_s = time.monotonic()
         tracker = self._gaps.get(name)
         if tracker is not None:
@@ -113,8 +113,8 @@ class RecorderNode(ManagedNode):
             self._latched[name] = data
         if not self._paused:
             self._write(name, data)
-        if grantor is not None and tracker is not None:
-            grantor.record_consumed(tracker)
+        if credits is not None and tracker is not None:
+            credits.record_consumed(tracker)
 
     def _write(self, name: str, data: bytes) -> None:
         if self._bag is None:

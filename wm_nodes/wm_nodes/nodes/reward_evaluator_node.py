@@ -216,12 +216,12 @@ class RewardEvaluatorNode(ManagedNode):
         return not self._goals_expected or all(int(episode_id) in self._goals for episode_id in judged)
 
     def _goals_of(self, transition: Transition, images: UInt8Array) -> tuple[UInt8Array | None, BoolArray | None]:
-        found = [self._goals.get(int(episode_id)) for episode_id in transition.episode_ids]
-        if all(goal is None or goal[0] is None for goal in found):
+        episode_goals = [self._goals.get(int(episode_id)) for episode_id in transition.episode_ids]
+        if all(goal is None or goal[0] is None for goal in episode_goals):
             return None, None
         goals = np.zeros_like(images)
         there = np.zeros(len(images), bool)
-        for i, goal in enumerate(found):
+        for i, goal in enumerate(episode_goals):
             if goal is not None and goal[0] is not None:
                 goals[i], there[i] = goal
         return goals, there

@@ -62,7 +62,7 @@ class VideoLearnerNode(TrainingNode):
         self._video = make_run(values, self.run_dir, self.ranks)
         self.own(self._video.close)
         self._watched = self._video.hacked
-        self._first_messages = StartBarrier(self, self.links.book)
+        self._start_barrier = StartBarrier(self, self.links.table)
         self._generate = ActionClient(self, GenerateClips, "video/generate")
         self._evaluate = ActionClient(self, EvaluateClips, "clips/evaluate")
         self.own(self._generate.destroy)
@@ -86,9 +86,12 @@ class VideoLearnerNode(TrainingNode):
         count = len(goal.from_buffers) or int(goal.iterations)
         if not count:
             raise ValueError("iterations is 0 and from_buffers is empty; ask for at least 1")
-        if not goal.from_buffers:
-            self._first_messages.wait(work)
-        with closing(self._read(goal.from_buffers) if goal.from_buffers else self._fresh(work, count)) as buffers:
+        if goal.from_buffers:
+            source = self._read_buffers(goal.from_buffers)
+        else:
+            self._start_barrier.wait(work)
+            source = self._sample_buffers(work, count)
+        with closing(source) as buffers:
             for done, buffer in enumerate(buffers, 1):
                 invalid = len(buffer) - int(buffer.valid.sum())
                 if invalid:
@@ -97,14 +100,14 @@ class VideoLearnerNode(TrainingNode):
                 if report.skipped:
                     self.diagnostics.count("skipped_buffers", text="no group of a buffer has rewards that differ")
                 self.announce()
-                self._tell(work, report, done, count)
-                self._warn()
+                self._send_feedback(work, report, done, count)
+                self._warn_of_hacking()
 
-    def _read(self, uris: Sequence[str]) -> Generator[RolloutBuffer]:
+    def _read_buffers(self, uris: Sequence[str]) -> Generator[RolloutBuffer]:
         for uri in uris:
             yield read_buffer(self.run_dir / uri, "")
 
-    def _fresh(self, work: Work, count: int) -> Generator[RolloutBuffer]:
+    def _sample_buffers(self, work: Work, count: int) -> Generator[RolloutBuffer]:
         """`count` buffers of fresh clips with their rewards, each to be trained on before the next one is taken.
 
         Where the settings allow the staleness, the next one is being made meanwhile; there is never more than one under
@@ -121,14 +124,14 @@ class VideoLearnerNode(TrainingNode):
         with ThreadPoolExecutor(1, "prefetch") as thread:
             try:
                 for left in reversed(range(count)):
-                    buffer = ahead.result() if ahead else self._sampled(run.iterations, run.sampling_version, check)
+                    buffer = ahead.result() if ahead else self._sample(run.iterations, run.sampling_version, check)
                     if left and run.prefetches:
-                        ahead = thread.submit(self._sampled, run.iterations + 1, run.version, check)
+                        ahead = thread.submit(self._sample, run.iterations + 1, run.version, check)
                     yield buffer
             finally:
                 closed.set()
 
-    def _sampled(self, iteration: int, version: int, check: Callable[[], None]) -> RolloutBuffer:
+    def _sample(self, iteration: int, version: int, check: Callable[[], None]) -> RolloutBuffer:
         """The buffer of an iteration, sampled by a version, with its rewards."""
         goal = GenerateClips.Goal(iteration=iteration, policy_version=version)
         clips = self._ask(self._generate, goal, check, "/video_model")
@@ -155,7 +158,7 @@ class VideoLearnerNode(TrainingNode):
             raise ValueError(f"{name}: {result.message or f'ended with reason {result.termination_reason}'}")
         return result
 
-    def _tell(self, work: Work, report: BufferReport, done: int, count: int) -> None:
+    def _send_feedback(self, work: Work, report: BufferReport, done: int, count: int) -> None:
         work.feedback(
             TrainVideo.Feedback(
                 iteration=done, policy_version=self._video.version, reward_mean=report.reward_mean,
@@ -164,7 +167,7 @@ class VideoLearnerNode(TrainingNode):
             )
         )
 
-    def _warn(self) -> None:
+    def _warn_of_hacking(self) -> None:
         """Say what a new held-out evaluation says of reward hacking."""
         if self._video.hacked is self._watched:
             return

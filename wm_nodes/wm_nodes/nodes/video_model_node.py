@@ -129,8 +129,8 @@ class VideoModelNode(ManagedNode):
 
     def _forget_old(self) -> None:
         written = (self.run_dir / "buffers").glob("buffer_*.safetensors")
-        kept = sorted(written, key=lambda path: path.stat().st_mtime_ns)
-        for path in kept[: -int(self.param("keep_buffers"))]:
+        newest_last = sorted(written, key=lambda path: path.stat().st_mtime_ns)
+        for path in newest_last[: -int(self.param("keep_buffers"))]:
             path.unlink(missing_ok=True)
 
 

@@ -135,7 +135,7 @@ class Links:
 
     def __init__(self, node: Node, session: int, is_active: Callable[[], bool]) -> None:
         self._node, self._is_active = node, is_active
-        self.book = EndpointTable(node.get_fully_qualified_name(), session)
+        self.table = EndpointTable(node.get_fully_qualified_name(), session)
         self._publisher = StampedPublisher(node, "run/links", session)
         row = topic("run/links")
         self._subscription = node.create_subscription(row.type, row.name, self._on_links, row.reader_qos)
@@ -143,19 +143,19 @@ class Links:
     def announce(self, *, again: bool = False) -> None:
         """Tell the others when this node has come to see more, or less, of them; again: in any case."""
         node = self._node
-        changed = self.book.refresh(
+        changed = self.table.refresh(
             {publisher.topic_name for publisher in node.publishers},
             {subscription.topic_name for subscription in node.subscriptions}, self._is_active(),
             lambda name: _nodes_of(node.get_subscriptions_info_by_topic(name)),
             lambda name: _nodes_of(node.get_publishers_info_by_topic(name)),
         )
         if changed or again:
-            message = self.book.announcement()
+            message = self.table.announcement()
             message.header.stamp = node.get_clock().now().to_msg()
             self._publisher.publish(message)
 
     def _on_links(self, message: NodeLinks) -> None:
-        self.book.note(message)
+        self.table.note(message)
         self.announce()
 
 
@@ -164,21 +164,21 @@ class StartBarrier:
 
     Args:
         node: has the parameters await_nodes and match_timeout_s.
-        book: what this node knows about the links of all nodes.
+        table: what this node knows about the links of all nodes.
     """
 
-    def __init__(self, node: WorkerNode, book: EndpointTable) -> None:
-        self._node, self._book = node, book
+    def __init__(self, node: WorkerNode, table: EndpointTable) -> None:
+        self._node, self._table = node, table
         self._given_up: set[str] = set()
 
     def wait(self, work: Work) -> None:
         """Return when all active nodes know each other, or, with a warning, after match_timeout_s."""
-        node, book = self._node, self._book
+        node, table = self._node, self._table
         namespace = node.get_namespace().rstrip("/")
         awaited = [f"{namespace}/{name}" for name in node.param("await_nodes") if name]
         deadline = time.monotonic() + float(node.param("match_timeout_s"))
-        self._given_up &= set(book.missing(awaited))
-        while lacking := set(book.missing(awaited)) - self._given_up:
+        self._given_up &= set(table.missing(awaited))
+        while lacking := set(table.missing(awaited)) - self._given_up:
             if time.monotonic() >= deadline:
                 text = f"data flow although {'; '.join(sorted(lacking))}: first messages may be missed"
                 node.get_logger().warning(text)

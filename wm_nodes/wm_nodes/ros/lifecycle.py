@@ -181,7 +181,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         while_inactive: latched topics, whose message must not be missed before activation.
         """
         row = topic(name)
-        grantor = ConsumerCredits(self, name) if credit else None
+        credits = ConsumerCredits(self, name) if credit else None
         tracker = self._trackers.setdefault(name, GapTracker())
 
         def observe(message: Any) -> None:
@@ -189,14 +189,14 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
                 self._note_gap(name, tracker, message)
             if self._active or while_inactive:
                 callback(message)
-            if grantor is not None:
-                grantor.record_consumed(tracker)
+            if credits is not None:
+                credits.record_consumed(tracker)
 
         subscription = self.create_subscription(row.type, row.name, observe, row.reader_qos)
         self.own(self.destroy_subscription, subscription)
-        if grantor is not None:
-            self.own(grantor.close)
-        return grantor
+        if credits is not None:
+            self.own(credits.close)
+        return credits
 
     def serve(self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service until cleanup."""
@@ -315,7 +315,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self._check_name(message)
         elif message.state in (RunState.FINISHED, RunState.FAILED):
             self.peers.left(message.node)
-            self.links.book.forget(message.node)
+            self.links.table.forget(message.node)
             self.diagnostics.clear_condition(f"peer {message.node}")
         elif self.peers.heard(message.node, identity=message.detail):
             self.diagnostics.clear_condition(f"peer {message.node}")
@@ -342,7 +342,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             text = f"{name} is lost: silent for more than {self.peers.timeout_s:g} s; restart it"
             self.get_logger().error(text)
             self.diagnostics.set_condition(f"peer {name}", diagnostics.ERROR, text)
-            self.links.book.forget(name, lost=True)
+            self.links.table.forget(name, lost=True)
             self.on_peer_lost(name)
 
     def _after_set(self, changes: Sequence[Parameter]) -> None:

@@ -1,4 +1,4 @@
-"""The reward agent's face in the graph, the same in both reward evaluators: verdict topic, rubric service, diagnostics,
+"""What the reward agent adds to both reward evaluators: verdict topic, rubric service, diagnostics,
 and an action that judges clips in a folder.
 """
 
@@ -81,11 +81,11 @@ class JudgeServices:
         Raises:
             Cancelled: the goal is to end.
         """
-        told = dict[int, ClipVerdict]()
+        messages = dict[int, ClipVerdict]()
 
         def done(clip: int, verdict: Verdict) -> None:
             message = self.publish(verdict, clip=first + clip, iteration=iteration, buffer_sha256=sha256)
-            told[clip] = message
+            messages[clip] = message
             progress.clips_done += 1
             progress.clips_invalid += not verdict.valid
             passed = zip(progress.stages_passed, message.stage_passed, strict=True)
@@ -100,7 +100,7 @@ class JudgeServices:
                 jobs, check=work.check, done=done, round_number=iteration,
                 within_s=None if deadline is None else max(0.0, deadline - time.monotonic()),
             )
-        return verdicts, [told[clip] for clip in range(len(jobs))]
+        return verdicts, [messages[clip] for clip in range(len(jobs))]
 
     def publish(self, verdict: Verdict, *, clip: int, iteration: int, buffer_sha256: str = "") -> ClipVerdict:
         """Publish a verdict and note it in the diagnostics; return its message. See ClipVerdict for the arguments."""
@@ -194,11 +194,11 @@ class JudgeServices:
             lines, sha256 = read_list(folder), list_sha256(folder, goal.sha256)
             for first in range(0, len(lines), at_once):
                 jobs = [read_job(folder, line) for line in lines[first : first + at_once]]
-                found, told = self.judge_round(
+                judged, round_messages = self.judge_round(
                     work, jobs, progress, of=len(lines), sha256=sha256, deadline=deadline, first=first
                 )
-                verdicts += found
-                messages += told
+                verdicts += judged
+                messages += round_messages
         except (ValueError, OSError) as error:
             result.termination_reason, result.message = JudgeClips.Result.FAILED, str(error)
             self._node.say_failed_goal(f"{goal.folder} not judged: {error}")

@@ -96,12 +96,12 @@ class LiveRollouts:
 
         alive()
         self._joiner.begin()
-        found: RolloutAction.Result = run_goal(self._client, goal, accept_s=5.0, check=self._check, alive=alive)
-        if found.termination_reason == RolloutAction.Result.FAILED:
-            raise WireError(ErrorCode.INTERNAL, f"the policy node failed: {found.message}")
-        if found.termination_reason != RolloutAction.Result.FINISHED:
-            raise PeerLost(found.message or "the rollout was cut short")
-        span = (found.env_session, found.first_step_id, found.last_step_id)
+        result: RolloutAction.Result = run_goal(self._client, goal, accept_s=5.0, check=self._check, alive=alive)
+        if result.termination_reason == RolloutAction.Result.FAILED:
+            raise WireError(ErrorCode.INTERNAL, f"the policy node failed: {result.message}")
+        if result.termination_reason != RolloutAction.Result.FINISHED:
+            raise PeerLost(result.message or "the rollout was cut short")
+        span = (result.env_session, result.first_step_id, result.last_step_id)
         deadline = time.monotonic() + float(node.param("join_timeout_s"))
         while missing := self._joiner.missing(*span):
             self._check()
@@ -111,7 +111,7 @@ class LiveRollouts:
                     break
                 raise PeerLost(f"images or rewards of {len(missing)} lock-steps did not arrive; is every node active?")
             self._joiner.wait(0.1)
-        return self._joiner.take(found.first_step_id, found.last_step_id, version)
+        return self._joiner.take(result.first_step_id, result.last_step_id, version)
 
     def _check_peers(self) -> None:
         namespace = self._node.get_namespace().rstrip("/")
@@ -179,15 +179,15 @@ class ReplayedRollouts:
             self._check()
             if self._error is not None:
                 raise self._error
-            found = self._joiner.take(float(self._node.param("join_timeout_s")))
-            if found is None:
+            taken = self._joiner.take(float(self._node.param("join_timeout_s")))
+            if taken is None:
                 if self._over():
                     self._progress.dropped_stale += stale
                     self._progress.dropped_gap += gap
                     return None
                 self._joiner.wait(0.1)
                 continue
-            version, rollout, dropped = found
+            version, rollout, dropped = taken
             if rollout is None:
                 self.left_out.append(f"a rollout of policy_version {version} was incomplete")
                 gap += dropped.gap

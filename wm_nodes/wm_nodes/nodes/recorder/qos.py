@@ -52,7 +52,7 @@ def message_class(msgtype: str) -> type[Any]:
     """
     package, kind, name = msgtype.split("/")
     try:
-        found: type[Any] = getattr(importlib.import_module(f"{package}.{kind}"), name)
+        message_type: type[Any] = getattr(importlib.import_module(f"{package}.{kind}"), name)
     except (ImportError, AttributeError):
         raise ValueError(f"message type {msgtype} is not installed; install or build {package}") from None
-    return found
+    return message_type
