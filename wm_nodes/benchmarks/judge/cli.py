@@ -101,9 +101,7 @@ def _common() -> argparse.ArgumentParser:
     common.add_argument("--judge", choices=NAMES, default="embedded", help="simulator: a control that knows the labels")
     common.add_argument("--rubric", default="robot", help="a rubric pack, or a .yaml")
     common.add_argument("--part", choices=("test", "validation", "train"), default="test")
-    common.add_argument(
-        "--again", default="", metavar="REASON", help="for a further evaluation on the test split"
-    )
+    common.add_argument("--again", default="", metavar="REASON", help="for a further evaluation on the test split")
     add_json(common)
     add_seed(common)
     common.add_argument("--at-once", type=int, default=1, help="clips under way together, behind a server")

@@ -60,9 +60,7 @@ class SamplerSetup:
 
 
 def sampler_setup(name: str, sampler: SamplerSettings, grpo: GrpoConfig | None = None) -> SamplerSetup:
-    return SamplerSetup(
-        name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or BASE.grpo
-    )
+    return SamplerSetup(name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or BASE.grpo)
 
 
 def dyndiff(eta: float, combine: str = "gated", budget: str = "literal", **knobs: object) -> SamplerSettings:

@@ -30,9 +30,7 @@ class SamplerTrial(Generic[Plan]):
     plan: Plan
 
 
-def ablation_trials(
-    learner: GrpoConfig, plan: DiscPlan
-) -> tuple[list[SamplerTrial[DiscPlan]], list[tuple[str, str]]]:
+def ablation_trials(learner: GrpoConfig, plan: DiscPlan) -> tuple[list[SamplerTrial[DiscPlan]], list[tuple[str, str]]]:
     """Return the trainings, and which is compared with which: (name, name of its base)."""
     cps = learner.with_values(logprob_weight="cps", learning_rate=SHORT_RATE)
     base = replace(sampler_setup("base", dyndiff(0.6, "gated", "rms"), cps), shared_noise=True)

@@ -24,15 +24,7 @@ from wm_nodes.apps.options import (
     settings,
 )
 from wm_nodes.apps.policy_pictures import write_pictures
-from wm_nodes.apps.policy_run import (
-    RunContext,
-    Stages,
-    console,
-    is_trained,
-    open_run_dir,
-    rate,
-    start_graph,
-)
+from wm_nodes.apps.policy_run import (RunContext, Stages, console, is_trained, open_run_dir, rate, start_graph)
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
