@@ -53,11 +53,7 @@ def trials(rubric: str, seed: int) -> list[JudgeTrial]:
 
 
 def measure_savings(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence[Outcome]]) -> list[Savings]:
-    """The agent against each of the others.
-
-    Raises:
-        ValueError: no clip that both decide.
-    """
+    """The agent against each of the others. Raises ValueError: no clip that both decide."""
     comparisons = []
     for name in list(ARMS)[1:]:
         decided = [

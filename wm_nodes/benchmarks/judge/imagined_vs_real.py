@@ -87,11 +87,7 @@ def jobs(
 
 
 def agreement(kind: str, verdicts: Sequence[Verdict], succeeded: BoolArray) -> ImaginedAgreement:
-    """Compare verdicts with what the simulator says of the same episodes.
-
-    Raises:
-        ValueError: no clip got a reward.
-    """
+    """Compare verdicts with what the simulator says of the same episodes. Raises ValueError: no clip got a reward."""
     both = zip(verdicts, succeeded, strict=True)
     judged = [(v, bool(real)) for v, real in both if v.valid and accepts(v) is not None]
     if not judged:

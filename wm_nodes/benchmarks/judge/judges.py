@@ -59,11 +59,7 @@ async def open_judge(
 
 @asynccontextmanager
 async def open_comparison(arguments: argparse.Namespace) -> AsyncIterator[ChatComparison]:
-    """What asks the same server by other papers' protocols.
-
-    Raises:
-        ValueError: no server is named.
-    """
+    """What asks the same server by other papers' protocols. Raises ValueError: no server is named."""
     settings = server_settings(arguments)
     transport = ChatTransport(
         [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],

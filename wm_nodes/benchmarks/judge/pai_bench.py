@@ -51,11 +51,7 @@ def metrics_of(clip: ClipRef, image: UInt8Array | None, backbones: dict[str, Fra
 
 
 def quality(videos: Sequence[Path], images: Path | None, backbones: dict[str, FrameFeatures]) -> dict[str, float]:
-    """Means over the videos.
-
-    Raises:
-        ValueError: a video or its conditioning image is missing or unreadable.
-    """
+    """Means over the videos. Raises ValueError: a video or its conditioning image is missing or unreadable."""
     rows = [metrics_of(read_video(path), _image(images, path.stem), backbones) for path in tqdm(videos, "quality")]
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if backbones else {}
 

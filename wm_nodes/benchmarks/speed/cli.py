@@ -19,8 +19,8 @@ from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.config.load import load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.allocator import keep_freed_memory
-from wm_nodes.reports import machine_facts
 from wm_nodes.reports.console_table import make_table
+from wm_nodes.reports.machine import machine_facts
 
 FULL, QUICK = Effort(60, 5000, 5, 30), Effort(3, 500, 2, 8)
 

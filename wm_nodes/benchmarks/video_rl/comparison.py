@@ -64,11 +64,7 @@ def value(row: dict[str, Any], measure: str) -> float:
 
 
 def paired_interval(differences: Sequence[float]) -> Difference:
-    """Return mean -+ t s / sqrt(n), s with n - 1.
-
-    Raises:
-        ValueError: fewer than two differences.
-    """
+    """Return mean -+ t s / sqrt(n), s with n - 1. Raises ValueError: fewer than two differences."""
     n = len(differences)
     if n < 2:
         raise ValueError(f"an interval needs at least two pairs, got {n}; train more seeds")

@@ -15,7 +15,9 @@ from wm_nodes.core.types import Environment, Episode, FloatArray, UInt8Array
 from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
-from wm_nodes.reports import Picture, curves, film_strip
+from wm_nodes.reports.curves import curves
+from wm_nodes.reports.film_strip import film_strip
+from wm_nodes.reports.html import Picture
 from wm_nodes.training.metrics import FILE_NAME
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.text import imagine_goals

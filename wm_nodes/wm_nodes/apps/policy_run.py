@@ -29,7 +29,7 @@ from wm_nodes.launching.runner import Runner
 from wm_nodes.policy_rl.evaluation import evaluate
 from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, models_of
 from wm_nodes.policy_rl.initial_policy import num_starts
-from wm_nodes.reports import SuccessRate
+from wm_nodes.reports.summary import SuccessRate
 
 READY_S = 120.0
 TRAINED = "trained.json"

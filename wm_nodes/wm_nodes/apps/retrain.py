@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from wm_nodes.apps.options import add_run_dir, add_set, add_tensorboard, prepare_torch, settings
 from wm_nodes.apps.policy_run import Stages, open_run_dir
-from wm_nodes.apps.video_results import Finished, conclude
+from wm_nodes.apps.video_results import conclude
 from wm_nodes.config.load import dump_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.video_model.clips import load_clips
@@ -66,8 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
     finally:
         training.close()
     conclude(
-        Finished(
-            config, run_dir, base, training.iterations, training.version, load_clips(heldout, folder.clip["stride"]),
-            load_probe(judge), f"as in {source.name}", "", arguments.command, stage.minutes,
-        )
+        config, run_dir, base=base, iterations=training.iterations, version=training.version,
+        heldout=load_clips(heldout, folder.clip["stride"]), probe=load_probe(judge), preset=f"as in {source.name}",
+        bag="", command=arguments.command, minutes=stage.minutes,
     )

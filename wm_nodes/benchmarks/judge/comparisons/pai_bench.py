@@ -108,11 +108,7 @@ async def answer(judge: ChatComparison, question: BenchQuestion, clip: ClipRef) 
 
 
 def yes_or_no(text: str) -> Literal["yes", "no"]:
-    """The one of the two words that an answer holds.
-
-    Raises:
-        AnswerError: neither or both.
-    """
+    """The one of the two words that an answer holds. Raises AnswerError: neither or both."""
     words = set(re.findall(r"[a-z]+", strip_reasoning(text).lower())) & {"yes", "no"}
     if len(words) != 1:
         raise AnswerError(f"the answer must hold either yes or no, got {text[:80]!r}")
