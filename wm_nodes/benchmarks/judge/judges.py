@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from benchmarks.judge.comparisons import ChatComparison
+from benchmarks.judge.comparisons.chat import ChatComparison
 from benchmarks.judge.label_judge import LabelJudge, known_clips
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import JudgeConfig, StageJudge

@@ -18,32 +18,26 @@ LAST_UPDATE = ("clip_low_share_2", "clip_high_share_2", "kl_2")
 
 def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     shown = ("diversity_dynamic", "reward_std", "reward", "background", "mass")
-    cells = (
-        (
-            row["sampler"], _regime(row), f"{row['noise_share']:.3f}",
-            estimate(bootstrap_mean(row["diversity"], seed=seed), ".3f"), *(f"{_average(row, n):.4f}" for n in shown),
-        )
-        for row in rows
-    )
     return _table(
         "diversity (DD-19) and quality, mean over contexts with 95 % bootstrap interval", ("sampler", "initial noise"),
-        ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"), cells,
+        ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"),
+        (_diversity_cells(row, seed, ".3f", shown) for row in rows),
     )
 
 
 def clip_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     shown = ("diversity_dynamic", "object_spread_cm", "reward_std", "tracking", "scenery")
-    cells = (
-        (
-            row["sampler"], _regime(row), f"{_average(row, 'noise_share'):.3f}",
-            estimate(bootstrap_mean(row["diversity"], seed=seed), ".4f"), *(f"{_average(row, n):.4f}" for n in shown),
-        )
-        for row in rows
-    )
     return _table(
         f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("sampler", "initial noise"),
         ("noise rms/s", "diversity (DD-19)", "moving part", "object spread, cm", "reward std", "tracking", "scenery"),
-        cells,
+        (_diversity_cells(row, seed, ".4f", shown) for row in rows),
+    )
+
+
+def _diversity_cells(row: dict[str, Any], seed: int, form: str, shown: Sequence[str]) -> tuple[str, ...]:
+    return (
+        row["sampler"], _regime(row), f"{np.mean(row['noise_share']):.3f}",
+        estimate(bootstrap_mean(row["diversity"], seed=seed), form), *(f"{_average(row, name):.4f}" for name in shown),
     )
 
 
