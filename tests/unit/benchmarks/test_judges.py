@@ -17,7 +17,7 @@ from benchmarks.judge.call_counter import CountingJudge
 from benchmarks.judge.cli import add_options
 from benchmarks.judge.efficiency import measure_savings, trials
 from benchmarks.judge.judges import open_judge
-from benchmarks.judge.label_judge import LabelJudge, known_clips
+from benchmarks.judge.label_judge import KnownClip, LabelJudge
 from benchmarks.judge.labels import truth_of
 from benchmarks.judge.line_file import LineFile
 from benchmarks.judge.metrics import agreement, cost_row, missed_patterns, missed_targets, mistakes, pattern_rows
@@ -61,7 +61,7 @@ def manifest(folder: Path) -> Manifest:
 
 
 def oracle(manifest: Manifest, error: float = 0.0) -> LabelJudge:
-    return LabelJudge(known_clips((row.sha256, row.labels, row.edits) for row in manifest.rows), RUBRIC, error=error)
+    return LabelJudge({row.sha256: KnownClip(row.labels, row.edits) for row in manifest.rows}, RUBRIC, error=error)
 
 
 def judged(judge: Any, folder: Path, manifest: Manifest, path: Path, trial: JudgeTrial | None = None) -> list[Any]:

@@ -38,8 +38,6 @@ JUDGED = "judged"
 ROUTED = [stage for stage in Stage if stage is not Stage.REFLECT]
 """Stages that may have a judge of their own."""
 console = Console()
-
-
 OTHERS = {
     "imagined-vs-real": (imagined_vs_real, "the judge on imagined clips against what the simulator says"),
     "speed": (speed, "clips that the embedded judge reads per second"),

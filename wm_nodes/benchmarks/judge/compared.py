@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from rich.table import Table
 
 from benchmarks.judge.comparisons.chat import ChatComparison, ComparisonReward
 from benchmarks.judge.comparisons.protocols import PAIRWISE, POINTWISE
 from benchmarks.judge.line_file import LineFile
+from benchmarks.judge.metrics import mean
 from wm_nodes.core.statistics import auroc, wilson_interval
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.rows import read_clip
@@ -29,8 +29,7 @@ PROTOCOLS = (*POINTWISE, *PAIRWISE)
 @dataclass(frozen=True)
 class ComparedAnswer:
     """of: sha256 of a clip, or of both of a pair. value: of the clip, or the preference for the clean one of the pair;
-    None where nothing usable was said.
-    """
+    None where nothing usable was said."""
 
     of: str
     value: float | None
@@ -44,8 +43,7 @@ class ComparedAnswer:
 class ComparedRow:
     """n: clips or pairs with a number. area: AUROC against the overall label; NaN for pairs. pairs: hacked clips with a
     clean recording. win_rate: share of them that score at least as high, with its Wilson interval. calls, tokens,
-    images: mean per clip or pair.
-    """
+    images: mean per clip or pair."""
 
     name: str
     n: int
@@ -136,11 +134,7 @@ def comparison_table(rows: Sequence[ComparedRow], caption: str) -> Table:
 def _row(name: str, answers: Sequence[ComparedAnswer], area: float, wins: Sequence[bool]) -> ComparedRow:
     invalid = sum(answer.value is None for answer in answers)
     low, high = wilson_interval(sum(wins), len(wins))
-    means = (_mean([getattr(answer, part) for answer in answers]) for part in ("calls", "tokens", "images"))
+    means = (mean([getattr(answer, part) for answer in answers]) for part in ("calls", "tokens", "images"))
     return ComparedRow(
-        name, len(answers) - invalid, invalid, area, len(wins), _mean([float(win) for win in wins]), low, high, *means
+        name, len(answers) - invalid, invalid, area, len(wins), mean([float(win) for win in wins]), low, high, *means
     )
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if values else float("nan")

@@ -47,8 +47,7 @@ FIRST_SEED = 700_000
 class ImaginedAgreement:
     """A judge against the simulator on n clips, of which `judged` got a reward. real: share of successes among them.
     accuracy, low, high: of accepting, with Wilson's 95 % interval; balanced: mean of both recalls; auroc: of the
-    reward. closed: clips that each gate refused. reward_success, reward_failure: mean rewards.
-    """
+    reward. closed: clips that each gate refused. reward_success, reward_failure: mean rewards."""
 
     kind: str
     n: int

@@ -56,10 +56,8 @@ async def judge_rows(
     at_once: int = 1, on_clip: Callable[[], object] = lambda: None,
 ) -> list[Outcome]:
     """Judge what `file` does not hold yet; returns an outcome per row, in their order. An ERROR is tried again next
-    time: it is no answer.
-
-    Args:
-        at_once: clips under way together, for a judge behind a server. on_clip: called after each clip, known or new.
+    time: it is no answer. at_once: clips under way together, for a judge behind a server. on_clip: called after each
+    clip, known or new.
 
     Raises:
         ManifestError: a clip cannot be read.

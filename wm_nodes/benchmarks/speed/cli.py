@@ -94,8 +94,7 @@ def show(results: dict[str, Any]) -> None:
         f"{simulator['imagined_envs']} environments with {simulator['reward']} reward",
     ))
     title = f"{facts['processor']}, {facts['cores']} cores, {results['date']}"
-    columns = ("", "value", "goal", "measured")
-    left = ("", "goal", "measured")
+    columns, left = ("", "value", "goal", "measured"), ("", "goal", "measured")
     console.print(make_table(title, columns, rows, left=left, caption=results["model"], no_wrap=("",)))
     stages = ((name, f"{v['ms']:.1f}", f"{v['peak_mib']:.1f}") for name, v in results["stages"].items())
     console.print(make_table(f"one batch of {IMAGINED_ENVS}", ("stage", "ms", "peak memory, MiB"), stages))

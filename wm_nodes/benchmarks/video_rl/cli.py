@@ -136,18 +136,21 @@ def _base(arguments: argparse.Namespace) -> None:
 
 def _diversity(arguments: argparse.Namespace) -> None:
     model, plan = load_base(arguments.base), {"contexts": arguments.contexts, "group_size": arguments.group_size}
-    rows, samplers = list[dict[str, Any]](), _choose_samplers(arguments)
-    with tqdm(total=2 * len(samplers), desc="diversity", unit="sampler") as bar:
-        for shared in (False, True):
-            for sampler in samplers:
-                setup = replace(sampler, shared_noise=shared)
-                rows.append(diversity.measure_discs(model, setup, **plan, seed=arguments.seed))
-                bar.update()
-    of = {"plan": plan, "seed": arguments.seed, "features": diversity.FEATURES, **_settings(samplers)}
+    chosen = _choose_samplers(arguments)
+    rows = [
+        diversity.measure_discs(model, setup, **plan, seed=arguments.seed)
+        for setup in tqdm(_with_both_noises(chosen), desc="diversity", unit="sampler")
+    ]
+    of = {"plan": plan, "seed": arguments.seed, "features": diversity.FEATURES, **_settings(chosen)}
     comparisons = diversity.disc_comparisons(rows, arguments.seed)
     write_results(arguments, {**of, **_base_of(arguments), "rows": rows, "comparisons": comparisons})
     _draw(arguments, plots.plot_diversity, rows, arguments.seed)
     console.print(tables.diversity_table(rows, arguments.seed))
+
+
+def _with_both_noises(setups: list[SamplerSetup]) -> list[SamplerSetup]:
+    """Each sampler with initial noise of every video's own, then each with one that a group shares."""
+    return [replace(setup, shared_noise=shared) for shared in (False, True) for setup in setups]
 
 
 def _clips(arguments: argparse.Namespace) -> None:
@@ -157,17 +160,15 @@ def _clips(arguments: argparse.Namespace) -> None:
     clips = load_clips(bags, folder.clip["stride"])
     drawn = numpy_stream(arguments.seed, "clip_diversity").permutation(len(clips))[: arguments.contexts]
     contexts, features = clips.select(torch.from_numpy(drawn)), diversity.load_features(arguments.features, config.task)
-    samplers = _choose_samplers(arguments)
-    rows, source = [], RecordedContexts(folder, contexts, config, probe)
-    with tqdm(total=2 * len(samplers) * len(contexts), desc="clips", unit="context") as bar:
-        for shared in (False, True):
-            for sampler in samplers:
-                bar.set_postfix_str(sampler.name)
-                named = replace(sampler, shared_noise=shared)
-                rows.append(diversity.measure_clips(source, named, features, arguments.group_size, bar.update))
+    chosen, rows = _choose_samplers(arguments), list[dict[str, Any]]()
+    source = RecordedContexts(folder, contexts, config, probe)
+    with tqdm(total=2 * len(chosen) * len(contexts), desc="clips", unit="context") as bar:
+        for setup in _with_both_noises(chosen):
+            bar.set_postfix_str(setup.name)
+            rows.append(diversity.measure_clips(source, setup, features, arguments.group_size, bar.update))
     compared = diversity.clip_comparisons(rows, arguments.seed)
     size = {"contexts": len(contexts), "group_size": arguments.group_size, "features": features.name}
-    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(samplers)}
+    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(chosen)}
     write_results(arguments, {**size, "seed": arguments.seed, **of, "rows": rows, "comparisons": compared})
     _draw(arguments, plots.plot_diversity, rows, arguments.seed)
     console.print(tables.clip_table(rows, arguments.seed), tables.clip_comparison_table(compared))
@@ -176,13 +177,12 @@ def _clips(arguments: argparse.Namespace) -> None:
 def _resolution(arguments: argparse.Namespace) -> None:
     config = load_video_config(arguments.preset, {"seed": arguments.seed})
     folder, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(config.task))
-    if arguments.context_bags:
-        found = [[bag] for bag in arguments.context_bags]
-    else:
-        sides = [{"simulation.image_size": side} for side in (probe.height, *arguments.sizes)]
-        found = [_episodes(arguments.contexts, HELDOUT_SEEDS, config.task, side) for side in sides]
+    sizes = [{"simulation.image_size": side} for side in (probe.height, *arguments.sizes)]
+    recordings = [[bag] for bag in arguments.context_bags] or [
+        _episodes(arguments.contexts, HELDOUT_SEEDS, config.task, size) for size in sizes
+    ]
     rows, own = list[dict[str, Any]](), None
-    for bags in tqdm(found, desc="resolution", unit="size"):
+    for bags in tqdm(recordings, desc="resolution", unit="size"):
         clips = load_clips(bags, folder.clip["stride"])
         clips = clips.select(torch.arange(min(arguments.contexts, len(clips))))
         if own is None:
@@ -202,14 +202,12 @@ def _episodes(clips: int, first_seed: int, task: str, settings: Mapping[str, Any
 
 def _clip_learning(arguments: argparse.Namespace) -> None:
     base, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(TASK))
-    given = (arguments.context_bags, arguments.heldout_bags)
-    wanted = ((arguments.contexts, NEW_SEEDS), (arguments.eval_contexts, HELDOUT_SEEDS))
-    contexts, heldout = (
-        load_clips(bags or _episodes(*what, TASK), base.clip["stride"])
-        for bags, what in zip(given, wanted, strict=True)
-    )
-    plan, of = LearningPlan(arguments.iterations, eval_contexts=arguments.eval_contexts), base.manifest["sha256"]
-    trials, of = [SamplerTrial(sampler, plan) for sampler in samplers.clip_learning_samplers()], {"sha256": of}
+    bags = arguments.context_bags or _episodes(arguments.contexts, NEW_SEEDS, TASK)
+    heldout_bags = arguments.heldout_bags or _episodes(arguments.eval_contexts, HELDOUT_SEEDS, TASK)
+    contexts, heldout = (load_clips(recorded, base.clip["stride"]) for recorded in (bags, heldout_bags))
+    plan = LearningPlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
+    of = {"sha256": base.manifest["sha256"]}
+    trials = [SamplerTrial(sampler, plan) for sampler in samplers.clip_learning_samplers()]
 
     def train(trial: SamplerTrial[LearningPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
         folder = load_video_folder(arguments.video_model)
@@ -218,8 +216,7 @@ def _clip_learning(arguments: argparse.Namespace) -> None:
 
     rows = _train(arguments, trials, train, of)
     comparisons = _compare(arguments, trials, rows, _against_cps(rows), of, CLIP_MEASURES)
-    if comparisons:
-        _draw(arguments, plots.plot_comparisons, comparisons)
+    _draw(arguments, plots.plot_comparisons, comparisons)
     console.print(tables.clip_training_table(rows), tables.comparison_table(comparisons))
 
 
@@ -236,8 +233,7 @@ def _ablations(arguments: argparse.Namespace) -> None:
     trials, pairs = ablation_trials(LEARNER, _plan(arguments, eval_every=4))
     rows = _train_discs(arguments, trials)
     comparisons = _compare(arguments, trials, rows, pairs, _base_of(arguments))
-    if comparisons:
-        _draw(arguments, plots.plot_comparisons, comparisons)
+    _draw(arguments, plots.plot_comparisons, comparisons)
     console.print(tables.training_table(rows), tables.comparison_table(comparisons))
 
 
@@ -316,17 +312,16 @@ def _base_of(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _cost(arguments: argparse.Namespace) -> None:
     model = load_base(arguments.base)
-    rollouts = [
-        toy_rollout(model, arguments.repeats, arguments.seed), pushcube_rollout(arguments.repeats, arguments.seed)
-    ]
+    repeats, seed = arguments.repeats, arguments.seed
+    rollouts = [toy_rollout(model, repeats, seed), pushcube_rollout(repeats, seed)]
     rows = [
-        *measure_anchors("moving disc", model, toy_buffer(model, arguments.seed), LEARNER, arguments.repeats),
-        *measure_anchors("PushCube", *pushcube_buffer(arguments.seed), LEARNER, arguments.repeats),
+        *measure_anchors("moving disc", model, toy_buffer(model, seed), LEARNER, repeats),
+        *measure_anchors("PushCube", *pushcube_buffer(seed), LEARNER, repeats),
     ]
-    of = {"seed": arguments.seed, "learner": LEARNER.model_dump(), **_base_of(arguments)}
+    of = {"seed": seed, "learner": LEARNER.model_dump(), **_base_of(arguments)}
     write_results(arguments, {**of, "rollouts": rollouts, "rows": rows})
     _draw(arguments, plots.plot_cost, rows)
-    console.print(tables.rollout_table(rollouts, arguments.repeats), tables.cost_table(rows, arguments.repeats))
+    console.print(tables.rollout_table(rollouts, repeats), tables.cost_table(rows, repeats))
 
 
 def _choose_samplers(arguments: argparse.Namespace) -> list[SamplerSetup]:
@@ -357,6 +352,6 @@ def _finished(path: Path | None, trials: Sequence[SamplerTrial[Any]]) -> list[di
 
 
 def _draw(arguments: argparse.Namespace, plot: Callable[..., None], what: Sequence[Any], *more: Any) -> None:
-    """The picture beside the --json file, where there is one."""
-    if arguments.json is not None:
+    """The picture beside the --json file, where there is one and something to draw."""
+    if arguments.json is not None and what:
         plot(what, arguments.json.with_suffix(".png"), *more)

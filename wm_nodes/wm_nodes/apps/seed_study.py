@@ -144,14 +144,23 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
     policy = load_policy(config, model_dir, weak)
     real = ManiSkillEnvironment(config.task, config.simulation, SIMULATOR_ENVS, seed=config.seed)
     imagined = make_imagined_environment(config, model_dir, starts, num_envs=config.ppo.num_envs, seed=config.seed)
-    real_before, imagined_before = _measure(policy, real, config), _imagine(policy, imagined, config)
+
+    def measure() -> tuple[EvaluationResult, EvaluationResult]:
+        """In the simulator and in the world model."""
+        how = config.evaluation
+        return (
+            evaluate(policy, real, how.episodes, how.first_seed, how.deterministic),
+            evaluate(policy, imagined, IMAGINED_EPISODES, how.first_seed),
+        )
+
+    real_before, imagined_before = measure()
     acceptance = accept_world_model(
         models_of(model_dir),
         load_arrays(collect_plan(acceptance_plan(config), config, folder / "heldout"), config), config,
         (imagined_before.successes, imagined_before.episodes), (real_before.successes, real_before.episodes),
     )
     course = _train(policy, real if arm == "simulator" else imagined, config, arm, model_dir)
-    real_after, imagined_after = _measure(policy, real, config), _imagine(policy, imagined, config)
+    real_after, imagined_after = measure()
     real.close()
     save_weights(policy, run_dir / f"{arm}.safetensors", {"tokenizer_sha256": policy.encoder.sha256})
     row = {
@@ -184,15 +193,6 @@ def _train(
             bar.update()
             bar.set_postfix(success=f"{success_rate:.2f}", refresh=False)
     return course
-
-
-def _measure(policy: ImagePolicy, env: Environment, config: RunConfig) -> EvaluationResult:
-    settings = config.evaluation
-    return evaluate(policy, env, settings.episodes, settings.first_seed, settings.deterministic)
-
-
-def _imagine(policy: ImagePolicy, env: Environment, config: RunConfig) -> EvaluationResult:
-    return evaluate(policy, env, IMAGINED_EPISODES, config.evaluation.first_seed)
 
 
 def _percent(successes: dict[str, float]) -> str:

@@ -35,7 +35,7 @@ STRIPS = 3
 def conclude(
     config: VideoRlConfig, run_dir: Path, *, base: Path, iterations: int, version: int, heldout: Clips,
     probe: PositionProbe, preset: str, bag: str, command: str, minutes: float,
-) -> ClipSummary:
+) -> None:
     """Measure a training that has come to its end, draw, write and print; what was measured on the same weights before
     is kept. base: folder of the model it began with. iterations, version: as progress() says.
 
@@ -75,7 +75,6 @@ def conclude(
     for alarm in summary.hacked:
         console.print(f"[bold yellow]reward hacking[/] after {alarm['step']} buffers: {alarm['text']}", highlight=False)
     console.print(f"report   {report}\nsummary  {path}\nbag      {bag}", highlight=False)
-    return summary
 
 
 def score_change(name: str, before: Sequence[float], after: Sequence[float], seed: int) -> ScoreChange:

@@ -22,8 +22,7 @@ TITLES = {
 @dataclass(frozen=True)
 class ScoreChange:
     """One held-out score, means over the contexts. low, high: 95 % bootstrap interval of after minus before on the same
-    contexts. verdict: better or worse; empty where chance may explain it.
-    """
+    contexts. verdict: better or worse; empty where chance may explain it."""
 
     before: float
     after: float

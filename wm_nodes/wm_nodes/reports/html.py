@@ -157,19 +157,15 @@ def _acceptance(report: Mapping[str, Any]) -> str:
         rule = escape(f"{criterion['rule']} {threshold}")
         rows.append((escape(str(criterion["name"])), _value(criterion["value"]), rule, mark))
     notes = "".join(f'<p class="faint">{escape(str(note))}</p>' for note in report.get("notes", ()))
+    metrics = [(escape(name), _value(value)) for name, value in report.get("metrics", {}).items()]
+    if metrics:
+        table = html_table(("metric", "value"), metrics)
+        notes += f"<details><summary>all numbers of the held-out rollouts</summary>{table}</details>"
     words = "Passed" if report["passed"] else "Failed: trained in it all the same"
     return (
         f"<p>{words}. Judged on {report['episodes']} held-out real episodes.</p>"
-        f"{html_table(('criterion', 'value', 'must be', ''), rows, numbers=(1,))}"
-        f"{notes}{_metrics(report.get('metrics', {}))}"
+        f"{html_table(('criterion', 'value', 'must be', ''), rows, numbers=(1,))}{notes}"
     )
-
-
-def _metrics(metrics: Mapping[str, Any]) -> str:
-    if not metrics:
-        return ""
-    table = html_table(("metric", "value"), ((escape(name), _value(value)) for name, value in metrics.items()))
-    return f"<details><summary>all numbers of the held-out rollouts</summary>{table}</details>"
 
 
 def _again(run_dir: Path, summary: Summary) -> str:

@@ -20,8 +20,7 @@ T = TypeVar("T")
 @dataclass(frozen=True)
 class ComparisonReward:
     """value: of a clip, or the preference for the first of two, in [0, 1]; NaN without a number, `reason` says why.
-    parts: in the protocol's own units. consistent: of two clips in both orders, both named one winner.
-    """
+    parts: in the protocol's own units. consistent: of two clips in both orders, both named one winner."""
 
     value: float
     parts: Parts = field(default_factory=dict)
@@ -35,10 +34,8 @@ class ComparisonReward:
 
 
 class ChatComparison:
-    """Asks a model that sees images. Belongs to the event loop of its transport.
-
-    Args:
-        timeout_s: per try. max_tokens: of an answer. seed: sent along; temperature is 0.
+    """Asks a model that sees images. Belongs to the event loop of its transport. timeout_s: per try. max_tokens: of an
+    answer. seed: sent along; temperature is 0.
     """
 
     def __init__(
