@@ -16,7 +16,7 @@ from safetensors.numpy import save_file
 from wm_nodes.apps.cli import main
 from wm_nodes.recording import Bag, read_episodes
 from wm_nodes.recording.rollouts import recorded_reward_name
-from wm_nodes.reports import read_summary
+from wm_nodes.reports.summary import read_summary
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.world_model import load_model_folder
 

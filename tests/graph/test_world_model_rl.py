@@ -26,7 +26,7 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.nodes.video_model_node import film_strip
 from wm_nodes.recording import BagError
 from wm_nodes.recording.bag import Bag
-from wm_nodes.reports import read_summary
+from wm_nodes.reports.summary import read_summary
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import Clips, load_clips

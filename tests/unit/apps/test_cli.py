@@ -49,7 +49,7 @@ def test_every_verb_is_listed_with_what_it_does(capsys: pytest.CaptureFixture[st
         assert cli.main(words, "wm.py") == 0
         listed = capsys.readouterr().out
         assert listed.startswith("usage: wm.py VERB") and "130 interrupted" in listed
-        assert all(f"  {verb.name} " in listed and verb.about in listed for verb in cli.VERBS.values())
+        assert all(f"  {name} " in listed and about in listed for name, about in cli.VERBS.items())
     assert set(OPTIONS) == set(cli.VERBS)
     for words in (["benchmark"], ["benchmark", "--help"]):
         assert cli.main(words) == 0

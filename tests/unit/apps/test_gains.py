@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from wm_nodes.apps.seed_study import gain_over_simulator, read_results
-from wm_nodes.reports import mean_gain
+from wm_nodes.apps.seed_study import gain_over_simulator, mean_gain, read_results
 
 TASKS = ("pick and place", "push", "pull", "move to aim")
 IND = {

@@ -9,7 +9,7 @@ import pytest
 from wm_nodes.apps.model_refresh_loop import round_config, split_updates
 from wm_nodes.apps.policy_run import kept, open_run_dir
 from wm_nodes.config.load import ConfigError, dump_config, load_config
-from wm_nodes.reports import SuccessRate, Summary
+from wm_nodes.reports.summary import SuccessRate, Summary
 from wm_nodes.reports.tables import ROUND_COLUMNS, round_rows
 from wm_nodes.training.metrics import MetricsWriter, join_metrics, read_metrics
 

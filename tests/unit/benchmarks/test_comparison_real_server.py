@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from tiny_vlm import save_tiny_vlm, transformers_serve
 
-from benchmarks.judge.comparisons import POINTWISE, ChatComparison
 from benchmarks.judge.comparisons import pai_bench as pai
+from benchmarks.judge.comparisons.chat import ChatComparison
+from benchmarks.judge.comparisons.protocols import POINTWISE
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
 from wm_nodes.judge.backends import ChatTransport, Endpoint
 

@@ -14,10 +14,11 @@ from chat_server import ChatServer, Fault
 from numpy.testing import assert_allclose
 from toy_set import write_toy_set
 
-from benchmarks.judge.compared import AnswerFile, compared, hacked_pairs
-from benchmarks.judge.comparisons import PAIRWISE, POINTWISE, ChatComparison
+from benchmarks.judge.compared import ComparedAnswer, answer_file, compared, hacked_pairs
 from benchmarks.judge.comparisons import pai_bench as pai
-from benchmarks.judge.comparisons.protocols import read_flex, read_unified
+from benchmarks.judge.comparisons.chat import ChatComparison
+from benchmarks.judge.comparisons.protocols import PAIRWISE, POINTWISE, read_flex, read_unified
+from benchmarks.judge.line_file import LineFile
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
 from wm_nodes.judge.backends import ChatTransport, Endpoint, RetryPolicy
 from wm_nodes.judge.backends.schemas import AnswerError
@@ -123,12 +124,12 @@ def test_a_pair_is_asked_in_both_orders_so_that_a_place_is_no_advantage() -> Non
         return judge.compare(protocol, CLIP, OTHER, TASK)
 
     fair, requests = asked(compare, first_is_better, second_is_better)
-    assert fair.valid and fair.preference == pytest.approx(0.7) and fair.consistent and fair.cost.calls == 2
+    assert fair.valid and fair.value == pytest.approx(0.7) and fair.consistent and fair.cost.calls == 2
     assert num_images(requests[0]) == 16 and "video 2, frame 0" in json.dumps(requests[0]["messages"])
     biased, _ = asked(compare, first_is_better, first_is_better)
-    assert biased.preference == pytest.approx(0.5) and not biased.consistent
+    assert biased.value == pytest.approx(0.5) and not biased.consistent
     lost, _ = asked(compare, first_is_better, reply("no"), reply("no"))
-    assert not lost.valid and math.isnan(lost.preference)
+    assert not lost.valid and math.isnan(lost.value)
 
 
 # PAI-Bench
@@ -206,11 +207,11 @@ def test_a_reward_is_compared_by_how_it_ranks_and_whether_hacked_clips_win(tmp_p
     pairs = hacked_pairs(rows)
     assert len(pairs) == 4 and all(row.labels.pattern and clean.labels.overall for row, clean in pairs)
 
-    def file() -> AnswerFile:
-        return AnswerFile(tmp_path / "judged", "single", "judge", 0)
+    def file() -> LineFile[ComparedAnswer]:
+        return answer_file(tmp_path / "judged", "single", "judge", 0)
 
     def over(count: int, name: str = "single") -> Any:
-        kept = file() if name == "single" else AnswerFile(tmp_path / "judged", name, "judge", 0)
+        kept = file() if name == "single" else answer_file(tmp_path / "judged", name, "judge", 0)
         replies = [reply('{"score": 5}') if name == "single" else reply(flex((8, 2), (8, 2), (8, 2)))] * count
         return asked(lambda judge: compared(judge, name, tmp_path, rows, kept), *replies)
 
@@ -220,6 +221,6 @@ def test_a_reward_is_compared_by_how_it_ranks_and_whether_hacked_clips_win(tmp_p
     (path,) = (tmp_path / "judged").iterdir()
     path.write_bytes(path.read_bytes()[:-20])  # killed in the middle of the last line
     again, requests = over(1)
-    assert len(requests) == 1 and again == alike and len(file().kept) == len(rows)
+    assert len(requests) == 1 and again == alike and len(file().rows) == len(rows)
     first_place, _ = over(8, "unifiedreward-flex")  # whoever comes first is better: a tie once both orders are asked
     assert (first_place.pairs, first_place.win_rate, first_place.calls) == (4, 1.0, 2.0)

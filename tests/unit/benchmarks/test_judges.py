@@ -17,10 +17,11 @@ from benchmarks.judge.call_counter import CountingJudge
 from benchmarks.judge.cli import add_options
 from benchmarks.judge.efficiency import measure_savings, trials
 from benchmarks.judge.judges import open_judge
-from benchmarks.judge.label_judge import LabelJudge, known_clips
+from benchmarks.judge.label_judge import KnownClip, LabelJudge
 from benchmarks.judge.labels import truth_of
+from benchmarks.judge.line_file import LineFile
 from benchmarks.judge.metrics import agreement, cost_row, missed_patterns, missed_targets, mistakes, pattern_rows
-from benchmarks.judge.run import JudgeTrial, OutcomeFile, judge_rows
+from benchmarks.judge.run import JudgeTrial, Outcome, judge_rows
 from benchmarks.judge.test_split_log import LOG_NAME, notice, read_evaluations, record_evaluation
 from wm_nodes.apps.cli import main
 from wm_nodes.judge.agent import RewardAgent, Verdict, load_rubric
@@ -60,13 +61,13 @@ def manifest(folder: Path) -> Manifest:
 
 
 def oracle(manifest: Manifest, error: float = 0.0) -> LabelJudge:
-    return LabelJudge(known_clips((row.sha256, row.labels, row.edits) for row in manifest.rows), RUBRIC, error=error)
+    return LabelJudge({row.sha256: KnownClip(row.labels, row.edits) for row in manifest.rows}, RUBRIC, error=error)
 
 
 def judged(judge: Any, folder: Path, manifest: Manifest, path: Path, trial: JudgeTrial | None = None) -> list[Any]:
     rows = select_rows(manifest, "test")
     wanted = trial or JudgeTrial("table", RUBRIC)
-    return asyncio.run(judge_rows(judge, wanted, folder, rows, OutcomeFile(path)))
+    return asyncio.run(judge_rows(judge, wanted, folder, rows, LineFile(path, Outcome, "sha256")))
 
 
 # truth
@@ -206,7 +207,7 @@ def test_a_killed_run_goes_on_where_it_was_and_judges_a_torn_line_again(
     judge = CountingLabelJudge(oracle(manifest))
     again = judged(judge, folder, manifest, path)
     assert len(judge.seen) == 2 and [replace(o, wall_s=0) for o in again] == [replace(o, wall_s=0) for o in whole]
-    assert len(OutcomeFile(path).kept) == len(whole)
+    assert len(LineFile(path, Outcome, "sha256").rows) == len(whole)
 
 
 def test_an_error_is_no_answer_and_is_tried_again(folder: Path, manifest: Manifest, tmp_path: Path) -> None:

@@ -10,25 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from wm_nodes.reports import (
-    ClipSummary,
-    Panel,
-    Picture,
-    ScoreChange,
-    SuccessRate,
-    Summary,
-    clip_panels,
-    curves,
-    film_strip,
-    machine_facts,
-    read_summary,
-    write_clip_report,
-    write_clip_summary,
-    write_report,
-    write_summary,
-)
-from wm_nodes.reports.clip_report import TITLES, clip_verdict
-from wm_nodes.reports.curves import read_series
+from wm_nodes.reports.clip_report import TITLES, ClipSummary, ScoreChange, clip_panels, clip_verdict, write_clip_report
+from wm_nodes.reports.curves import Panel, curves, read_series
+from wm_nodes.reports.film_strip import film_strip
+from wm_nodes.reports.html import Picture, write_report
+from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.summary import SuccessRate, Summary, read_summary, write_summary
 from wm_nodes.reports.tables import result_rows, verdict
 
 PAIRED = {"difference": 0.25, "low": 0.157, "high": 0.348, "gained": 79, "lost": 28}
@@ -235,7 +222,7 @@ def test_the_report_of_loop_2_shows_scores_alarms_and_how_to_do_it_again(tmp_pat
     for part in ("Better: tracking score (n = 48 held-out contexts).", "+0.1000 (+0.0500 to +0.1500)",
                  "averaged weights", "scenery gets &lt;worse&gt;", f"retrain {tmp_path}", "P &amp; Q"):
         assert part in text
-    write_clip_summary(tmp_path, CLIPS)
+    write_summary(tmp_path, CLIPS)
     values = read_summary(tmp_path)
     assert values["scores"]["tracking"]["after"] == 0.6 and values["minutes"] is None
     quiet = write_clip_report(tmp_path, replace(CLIPS, hacked=())).read_text()

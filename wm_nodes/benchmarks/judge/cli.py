@@ -7,40 +7,19 @@ import asyncio
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from tqdm import tqdm
 
-from benchmarks.judge import fault_visibility, imagined_vs_real, pai_bench, speed
-from benchmarks.judge.compared import PROTOCOLS, AnswerFile, ComparedRow, compared, comparison_table, num_answers
+from benchmarks.judge import fault_visibility, hacking, imagined_vs_real, metrics, pai_bench, speed, tables
+from benchmarks.judge.compared import PROTOCOLS, ComparedRow, answer_file, compared, comparison_table, num_answers
 from benchmarks.judge.efficiency import ARMS, measure_savings, savings_table, trials
-from benchmarks.judge.hacking import (
-    Proxy,
-    SearchPlan,
-    agent_reward,
-    climb,
-    curve,
-    has_numbers,
-    mean_score,
-    pixel_similarity,
-    plot_curves,
-)
 from benchmarks.judge.judges import NAMES, open_comparison, open_judge
 from benchmarks.judge.label_judge import KnownClip, LabelJudge
-from benchmarks.judge.metrics import (
-    agreement,
-    by_split,
-    cost_row,
-    missed_patterns,
-    missed_targets,
-    mistakes,
-    most_frequent,
-    pattern_rows,
-    statuses,
-)
-from benchmarks.judge.run import JudgeTrial, Outcome, OutcomeFile, judge_rows
+from benchmarks.judge.line_file import LineFile
+from benchmarks.judge.run import JudgeTrial, Outcome, judge_rows
 from benchmarks.judge.search_starts import hacking_starts
-from benchmarks.judge.tables import confusion_table, cost_table, curve_table, pattern_table, split_table, table2
 from benchmarks.judge.test_split_log import judge_name, notice, record_evaluation
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_json, add_seed
@@ -59,8 +38,6 @@ JUDGED = "judged"
 ROUTED = [stage for stage in Stage if stage is not Stage.REFLECT]
 """Stages that may have a judge of their own."""
 console = Console()
-
-
 OTHERS = {
     "imagined-vs-real": (imagined_vs_real, "the judge on imagined clips against what the simulator says"),
     "speed": (speed, "clips that the embedded judge reads per second"),
@@ -101,9 +78,7 @@ def _common() -> argparse.ArgumentParser:
     common.add_argument("--judge", choices=NAMES, default="embedded", help="simulator: a control that knows the labels")
     common.add_argument("--rubric", default="robot", help="a rubric pack, or a .yaml")
     common.add_argument("--part", choices=("test", "validation", "train"), default="test")
-    common.add_argument(
-        "--again", default="", metavar="REASON", help="for a further evaluation on the test split"
-    )
+    common.add_argument("--again", default="", metavar="REASON", help="for a further evaluation on the test split")
     add_json(common)
     add_seed(common)
     common.add_argument("--at-once", type=int, default=1, help="clips under way together, behind a server")
@@ -130,66 +105,58 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 async def _table(arguments: argparse.Namespace) -> None:
-    rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
-    rows = select_rows(manifest, arguments.part, arguments.clips)
-    async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
-        said = _record_test_evaluation(arguments, manifest, judge, rubric)
-        outcomes = await _judge_trials(arguments, judge, [JudgeTrial("table", rubric, seed=arguments.seed)], rows)
-        who = judge_name(judge.capabilities)
+    rubric = load_rubric(arguments.rubric)
+    rows, outcomes, facts = await _judge_set(arguments, rubric, [JudgeTrial("table", rubric, seed=arguments.seed)])
     results = outcomes["table"]
-    agreements, patterns = agreement(rows, results, rubric), pattern_rows(rows, results, tuple(rubric.hack.patterns))
-    caption = f"{who}; rubric {rubric.version}; {arguments.part}, {len(rows)} clips: {statuses(results)}"
-    splits = by_split(rows, results, rubric)
-    console.print(table2(agreements, caption), split_table(splits), confusion_table(agreements, patterns))
-    console.print(pattern_table(patterns))
-    cost = cost_row(results, arguments.price)
-    console.print(cost_table({"agent, benchmark mode": cost}))
-    below = [*missed_targets(agreements), *missed_patterns(patterns)]
-    _print_notes(arguments, len(rows), said, below, most_frequent(mistakes(rows, results, rubric)))
+    agreements = metrics.agreement(rows, results, rubric)
+    patterns = metrics.pattern_rows(rows, results, tuple(rubric.hack.patterns))
+    statuses, cost = metrics.statuses(results), metrics.cost_row(results, arguments.price)
+    caption = f"{facts['judge']}; rubric {rubric.version}; {arguments.part}, {len(rows)} clips: {statuses}"
+    splits = metrics.by_split(rows, results, rubric)
+    console.print(tables.table2(agreements, caption), tables.split_table(splits))
+    console.print(tables.confusion_table(agreements, patterns), tables.pattern_table(patterns))
+    console.print(tables.cost_table({"agent, benchmark mode": cost}))
+    below = [*metrics.missed_targets(agreements), *metrics.missed_patterns(patterns)]
+    mistakes = metrics.mistakes(rows, results, rubric)
+    _print_notes(arguments, len(rows), facts["notice"], below, metrics.most_frequent(mistakes))
     write_results(arguments, {
-        "experiment": "table", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
-        "seed": arguments.seed, "notice": said, "statuses": statuses(results), "cost": cost,
+        "experiment": "table", **facts, "statuses": statuses, "cost": cost,
         "splits": {name: [asdict(row) for row in table] for name, table in splits.items()},
         "rows": [asdict(row) for row in agreements], "patterns": [asdict(row) for row in patterns],
-        "missed": below, "mistakes": most_frequent(mistakes(rows, results, rubric), 40),
+        "missed": below, "mistakes": metrics.most_frequent(mistakes, 40),
     })
 
 
 async def _efficiency(arguments: argparse.Namespace) -> None:
-    rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
-    rows = select_rows(manifest, arguments.part, arguments.clips)
-    async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
-        said = _record_test_evaluation(arguments, manifest, judge, rubric)
-        outcomes = await _judge_trials(arguments, judge, trials(arguments.rubric, arguments.seed), rows)
-        who = judge_name(judge.capabilities)
-    costs = {ARMS[name]: cost_row(outcomes_of_arm, arguments.price) for name, outcomes_of_arm in outcomes.items()}
-    compared = measure_savings(rows, outcomes)
-    console.print(cost_table(costs), savings_table(compared, f"{who}; {arguments.part}, {len(rows)} clips"))
-    _print_notes(arguments, len(rows), said, [], [])
-    write_results(arguments, {
-        "experiment": "efficiency", "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows),
-        "seed": arguments.seed, "notice": said, "per_clip": costs, "compared": [asdict(row) for row in compared],
-    })
+    wanted = trials(arguments.rubric, arguments.seed)
+    rows, outcomes, facts = await _judge_set(arguments, load_rubric(arguments.rubric), wanted)
+    costs = {ARMS[name]: metrics.cost_row(of_arm, arguments.price) for name, of_arm in outcomes.items()}
+    savings = measure_savings(rows, outcomes)
+    caption = f"{facts['judge']}; {arguments.part}, {len(rows)} clips"
+    console.print(tables.cost_table(costs), savings_table(savings, caption))
+    _print_notes(arguments, len(rows), facts["notice"], [], [])
+    compared_rows = [asdict(row) for row in savings]
+    write_results(arguments, {"experiment": "efficiency", **facts, "per_clip": costs, "compared": compared_rows})
 
 
 async def _hacking(arguments: argparse.Namespace) -> None:
     rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
-    plan = SearchPlan(arguments.generations, arguments.candidates, severities=tuple(arguments.severities))
+    plan = hacking.SearchPlan(arguments.generations, arguments.candidates, severities=tuple(arguments.severities))
     part = select_rows(manifest, arguments.part)
     config = load_config("cpu").simulation
     starts, curves = [], []
     async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
         who = judge_name(judge.capabilities)
         said = _record_test_evaluation(arguments, manifest, judge, rubric)
-        rewards: dict[str, Proxy] = {
-            "agent": agent_reward(judge, rubric, arguments.seed),
-            "mean score": mean_score(judge, rubric, arguments.seed),
-            "pixel similarity": pixel_similarity,
+        rewards: dict[str, hacking.Proxy] = {
+            "agent": hacking.agent_reward(judge, rubric, arguments.seed),
+            "mean score": hacking.mean_score(judge, rubric, arguments.seed),
+            "pixel similarity": hacking.pixel_similarity,
         }
         proxies = {name: _with_labels(reward, judge) for name, reward in rewards.items()}
         with tqdm(total=arguments.starts, desc="clips with a defect") as bar:
             for start in hacking_starts(part, manifest.division, config, arguments.seed):
-                if await has_numbers(start, proxies.values()):
+                if await hacking.has_numbers(start, proxies.values()):
                     starts.append(start)
                     bar.update()
                 if len(starts) == arguments.starts:
@@ -199,13 +166,13 @@ async def _hacking(arguments: argparse.Namespace) -> None:
         most = len(rewards) * len(starts) * (1 + plan.generations * plan.candidates)
         with tqdm(total=most, desc="search", unit="clip") as bar:
             for name, reward in proxies.items():
-                climbs = [await climb(start, reward, plan, arguments.seed, on_clip=bar.update) for start in starts]
-                curves.append(curve(name, [one for one in climbs if one is not None]))
-    console.print(curve_table(curves, f"{who}; {arguments.part}, {len(starts)} clips with a defect"))
+                searches = [await hacking.climb(s, reward, plan, arguments.seed, on_clip=bar.update) for s in starts]
+                curves.append(hacking.curve(name, [search for search in searches if search is not None]))
+    console.print(tables.curve_table(curves, f"{who}; {arguments.part}, {len(starts)} clips with a defect"))
     if said:
         console.print(said, style="bold", highlight=False)
     if arguments.json is not None:
-        plot_curves(curves, arguments.json.with_suffix(".png"))
+        hacking.plot_curves(curves, arguments.json.with_suffix(".png"))
     write_results(arguments, {
         "experiment": "hacking", "judge": who, "rubric": rubric.version, "part": arguments.part, "notice": said,
         "seed": arguments.seed, "plan": asdict(plan), "starts": [start.clip.recipe for start in starts],
@@ -221,12 +188,9 @@ async def _comparisons(arguments: argparse.Namespace) -> None:
         with tqdm(total=sum(num_answers(name, rows) for name in arguments.protocols), desc="asked") as bar:
             for name in arguments.protocols:
                 bar.set_postfix_str(name)
-                file = AnswerFile(arguments.set / JUDGED, name, arguments.model, arguments.seed)
-                results.append(
-                    await compared(
-                        judge, name, arguments.set, rows, file, at_once=arguments.at_once, on_answer=bar.update
-                    )
-                )
+                file = answer_file(arguments.set / JUDGED, name, arguments.model, arguments.seed)
+                options: dict[str, Any] = {"at_once": arguments.at_once, "on_answer": bar.update}
+                results.append(await compared(judge, name, arguments.set, rows, file, **options))
     caption = f"{arguments.model}; {arguments.part}, {len(rows)} clips; wins: hacked scores >= its clean recording"
     console.print(comparison_table(results, caption))
     write_results(arguments, {
@@ -235,7 +199,7 @@ async def _comparisons(arguments: argparse.Namespace) -> None:
     })
 
 
-def _with_labels(reward: Proxy, judge: Judge) -> Proxy:
+def _with_labels(reward: hacking.Proxy, judge: Judge) -> hacking.Proxy:
     """The control judge must be told the labels of every new clip; others look."""
     if not isinstance(judge, LabelJudge):
         return reward
@@ -247,18 +211,27 @@ def _with_labels(reward: Proxy, judge: Judge) -> Proxy:
     return proxy
 
 
-async def _judge_trials(
-    arguments: argparse.Namespace, judge: Judge, wanted: Sequence[JudgeTrial], rows: Sequence[ManifestRow]
-) -> dict[str, list[Outcome]]:
-    outcomes = {}
-    with tqdm(total=len(wanted) * len(rows), desc="judged", unit="clip") as bar:
-        for trial in wanted:
-            bar.set_postfix_str(trial.name)
-            path = arguments.set / JUDGED / f"{trial.key(judge.capabilities)}.jsonl"
-            outcomes[trial.name] = await judge_rows(
-                judge, trial, arguments.set, rows, OutcomeFile(path), at_once=arguments.at_once, on_clip=bar.update
-            )
-    return outcomes
+async def _judge_set(
+    arguments: argparse.Namespace, rubric: Rubric, wanted: Sequence[JudgeTrial]
+) -> tuple[list[ManifestRow], dict[str, list[Outcome]], dict[str, Any]]:
+    """The clips of the part, their outcomes by trial, and what the --json file says of the judge and the clips."""
+    manifest, outcomes = load_set(arguments.set), dict[str, list[Outcome]]()
+    rows = select_rows(manifest, arguments.part, arguments.clips)
+    async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
+        said = _record_test_evaluation(arguments, manifest, judge, rubric)
+        with tqdm(total=len(wanted) * len(rows), desc="judged", unit="clip") as bar:
+            for trial in wanted:
+                bar.set_postfix_str(trial.name)
+                path = arguments.set / JUDGED / f"{trial.key(judge.capabilities)}.jsonl"
+                outcomes[trial.name] = await judge_rows(
+                    judge, trial, arguments.set, rows, LineFile(path, Outcome, "sha256"), at_once=arguments.at_once,
+                    on_clip=bar.update,
+                )
+        who = judge_name(judge.capabilities)
+    return rows, outcomes, {
+        "judge": who, "rubric": rubric.version, "part": arguments.part, "clips": len(rows), "seed": arguments.seed,
+        "notice": said,
+    }
 
 
 def _record_test_evaluation(arguments: argparse.Namespace, manifest: Manifest, judge: Judge, rubric: Rubric) -> str:

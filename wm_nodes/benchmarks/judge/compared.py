@@ -7,16 +7,17 @@ share of hacked clips that score at least as high as their clean recording. Answ
 import asyncio
 import hashlib
 import json
-import os
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from rich.table import Table
 
-from benchmarks.judge.comparisons import PAIRWISE, POINTWISE, ChatComparison
+from benchmarks.judge.comparisons.chat import ChatComparison, ComparisonReward
+from benchmarks.judge.comparisons.protocols import PAIRWISE, POINTWISE
+from benchmarks.judge.line_file import LineFile
+from benchmarks.judge.metrics import mean
 from wm_nodes.core.statistics import auroc, wilson_interval
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.rows import read_clip
@@ -27,8 +28,10 @@ PROTOCOLS = (*POINTWISE, *PAIRWISE)
 
 @dataclass(frozen=True)
 class ComparedAnswer:
-    """value: of a clip, or the preference for the clean clip of a pair; None where nothing usable was said."""
+    """of: sha256 of a clip, or of both of a pair. value: of the clip, or the preference for the clean one of the pair;
+    None where nothing usable was said."""
 
+    of: str
     value: float | None
     reason: str
     calls: int
@@ -40,8 +43,7 @@ class ComparedAnswer:
 class ComparedRow:
     """n: clips or pairs with a number. area: AUROC against the overall label; NaN for pairs. pairs: hacked clips with a
     clean recording. win_rate: share of them that score at least as high, with its Wilson interval. calls, tokens,
-    images: mean per clip or pair.
-    """
+    images: mean per clip or pair."""
 
     name: str
     n: int
@@ -56,36 +58,10 @@ class ComparedRow:
     images: float
 
 
-class AnswerFile:
-    """Answers by clip or pair; torn lines and failures are asked again."""
-
-    def __init__(self, folder: Path, protocol: str, model: str, seed: int) -> None:
-        name = hashlib.sha256(json.dumps([protocol, model, seed]).encode()).hexdigest()[:16]
-        folder.mkdir(parents=True, exist_ok=True)
-        self._path = folder / f"{protocol}-{name}.jsonl"
-        self.kept: dict[str, ComparedAnswer] = {}
-        lines = self._path.read_text().splitlines() if self._path.is_file() else []
-        for line in lines:
-            try:
-                entry = json.loads(line)
-                key = entry.pop("of")
-                self.kept[key] = ComparedAnswer(**entry)
-            except (ValueError, KeyError, TypeError, AttributeError):
-                continue
-
-    async def get(self, key: str, ask: Callable[[], Awaitable[ComparedAnswer]]) -> ComparedAnswer:
-        known = self.kept.get(key)
-        if known is None or known.value is None:
-            known = self.kept[key] = await ask()
-            with self._path.open("a") as file:
-                file.write("\n" * bool(self._is_torn()) + json.dumps({"of": key, **asdict(known)}) + "\n")
-                file.flush()
-                os.fsync(file.fileno())
-        return known
-
-    def _is_torn(self) -> bool:
-        data = self._path.read_bytes()
-        return bool(data) and not data.endswith(b"\n")
+def answer_file(folder: Path, protocol: str, model: str, seed: int) -> LineFile[ComparedAnswer]:
+    """The answers kept so far; failures among them are asked again."""
+    name = hashlib.sha256(json.dumps([protocol, model, seed]).encode()).hexdigest()[:16]
+    return LineFile(folder / f"{protocol}-{name}.jsonl", ComparedAnswer, "of")
 
 
 def hacked_pairs(rows: Sequence[ManifestRow]) -> list[tuple[ManifestRow, ManifestRow]]:
@@ -95,9 +71,8 @@ def hacked_pairs(rows: Sequence[ManifestRow]) -> list[tuple[ManifestRow, Manifes
 
 
 async def compared(
-    judge: ChatComparison, protocol: str, folder: Path, rows: Sequence[ManifestRow], file: AnswerFile, *,
-    at_once: int = 1,
-    on_answer: Callable[[], object] = lambda: None,
+    judge: ChatComparison, protocol: str, folder: Path, rows: Sequence[ManifestRow], file: LineFile[ComparedAnswer], *,
+    at_once: int = 1, on_answer: Callable[[], object] = lambda: None,
 ) -> ComparedRow:
     """Ask one protocol about every clip, or about every hacked clip beside its recording.
 
@@ -107,24 +82,31 @@ async def compared(
     gate = asyncio.Semaphore(at_once)
     pairs = hacked_pairs(rows)
 
-    async def score_clip(row: ManifestRow) -> ComparedAnswer:
+    async def answer(key: str, ask: Callable[[], Awaitable[ComparisonReward]]) -> ComparedAnswer:
         async with gate:
-            answer = await file.get(row.sha256, lambda: _score(judge, protocol, folder, row))
+            known = file.rows.get(key)
+            if known is None or known.value is None:
+                reward = await ask()
+                cost, value = reward.cost, reward.value if reward.valid else None
+                tokens = cost.prompt_tokens + cost.completion_tokens
+                known = ComparedAnswer(key, value, reward.reason, cost.calls, tokens, cost.images)
+                file.add(known)
             on_answer()
-            return answer
+            return known
 
-    async def compare_pair(hacked: ManifestRow, clean: ManifestRow) -> ComparedAnswer:
-        async with gate:
-            key = f"{hacked.sha256}/{clean.sha256}"
-            answer = await file.get(key, lambda: _prefer(judge, protocol, folder, hacked, clean))
-            on_answer()
-            return answer
+    async def compare_pair(hacked: ManifestRow, clean: ManifestRow) -> ComparisonReward:
+        other, task = read_clip(folder, clean)
+        return await judge.compare(PAIRWISE[protocol], other, read_clip(folder, hacked)[0], task)
+
+    async def score_clip(row: ManifestRow) -> ComparisonReward:
+        return await judge.score(POINTWISE[protocol], *read_clip(folder, row))
 
     if protocol in PAIRWISE:
-        answers = list(await asyncio.gather(*(compare_pair(*pair) for pair in pairs)))
+        asked = (answer(f"{pair[0].sha256}/{pair[1].sha256}", partial(compare_pair, *pair)) for pair in pairs)
+        answers = list(await asyncio.gather(*asked))
         wins = [answer.value <= 0.5 for answer in answers if answer.value is not None]
         return _row(protocol, answers, float("nan"), wins)
-    answers = list(await asyncio.gather(*(score_clip(row) for row in rows)))
+    answers = list(await asyncio.gather(*(answer(row.sha256, partial(score_clip, row)) for row in rows)))
     values = {row.sha256: answer.value for row, answer in zip(rows, answers)}
     known = [(row.labels.overall, value) for row in rows if (value := values[row.sha256]) is not None]
     both = [(values[hacked.sha256], values[clean.sha256]) for hacked, clean in pairs]
@@ -149,32 +131,10 @@ def comparison_table(rows: Sequence[ComparedRow], caption: str) -> Table:
     return make_table("comparison rewards", columns, cells, caption=caption)
 
 
-async def _score(judge: ChatComparison, protocol: str, folder: Path, row: ManifestRow) -> ComparedAnswer:
-    scored = await judge.score(POINTWISE[protocol], *read_clip(folder, row))
-    return _answer(scored.value if scored.valid else None, scored)
-
-
-async def _prefer(
-    judge: ChatComparison, protocol: str, folder: Path, hacked: ManifestRow, clean: ManifestRow
-) -> ComparedAnswer:
-    other, task = read_clip(folder, clean)
-    preferred = await judge.compare(PAIRWISE[protocol], other, read_clip(folder, hacked)[0], task)
-    return _answer(preferred.preference if preferred.valid else None, preferred)
-
-
-def _answer(value: float | None, result: Any) -> ComparedAnswer:
-    cost = result.cost
-    return ComparedAnswer(value, result.reason, cost.calls, cost.prompt_tokens + cost.completion_tokens, cost.images)
-
-
 def _row(name: str, answers: Sequence[ComparedAnswer], area: float, wins: Sequence[bool]) -> ComparedRow:
     invalid = sum(answer.value is None for answer in answers)
     low, high = wilson_interval(sum(wins), len(wins))
-    means = (_mean([getattr(answer, part) for answer in answers]) for part in ("calls", "tokens", "images"))
+    means = (mean([getattr(answer, part) for answer in answers]) for part in ("calls", "tokens", "images"))
     return ComparedRow(
-        name, len(answers) - invalid, invalid, area, len(wins), _mean([float(win) for win in wins]), low, high, *means
+        name, len(answers) - invalid, invalid, area, len(wins), mean([float(win) for win in wins]), low, high, *means
     )
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if values else float("nan")

@@ -31,8 +31,7 @@ MEASURES = ("reads", "calls", "images", "pixels", "tokens")
 class Savings:
     """The agent against another way, on the n clips that both decide. saved: share of the other's measures, by name.
     same: share of them with the same decision. accuracy, other_accuracy: of accepting, against the labels.
-    difference: agent - other on the same clips, with Tango's interval.
-    """
+    difference: agent - other on the same clips, with Tango's interval."""
 
     against: str
     n: int
@@ -53,11 +52,7 @@ def trials(rubric: str, seed: int) -> list[JudgeTrial]:
 
 
 def measure_savings(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence[Outcome]]) -> list[Savings]:
-    """The agent against each of the others.
-
-    Raises:
-        ValueError: no clip that both decide.
-    """
+    """The agent against each of the others. Raises ValueError: no clip that both decide."""
     comparisons = []
     for name in list(ARMS)[1:]:
         decided = [
@@ -67,12 +62,11 @@ def measure_savings(rows: Sequence[ManifestRow], outcomes: Mapping[str, Sequence
         both = [(row.labels.overall, a.decisions[OVERALL].value, b.decisions[OVERALL].value) for row, a, b in decided]
         if not both:
             raise ValueError(f"no clip is decided by the agent and by {ARMS[name]}; see the statuses of the table")
-        right = [said == label for label, said, _ in both]
-        other_right = [said == label for label, _, said in both]
+        right, other_right = ([pair[k] == pair[0] for pair in both] for k in (1, 2))
         cost, other_cost = cost_row([mine for _, mine, _ in decided]), cost_row([other for _, _, other in decided])
         saved = {part: 1 - cost[part] / other_cost[part] for part in MEASURES}
         same = [mine == other for _, mine, other in both]
-        agreed, mine_right, its_right = (sum(decisions) / len(both) for decisions in (same, right, other_right))
+        agreed, mine_right, its_right = (sum(hits) / len(both) for hits in (same, right, other_right))
         paired = paired_difference(other_right, right)
         comparisons.append(Savings(ARMS[name], len(both), saved, agreed, mine_right, its_right, paired))
     return comparisons

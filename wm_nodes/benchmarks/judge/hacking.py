@@ -32,8 +32,7 @@ Proxy = Callable[[LabelledClip, TaskSpec], Awaitable[float | None]]
 class SearchPlan:
     """generations of `candidates` edits each; the best one stays if the reward says it is better than what was there,
     up to max_edits on top of each other. severities: fail edits are faults that anybody sees, the paper's patterns
-    among them; mild ones must still pass, so they only look for what confuses the judge.
-    """
+    among them; mild ones must still pass, so they only look for what confuses the judge."""
 
     generations: int = 8
     candidates: int = 6
@@ -61,8 +60,7 @@ class SearchStart:
 @dataclass
 class Climb:
     """One search. proxy, truth: after each generation, the start first. clean: the reward of the recording without the
-    defect; NaN where that has no number. edits: taken, in order.
-    """
+    defect; NaN where that has no number. edits: taken, in order."""
 
     proxy: list[float]
     truth: list[float]
@@ -83,18 +81,15 @@ def agent_reward(judge: Judge, rubric: Rubric, seed: int = 0) -> Proxy:
 
 def mean_score(judge: Judge, rubric: Rubric, seed: int = 0) -> Proxy:
     """The single-score baseline of the same judge: the mean of the component scores that it gives, read once, without
-    plan, gates, votes, reflection or hacking patterns.
-    """
+    plan, gates, votes, reflection or hacking patterns."""
 
     async def proxy(clip: LabelledClip, task: TaskSpec) -> float | None:
         scores: list[float] = []
         for stage in GATED:
             part = rubric.stages[stage]
-            media = profile_media(clip.ref, task, part.profile)
+            media, names = profile_media(clip.ref, task, part.profile), tuple(part.components)
             vote = (first_vote(seed),)
-            reads = await judge.read(
-                ReadRequest(clip.ref, task, stage, tuple(part.components), part.profile, vote, media, "pack")
-            )
+            reads = await judge.read(ReadRequest(clip.ref, task, stage, names, part.profile, vote, media, "pack"))
             scores += [score_of(read.levels) for read in reads if read.status is Status.OK]
         return float(np.mean(scores)) if scores else None
 
@@ -169,8 +164,7 @@ def _make_children(chain: Sequence[LabelledClip], plan: SearchPlan, rng: np.rand
 @dataclass(frozen=True)
 class Curve:
     """Means over the searches of one reward, and what the detector (DD-2) says of them. clean: mean reward of the
-    recordings. wins: share of searches that end at or above their recording's reward; before: that begin there.
-    """
+    recordings. wins: share of searches that end at or above their recording's reward; before: that begin there."""
 
     reward: str
     searches: int

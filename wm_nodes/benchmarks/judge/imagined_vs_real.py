@@ -47,8 +47,7 @@ FIRST_SEED = 700_000
 class ImaginedAgreement:
     """A judge against the simulator on n clips, of which `judged` got a reward. real: share of successes among them.
     accuracy, low, high: of accepting, with Wilson's 95 % interval; balanced: mean of both recalls; auroc: of the
-    reward. closed: clips that each gate refused. reward_success, reward_failure: mean rewards.
-    """
+    reward. closed: clips that each gate refused. reward_success, reward_failure: mean rewards."""
 
     kind: str
     n: int
@@ -87,11 +86,7 @@ def jobs(
 
 
 def agreement(kind: str, verdicts: Sequence[Verdict], succeeded: BoolArray) -> ImaginedAgreement:
-    """Compare verdicts with what the simulator says of the same episodes.
-
-    Raises:
-        ValueError: no clip got a reward.
-    """
+    """Compare verdicts with what the simulator says of the same episodes. Raises ValueError: no clip got a reward."""
     both = zip(verdicts, succeeded, strict=True)
     judged = [(v, bool(real)) for v, real in both if v.valid and accepts(v) is not None]
     if not judged:

@@ -6,8 +6,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from benchmarks.judge.comparisons import ChatComparison
-from benchmarks.judge.label_judge import LabelJudge, known_clips
+from benchmarks.judge.comparisons.chat import ChatComparison
+from benchmarks.judge.label_judge import KnownClip, LabelJudge
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import JudgeConfig, StageJudge
 from wm_nodes.judge.agent import Judge, Rubric
@@ -24,10 +24,7 @@ NAMES = ("embedded", "openai", "simulator")
 async def open_judge(
     arguments: argparse.Namespace, rubric: Rubric, manifest: Manifest, reads: Path
 ) -> AsyncIterator[Judge]:
-    """The judge that --judge names, closed afterwards.
-
-    Args:
-        reads: folder of the answers that were bought from a server.
+    """The judge that --judge names, closed afterwards. reads: folder of the answers that were bought from a server.
 
     Raises:
         ValueError: a setting it needs is missing, named, or --stages is given to another judge than the embedded one.
@@ -36,8 +33,8 @@ async def open_judge(
     if arguments.stages and arguments.judge != "embedded":
         raise ValueError(f"--stages gives stages of the embedded judge to --model; got --judge {arguments.judge}")
     if arguments.judge == "simulator":
-        rows = ((row.sha256, row.labels, row.edits) for row in manifest.rows)
-        yield LabelJudge(known_clips(rows), rubric, error=arguments.error, seed=arguments.seed)
+        clips = {row.sha256: KnownClip(row.labels, row.edits) for row in manifest.rows}
+        yield LabelJudge(clips, rubric, error=arguments.error, seed=arguments.seed)
         return
     if arguments.judge == "embedded" and not arguments.stages:
         yield EmbeddedJudge(load_head(arguments.folder or shipped_head()), arguments.conformal)
@@ -45,11 +42,10 @@ async def open_judge(
     settings = server_settings(arguments)
     if arguments.judge == "embedded":
         server = {name: getattr(settings, name) for name in ("endpoints", "model", "api_key_env")}
-        changes: dict[str, Any] = {
+        settings = settings.model_copy(update={
             "kind": "embedded", "folder": str(arguments.folder or ""), "conformal": arguments.conformal,
-            "endpoints": [], "model": "",
-        }
-        settings = settings.model_copy(update={**changes, "routes": [StageJudge(stages=arguments.stages, **server)]})
+            "endpoints": [], "model": "", "routes": [StageJudge(stages=arguments.stages, **server)],
+        })
     opened = make_judge(settings, rubric, reads)
     try:
         yield opened.judge
@@ -59,11 +55,7 @@ async def open_judge(
 
 @asynccontextmanager
 async def open_comparison(arguments: argparse.Namespace) -> AsyncIterator[ChatComparison]:
-    """What asks the same server by other papers' protocols.
-
-    Raises:
-        ValueError: no server is named.
-    """
+    """What asks the same server by other papers' protocols. Raises ValueError: no server is named."""
     settings = server_settings(arguments)
     transport = ChatTransport(
         [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],

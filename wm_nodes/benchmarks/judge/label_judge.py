@@ -5,23 +5,12 @@ save, and how far votes correct independent errors.
 """
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.judge.agent import types
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    NUM_PLAN_LEVELS,
-    PLANNING,
-    Capabilities,
-    Component,
-    Cost,
-    Health,
-    Read,
-    ReadRequest,
-    Stage,
-    Vote,
-)
 from wm_nodes.judge.dataset.edits import TC, ClipTruth, Edit, planning_level
 
 SURE = 0.9
@@ -36,11 +25,8 @@ class KnownClip:
 
 
 class LabelJudge:
-    """Answers from the labels of known clips.
-
-    Args:
-        error: probability that a read says the contrary; drawn by clip, component and vote, so that votes are
-            independent, which those of a real judge are not.
+    """Answers from the labels of known clips. error: probability that a read says the contrary; drawn by clip,
+    component and vote, so that votes are independent, which those of a real judge are not.
 
     Raises:
         ValueError: error is outside [0, 1]; at a read: a clip it does not know.
@@ -53,35 +39,37 @@ class LabelJudge:
         self._labels = hashlib.sha256(repr(sorted(clips.items())).encode()).hexdigest()[:8]
 
     @property
-    def capabilities(self) -> Capabilities:
-        names = frozenset({PLANNING, *self._rubric.component_names, *self._rubric.hack.patterns})
+    def capabilities(self) -> types.Capabilities:
+        names = frozenset({types.PLANNING, *self._rubric.component_names, *self._rubric.hack.patterns})
         model = f"labels {self._labels}, error {self._error:g}, seed {self._seed}"
-        return Capabilities("simulator labels", "none", model, "1", names, reasons=False, deterministic=True)
+        return types.Capabilities("simulator labels", "none", model, "1", names, reasons=False, deterministic=True)
 
-    async def health(self) -> Health:
-        return Health(True)
+    async def health(self) -> types.Health:
+        return types.Health(True)
 
-    async def read(self, request: ReadRequest) -> list[Read]:
+    async def read(self, request: types.ReadRequest) -> list[types.Read]:
         known = self.clips.get(request.clip.sha256)
         if known is None:
             raise ValueError(f"clip {request.clip.clip_id} has no labels; this judge knows the clips of its set only")
         return [self._read(request, known, name, vote) for name in request.components for vote in request.votes]
 
-    def _read(self, request: ReadRequest, known: KnownClip, name: Component, vote: Vote) -> Read:
+    def _read(self, request: types.ReadRequest, known: KnownClip, name: str, vote: types.Vote) -> types.Read:
         rng = numpy_stream(self._seed, f"oracle/{request.clip.sha256}/{request.stage}/{name}/{vote.index}")
         errs = bool(rng.random() < self._error)
-        if name == PLANNING:
+        if name == types.PLANNING:
             level = planning_level(known.labels, known.edits)
-            level = _neighbour_level(2 if level is None else level, errs, NUM_PLAN_LEVELS)
-            levels = _spread(level, NUM_PLAN_LEVELS)
+            level = 2 if level is None else level
+            if errs:
+                level += 1 if level + 1 < types.NUM_PLAN_LEVELS else -1
+            levels = _spread(level, types.NUM_PLAN_LEVELS)
         else:
             levels = _spread(self._level(request.stage, known.labels, name, errs), 5)
-        cost = Cost(calls=1, images=len(request.media))
-        cited = (0,) if request.stage is Stage.REFLECT else ()
-        return Read(name, levels, "label" if vote.kind == "label" else "json", vote, frames_cited=cited, cost=cost)
+        cost = types.Cost(calls=1, images=len(request.media))
+        cited = (0,) if request.stage is types.Stage.REFLECT else ()
+        return types.Read(name, levels, vote.kind, vote, frames_cited=cited, cost=cost)
 
-    def _level(self, stage: Stage, labels: ClipTruth, name: Component, errs: bool) -> int:
-        if stage is Stage.HACK:
+    def _level(self, stage: types.Stage, labels: ClipTruth, name: types.Component, errs: bool) -> int:
+        if stage is types.Stage.HACK:
             return CLEAN if (labels.pattern != name) != errs else 0
         if name == TC:
             return 4 - labels.tc_level if errs else labels.tc_level
@@ -89,14 +77,6 @@ class LabelJudge:
         if passed is None:
             return UNSAID
         return CLEAN if passed != errs else WRONG
-
-
-def known_clips(rows: Iterable[tuple[str, ClipTruth, tuple[Edit, ...]]]) -> dict[str, KnownClip]:
-    return {sha: KnownClip(labels, edits) for sha, labels, edits in rows}
-
-
-def _neighbour_level(level: int, errs: bool, count: int) -> int:
-    return level if not errs else level + 1 if level + 1 < count else level - 1
 
 
 def _spread(level: int, count: int) -> tuple[float, ...]:

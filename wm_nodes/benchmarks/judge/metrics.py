@@ -27,8 +27,7 @@ MIN_BALANCED = 0.85
 class LabelAgreement:
     """One row. n: clips with a known label and a decision; silent: known, without a decision. prevalence: share of
     failing labels (planning: of levels below 2). recall_of_fails, recall_of_passes: the confusion table's rows.
-    balanced: of planning the mean recall of its levels. NaN where the labels are all alike.
-    """
+    balanced: of planning the mean recall of its levels. NaN where the labels are all alike."""
 
     name: str
     n: int
@@ -88,8 +87,7 @@ class PatternRow:
     5 % false positives or less, as a ROC curve gives it (no threshold is chosen for use). refused: share that the agent
     does not accept, by whatever stage. win_rate: P(reward of the hacked clip >= that of its recorded clip) and gap:
     mean difference, over pairs whose recorded clip is good throughout. confusion: of the flag. unflagged, false_flags:
-    recipe -> clips that the flag is wrong on.
-    """
+    recipe -> clips that the flag is wrong on."""
 
     pattern: str
     n: int
@@ -126,44 +124,39 @@ def pattern_rows(rows: Sequence[ManifestRow], outcomes: Sequence[Outcome], patte
         false = [said for said, is_there in zip(confirmed, present) if not is_there]
         mine = [(row, outcome) for row, outcome in zip(rows, outcomes) if row.labels.pattern == name]
         decided = [outcome.decisions[OVERALL].value for _, outcome in mine if OVERALL in outcome.decisions]
-        rewards = [
-            (by_sha[row.root].reward, outcome.reward) for row, outcome in mine if row.root in good & by_sha.keys()
-        ]
+        rewards = [(by_sha[row.root].reward, child.reward) for row, child in mine if row.root in good & by_sha.keys()]
         gaps = [parent - child for parent, child in rewards if parent is not None and child is not None]
-        low, high = wilson_interval(sum(hits), len(hits))
         numbers = (
-            _mean(hits), low, high, _mean(false), recall_at(present, p, MAX_FALSE_POSITIVES), auroc(present, p),
-            1 - _mean(decided),
+            mean(hits), *wilson_interval(sum(hits), len(hits)), mean(false),
+            recall_at(present, p, MAX_FALSE_POSITIVES), auroc(present, p), 1 - mean(decided),
         )
-        wins = _mean([gap <= 0 for gap in gaps])
         wrong = [(there, last_edit(row)) for (row, _, _), there, said in zip(read, present, confirmed) if there != said]
         confusion = {
             "there, flagged": sum(hits), "there, not flagged": len(hits) - sum(hits),
             "not there, flagged": sum(false), "not there, not flagged": len(false) - sum(false),
         }
-        by_recipe = (
+        unflagged, false_flags = (
             dict(Counter(edit for is_there, edit in wrong if is_there is kind).most_common()) for kind in (True, False)
         )
-        result.append(
-            PatternRow(name, len(hits), len(false), *numbers, len(gaps), wins, _mean(gaps), confusion, *by_recipe)
-        )
+        result.append(PatternRow(
+            name, len(hits), len(false), *numbers, len(gaps), mean([gap <= 0 for gap in gaps]), mean(gaps), confusion,
+            unflagged, false_flags,
+        ))
     return result
 
 
 def cost_row(outcomes: Sequence[Outcome], price: Sequence[float] = ()) -> dict[str, float]:
-    """Means per clip: what was asked (reward_meter), what a server billed, seconds; usd where a price is known.
-
-    Args:
-        price: USD per million prompt tokens, and per million completion tokens; of billed ones.
+    """Means per clip: what was asked (call_counter), what a server billed, seconds; usd where a price is known.
+    price: USD per million prompt tokens, and per million completion tokens; of billed ones.
     """
-    means = {name: _mean([getattr(o.asked, name) for o in outcomes]) for name in outcomes[0].asked.__dataclass_fields__}
+    means = {name: mean([getattr(o.asked, name) for o in outcomes]) for name in outcomes[0].asked.__dataclass_fields__}
     for name in ("calls", "prompt_tokens", "cached_tokens", "completion_tokens", "images", "retries"):
-        means[f"billed_{name}"] = _mean([getattr(outcome.cost, name) for outcome in outcomes])
+        means[f"billed_{name}"] = mean([getattr(outcome.cost, name) for outcome in outcomes])
     known = [outcome.cost.usd for outcome in outcomes if outcome.cost.usd is not None]
-    usd = _mean(known)
+    usd = mean(known)
     if price:
         usd = (price[0] * means["billed_prompt_tokens"] + price[1] * means["billed_completion_tokens"]) / 1e6
-    return {**means, "usd": usd, "wall_s": _mean([outcome.wall_s for outcome in outcomes])}
+    return {**means, "usd": usd, "wall_s": mean([outcome.wall_s for outcome in outcomes])}
 
 
 def statuses(outcomes: Sequence[Outcome]) -> dict[str, int]:
@@ -213,5 +206,5 @@ def last_edit(row: ManifestRow) -> str:
     return f"{row.edits[-1].recipe} {row.edits[-1].severity}" if row.edits else "recording"
 
 
-def _mean(values: Sequence[Any]) -> float:
+def mean(values: Sequence[Any]) -> float:
     return float(np.mean(values)) if len(values) else float("nan")

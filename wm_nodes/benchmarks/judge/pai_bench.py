@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from benchmarks.judge.comparisons import ChatComparison
 from benchmarks.judge.comparisons import pai_bench as pai
+from benchmarks.judge.comparisons.chat import ChatComparison
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.core.types import UInt8Array
@@ -51,11 +51,7 @@ def metrics_of(clip: ClipRef, image: UInt8Array | None, backbones: dict[str, Fra
 
 
 def quality(videos: Sequence[Path], images: Path | None, backbones: dict[str, FrameFeatures]) -> dict[str, float]:
-    """Means over the videos.
-
-    Raises:
-        ValueError: a video or its conditioning image is missing or unreadable.
-    """
+    """Means over the videos. Raises ValueError: a video or its conditioning image is missing or unreadable."""
     rows = [metrics_of(read_video(path), _image(images, path.stem), backbones) for path in tqdm(videos, "quality")]
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]} if backbones else {}
 

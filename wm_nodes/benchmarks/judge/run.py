@@ -3,19 +3,17 @@
 import asyncio
 import hashlib
 import json
-import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
 from benchmarks.judge.call_counter import CallCounts, CountingJudge
 from benchmarks.judge.labels import pattern_scores
+from benchmarks.judge.line_file import LineFile
 from wm_nodes.judge.agent import RewardAgent, Rubric
 from wm_nodes.judge.agent.machine import Mode
-from wm_nodes.judge.agent.types import Capabilities, Cost, Judge, Verdict
+from wm_nodes.judge.agent.types import Capabilities, Cost, Judge
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.rows import read_clip
 from wm_nodes.judge.decisions import Decision, decisions_of
@@ -23,7 +21,7 @@ from wm_nodes.judge.decisions import Decision, decisions_of
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is kept of a verdict. reward: None unless the status is OK. decisions, patterns: see reward_truth."""
+    """What is kept of a verdict. reward: None unless the status is OK. decisions, patterns: see labels."""
 
     sha256: str
     status: str
@@ -53,50 +51,13 @@ class JudgeTrial:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-_OUTCOME = TypeAdapter(Outcome)
-
-
-class OutcomeFile:
-    """Outcomes by clip, one JSON line each; a line that a killed run left torn is judged again."""
-
-    def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._path = path
-        self.kept = {outcome.sha256: outcome for outcome in _lines(path)}
-
-    def add(self, outcome: Outcome) -> None:
-        self.kept[outcome.sha256] = outcome
-        with self._path.open("ab") as file:
-            if file.tell() and not self._path.read_bytes().endswith(b"\n"):
-                file.write(b"\n")
-            file.write(_OUTCOME.dump_json(outcome) + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-
-
-def outcome_of(verdict: Verdict, asked: CallCounts) -> Outcome:
-    return Outcome(
-        verdict.provenance.media_sha, str(verdict.status), verdict.reason, verdict.reward if verdict.valid else None,
-        decisions_of(verdict), pattern_scores(verdict), asked, replace(verdict.cost, wall_s=0.0),
-        verdict.cost.wall_s,
-    )
-
-
 async def judge_rows(
-    judge: Judge,
-    trial: JudgeTrial,
-    folder: Path,
-    rows: Sequence[ManifestRow],
-    file: OutcomeFile,
-    *,
-    at_once: int = 1,
-    on_clip: Callable[[], object] = lambda: None,
+    judge: Judge, trial: JudgeTrial, folder: Path, rows: Sequence[ManifestRow], file: LineFile[Outcome], *,
+    at_once: int = 1, on_clip: Callable[[], object] = lambda: None,
 ) -> list[Outcome]:
     """Judge what `file` does not hold yet; returns an outcome per row, in their order. An ERROR is tried again next
-    time: it is no answer.
-
-    Args:
-        at_once: clips under way together, for a judge behind a server. on_clip: called after each clip, known or new.
+    time: it is no answer. at_once: clips under way together, for a judge behind a server. on_clip: called after each
+    clip, known or new.
 
     Raises:
         ManifestError: a clip cannot be read.
@@ -106,15 +67,19 @@ async def judge_rows(
 
     async def judge_row(row: ManifestRow) -> None:
         async with gate:
-            known = file.kept.get(row.sha256)
+            known = file.rows.get(row.sha256)
             if known is None or known.status == "ERROR":
                 clip, task = read_clip(folder, row)
                 metered = CountingJudge(judge)
                 agent = RewardAgent(
-                    metered, trial.rubric, mode=trial.mode, seed=trial.seed, max_reads=trial.max_reads,
-                    call_plan="pack",
+                    metered, trial.rubric, mode=trial.mode, seed=trial.seed, max_reads=trial.max_reads, call_plan="pack"
                 )
-                known = outcome_of(await agent.evaluate(clip, task), metered.asked)
+                verdict = await agent.evaluate(clip, task)
+                known = Outcome(
+                    verdict.provenance.media_sha, str(verdict.status), verdict.reason,
+                    verdict.reward if verdict.valid else None, decisions_of(verdict), pattern_scores(verdict),
+                    metered.asked, replace(verdict.cost, wall_s=0.0), verdict.cost.wall_s,
+                )
                 file.add(known)
             fresh[row.sha256] = known
             on_clip()
@@ -123,13 +88,3 @@ async def judge_rows(
         for row in rows:
             group.create_task(judge_row(row))
     return [fresh[row.sha256] for row in rows]
-
-
-def _lines(path: Path) -> Iterator[Outcome]:
-    if not path.is_file():
-        return
-    for line in path.read_bytes().splitlines():
-        try:
-            yield _OUTCOME.validate_json(line)
-        except ValidationError:
-            continue

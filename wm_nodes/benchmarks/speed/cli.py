@@ -19,8 +19,8 @@ from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.config.load import load_config, parse_override, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.allocator import keep_freed_memory
-from wm_nodes.reports import machine_facts
 from wm_nodes.reports.console_table import make_table
+from wm_nodes.reports.machine import machine_facts
 
 FULL, QUICK = Effort(60, 5000, 5, 30), Effort(3, 500, 2, 8)
 
@@ -94,8 +94,7 @@ def show(results: dict[str, Any]) -> None:
         f"{simulator['imagined_envs']} environments with {simulator['reward']} reward",
     ))
     title = f"{facts['processor']}, {facts['cores']} cores, {results['date']}"
-    columns = ("", "value", "goal", "measured")
-    left = ("", "goal", "measured")
+    columns, left = ("", "value", "goal", "measured"), ("", "goal", "measured")
     console.print(make_table(title, columns, rows, left=left, caption=results["model"], no_wrap=("",)))
     stages = ((name, f"{v['ms']:.1f}", f"{v['peak_mib']:.1f}") for name, v in results["stages"].items())
     console.print(make_table(f"one batch of {IMAGINED_ENVS}", ("stage", "ms", "peak memory, MiB"), stages))

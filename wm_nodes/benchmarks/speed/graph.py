@@ -1,8 +1,7 @@
 """The same step over DDS and in this process, with as many threads on both sides."""
 
 import os
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from wm_nodes.policy_rl.factories import make_imagined_environment
 
 GRAPH_ENVS, GRAPH_THREADS = 16, 1
 """One torch thread per node is the graph's default; the loop in one process gets as many."""
-
 TIMEOUT_S = 60.0
 DOMAINS = range(60, 102)
 
@@ -58,11 +56,11 @@ def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, 
         )
         local = make_imagined_environment(config, model, starts, num_envs=GRAPH_ENVS, seed=config.seed)
         console.print("graph: step over DDS against the same step in one process", highlight=False)
-        with torch_threads(GRAPH_THREADS):
-            over_dds, in_process = interleave(
-                [lambda block: time_episode(remote, block), lambda block: time_episode(local, block)],
-                effort.overhead_blocks,
-            )
+        contenders = [lambda block: time_episode(remote, block), lambda block: time_episode(local, block)]
+        with ExitStack() as after:
+            after.callback(torch.set_num_threads, torch.get_num_threads())
+            torch.set_num_threads(GRAPH_THREADS)
+            over_dds, in_process = interleave(contenders, effort.overhead_blocks)
         console.print(f"graph: {effort.growth_steps} steps of a costless environment", highlight=False)
         growth_s = time_steps(still_remote, effort.growth_steps)
     tenth = max(1, len(growth_s) // 10)
@@ -83,14 +81,3 @@ def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, 
             "growth_first_p10_ms": fastest[0], "growth_last_p10_ms": fastest[1],
         },
     }
-
-
-@contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Compute with `count` threads in this process."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -6,7 +6,7 @@ import time
 from typing import Any
 
 from wm_nodes.core.files import write_atomic
-from wm_nodes.reports import machine_facts
+from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import plain
 
 

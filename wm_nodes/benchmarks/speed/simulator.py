@@ -9,7 +9,6 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -53,7 +52,7 @@ def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Pa
     console.print(f"world model against ManiSkill with rendering, {len(cores)} cores each", highlight=False)
     kinds = {} if missing else {"simulator": _serve_blocks, **({"stock": _serve_stock} if config.task in STOCK else {})}
     with ExitStack() as stack:
-        contenders = {"imagined": lambda block: rate_episode(imagined, reward, block).steps_per_s}
+        contenders = {"imagined": lambda block: rate_episode(imagined, reward, block)}
         for kind, serve in kinds.items():
             contenders[kind] = partial(rate_workers, stack.enter_context(simulator_workers(config, cores, serve)))
         blocks = interleave([*contenders.values()], effort.simulator_blocks)
@@ -65,11 +64,10 @@ def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Pa
         "reward": reward.name,
     }
     details |= {f"{kind}_steps_per_s": rates[kind] for kind in kinds}
+    ratios = [rates["imagined"] / rates[kind] if kind in kinds else None for kind in ("simulator", "stock")]
     return {
-        "imagined_steps_per_s": rates["imagined"],
-        "imagined_over_simulator": rates["imagined"] / rates["simulator"] if "simulator" in kinds else None,
-        "imagined_over_stock_simulator": rates["imagined"] / rates["stock"] if "stock" in kinds else None,
-        "simulator": details,
+        "imagined_steps_per_s": rates["imagined"], "imagined_over_simulator": ratios[0],
+        "imagined_over_stock_simulator": ratios[1], "simulator": details,
     }
 
 
@@ -100,7 +98,7 @@ def simulator_workers(
 
 
 def _serve_blocks(config: RunConfig, core: int, commands: Connection) -> None:
-    """StepRate every block that is asked for, until the other end closes."""
+    """Send the steps per second of every block that is asked for, until the other end closes."""
     os.sched_setaffinity(0, {core})
     torch.set_num_threads(1)
     keep_freed_memory()
@@ -134,7 +132,7 @@ def _serve_stock(config: RunConfig, core: int, commands: Connection) -> None:
             start = time.perf_counter()
             for _ in range(config.simulation.max_episode_steps):
                 env.step(env.action_space.sample())
-            commands.send(StepRate(config.simulation.max_episode_steps / (time.perf_counter() - start)))
+            commands.send(config.simulation.max_episode_steps / (time.perf_counter() - start))
     except EOFError:
         env.close()
 
@@ -152,21 +150,14 @@ def rate_workers(workers: list[Connection], block: int) -> float:
         try:
             if not worker.poll(WORKER_TIMEOUT_S):
                 raise RunError(f"a simulator process gave no answer for {WORKER_TIMEOUT_S:g} s; is memory short?")
-            total += worker.recv().steps_per_s
+            total += worker.recv()
         except EOFError:
             raise RunError("a simulator process ended; its error is above") from None
     return total
 
 
-@dataclass(frozen=True)
-class StepRate:
-    """steps_per_s: environment steps that counted, per second of stepping."""
-
-    steps_per_s: float
-
-
-def rate_episode(env: Environment, reward: RewardModel, block: int) -> StepRate:
-    """Reset, then step with rewards to the step limit; environments that have ended do not count.
+def rate_episode(env: Environment, reward: RewardModel, block: int) -> float:
+    """Steps per second of a reset and then steps with rewards to the limit; environments that have ended do not count.
 
     Every goal counts as found: a reward without a goal would be skipped, and look fast.
     """
@@ -180,4 +171,4 @@ def rate_episode(env: Environment, reward: RewardModel, block: int) -> StepRate:
         reward.evaluate(reward_input(observation, result, goals))
         observation = result.observation
         steps += int(result.valid.sum())
-    return StepRate(steps / (time.perf_counter() - start))
+    return steps / (time.perf_counter() - start)

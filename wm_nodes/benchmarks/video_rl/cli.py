@@ -19,19 +19,12 @@ from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
-from benchmarks.video_rl import diversity, plots, tables
+from benchmarks.video_rl import diversity, plots, samplers, tables
 from benchmarks.video_rl.clip_resolution import sample_clips, size_rows
 from benchmarks.video_rl.comparison import CLIP_MEASURES, MEASURES, SamplerComparison, compare_samplers
 from benchmarks.video_rl.cost import measure_anchors, pushcube_buffer, pushcube_rollout, toy_buffer, toy_rollout
 from benchmarks.video_rl.learning import train_on_discs, train_sampler
-from benchmarks.video_rl.samplers import (
-    DiscPlan,
-    LearningPlan,
-    SamplerSetup,
-    clip_learning_samplers,
-    diversity_samplers,
-    learning_samplers,
-)
+from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup, diversity_samplers, learning_samplers
 from benchmarks.video_rl.sources import TASK, RecordedSource
 from benchmarks.video_rl.trials import Plan, SamplerTrial, ablation_trials, hacking_trials
 from wm_nodes.apps.options import add_json, add_seed, positive, prepare_torch
@@ -142,18 +135,22 @@ def _base(arguments: argparse.Namespace) -> None:
 
 
 def _diversity(arguments: argparse.Namespace) -> None:
-    model, plan = load_base(arguments.base), diversity.DiversityPlan(arguments.contexts, arguments.group_size)
-    rows, samplers = list[dict[str, Any]](), _chosen(arguments)
-    with tqdm(total=2 * len(samplers), desc="diversity", unit="sampler") as bar:
-        for shared in (False, True):
-            for sampler in samplers:
-                rows.append(diversity.measure_discs(model, replace(sampler, shared_noise=shared), plan, arguments.seed))
-                bar.update()
-    of = {"plan": asdict(plan), "seed": arguments.seed, "features": diversity.FEATURES, **_settings(samplers)}
+    model, plan = load_base(arguments.base), {"contexts": arguments.contexts, "group_size": arguments.group_size}
+    chosen = _choose_samplers(arguments)
+    rows = [
+        diversity.measure_discs(model, setup, **plan, seed=arguments.seed)
+        for setup in tqdm(_with_both_noises(chosen), desc="diversity", unit="sampler")
+    ]
+    of = {"plan": plan, "seed": arguments.seed, "features": diversity.FEATURES, **_settings(chosen)}
     comparisons = diversity.disc_comparisons(rows, arguments.seed)
     write_results(arguments, {**of, **_base_of(arguments), "rows": rows, "comparisons": comparisons})
     _draw(arguments, plots.plot_diversity, rows, arguments.seed)
     console.print(tables.diversity_table(rows, arguments.seed))
+
+
+def _with_both_noises(setups: list[SamplerSetup]) -> list[SamplerSetup]:
+    """Each sampler with initial noise of every video's own, then each with one that a group shares."""
+    return [replace(setup, shared_noise=shared) for shared in (False, True) for setup in setups]
 
 
 def _clips(arguments: argparse.Namespace) -> None:
@@ -163,17 +160,15 @@ def _clips(arguments: argparse.Namespace) -> None:
     clips = load_clips(bags, folder.clip["stride"])
     drawn = numpy_stream(arguments.seed, "clip_diversity").permutation(len(clips))[: arguments.contexts]
     contexts, features = clips.select(torch.from_numpy(drawn)), diversity.load_features(arguments.features, config.task)
-    samplers = _chosen(arguments)
-    rows, source = [], RecordedContexts(folder, contexts, config, probe)
-    with tqdm(total=2 * len(samplers) * len(contexts), desc="clips", unit="context") as bar:
-        for shared in (False, True):
-            for sampler in samplers:
-                bar.set_postfix_str(sampler.name)
-                named = replace(sampler, shared_noise=shared)
-                rows.append(diversity.measure_clips(source, named, features, arguments.group_size, bar.update))
+    chosen, rows = _choose_samplers(arguments), list[dict[str, Any]]()
+    source = RecordedContexts(folder, contexts, config, probe)
+    with tqdm(total=2 * len(chosen) * len(contexts), desc="clips", unit="context") as bar:
+        for setup in _with_both_noises(chosen):
+            bar.set_postfix_str(setup.name)
+            rows.append(diversity.measure_clips(source, setup, features, arguments.group_size, bar.update))
     compared = diversity.clip_comparisons(rows, arguments.seed)
     size = {"contexts": len(contexts), "group_size": arguments.group_size, "features": features.name}
-    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(samplers)}
+    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(chosen)}
     write_results(arguments, {**size, "seed": arguments.seed, **of, "rows": rows, "comparisons": compared})
     _draw(arguments, plots.plot_diversity, rows, arguments.seed)
     console.print(tables.clip_table(rows, arguments.seed), tables.clip_comparison_table(compared))
@@ -182,13 +177,12 @@ def _clips(arguments: argparse.Namespace) -> None:
 def _resolution(arguments: argparse.Namespace) -> None:
     config = load_video_config(arguments.preset, {"seed": arguments.seed})
     folder, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(config.task))
-    if arguments.context_bags:
-        found = [[bag] for bag in arguments.context_bags]
-    else:
-        sides = [{"simulation.image_size": side} for side in (probe.height, *arguments.sizes)]
-        found = [_episodes(arguments.contexts, HELDOUT_SEEDS, config.task, side) for side in sides]
+    sizes = [{"simulation.image_size": side} for side in (probe.height, *arguments.sizes)]
+    recordings = [[bag] for bag in arguments.context_bags] or [
+        _episodes(arguments.contexts, HELDOUT_SEEDS, config.task, size) for size in sizes
+    ]
     rows, own = list[dict[str, Any]](), None
-    for bags in tqdm(found, desc="resolution", unit="size"):
+    for bags in tqdm(recordings, desc="resolution", unit="size"):
         clips = load_clips(bags, folder.clip["stride"])
         clips = clips.select(torch.arange(min(arguments.contexts, len(clips))))
         if own is None:
@@ -208,14 +202,12 @@ def _episodes(clips: int, first_seed: int, task: str, settings: Mapping[str, Any
 
 def _clip_learning(arguments: argparse.Namespace) -> None:
     base, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(TASK))
-    given = (arguments.context_bags, arguments.heldout_bags)
-    wanted = ((arguments.contexts, NEW_SEEDS), (arguments.eval_contexts, HELDOUT_SEEDS))
-    contexts, heldout = (
-        load_clips(bags or _episodes(*what, TASK), base.clip["stride"])
-        for bags, what in zip(given, wanted, strict=True)
-    )
-    plan, of = LearningPlan(arguments.iterations, eval_contexts=arguments.eval_contexts), base.manifest["sha256"]
-    trials, of = [SamplerTrial(sampler, plan) for sampler in clip_learning_samplers()], {"sha256": of}
+    bags = arguments.context_bags or _episodes(arguments.contexts, NEW_SEEDS, TASK)
+    heldout_bags = arguments.heldout_bags or _episodes(arguments.eval_contexts, HELDOUT_SEEDS, TASK)
+    contexts, heldout = (load_clips(recorded, base.clip["stride"]) for recorded in (bags, heldout_bags))
+    plan = LearningPlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
+    of = {"sha256": base.manifest["sha256"]}
+    trials = [SamplerTrial(sampler, plan) for sampler in samplers.clip_learning_samplers()]
 
     def train(trial: SamplerTrial[LearningPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
         folder = load_video_folder(arguments.video_model)
@@ -223,10 +215,8 @@ def _clip_learning(arguments: argparse.Namespace) -> None:
         return train_sampler(source, trial.sampler, trial.plan, seed, on_iteration)
 
     rows = _train(arguments, trials, train, of)
-    comparisons = _compared(rows, _against_cps(rows), CLIP_MEASURES)
-    _write_trainings(arguments, trials, rows, comparisons, of)
-    if comparisons:
-        _draw(arguments, plots.plot_comparisons, comparisons)
+    comparisons = _compare(arguments, trials, rows, _against_cps(rows), of, CLIP_MEASURES)
+    _draw(arguments, plots.plot_comparisons, comparisons)
     console.print(tables.clip_training_table(rows), tables.comparison_table(comparisons))
 
 
@@ -234,8 +224,7 @@ def _learning(arguments: argparse.Namespace) -> None:
     plan = _plan(arguments, eval_every=5)
     trials = [SamplerTrial(sampler, plan) for sampler in learning_samplers(LEARNER)]
     rows = _train_discs(arguments, trials)
-    comparisons = _compared(rows, _against_cps(rows))
-    _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
+    comparisons = _compare(arguments, trials, rows, _against_cps(rows), _base_of(arguments))
     _draw(arguments, plots.plot_learning, rows)
     console.print(tables.training_table(rows), tables.comparison_table(comparisons))
 
@@ -243,10 +232,8 @@ def _learning(arguments: argparse.Namespace) -> None:
 def _ablations(arguments: argparse.Namespace) -> None:
     trials, pairs = ablation_trials(LEARNER, _plan(arguments, eval_every=4))
     rows = _train_discs(arguments, trials)
-    comparisons = _compared(rows, pairs)
-    _write_trainings(arguments, trials, rows, comparisons, _base_of(arguments))
-    if comparisons:
-        _draw(arguments, plots.plot_comparisons, comparisons)
+    comparisons = _compare(arguments, trials, rows, pairs, _base_of(arguments))
+    _draw(arguments, plots.plot_comparisons, comparisons)
     console.print(tables.training_table(rows), tables.comparison_table(comparisons))
 
 
@@ -257,10 +244,7 @@ def _hacking(arguments: argparse.Namespace) -> None:
 
 
 def _plan(arguments: argparse.Namespace, eval_every: int) -> DiscPlan:
-    return DiscPlan(
-        iterations=arguments.iterations, contexts=arguments.scenes, eval_contexts=arguments.eval_scenes,
-        eval_every=eval_every,
-    )
+    return DiscPlan(arguments.iterations, arguments.scenes, eval_contexts=arguments.eval_scenes, eval_every=eval_every)
 
 
 def _train_discs(arguments: argparse.Namespace, trials: list[SamplerTrial[DiscPlan]]) -> list[dict[str, Any]]:
@@ -280,7 +264,7 @@ def _train(
     """
     rows = _finished(arguments.json, trials)
     done = {(row["sampler"], row["seed"]) for row in rows}
-    wanted = _named({trial.sampler.name: trial for trial in trials}, arguments.samplers)
+    wanted = _select({trial.sampler.name: trial for trial in trials}, arguments.samplers)
     todo = [(trial, seed) for seed in arguments.seeds for trial in wanted if (trial.sampler.name, seed) not in done]
     with tqdm(total=sum(trial.plan.iterations for trial, _ in todo), desc=arguments.experiment, unit="buffer") as bar:
         for trial, seed in todo:
@@ -296,11 +280,15 @@ def _against_cps(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
     return [(name, base) for name in names for base in names if base.startswith("CPS") and name != base]
 
 
-def _compared(
-    rows: list[dict[str, Any]], pairs: list[tuple[str, str]], measures: Sequence[str] = MEASURES
+def _compare(
+    arguments: argparse.Namespace, trials: Sequence[SamplerTrial[Any]], rows: list[dict[str, Any]],
+    pairs: list[tuple[str, str]], of: dict[str, Any], measures: Sequence[str] = MEASURES,
 ) -> list[SamplerComparison]:
-    found = (compare_samplers(rows, sampler, base, measures) for sampler, base in pairs)
-    return [comparison for comparison in found if comparison is not None]
+    """Compare each pair that has seeds in common, and write that beside the rows."""
+    compared = (compare_samplers(rows, sampler, base, measures) for sampler, base in pairs)
+    comparisons = [comparison for comparison in compared if comparison is not None]
+    _write_trainings(arguments, trials, rows, comparisons, of)
+    return comparisons
 
 
 def _write_trainings(
@@ -310,7 +298,7 @@ def _write_trainings(
     """The rows, the resolved settings of their samplers, and the comparisons."""
     names = {row["sampler"] for row in rows}
     samplers = _settings([trial.sampler for trial in trials if trial.sampler.name in names])
-    write_results(arguments, {**of, **samplers, "comparisons": [asdict(one) for one in comparisons], "rows": rows})
+    write_results(arguments, {**of, **samplers, "comparisons": list(map(asdict, comparisons)), "rows": rows})
 
 
 def _settings(samplers: list[SamplerSetup]) -> dict[str, Any]:
@@ -324,25 +312,24 @@ def _base_of(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _cost(arguments: argparse.Namespace) -> None:
     model = load_base(arguments.base)
-    rollouts = [
-        toy_rollout(model, arguments.repeats, arguments.seed), pushcube_rollout(arguments.repeats, arguments.seed)
-    ]
+    repeats, seed = arguments.repeats, arguments.seed
+    rollouts = [toy_rollout(model, repeats, seed), pushcube_rollout(repeats, seed)]
     rows = [
-        *measure_anchors("moving disc", model, toy_buffer(model, arguments.seed), LEARNER, arguments.repeats),
-        *measure_anchors("PushCube", *pushcube_buffer(arguments.seed), LEARNER, arguments.repeats),
+        *measure_anchors("moving disc", model, toy_buffer(model, seed), LEARNER, repeats),
+        *measure_anchors("PushCube", *pushcube_buffer(seed), LEARNER, repeats),
     ]
-    of = {"seed": arguments.seed, "learner": LEARNER.model_dump(), **_base_of(arguments)}
+    of = {"seed": seed, "learner": LEARNER.model_dump(), **_base_of(arguments)}
     write_results(arguments, {**of, "rollouts": rollouts, "rows": rows})
     _draw(arguments, plots.plot_cost, rows)
-    console.print(tables.rollout_table(rollouts, arguments.repeats), tables.cost_table(rows, arguments.repeats))
+    console.print(tables.rollout_table(rollouts, repeats), tables.cost_table(rows, repeats))
 
 
-def _chosen(arguments: argparse.Namespace) -> list[SamplerSetup]:
-    """The samplers of claim A that --samplers names."""
-    return _named({sampler.name: sampler for sampler in diversity_samplers()}, arguments.samplers)
+def _choose_samplers(arguments: argparse.Namespace) -> list[SamplerSetup]:
+    """The samplers of the diversity experiments that --samplers names."""
+    return _select({sampler.name: sampler for sampler in diversity_samplers()}, arguments.samplers)
 
 
-def _named(known: dict[str, T], names: list[str] | None) -> list[T]:
+def _select(known: dict[str, T], names: list[str] | None) -> list[T]:
     unknown = [name for name in names or [] if name not in known]
     if unknown:
         raise ValueError(f"unknown samplers {', '.join(unknown)}; choose among: {'; '.join(known)}")
@@ -365,6 +352,6 @@ def _finished(path: Path | None, trials: Sequence[SamplerTrial[Any]]) -> list[di
 
 
 def _draw(arguments: argparse.Namespace, plot: Callable[..., None], what: Sequence[Any], *more: Any) -> None:
-    """The picture beside the --json file, where there is one."""
-    if arguments.json is not None:
+    """The picture beside the --json file, where there is one and something to draw."""
+    if arguments.json is not None and what:
         plot(what, arguments.json.with_suffix(".png"), *more)

@@ -42,8 +42,7 @@ def compare_samplers(
     rows: Sequence[dict[str, Any]], sampler: str, base: str, measures: Sequence[str] = MEASURES
 ) -> SamplerComparison | None:
     """Compare trainings, whose rows hold `sampler`, `seed` and `evaluations`, the first one of before; None where the
-    two have fewer than two seeds in common.
-    """
+    two have fewer than two seeds in common."""
     of = {name: {row["seed"]: row for row in rows if row["sampler"] == name} for name in (sampler, base)}
     seeds = sorted(of[sampler].keys() & of[base].keys())
     if len(seeds) < 2:
@@ -64,11 +63,7 @@ def value(row: dict[str, Any], measure: str) -> float:
 
 
 def paired_interval(differences: Sequence[float]) -> Difference:
-    """Return mean -+ t s / sqrt(n), s with n - 1.
-
-    Raises:
-        ValueError: fewer than two differences.
-    """
+    """Return mean -+ t s / sqrt(n), s with n - 1. Raises ValueError: fewer than two differences."""
     n = len(differences)
     if n < 2:
         raise ValueError(f"an interval needs at least two pairs, got {n}; train more seeds")

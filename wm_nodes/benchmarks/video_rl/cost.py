@@ -23,12 +23,10 @@ from wm_nodes.video_model import (
     RolloutSettings,
     SamplerSettings,
     VideoNetwork,
-    config_hash,
-    initial_noise,
     kernels,
-    sample_videos,
     sampling,
 )
+from wm_nodes.video_model.buffer import config_hash
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.sampling import rollout_settings
@@ -83,14 +81,14 @@ def measure_rollout(
     """
     cps = replace(rollout, sampler=SamplerSettings("cps", rollout.sampler.eta))
     seeds = torch.arange(len(condition.frames)) + seed
-    noise = initial_noise(shape, seeds)
+    noise = sampling.initial_noise(shape, seeds)
     found: dict[str, list[float]] = {"cps_s": [], "rollout_s": [], "mask_share": [], "cache_share": []}
     network.eval()
     for turn in range(repeats + 1):  # the first one warms up
         for name, settings in (("cps_s", cps), ("rollout_s", rollout)):
             with clocked(kernels, "rollout_mask") as mask, clocked(sampling, *CACHING) as caching:
                 start = time.perf_counter()
-                sample_videos(network, condition, noise, seeds, settings)
+                sampling.sample_videos(network, condition, noise, seeds, settings)
                 total = time.perf_counter() - start
             if turn:
                 found[name].append(total)
@@ -125,7 +123,8 @@ def pushcube_buffer(seed: int) -> tuple[VideoNetwork, tuple[RolloutBuffer, Rollo
     """The shipped PushCube network and SCENES x GROUP of its videos with random rewards, by the recommended preset."""
     network, condition, shape, rollout = _pushcube(seed)
     index = torch.arange(SCENES * GROUP)
-    videos = sample_videos(network, condition, initial_noise(shape, index + seed), index + seed, rollout)
+    noise = sampling.initial_noise(shape, index + seed)
+    videos = sampling.sample_videos(network, condition, noise, index + seed, rollout)
     rewards = torch.rand(len(index), generator=torch_stream(seed, "cost_rewards"), dtype=torch.float64)
     buffer = RolloutBuffer(
         videos, condition, index // GROUP, index % GROUP, {}, torch.ones(len(index), dtype=torch.bool), 0, 0,
@@ -136,8 +135,7 @@ def pushcube_buffer(seed: int) -> tuple[VideoNetwork, tuple[RolloutBuffer, Rollo
 
 def _pushcube(seed: int) -> tuple[VideoNetwork, Condition, tuple[int, ...], RolloutSettings]:
     """The shipped network, what it is asked for, the shape of its latents, and how it samples; given frames and actions
-    are random, because times depend on sizes only.
-    """
+    are random, because times depend on sizes only."""
     config = load_video_config("recommended")
     folder = load_video_folder(shipped_model(config.task) / "video_model")
     settings, codec, videos, frames = folder.network.settings, folder.manifest["codec"], SCENES * GROUP, CLIP_FRAMES

@@ -4,7 +4,6 @@ Shapes: n videos of a context, F frames, C channels, H W cells or pixels.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,9 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import RolloutConfig
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.video_model import VideoNetwork
+from wm_nodes.video_rl import frame_features
 from wm_nodes.video_rl.diversity import rollout_diversity
-from wm_nodes.video_rl.frame_features import (
-    CentredPixels,
-    FrameFeatures,
-    RandomFeatures,
-    TokenizerFeatures,
-    load_backbone,
-)
+from wm_nodes.video_rl.frame_features import FrameFeatures
 from wm_nodes.video_rl.reference_reward import SEEN_MOTION
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.video_rl.toy_scene import centred_pixels, draw_scenes, opacity_at
@@ -45,22 +39,16 @@ SPREADS = ("diversity", "diversity_dynamic", "object_spread_cm", "reward_std")
 SCORES = ("tracking", "scenery", "object_cm", "motion")
 
 
-@dataclass(frozen=True)
-class DiversityPlan:
-    """contexts x group_size videos per sampler and regime."""
-
-    contexts: int = 100
-    group_size: int = 8
-
-
-def measure_discs(model: VideoNetwork, sampler: SamplerSetup, plan: DiversityPlan, seed: int) -> dict[str, Any]:
+def measure_discs(
+    model: VideoNetwork, sampler: SamplerSetup, contexts: int, group_size: int, seed: int
+) -> dict[str, Any]:
     """Per context: diversity, diversity of the dynamic region, within-group reward std; means of the true metrics."""
-    scenes = draw_scenes(plan.contexts, seed, "diversity")
-    buffer = sample_scenes(model, sampler, scenes, plan.group_size, seed)
-    groups = buffer.rollout.latents.view(plan.contexts, plan.group_size, *buffer.rollout.latents.shape[1:])
+    scenes = draw_scenes(contexts, seed, "diversity")
+    buffer = sample_scenes(model, sampler, scenes, group_size, seed)
+    groups = buffer.rollout.latents.view(contexts, group_size, *buffer.rollout.latents.shape[1:])
     reach = opacity_at(scenes.path(scenes.action)[:, :1].expand(-1, groups.shape[3], -1), REACH)
     moving = (reach > 0.3).float()[:, None]
-    scores = {name: values.view(plan.contexts, plan.group_size) for name, values in buffer.rewards.items()}
+    scores = {name: values.view(contexts, group_size) for name, values in buffer.rewards.items()}
     return {
         **_named(sampler),
         "diversity": [rollout_diversity(centred_pixels(videos)) for videos in groups],
@@ -110,13 +98,13 @@ def measure_clips(
 def load_features(name: str, task: str) -> FrameFeatures:
     """Frame features by name: pixels, random, tokenizer (of the task's shipped world model), or a backbone's folder."""
     if name == "pixels":
-        return CentredPixels()
+        return frame_features.CentredPixels()
     if name == "random":
-        return RandomFeatures()
+        return frame_features.RandomFeatures()
     if name == "tokenizer":
         folder = shipped_model(task)
-        return TokenizerFeatures(load_model_folder(folder).tokenizer, folder.name)
-    return load_backbone(Path(name))
+        return frame_features.TokenizerFeatures(load_model_folder(folder).tokenizer, folder.name)
+    return frame_features.load_backbone(Path(name))
 
 
 def group_diversity(frames: Tensor, features: FrameFeatures) -> float:

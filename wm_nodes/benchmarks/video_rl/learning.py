@@ -25,8 +25,7 @@ def train_sampler(
     on_iteration: Callable[[], object] = lambda: None,
 ) -> dict[str, Any]:
     """Post-train source.network in place; return what that gave: scores of each held-out context before and after,
-    means over them (before, every eval_every buffers, and after), a list per quantity of the buffers, and seconds.
-    """
+    means over them (before, every eval_every buffers, and after), a list per quantity of the buffers, and seconds."""
     learner = GrpoLearner(source.network, sampler.grpo, sampler.rollout, seed=seed)
     before = after = source.validate()
     evaluations, buffers = [{"iteration": 0, **_means(before)}], list[dict[str, float]]()
@@ -67,8 +66,8 @@ def hacked(evaluations: list[dict[str, float]], proxy: str) -> list[str]:
         "mass": [-abs(row["mass"] - 1) for row in evaluations],
         "background": [-row["background"] for row in evaluations],
     }
-    found = hacked_metrics([row[proxy] for row in evaluations], truths, window=len(evaluations))
-    return [alarm.metric for alarm in found]
+    alarmed = hacked_metrics([row[proxy] for row in evaluations], truths, window=len(evaluations))
+    return [alarm.metric for alarm in alarmed]
 
 
 def alarms(row: dict[str, Any]) -> list[str]:

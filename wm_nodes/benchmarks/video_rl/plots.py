@@ -54,8 +54,7 @@ def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> Non
 
 def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Held-out reward above the base model's over the buffers, mean with standard error over seeds; every sampler's
-    mean over its training, by seed; and the diversity of its rollouts over the buffers, where the rows have it.
-    """
+    mean over its training, by seed; and the diversity of its rollouts over the buffers, where the rows have it."""
     spread = [row for row in rows if "rollout_diversity" in row["buffers"]]
     figure = make_figure(17.0 if spread else 12.0, 4.8)
     left, right, *more = figure.subplots(1, 3 if spread else 2, width_ratios=(1.15, 1, 1)[: 3 if spread else 2])

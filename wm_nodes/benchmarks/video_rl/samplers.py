@@ -22,8 +22,7 @@ clips of few steps, only the weights that carry the condition, no KL."""
 @dataclass(frozen=True)
 class LearningPlan:
     """iterations: buffers of contexts x group_size videos. eval_contexts: held out, one video each by ODE, before,
-    every eval_every buffers, and at the end.
-    """
+    every eval_every buffers, and at the end."""
 
     iterations: int = 8
     contexts: int = 16
@@ -35,8 +34,7 @@ class LearningPlan:
 @dataclass(frozen=True)
 class DiscPlan(LearningPlan):
     """Of the moving disc. proxy: the score that trains, `reward` or one that can be hacked. side, eval_side: of the
-    videos that train and the held-out ones, px.
-    """
+    videos that train and the held-out ones, px."""
 
     iterations: int = 40
     contexts: int = 6
@@ -49,8 +47,7 @@ class DiscPlan(LearningPlan):
 @dataclass(frozen=True)
 class SamplerSetup:
     """One sampler with the learner settings that belong to it. shared_noise: one initial noise for a whole group.
-    window: which of its steps are stochastic.
-    """
+    window: which of its steps are stochastic."""
 
     name: str
     rollout: RolloutSettings
@@ -60,9 +57,7 @@ class SamplerSetup:
 
 
 def sampler_setup(name: str, sampler: SamplerSettings, grpo: GrpoConfig | None = None) -> SamplerSetup:
-    return SamplerSetup(
-        name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or BASE.grpo
-    )
+    return SamplerSetup(name, RolloutSettings(NUM_STEPS, SHIFT, sampler=sampler, micro_batch=64), grpo or BASE.grpo)
 
 
 def dyndiff(eta: float, combine: str = "gated", budget: str = "literal", **knobs: object) -> SamplerSettings:
@@ -72,15 +67,16 @@ def dyndiff(eta: float, combine: str = "gated", budget: str = "literal", **knobs
 
 def diversity_samplers() -> list[SamplerSetup]:
     """For diversity: ODE, CPS at several noise levels, DynDiff as written, sparse, and at CPS's noise budget."""
-    samplers = [sampler_setup("ODE", SamplerSettings("ode", 0.0))]
-    samplers += [sampler_setup(f"CPS {eta:g}", SamplerSettings("cps", eta)) for eta in (0.2, 0.4, 0.6)]
-    samplers += [sampler_setup(f"DynDiff {eta:g} gated", dyndiff(eta)) for eta in (0.6, 1.0)]
-    samplers += [sampler_setup("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"))]
-    for eta in (0.2, 0.4, 0.6):
-        samplers += [
-            sampler_setup(f"DynDiff {eta:g} {kind}, rms", dyndiff(eta, kind, "rms")) for kind in ("gated", "sparse")
-        ]
-    return samplers
+    return [
+        sampler_setup("ODE", SamplerSettings("ode", 0.0)),
+        *(sampler_setup(f"CPS {eta:g}", SamplerSettings("cps", eta)) for eta in (0.2, 0.4, 0.6)),
+        *(sampler_setup(f"DynDiff {eta:g} gated", dyndiff(eta)) for eta in (0.6, 1.0)),
+        sampler_setup("DynDiff 0.6 sparse", dyndiff(0.6, "sparse")),
+        *(
+            sampler_setup(f"DynDiff {eta:g} {kind}, rms", dyndiff(eta, kind, "rms"))
+            for eta in (0.2, 0.4, 0.6) for kind in ("gated", "sparse")
+        ),
+    ]
 
 
 def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
@@ -99,36 +95,31 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
         sampler_setup("CPS 0.2", SamplerSettings("cps", 0.2), cps),
         sampler_setup("DynDiff 0.2 sparse, rms, cps", dyndiff(0.2, "sparse", "rms"), cps),
     ]
-    shared = (plain, matched, sparse, gated, *quiet)
-    mix = _in_window(sampler_setup("Flow-GRPO 0.7", SamplerSettings("flow", 0.7), learner))
+    flow = sampler_setup("Flow-GRPO 0.7", SamplerSettings("flow", 0.7), learner)
     return [
-        plain,
-        sampler_setup("CPS 0.6, full", SamplerSettings("cps", 0.6), learner),
-        sampler_setup("Flow-GRPO 0.7", SamplerSettings("flow", 0.7), learner),
-        replace(mix, name="Mix-GRPO 0.7"),
+        plain, sampler_setup("CPS 0.6, full", SamplerSettings("cps", 0.6), learner),
+        flow, replace(_in_window(flow), name="Mix-GRPO 0.7"),
         sampler_setup("DanceGRPO 0.3", SamplerSettings("dance", 0.3), learner),
         sampler_setup("SAGE 0.5", SamplerSettings("sage", 0.5), learner),
         sampler_setup("DynDiff 0.6 gated", dyndiff(0.6), learner),
         sampler_setup("DynDiff 0.6 sparse", dyndiff(0.6, "sparse"), learner),
         sampler_setup("DynDiff 0.4 sparse, rms", dyndiff(0.4, "sparse", "rms"), learner),
-        matched,
-        sparse,
-        gated,
+        matched, sparse, gated,
         *(replace(one, name=f"{one.name}, frozen", grpo=one.grpo.with_values(kl=frozen)) for one in (plain, matched)),
-        *(replace(sampler, name=f"{sampler.name}, shared", shared_noise=True) for sampler in shared),
+        *(
+            replace(sampler, name=f"{sampler.name}, shared", shared_noise=True)
+            for sampler in (plain, matched, sparse, gated, *quiet)
+        ),
         *(replace(_in_window(sampler), name=f"{sampler.name}, window") for sampler in (plain, gated)),
     ]
 
 
 def clip_learning_samplers() -> list[SamplerSetup]:
     """Claim B on recorded contexts: CPS and DynDiff at one eta, CPS at the noise that DynDiff spends there, and DynDiff
-    as written.
-    """
+    as written."""
     samplers = {
-        "CPS 0.6": SamplerSettings("cps", 0.6),
-        "CPS 0.4": SamplerSettings("cps", 0.4),
-        "DynDiff 0.6 gated, rms": dyndiff(0.6, "gated", "rms"),
-        "DynDiff 0.6 gated": dyndiff(0.6),
+        "CPS 0.6": SamplerSettings("cps", 0.6), "CPS 0.4": SamplerSettings("cps", 0.4),
+        "DynDiff 0.6 gated, rms": dyndiff(0.6, "gated", "rms"), "DynDiff 0.6 gated": dyndiff(0.6),
     }
     return [
         SamplerSetup(name, RolloutSettings(CLIP_STEPS, SHIFT, sampler=sampler), CLIP_LEARNER, shared_noise=True)

@@ -18,32 +18,26 @@ LAST_UPDATE = ("clip_low_share_2", "clip_high_share_2", "kl_2")
 
 def diversity_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     shown = ("diversity_dynamic", "reward_std", "reward", "background", "mass")
-    cells = (
-        (
-            row["sampler"], _regime(row), f"{row['noise_share']:.3f}",
-            estimate(bootstrap_mean(row["diversity"], seed=seed), ".3f"), *(f"{_average(row, n):.4f}" for n in shown),
-        )
-        for row in rows
-    )
     return _table(
         "diversity (DD-19) and quality, mean over contexts with 95 % bootstrap interval", ("sampler", "initial noise"),
-        ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"), cells,
+        ("noise rms/s", "diversity", "moving part", "reward std", "reward", "bg", "mass"),
+        (_diversity_cells(row, seed, ".3f", shown) for row in rows),
     )
 
 
 def clip_table(rows: Sequence[dict[str, Any]], seed: int) -> Table:
     shown = ("diversity_dynamic", "object_spread_cm", "reward_std", "tracking", "scenery")
-    cells = (
-        (
-            row["sampler"], _regime(row), f"{_average(row, 'noise_share'):.3f}",
-            estimate(bootstrap_mean(row["diversity"], seed=seed), ".4f"), *(f"{_average(row, n):.4f}" for n in shown),
-        )
-        for row in rows
-    )
     return _table(
         f"clips of recorded contexts, {rows[0]['features']}; means over contexts", ("sampler", "initial noise"),
         ("noise rms/s", "diversity (DD-19)", "moving part", "object spread, cm", "reward std", "tracking", "scenery"),
-        cells,
+        (_diversity_cells(row, seed, ".4f", shown) for row in rows),
+    )
+
+
+def _diversity_cells(row: dict[str, Any], seed: int, form: str, shown: Sequence[str]) -> tuple[str, ...]:
+    return (
+        row["sampler"], _regime(row), f"{np.mean(row['noise_share']):.3f}",
+        estimate(bootstrap_mean(row["diversity"], seed=seed), form), *(f"{np.mean(row[name]):.4f}" for name in shown),
     )
 
 
@@ -94,7 +88,7 @@ def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
         changes = (np.subtract(row["after"][name], row["before"][name]) for name in SCORES)
         cells.append((
             row["sampler"], row["seed"], _over_buffers([row], "noise_share"),
-            f"{_average(row['before'], 'tracking'):.3f}",
+            f"{np.mean(row['before']['tracking']):.3f}",
             *(estimate(bootstrap_mean(change, seed=row["seed"]), "+.3f") for change in changes),
             f"{sum(row['seconds'].values()):.0f}",
         ))
@@ -117,7 +111,7 @@ def comparison_table(comparisons: Sequence[SamplerComparison]) -> Table:
 
 
 def resolution_table(rows: Sequence[dict[str, Any]]) -> Table:
-    cells = ((row["side_px"], row["shown"], *(f"{_average(row, name):.3f}" for name in SCORES)) for row in rows)
+    cells = ((row["side_px"], row["shown"], *(f"{np.mean(row[name]):.3f}" for name in SCORES)) for row in rows)
     return _table("clips at other picture sizes, means over contexts", ("side, px", "shown"), SCORES, cells)
 
 
@@ -160,10 +154,6 @@ def _table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Any) 
 
 def _regime(row: dict[str, Any]) -> str:
     return "shared" if row["shared_noise"] else "own"
-
-
-def _average(row: dict[str, Any], name: str) -> float:
-    return float(sum(row[name]) / len(row[name]))
 
 
 def _mean(rows: Sequence[dict[str, Any]], name: str) -> float:

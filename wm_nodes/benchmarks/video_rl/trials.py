@@ -17,8 +17,6 @@ SHORT_RATE = 2e-4
 """Learning rate of these short trainings, twice that of the learning experiment: 12 buffers go as far as 24."""
 PAPER_GROUP = 16
 """Videos per context of Table 5: a clip of 2.5 can act from groups of 8 on, one of 5 only from 27 on."""
-
-
 Plan = TypeVar("Plan", bound=LearningPlan)
 
 
@@ -30,9 +28,7 @@ class SamplerTrial(Generic[Plan]):
     plan: Plan
 
 
-def ablation_trials(
-    learner: GrpoConfig, plan: DiscPlan
-) -> tuple[list[SamplerTrial[DiscPlan]], list[tuple[str, str]]]:
+def ablation_trials(learner: GrpoConfig, plan: DiscPlan) -> tuple[list[SamplerTrial[DiscPlan]], list[tuple[str, str]]]:
     """Return the trainings, and which is compared with which: (name, name of its base)."""
     cps = learner.with_values(logprob_weight="cps", learning_rate=SHORT_RATE)
     base = replace(sampler_setup("base", dyndiff(0.6, "gated", "rms"), cps), shared_noise=True)
@@ -61,8 +57,7 @@ def ablation_trials(
 
 def hacking_trials(learner: GrpoConfig, plan: DiscPlan) -> list[SamplerTrial[DiscPlan]]:
     """The honest reward; temporal consistency alone, which a picture that stands still, or has no disc, satisfies best;
-    the same with a frozen anchor, which holds it back.
-    """
+    the same with a frozen anchor, which holds it back."""
     cps = learner.with_values(logprob_weight="cps", learning_rate=SHORT_RATE)
     sampler = replace(sampler_setup("honest reward", SamplerSettings("cps", 0.6), cps), shared_noise=True)
     hackable, frozen = replace(plan, proxy="consistency"), learner.kl.with_values(anchor="frozen")

@@ -25,6 +25,8 @@ from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
 
 VIDEOS = 4
+ModelToCheck = tuple[nn.Module, Condition, tuple[int, int, int, int], VideoRlConfig]
+"""The model, what it is asked for, the shape of its latents (C, F, H, W), and the settings."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -53,18 +55,13 @@ def run(arguments: argparse.Namespace) -> int:
     )
     title = f"{len(condition.actions)} videos of {' x '.join(map(str, shape))} latents (C x F x H x W)"
     columns = ("check", "", "found", "where it failed")
-    rows = (
-        (finding.name, *(("[green]passed", finding.value, "") if finding.passed
-                         else ("[red]FAILED", finding.value, finding.remedy)))
-        for finding in findings
-    )
+    marks = {True: "[green]passed", False: "[red]FAILED"}
+    rows = ((f.name, marks[f.passed], f.value, "" if f.passed else f.remedy) for f in findings)
     Console().print(make_table(title, columns, rows, left=columns))
     return int(not all(finding.passed for finding in findings))
 
 
-def _model_to_check(
-    arguments: argparse.Namespace, config: VideoRlConfig
-) -> tuple[nn.Module, Condition, tuple[int, int, int, int], VideoRlConfig]:
+def _model_to_check(arguments: argparse.Namespace, config: VideoRlConfig) -> ModelToCheck:
     if arguments.public:
         return _public(arguments, config)
     if arguments.video_model is None:
@@ -81,9 +78,7 @@ def _model_to_check(
     return folder.network, condition, (C, F, H, W), config
 
 
-def _public(
-    arguments: argparse.Namespace, config: VideoRlConfig
-) -> tuple[nn.Module, Condition, tuple[int, int, int, int], VideoRlConfig]:
+def _public(arguments: argparse.Namespace, config: VideoRlConfig) -> ModelToCheck:
     from wm_nodes.video_model.adapters import LoadSettings, add_lora, load_public_model
 
     loading = LoadSettings(dtype=arguments.dtype, device=arguments.device, offload=arguments.offload)

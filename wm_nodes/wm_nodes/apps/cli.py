@@ -10,7 +10,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 
@@ -25,40 +25,34 @@ BENCHMARKS = "benchmarks"
 """Package beside this one in the repository, not installed with it."""
 
 
-class Verb(NamedTuple):
-    """A line of `wm --help`. name: as typed. module: what is imported when the verb is chosen."""
-
-    name: str
-    module: str
-    about: str
-
-
-GROUPS: dict[str, tuple[Verb, ...]] = {
-    "train": (
-        Verb("train-policy", "wm_nodes.apps.train_policy", "a policy in the world model, measured in the simulator"),
-        Verb("train-video-model", "wm_nodes.apps.train_video_model", "the video world model by GRPO on its own clips"),
-        Verb("check-video-model", "wm_nodes.apps.check_video_model", "whether a video model is fit to be trained so"),
-        Verb("seed-study", "wm_nodes.apps.seed_study", "several seeds and tasks: world model against simulator"),
-    ),
-    "recordings": (
-        Verb("rescore", "wm_nodes.apps.rescore", "score a recording again, compare bit for bit"),
-        Verb("retrain", "wm_nodes.apps.retrain", "train a video model again on a run's recorded clips and scores"),
-        Verb("recover-bag", "wm_nodes.apps.recover_bag", "bring back a recording whose process was killed"),
-    ),
-    "judge": (
-        Verb("judge-clips", "wm_nodes.apps.judge_clips", "judge videos of your own"),
-        Verb("audit", "wm_nodes.apps.audit", "verify, label, replay and compare the judge's logs"),
-        Verb("build-judge-dataset", "wm_nodes.apps.build_judge_dataset", "clips with known labels, from the simulator"),
-        Verb("train-judge", "wm_nodes.apps.train_judge", "the embedded judge, from such clips; or measure it"),
-        Verb("normal-ranges", "wm_nodes.apps.normal_ranges", "of the world model's evidence, for a rubric"),
-    ),
-    "benchmarks, where the repository is": (
-        Verb("benchmark speed", "benchmarks.speed.cli", "graph against one process, world model against simulator"),
-        Verb("benchmark video-rl", "benchmarks.video_rl.cli", "DynDiff-GRPO against its rivals"),
-        Verb("benchmark judge", "benchmarks.judge.cli", "the reward agent against labels, and its speed"),
-    ),
+GROUPS = {
+    "train": {
+        "train-policy": "a policy in the world model, measured in the simulator",
+        "train-video-model": "the video world model by GRPO on its own clips",
+        "check-video-model": "whether a video model is fit to be trained so",
+        "seed-study": "several seeds and tasks: world model against simulator",
+    },
+    "recordings": {
+        "rescore": "score a recording again, compare bit for bit",
+        "retrain": "train a video model again on a run's recorded clips and scores",
+        "recover-bag": "bring back a recording whose process was killed",
+    },
+    "judge": {
+        "judge-clips": "judge videos of your own",
+        "audit": "verify, label, replay and compare the judge's logs",
+        "build-judge-dataset": "clips with known labels, from the simulator",
+        "train-judge": "the embedded judge, from such clips; or measure it",
+        "normal-ranges": "of the world model's evidence, for a rubric",
+    },
+    "benchmarks, where the repository is": {
+        "benchmark speed": "graph against one process, world model against simulator",
+        "benchmark video-rl": "DynDiff-GRPO against its rivals",
+        "benchmark judge": "the reward agent against labels, and its speed",
+    },
 }
-VERBS = {verb.name: verb for verbs in GROUPS.values() for verb in verbs}
+VERBS = {name: about for verbs in GROUPS.values() for name, about in verbs.items()}
+"""What each verb does, by its name; `train-policy` is the module wm_nodes.apps.train_policy, `benchmark video-rl` is
+benchmarks.video_rl.cli."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -94,8 +88,10 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
     Raises:
         SystemExit: after --help, and where the verb has no such option.
     """
+    kind, _, experiment = name.partition(" ")
+    file = (experiment or kind).replace("-", "_")
     try:
-        module = import_module(VERBS[name].module)
+        module = import_module(f"wm_nodes.apps.{file}" if kind != "benchmark" else f"{BENCHMARKS}.{file}.cli")
     except ModuleNotFoundError as error:
         if error.name != BENCHMARKS:
             raise
@@ -125,8 +121,8 @@ def overview(program: str, names: Sequence[str] = ()) -> str:
     lines = [f"usage: {program} VERB [options]; {program} VERB --help explains one"]
     width = max(map(len, VERBS))
     for title, verbs in GROUPS.items():
-        if shown := [verb for verb in verbs if not names or verb.name in names]:
-            lines += ["", f"{title}:", *(f"  {verb.name:{width}}  {verb.about}" for verb in shown)]
+        if shown := [name for name in verbs if not names or name in names]:
+            lines += ["", f"{title}:", *(f"  {name:{width}}  {verbs[name]}" for name in shown)]
     return "\n".join([*lines, "", EXIT_CODES])
 
 

@@ -16,29 +16,14 @@ from typing import Any
 
 from rich.table import Table
 
-from wm_nodes.apps.policy_run import (
-    RunContext,
-    TrainingResult,
-    TrainingStart,
-    WaitingGraph,
-    console,
-    imagined_success,
-    rate,
-    read_success,
-    train_round,
-)
+from wm_nodes.apps import policy_run
+from wm_nodes.apps.policy_run import RunContext, TrainingResult, TrainingStart, WaitingGraph, console, read_success
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import BoolArray
-from wm_nodes.policy_rl.model_refresh import (
-    RefreshDecision,
-    check_refreshable,
-    collect_replay,
-    collect_round,
-    compare_models,
-    refresh_model,
-)
+from wm_nodes.policy_rl import model_refresh
+from wm_nodes.policy_rl.model_refresh import RefreshDecision
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
@@ -46,8 +31,6 @@ from wm_nodes.training.metrics import join_metrics
 from wm_nodes.world_model import load_model_folder
 
 RESULT = "result.json"
-
-
 Judge = Callable[[BoolArray, BoolArray], None]
 """(imagined, real success of the starting policy) -> None; may raise to refuse the training."""
 
@@ -104,17 +87,17 @@ def run_rounds(
     config = job.config
     shares = split_updates(config.ppo.updates, config.model_refresh.num_rounds)
     if len(shares) > 1:
-        check_refreshable(model_dir)
+        model_refresh.check_refreshable(model_dir)
     starts, trainings, table = list[TrainingStart](), list[TrainingResult](), list[dict[str, Any]]()
     for number, updates in enumerate(shares, 1):
         start = round_start(job, number, model_dir, policy)
         if len(shares) > 1:
             job.stage(f"round {number} of {len(shares)}: {updates} updates in {model_dir}")
-        imagined = imagined_success(job, start.folder, "before", model_dir, policy)
-        is_first = number == 1
-        trained = train_round(job, start, partial(judge, imagined) if is_first else None, waiting if is_first else None)
+        imagined = policy_run.imagined_success(job, start.folder, "before", model_dir, policy)
+        first_only = (partial(judge, imagined), waiting) if number == 1 else ()
+        trained = policy_run.train_round(job, start, *first_only)
         policy = trained.policy(start.folder)
-        imagined_success(job, start.folder, "after", model_dir, policy)
+        policy_run.imagined_success(job, start.folder, "after", model_dir, policy)
         starts.append(start)
         trainings.append(trained)
         if len(shares) > 1:
@@ -151,9 +134,8 @@ def _finish(
         found: dict[str, Any] = json.loads(marker.read_text())
         return found
     policy = trained.policy(start.folder)
-    before, imagined, real = (
-        rate(read_success(start.folder, name)) for name in ("imagined_before", "imagined_after", "real_after")
-    )
+    measured = ("imagined_before", "imagined_after", "real_after")
+    before, imagined, real = (policy_run.rate(read_success(start.folder, name)) for name in measured)
     job.stage(
         f"round {number}: imagined success {imagined.successes}/{imagined.episodes}, "
         f"real success {real.successes}/{real.episodes}"
@@ -177,12 +159,13 @@ def _refresh(job: RunContext, start: TrainingStart, policy: Path, number: int) -
         f"collecting {settings.episodes_per_round} + {settings.heldout_episodes} (held out) episodes of the policy in "
         "the simulator"
     )
-    bags, heldout = collect_round(config, start.model_dir, policy, start.folder / "bags", number)
-    replay, scripted = collect_replay(config, job.run_dir)
+    bags, heldout = model_refresh.collect_round(config, start.model_dir, policy, start.folder / "bags", number)
+    replay, scripted = model_refresh.collect_replay(config, job.run_dir)
     earlier = [bag for k in range(1, number) for bag in sorted((_folder(job, k) / "bags" / "train").glob("shard_*"))]
     job.stage(f"refreshing the world model: {settings.refresh_iterations} iterations")
-    folder = refresh_model(config, start.model_dir, [*replay, *earlier, *bags], start.folder / "model", number=number)
-    verdict = compare_models(
+    episodes, folder = [*replay, *earlier, *bags], start.folder / "model"
+    model_refresh.refresh_model(config, start.model_dir, episodes, folder, number=number)
+    verdict = model_refresh.compare_models(
         load_model_folder(start.model_dir), load_model_folder(folder),
         {"policy": load_arrays(heldout, config), "scripted": load_arrays(scripted, config)}, config,
     )

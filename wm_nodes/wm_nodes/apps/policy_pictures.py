@@ -15,7 +15,9 @@ from wm_nodes.core.types import Environment, Episode, FloatArray, UInt8Array
 from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
-from wm_nodes.reports import Picture, curves, film_strip
+from wm_nodes.reports.curves import curves
+from wm_nodes.reports.film_strip import film_strip
+from wm_nodes.reports.html import Picture
 from wm_nodes.training.metrics import FILE_NAME
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.text import imagine_goals
@@ -41,9 +43,9 @@ class SideBySide:
 
 
 def write_pictures(
-    run_dir: Path, config: RunConfig, model_dir: Path, policy: ImagePolicy, first_seed: int, *, strips: int = NUM_STRIPS
+    run_dir: Path, config: RunConfig, model_dir: Path, policy: ImagePolicy, first_seed: int
 ) -> list[Picture]:
-    """Play `strips` episodes of the policy in the simulator, imagine the same actions, and draw both; and the curves.
+    """Play NUM_STRIPS episodes of the policy in the simulator, imagine the same actions, and draw both; and the curves.
 
     Writes PNGs to <run_dir>/pictures.
     """
@@ -51,13 +53,15 @@ def write_pictures(
 
     environment = ManiSkillEnvironment(config.task, config.simulation, num_envs=1, seed=config.seed)
     try:
-        episodes = [play(environment, policy, first_seed + i) for i in range(strips)]
+        episodes = [play(environment, policy, first_seed + i) for i in range(NUM_STRIPS)]
     finally:
         environment.close()
     folder, pictures = run_dir / "pictures", list[Picture]()
     for index, pair in enumerate(side_by_side(models_of(Path(model_dir)), episodes, config)):
         path = folder / f"film_strip_{index}.png"
-        draw(pair, path)
+        rows = {"real": pair.real, "imagined": pair.imagined} | ({} if pair.goal is None else {"goal": pair.goal[None]})
+        done = {"real": pair.real_done, "imagined": pair.imagined_done}
+        film_strip(rows, path, marks={name: step for name, step in done.items() if step >= 0})
         pictures.append(Picture(f"Real and imagined, episode {index + 1}", describe(pair, first_seed + index), path))
     drawn = curves(run_dir / FILE_NAME, folder / "curves.png")
     if drawn is not None:
@@ -108,14 +112,6 @@ def side_by_side(models: WorldModels, episodes: list[Episode], config: RunConfig
         goal = None if goals is None else goals[row]
         pairs.append(SideBySide(episode.images, frames, goal, first_true(episode.success), first_true(above), signals))
     return pairs
-
-
-def draw(pair: SideBySide, path: Path) -> None:
-    rows = {"real": pair.real, "imagined": pair.imagined}
-    if pair.goal is not None:
-        rows["goal"] = pair.goal[None]
-    marks = {name: step for name, step in (("real", pair.real_done), ("imagined", pair.imagined_done)) if step >= 0}
-    film_strip(rows, path, marks=marks)
 
 
 def describe(pair: SideBySide, seed: int) -> str:

@@ -29,7 +29,7 @@ from wm_nodes.launching.runner import Runner
 from wm_nodes.policy_rl.evaluation import evaluate
 from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, models_of
 from wm_nodes.policy_rl.initial_policy import num_starts
-from wm_nodes.reports import SuccessRate
+from wm_nodes.reports.summary import SuccessRate
 
 READY_S = 120.0
 TRAINED = "trained.json"
@@ -38,10 +38,8 @@ console = Console()
 
 
 def open_run_dir(given: Path | None, name: str, config_text: str, *, begun_with: Sequence[str] = ()) -> Path:
-    """Make the run folder (default: runs/<time>-<name>) and keep its configuration there.
-
-    Args:
-        begun_with: options that are no settings but without which the run must not go on; kept as comments.
+    """Make the run folder (default: runs/<time>-<name>) and keep its configuration there. begun_with: options that are
+    no settings but without which the run must not go on; kept as comments.
 
     Raises:
         ConfigError: the folder was begun with another configuration or other such options.
@@ -97,10 +95,6 @@ class TrainingStart:
     config: RunConfig
     label: str = ""
 
-    @property
-    def updates(self) -> int:
-        return self.config.ppo.updates
-
 
 @dataclass(frozen=True)
 class TrainingResult:
@@ -125,7 +119,7 @@ class WaitingGraph:
 
 
 def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
-    """TrainingStart the processes of one training; the caller stops the runner."""
+    """Start the processes of one training; the caller stops the runner."""
     start.folder.mkdir(parents=True, exist_ok=True)
     config_file = start.folder / "config.yaml"
     if not config_file.exists():  # the run folder's own says more, see open_run_dir
@@ -149,16 +143,13 @@ def is_trained(start: TrainingStart) -> bool:
 
 
 def train_round(
-    job: RunContext,
-    start: TrainingStart,
-    judge: Callable[[BoolArray], None] | None = None,
+    job: RunContext, start: TrainingStart, judge: Callable[[BoolArray], None] | None = None,
     waiting: WaitingGraph | None = None,
 ) -> TrainingResult:
     """Train start.policy in start.model_dir and measure it in the simulator; finished parts are kept.
 
-    Args:
-        judge: called with the starting policy's real success before any update; may raise to refuse the training.
-        waiting: this training's processes, where they run already; stopped at the end.
+    judge: called with the starting policy's real success before any update; may raise to refuse the training.
+    waiting: this training's processes, where they run already; stopped at the end.
     """
     marker = start.folder / TRAINED
     if is_trained(start):
@@ -172,15 +163,14 @@ def train_round(
             if judge is not None:
                 judge(_real(operator, job, start, "before", start.policy))
             before, began = _progress(start.folder), time.monotonic()
-            remaining = max(0, start.updates - int(before["updates"]))
+            remaining = max(0, start.config.ppo.updates - int(before["updates"]))
             job.stage(f"training the policy in the world model: {remaining} updates")
             if remaining:
                 _train(operator, remaining)
             after, seconds = _progress(start.folder), time.monotonic() - began
             samples = int(after["samples"]) - int(before["samples"])
-            trained = TrainingResult(
-                int(after["version"]), int(after["updates"]), int(after["samples"]), samples / seconds, str(waiting.bag)
-            )
+            version, updates, total = (int(after[name]) for name in ("version", "updates", "samples"))
+            trained = TrainingResult(version, updates, total, samples / seconds, str(waiting.bag))
             _real(operator, job, start, "after", trained.policy(start.folder))
     write_atomic(marker, json.dumps(asdict(trained), indent=1).encode())
     return trained
@@ -198,9 +188,8 @@ def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path,
 
     def measure() -> BoolArray:
         env = make_imagined_environment(job.config, model_dir, job.starts, num_envs=64, seed=job.config.seed)
-        return evaluate(
-            load_policy(job.config, model_dir, policy), env, episodes, job.config.evaluation.first_seed
-        ).success
+        weights = load_policy(job.config, model_dir, policy)
+        return evaluate(weights, env, episodes, job.config.evaluation.first_seed).success
 
     identity = {"policy_sha256": file_sha256(policy), "model_sha256": models_of(model_dir).sha256}
     success = kept(folder / "evaluations" / f"imagined_{label}.json", identity, measure)

@@ -13,6 +13,7 @@ import argparse
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -38,17 +39,8 @@ from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 from wm_nodes.video_model.clips import Clips, load_clips
-from wm_nodes.video_rl.recorded_buffers import (
-    BufferJudge,
-    JudgedBuffer,
-    RecordedClips,
-    Rescored,
-    read_clips,
-    read_run,
-    recorded_bags,
-    recorded_episodes,
-    rescore,
-)
+from wm_nodes.video_rl import recorded_buffers
+from wm_nodes.video_rl.recorded_buffers import BufferJudge, JudgedBuffer, RecordedClips, Rescored
 from wm_nodes.video_rl.reference_reward import load_probe
 
 RESCORED = "rescored.json"
@@ -125,14 +117,15 @@ def _judge_episodes(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dic
 def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any], Path]:
     """Every recorded picture of a run of loop 2."""
     chosen = {**reward_overrides(arguments.reward), **judge_settings(arguments)}
-    run_dir, config = read_run(arguments.recording, chosen)
+    run_dir, config = recorded_buffers.read_run(arguments.recording, chosen)
     probe = load_probe(shipped_model(config.task))
-    bags = recorded_episodes(run_dir, "train")
+    bags = recorded_buffers.recorded_episodes(run_dir, "train")
     contexts = load_clips(bags, config.model.stride)
     with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
-        clips = (recorded for bag in recorded_bags(run_dir) for recorded in read_clips(bag, pictures=True))
+        recordings = recorded_buffers.recorded_bags(run_dir)
+        clips = chain.from_iterable(recorded_buffers.read_clips(recording, pictures=True) for recording in recordings)
         rows = [
-            rescore(recorded, contexts, probe, config.rewards, config.model.num_conditioning, judge)
+            recorded_buffers.rescore(recorded, contexts, probe, config.rewards, config.model.num_conditioning, judge)
             for recorded in tqdm(clips, desc="rescoring", unit="buffer")
         ]
     equal = all(not row.different for row in rows)

@@ -13,18 +13,12 @@ from tqdm import tqdm
 
 from wm_nodes.apps.options import add_run_dir, add_set, add_tensorboard, prepare_torch, settings
 from wm_nodes.apps.policy_run import Stages, open_run_dir
-from wm_nodes.apps.video_results import Finished, conclude
+from wm_nodes.apps.video_results import conclude
 from wm_nodes.config.load import dump_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
-from wm_nodes.video_rl.recorded_buffers import (
-    read_run,
-    recorded_bags,
-    recorded_buffer,
-    recorded_episodes,
-    trained_clips,
-)
+from wm_nodes.video_rl import recorded_buffers
 from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.video_rl.training_run import VideoRun, progress
 from wm_nodes.video_rl.validation import validation_scores
@@ -41,7 +35,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Train in a new run folder and measure as train-video-model does."""
     prepare_torch()
     stage = Stages()
-    source, live = read_run(arguments.run_folder)
+    source, live = recorded_buffers.read_run(arguments.run_folder)
     config = load_video_config(str(source / "config.yaml"), settings(arguments))
     if config.seed != live.seed:
         raise ValueError(f"the clips of {source} were drawn with seed {live.seed}, not {config.seed}; do not set it")
@@ -51,9 +45,10 @@ def run(arguments: argparse.Namespace) -> None:
     _, iterations = progress(source)
     if not iterations:
         raise ValueError(f"{source} has no checkpoint of a learner: nothing was trained there to train again")
-    clips = trained_clips(recorded_bags(source), iterations)
+    clips = recorded_buffers.trained_clips(recorded_buffers.recorded_bags(source), iterations)
     stage(f"training on {len(clips)} buffers of {source} in {run_dir}")
-    base, heldout, judge = source / "video_model", recorded_episodes(source, "heldout"), shipped_model(config.task)
+    base, judge = source / "video_model", shipped_model(config.task)
+    heldout = recorded_buffers.recorded_episodes(source, "heldout")
     folder = load_video_folder(base)
     training = VideoRun(
         folder.network, config, run_dir, tensorboard=arguments.tensorboard,
@@ -62,12 +57,11 @@ def run(arguments: argparse.Namespace) -> None:
     rewards = None if config.rewards == live.rewards else config.rewards
     try:
         for recorded in tqdm(clips[training.iterations :], desc="GRPO", unit="buffer"):
-            training.train(recorded_buffer(source, recorded, rewards))
+            training.train(recorded_buffers.recorded_buffer(source, recorded, rewards))
     finally:
         training.close()
     conclude(
-        Finished(
-            config, run_dir, base, training.iterations, training.version, load_clips(heldout, folder.clip["stride"]),
-            load_probe(judge), f"as in {source.name}", "", arguments.command, stage.minutes,
-        )
+        config, run_dir, base=base, iterations=training.iterations, version=training.version,
+        heldout=load_clips(heldout, folder.clip["stride"]), probe=load_probe(judge), preset=f"as in {source.name}",
+        bag="", command=arguments.command, minutes=stage.minutes,
     )

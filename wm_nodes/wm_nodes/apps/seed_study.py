@@ -7,9 +7,10 @@ Each (task, seed, arm) is one line of results.jsonl; finished lines are not run 
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from rich.console import Console
@@ -17,11 +18,12 @@ from rich.table import Table
 from tqdm import tqdm
 
 from wm_nodes.apps.options import add_preset, add_threads, prepare_torch, settings
+from wm_nodes.apps.policy_run import rate
 from wm_nodes.config.load import default_task, dump_config, load_config, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import model_tasks
-from wm_nodes.core.statistics import paired_difference, wilson_interval
+from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.record import acceptance_plan, collect_plan
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
@@ -31,7 +33,7 @@ from wm_nodes.policy_rl.initial_policy import prepare_start
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
-from wm_nodes.reports import machine_facts, mean_gain
+from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.validation.acceptance import accept_world_model
@@ -62,7 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
         for seed in arguments.seeds:
             config = load_config(arguments.preset, {"task": task, "seed": seed, **settings(arguments)})
             for arm in arguments.arms:
-                if not _done(folder, task, seed, arm):
+                if not any((row["task"], row["seed"], row["arm"]) == (task, seed, arm) for row in read_results(folder)):
                     _run(config, arm, arguments.model_dir or shipped_model(task), folder)
     rows = read_results(folder)
     Console().print(table(rows))
@@ -78,13 +80,12 @@ def read_results(folder: Path) -> list[dict[str, Any]]:
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
     """One line per run, and per task and arm the pooled paired difference."""
-    found = Table(
-        "task", "trained in", "seed", "real before", "real after", "difference (95 %)", "imagined", "acceptance"
-    )
+    columns = ("task", "trained in", "seed", "real before", "real after", "difference (95 %)", "imagined", "acceptance")
+    lines = Table(*columns)
     for row in rows:
         before, after, pair = row["real_before"], row["real_after"], row["paired"]
         imagined = row["imagined_before"], row["imagined_after"]
-        found.add_row(
+        lines.add_row(
             row["task"], row["arm"].replace("_", " "), str(row["seed"]), _percent(before), _percent(after),
             f"{100 * pair['difference']:+.1f} ({100 * pair['low']:+.1f} to {100 * pair['high']:+.1f})",
             f"{_percent(imagined[0])} -> {_percent(imagined[1])}", "passed" if row["accepted"] else "failed",
@@ -95,11 +96,28 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
             [bool(x) for row in chosen for x in row["success_before"]],
             [bool(x) for row in chosen for x in row["success_after"]],
         )
-        found.add_row(
+        lines.add_row(
             task, arm.replace("_", " "), f"all {len(chosen)}", "", f"n = {pooled.episodes}",
             f"{100 * pooled.difference:+.1f} ({100 * pooled.low:+.1f} to {100 * pooled.high:+.1f})", "", "",
         )
-    return found
+    return lines
+
+
+def mean_gain(rates: Mapping[tuple[str, str, str], float], training: str, baseline: str) -> float:
+    """Mean over policies and tasks of rate(training) - rate(baseline), in the unit of the rates, as RoboScape-R reports
+    it. rates: a success rate for each policy, training and task.
+
+    Raises:
+        ValueError: a cell that only one of the two trainings has, or none at all.
+    """
+    names = {name: {(policy, task) for policy, other, task in rates if other == name} for name in (training, baseline)}
+    alone = names[training] ^ names[baseline]
+    if alone or not names[training]:
+        raise ValueError(
+            f"{training!r} and {baseline!r} have been measured on different cells: {sorted(alone) or 'none'}; "
+            "leave out what has no fellow"
+        )
+    return fmean(rates[policy, training, task] - rates[policy, baseline, task] for policy, task in names[training])
 
 
 def gain_over_simulator(rows: Sequence[dict[str, Any]]) -> float | None:
@@ -112,13 +130,9 @@ def gain_over_simulator(rows: Sequence[dict[str, Any]]) -> float | None:
         seeds = set.intersection(*tried)
         for arm in ARMS if seeds else ():
             found = [after[task, seed, arm] for seed in seeds]
-            successes, episodes = (sum(rate[name] for rate in found) for name in ("successes", "episodes"))
+            successes, episodes = (sum(result[name] for result in found) for name in ("successes", "episodes"))
             rates["image policy", arm, task] = 100 * successes / episodes
     return mean_gain(rates, *ARMS) if rates else None
-
-
-def _done(folder: Path, task: str, seed: int, arm: str) -> bool:
-    return any((row["task"], row["seed"], row["arm"]) == (task, seed, arm) for row in read_results(folder))
 
 
 def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
@@ -130,19 +144,30 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
     policy = load_policy(config, model_dir, weak)
     real = ManiSkillEnvironment(config.task, config.simulation, SIMULATOR_ENVS, seed=config.seed)
     imagined = make_imagined_environment(config, model_dir, starts, num_envs=config.ppo.num_envs, seed=config.seed)
-    real_before, imagined_before = _measure(policy, real, config), _imagine(policy, imagined, config)
+
+    def measure() -> tuple[EvaluationResult, EvaluationResult]:
+        """In the simulator and in the world model."""
+        how = config.evaluation
+        return (
+            evaluate(policy, real, how.episodes, how.first_seed, how.deterministic),
+            evaluate(policy, imagined, IMAGINED_EPISODES, how.first_seed),
+        )
+
+    real_before, imagined_before = measure()
     acceptance = accept_world_model(
-        models_of(model_dir), _heldout(config, folder), config,
+        models_of(model_dir),
+        load_arrays(collect_plan(acceptance_plan(config), config, folder / "heldout"), config), config,
         (imagined_before.successes, imagined_before.episodes), (real_before.successes, real_before.episodes),
     )
     course = _train(policy, real if arm == "simulator" else imagined, config, arm, model_dir)
-    real_after, imagined_after = _measure(policy, real, config), _imagine(policy, imagined, config)
+    real_after, imagined_after = measure()
     real.close()
     save_weights(policy, run_dir / f"{arm}.safetensors", {"tokenizer_sha256": policy.encoder.sha256})
     row = {
-        "task": config.task, "arm": arm, "seed": config.seed, "real_before": _rate(real_before),
-        "real_after": _rate(real_after), "imagined_before": _rate(imagined_before),
-        "imagined_after": _rate(imagined_after),
+        "task": config.task, "arm": arm, "seed": config.seed,
+        "real_before": asdict(rate(real_before.success)), "real_after": asdict(rate(real_after.success)),
+        "imagined_before": asdict(rate(imagined_before.success)),
+        "imagined_after": asdict(rate(imagined_after.success)),
         "paired": asdict(paired_difference(real_before.success.tolist(), real_after.success.tolist())),
         "accepted": acceptance.passed, "acceptance": acceptance.to_dict(),
         "environment_steps": sum(c["steps"] for c in course),
@@ -170,23 +195,6 @@ def _train(
     return course
 
 
-def _heldout(config: RunConfig, folder: Path) -> Any:
-    return load_arrays(collect_plan(acceptance_plan(config), config, folder / "heldout"), config)
-
-
-def _measure(policy: ImagePolicy, env: Environment, config: RunConfig) -> EvaluationResult:
-    settings = config.evaluation
-    return evaluate(policy, env, settings.episodes, settings.first_seed, settings.deterministic)
-
-
-def _imagine(policy: ImagePolicy, env: Environment, config: RunConfig) -> EvaluationResult:
-    return evaluate(policy, env, IMAGINED_EPISODES, config.evaluation.first_seed)
-
-
-def _rate(result: EvaluationResult) -> dict[str, float]:
-    low, high = wilson_interval(result.successes, result.episodes)
-    return {"successes": result.successes, "episodes": result.episodes, "low": low, "high": high}
-
-
-def _percent(rate: dict[str, float]) -> str:
-    return f"{100 * rate['successes'] / rate['episodes']:.1f} % ({rate['successes']}/{rate['episodes']})"
+def _percent(successes: dict[str, float]) -> str:
+    share = successes["successes"] / successes["episodes"]
+    return f"{100 * share:.1f} % ({successes['successes']}/{successes['episodes']})"

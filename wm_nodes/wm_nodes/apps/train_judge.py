@@ -93,8 +93,7 @@ def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def table(report: Mapping[str, Any]) -> str:
     """One line per target; of hacking patterns the share flagged (of clips with it, of others) and what could be
-    flagged at 5 % of the others; then how many clips of each split are too foreign to judge.
-    """
+    flagged at 5 % of the others; then how many clips of each split are too foreign to judge."""
     columns = ("n", "fails", "acc", "bal.", "AUROC", "ECE", "level", "flag", "false", "at 5 %")
     lines = [f"{'target':16} " + " ".join(f"{name:>6}" for name in columns)]
     for name in TARGETS:

@@ -12,27 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.apps import options
 from wm_nodes.apps.model_refresh_loop import round_start, run_rounds
-from wm_nodes.apps.options import (
-    add_graph,
-    add_judge,
-    add_preset,
-    add_run_dir,
-    add_seed,
-    judge_settings,
-    prepare_torch,
-    settings,
-)
 from wm_nodes.apps.policy_pictures import write_pictures
-from wm_nodes.apps.policy_run import (
-    RunContext,
-    Stages,
-    console,
-    is_trained,
-    open_run_dir,
-    rate,
-    start_graph,
-)
+from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, open_run_dir, rate, start_graph
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
@@ -46,7 +29,10 @@ from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.policy_rl.factories import load_policy
 from wm_nodes.policy_rl.initial_policy import prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import load_arrays, make_model
-from wm_nodes.reports import Summary, machine_facts, results_table, rounds_table, write_report, write_summary
+from wm_nodes.reports.html import write_report
+from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.summary import Summary, write_summary
+from wm_nodes.reports.tables import results_table, rounds_table
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
@@ -56,10 +42,10 @@ ACCEPTANCE, FORMER_ACCEPTANCE = "acceptance.json", "gate.json"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    add_preset(parser, "cpu", preset_names())
+    options.add_preset(parser, "cpu", preset_names())
     parser.add_argument("--task", choices=task_names(), help="default: the preset's")
-    add_seed(parser, None)
-    add_run_dir(parser)
+    options.add_seed(parser, None)
+    options.add_run_dir(parser)
     parser.add_argument("--model-dir", type=Path, help="world model to use instead of the shipped one")
     parser.add_argument("--from-scratch", action="store_true", help="collect data and train the world model too")
     parser.add_argument("--force", action="store_true", help="train even in a model that does not pass acceptance")
@@ -73,15 +59,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="what the policy is paid for in the world model. endogenous: the model's own signal; agent: a judge's "
         "verdict on each whole episode; name the judge below, or in section judge of the settings. Default: endogenous",
     )
-    add_judge(parser)
+    options.add_judge(parser)
     parser.add_argument("--compose", action="store_true", help="all nodes in one process")
-    add_graph(parser)
+    options.add_graph(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Collect, check the world model, clone a weak policy, train it in the world model, measure it in the simulator."""
     stage = Stages()
-    prepare_torch()
+    options.prepare_torch()
     config, run_dir = _open_run(arguments)
     stage(f"run folder {run_dir}")
     model_dir = _model(arguments, config, run_dir, stage)
@@ -120,12 +106,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
-    overrides = settings(arguments)
+    overrides = options.settings(arguments)
     if arguments.task:
         overrides["task"] = arguments.task
     if arguments.rounds is not None:
         overrides["rounds.num_rounds"] = arguments.rounds
-    judge = judge_settings(arguments)
+    judge = options.judge_settings(arguments)
     if judge and arguments.reward != AGENT:
         raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")
     config = load_config(arguments.preset, {**overrides, **judge})

@@ -15,19 +15,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from wm_nodes.apps.options import (
-    add_graph,
-    add_judge,
-    add_preset,
-    add_run_dir,
-    add_seed,
-    add_tensorboard,
-    judge_settings,
-    prepare_torch,
-    settings,
-)
+from wm_nodes.apps import options
 from wm_nodes.apps.policy_run import READY_S, Stages, open_run_dir
-from wm_nodes.apps.video_results import Finished, conclude
+from wm_nodes.apps.video_results import conclude
 from wm_nodes.config.load import (
     REWARDS,
     VIDEO,
@@ -56,9 +46,9 @@ HELDOUT_EPISODES = 100
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    add_preset(parser, "recommended", preset_names(VIDEO))
-    add_seed(parser, None)
-    add_run_dir(parser)
+    options.add_preset(parser, "recommended", preset_names(VIDEO))
+    options.add_seed(parser, None)
+    options.add_run_dir(parser)
     parser.add_argument(
         "--from-scratch", action="store_true",
         help="train a video model of your own even where one with these settings is shipped (half an hour on one core)",
@@ -78,14 +68,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording. Default: what "
         "the preset weighs",
     )
-    add_judge(parser)
-    add_tensorboard(parser)
-    add_graph(parser)
+    options.add_judge(parser)
+    options.add_tensorboard(parser)
+    options.add_graph(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Take or record episodes, take or train a video model, run GRPO over the graph, measure, report."""
-    prepare_torch()
+    options.prepare_torch()
     stage = Stages()
     config, run_dir = _open_run(arguments)
     stage(f"run folder {run_dir}")
@@ -109,10 +99,8 @@ def run(arguments: argparse.Namespace) -> None:
         _post_train(arguments, config, (bags, heldout_bags), run_dir, stage)
         version, done = progress(run_dir)
     conclude(
-        Finished(
-            config, run_dir, run_dir / "video_model", done, version, heldout, probe, arguments.preset,
-            str(recorded_bags(run_dir)[-1]), arguments.command, stage.minutes,
-        )
+        config, run_dir, base=run_dir / "video_model", iterations=done, version=version, heldout=heldout, probe=probe,
+        preset=arguments.preset, bag=str(recorded_bags(run_dir)[-1]), command=arguments.command, minutes=stage.minutes,
     )
 
 
@@ -181,7 +169,7 @@ def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
         raise ValueError("--bags and --heldout-bags go together: what is trained on, and what is held out")
     if twice := {bag.resolve() for bag in arguments.bags} & {bag.resolve() for bag in arguments.heldout_bags}:
         raise ValueError(f"{min(twice)} cannot be trained on and held out; name other --heldout-bags")
-    chosen = {**settings(arguments), **reward_overrides(arguments.reward), **judge_settings(arguments)}
+    chosen = {**options.settings(arguments), **reward_overrides(arguments.reward), **options.judge_settings(arguments)}
     config = load_video_config(arguments.preset, chosen)
     if config.rewards.get(AGENT):
         config = config.with_values(judge=judge_or_embedded(config.judge))

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +11,12 @@ from wm_nodes.apps.policy_run import console
 from wm_nodes.config.load import dump_config
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.statistics import bootstrap_mean
-from wm_nodes.reports import (
-    ClipSummary,
-    Picture,
-    ScoreChange,
-    clip_panels,
-    curves,
-    film_strip,
-    machine_facts,
-    scores_table,
-    write_clip_report,
-    write_clip_summary,
-)
-from wm_nodes.reports.clip_report import TITLES
+from wm_nodes.reports.clip_report import TITLES, ClipSummary, ScoreChange, clip_panels, scores_table, write_clip_report
+from wm_nodes.reports.curves import curves
+from wm_nodes.reports.film_strip import film_strip
+from wm_nodes.reports.html import Picture
+from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.summary import write_summary
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
 from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import Clips
@@ -40,41 +32,25 @@ AFTER = Path("evaluations") / "after.json"
 STRIPS = 3
 
 
-@dataclass(frozen=True)
-class Finished:
-    """A training that has come to its end. base: folder of the model it began with. iterations, version: as progress()
-    says.
-    """
-
-    config: VideoRlConfig
-    run_dir: Path
-    base: Path
-    iterations: int
-    version: int
-    heldout: Clips
-    probe: PositionProbe
-    preset: str
-    bag: str
-    command: str
-    minutes: float
-
-
-def conclude(run: Finished) -> ClipSummary:
-    """Measure, draw, write and print; what was measured on the same weights before is kept.
+def conclude(
+    config: VideoRlConfig, run_dir: Path, *, base: Path, iterations: int, version: int, heldout: Clips,
+    probe: PositionProbe, preset: str, bag: str, command: str, minutes: float,
+) -> None:
+    """Measure a training that has come to its end, draw, write and print; what was measured on the same weights before
+    is kept. base: folder of the model it began with. iterations, version: as progress() says.
 
     Raises:
         OSError: the version's weights are gone.
     """
-    config, run_dir = run.config, run.run_dir
-    base, trained = load_video_folder(run.base), load_video_folder(run.base)
-    uri = evaluated_uri(run.version, config)
-    if run.version:
+    base_folder, trained = load_video_folder(base), load_video_folder(base)
+    uri = evaluated_uri(version, config)
+    if version:
         load_weights(trained.network, (run_dir / uri).read_bytes())
-    before = kept_scores(run_dir / BEFORE, base, run.heldout, run.probe, config)
-    after = kept_scores(run_dir / AFTER, trained, run.heldout, run.probe, config)
+    before = kept_scores(run_dir / BEFORE, base_folder, heldout, probe, config)
+    after = kept_scores(run_dir / AFTER, trained, heldout, probe, config)
     watched = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []
     summary = ClipSummary(
-        task=config.task, preset=run.preset, seed=config.seed, iterations=run.iterations, version=run.version,
+        task=config.task, preset=preset, seed=config.seed, iterations=iterations, version=version,
         weights="averaged" if config.grpo.ema_decay > 0 else "last", contexts=len(before["tracking"]),
         scores={name: score_change(name, before[name], after[name], config.seed) for name in TITLES},
         evaluations=len(watched),
@@ -83,10 +59,11 @@ def conclude(run: Finished) -> ClipSummary:
              "slopes": {alarm.metric: alarm.true_slope for alarm in alarms}, "text": alarm_text(alarms)}
             for line in watched if (alarms := alarms_of(line))
         ],
-        bag=run.bag, minutes=run.minutes, command=run.command, machine=machine_facts(), date=time.strftime("%Y-%m-%d"),
+        bag=bag, minutes=minutes, command=command, machine=machine_facts(), date=time.strftime("%Y-%m-%d"),
     )
-    path = write_clip_summary(run_dir, summary)
-    strips = _strips(run, [ClipGenerator(folder, run.heldout, config) for folder in (base, trained)])
+    path = write_summary(run_dir, summary)
+    generators = [ClipGenerator(folder, heldout, config) for folder in (base_folder, trained)]
+    strips = _strips(config, run_dir, heldout, generators)
     drawn = curves(
         run_dir / FILE_NAME, run_dir / "pictures" / "curves.png", clip_panels(config.grpo.updates_per_buffer),
         step="buffers trained on",
@@ -97,8 +74,7 @@ def conclude(run: Finished) -> ClipSummary:
     console.print(scores_table(summary))
     for alarm in summary.hacked:
         console.print(f"[bold yellow]reward hacking[/] after {alarm['step']} buffers: {alarm['text']}", highlight=False)
-    console.print(f"report   {report}\nsummary  {path}\nbag      {run.bag}", highlight=False)
-    return summary
+    console.print(f"report   {report}\nsummary  {path}\nbag      {bag}", highlight=False)
 
 
 def score_change(name: str, before: Sequence[float], after: Sequence[float], seed: int) -> ScoreChange:
@@ -109,15 +85,15 @@ def score_change(name: str, before: Sequence[float], after: Sequence[float], see
     return ScoreChange(float(np.mean(before)), float(np.mean(after)), difference, low, high, verdict)
 
 
-def _strips(run: Finished, generators: Sequence[ClipGenerator]) -> list[Picture]:
+def _strips(config: VideoRlConfig, run_dir: Path, heldout: Clips, generators: Sequence[ClipGenerator]) -> list[Picture]:
     """The recording, the base model and the trained model from the same first frames and noise."""
-    some = run.heldout.select(torch.arange(min(STRIPS, len(run.heldout))))
-    made = [generator.evaluate(some, run.config.evaluation.num_steps) for generator in generators]
-    rows = dict(zip(("recorded", "before", "after"), [some.frames, *made], strict=True))
+    shown = heldout.select(torch.arange(min(STRIPS, len(heldout))))
+    frames = [generator.evaluate(shown, config.evaluation.num_steps) for generator in generators]
+    rows = dict(zip(("recorded", "before", "after"), [shown.frames, *frames], strict=True))
     pictures = []
-    for index, instruction in enumerate(some.instructions):
-        path = run.run_dir / "pictures" / f"film_strip_{index}.png"
-        film_strip({label: np.ascontiguousarray(frames[index].numpy()) for label, frames in rows.items()}, path)
+    for index, instruction in enumerate(shown.instructions):
+        path = run_dir / "pictures" / f"film_strip_{index}.png"
+        film_strip({label: np.ascontiguousarray(clips[index].numpy()) for label, clips in rows.items()}, path)
         pictures.append(
             Picture(
                 f"Held-out context {index + 1}",

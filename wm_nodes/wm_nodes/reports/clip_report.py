@@ -1,19 +1,16 @@
 """The report of a run of loop 2: summary.json, the table of held-out scores, report.html."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
-from wm_nodes.core.files import write_atomic
 from wm_nodes.reports.console_table import estimate, make_table
 from wm_nodes.reports.curves import Panel
 from wm_nodes.reports.html import Picture, figures, html_table, made_on, write_page
-from wm_nodes.reports.summary import FILE_NAME, plain
 
 TITLES = {
     "tracking": "tracking score", "object_cm": "object error, cm", "tool_cm": "tool error, cm", "psnr_db": "PSNR, dB",
@@ -25,8 +22,7 @@ TITLES = {
 @dataclass(frozen=True)
 class ScoreChange:
     """One held-out score, means over the contexts. low, high: 95 % bootstrap interval of after minus before on the same
-    contexts. verdict: better or worse; empty where chance may explain it.
-    """
+    contexts. verdict: better or worse; empty where chance may explain it."""
 
     before: float
     after: float
@@ -63,13 +59,6 @@ class ClipSummary:
     date: str = ""
 
 
-def write_clip_summary(run_dir: Path, summary: ClipSummary) -> Path:
-    """Write <run_dir>/summary.json, complete or not at all."""
-    path = Path(run_dir) / FILE_NAME
-    write_atomic(path, (json.dumps(plain(asdict(summary)), indent=1, allow_nan=False) + "\n").encode())
-    return path
-
-
 def clip_verdict(summary: ClipSummary) -> str:
     """One sentence: which scores changed by more than chance explains."""
     parts = []
@@ -92,7 +81,6 @@ def scores_table(summary: ClipSummary) -> Table:
 
 def clip_panels(updates: int) -> tuple[Panel, ...]:
     """The course of a training with so many optimizer steps on each buffer."""
-    last = updates if updates > 1 else 1
     return (
         Panel("reward", {"grpo/reward_mean": "of the clips trained on", "heldout/reward": "held out, ODE"}),
         Panel("held-out tracking score, (0, 1]", {"heldout/tracking": ""}),
@@ -100,8 +88,8 @@ def clip_panels(updates: int) -> tuple[Panel, ...]:
         Panel("held-out scenery error, of [0, 1]", {"heldout/scenery": ""}),
         Panel("KL to the anchor", {f"grpo/kl_{k}": f"update {k}" for k in range(1, updates + 1)}),
         Panel(
-            f"clipped transitions (share), update {last}",
-            {f"grpo/clip_low_share_{last}": "below", f"grpo/clip_high_share_{last}": "above"}, (0.0, 1.0),
+            f"clipped transitions (share), update {updates}",
+            {f"grpo/clip_low_share_{updates}": "below", f"grpo/clip_high_share_{updates}": "above"}, (0.0, 1.0),
         ),
         Panel("groups without spread (share)", {"grpo/zero_std_ratio": ""}, (0.0, 1.0)),
         Panel("gradient norm before clipping", {f"grpo/grad_norm_{k}": f"update {k}" for k in range(1, updates + 1)}),
@@ -111,11 +99,7 @@ def clip_panels(updates: int) -> tuple[Panel, ...]:
 def write_clip_report(
     run_dir: Path, summary: ClipSummary, pictures: Sequence[Picture] = (), *, config_text: str = ""
 ) -> Path:
-    """Write <run_dir>/report.html and return its path.
-
-    Raises:
-        FileNotFoundError: a picture does not exist.
-    """
+    """Write <run_dir>/report.html and return its path. Raises FileNotFoundError: a picture does not exist."""
     title = f"{summary.task}: a video world model post-trained by GRPO"
     body = [
         f"<h1>{escape(title)}</h1>",

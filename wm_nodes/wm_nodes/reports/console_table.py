@@ -9,11 +9,8 @@ def make_table(
     title: str | None, columns: Sequence[str], rows: Iterable[Sequence[object]] = (), *,
     left: Collection[str] | None = None, caption: str | None = None, no_wrap: Collection[str] = (),
 ) -> Table:
-    """Build a table; columns of text are aligned left, columns of numbers right.
-
-    Args:
-        left: names of the columns of text; None: only the first column.
-        no_wrap: names of the columns whose cells stay on one line.
+    """Build a table; columns of text are aligned left, columns of numbers right. left: names of the columns of text;
+    None: only the first column. no_wrap: names of the columns whose cells stay on one line.
     """
     table = Table(title=title, caption=caption)
     for name in columns:

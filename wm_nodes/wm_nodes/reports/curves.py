@@ -13,8 +13,7 @@ from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figu
 @dataclass(frozen=True)
 class Panel:
     """One diagram. lines: metric to its label in the legend, "" for none; "section/metric" takes it from that section
-    only. limits: fixed limits of the y axis.
-    """
+    only. limits: fixed limits of the y axis."""
 
     title: str
     lines: Mapping[str, str]
@@ -35,10 +34,7 @@ def curves(
     """Draw the panels over the steps of the metrics, two in a row; returns the PNG.
 
     Returns None, and draws nothing, where no line of the file carries any of them. Values that were written as null
-    leave a gap; a metric without any number is neither drawn nor in the legend.
-
-    Args:
-        step: what a step is; under every panel.
+    leave a gap; a metric without any number is neither drawn nor in the legend. step: said under each panel.
     """
     series = [{name: read_series(metrics_file, name) for name in panel.lines} for panel in panels]
     if not any(points for lines in series for points in lines.values()):
@@ -56,8 +52,7 @@ def curves(
 
 def read_series(metrics_file: Path, name: str) -> list[tuple[int, float]]:
     """(step, value) of a metric ("section/metric": of that section only) in order; the last line of a step wins, as a
-    resumed run may repeat steps.
-    """
+    resumed run may repeat steps."""
     if not metrics_file.is_file():
         return []
     section, _, metric = name.rpartition("/")

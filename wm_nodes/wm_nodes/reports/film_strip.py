@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import UInt8Array
 
 INK, FAINT, PAPER = (32, 32, 36), (120, 120, 128), 255
@@ -14,11 +15,7 @@ LABEL_SCALE, STEP_SCALE = 0.6, 0.5
 
 
 def film_strip(
-    rows: Mapping[str, UInt8Array],
-    path: Path | None = None,
-    *,
-    scale: int = 2,
-    max_columns: int = 7,
+    rows: Mapping[str, UInt8Array], path: Path | None = None, *, scale: int = 2, max_columns: int = 7,
     marks: Mapping[str, int] | None = None,
 ) -> UInt8Array:
     """Draw frames 0, ..., T - 1 of each row; labels left, step numbers on top, pixels enlarged as they are.
@@ -54,33 +51,17 @@ def film_strip(
         y = HEADER_PX + index * (height + GAP_PX)
         cv2.putText(picture, label, (6, y + height // 2 + 6), FONT, LABEL_SCALE, INK, 1, cv2.LINE_AA)
         for column, step in enumerate(steps):
-            frame = _frame(frames, step, is_last=column == len(steps) - 1)
-            if frame is None:
+            is_goal = len(frames) == 1
+            if (column < len(steps) - 1) if is_goal else step >= len(frames):
                 continue
             x = left + column * (width + GAP_PX)
+            frame = frames[0 if is_goal else step]
             picture[y : y + height, x : x + width] = frame.repeat(scale, 0).repeat(scale, 1)
             if marks and marks.get(label) == step:
                 cv2.rectangle(picture, (x, y), (x + width - 1, y + height - 1), (30, 170, 80), 3)
     if path is not None:
-        write_png(picture, path)
+        write_atomic(path, cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
     return picture
-
-
-def write_png(picture: UInt8Array, path: Path) -> None:
-    """Write an RGB picture, complete or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    done, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    if not done:
-        raise ValueError(f"OpenCV could not encode a picture of shape {picture.shape} for {path}")
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_bytes(data.tobytes())
-    temporary.replace(path)
-
-
-def _frame(frames: UInt8Array, step: int, *, is_last: bool) -> UInt8Array | None:
-    if len(frames) == 1:
-        return frames[0] if is_last else None
-    return frames[step] if step < len(frames) else None
 
 
 def _shown_steps(num_frames: int, max_columns: int, wanted: Iterable[int]) -> list[int]:

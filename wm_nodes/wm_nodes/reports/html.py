@@ -46,16 +46,13 @@ class Picture:
 
 
 def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = (), *, config_text: str = "") -> Path:
-    """Write <run_dir>/report.html and return its path.
-
-    Raises:
-        FileNotFoundError: a picture does not exist.
-    """
+    """Write <run_dir>/report.html and return its path. Raises FileNotFoundError: a picture does not exist."""
     title = f"{summary.task}: a policy trained inside a world model"
+    reward = f"{summary.reward} ({summary.judge})" if summary.judge else summary.reward
     body = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="lead">{escape(verdict(summary))}</p>',
-        f'<p class="faint">preset {escape(summary.preset)}, seed {summary.seed}, reward {escape(_reward(summary))}, '
+        f'<p class="faint">preset {escape(summary.preset)}, seed {summary.seed}, reward {escape(reward)}, '
         f"{summary.samples} imagined environment steps at {summary.imagined_steps_per_s:.0f} per second, "
         f"{summary.minutes:.1f} minutes in all</p>",
         "<h2>Success</h2>", _results(summary),
@@ -66,10 +63,6 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
         *made_on(summary.machine, config_text),
     ]
     return write_page(run_dir, title, body)
-
-
-def _reward(summary: Summary) -> str:
-    return f"{summary.reward} ({summary.judge})" if summary.judge else summary.reward
 
 
 def write_page(run_dir: Path, title: str, body: Iterable[str]) -> Path:
@@ -85,11 +78,7 @@ def write_page(run_dir: Path, title: str, body: Iterable[str]) -> Path:
 
 
 def figures(pictures: Sequence[Picture]) -> Iterable[str]:
-    """Each picture, inside the page, under its title.
-
-    Raises:
-        FileNotFoundError: a picture does not exist.
-    """
+    """Each picture, inside the page, under its title. Raises FileNotFoundError: a picture does not exist."""
     for picture in pictures:
         if not picture.path.is_file():
             raise FileNotFoundError(f"picture {picture.path} of the report does not exist")
@@ -111,8 +100,7 @@ def made_on(machine: Mapping[str, str], config_text: str) -> Iterable[str]:
 
 
 def html_table(
-    columns: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Collection[int] = (),
-    emphasise_last: bool = False,
+    columns: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Collection[int] = (), mark_last: bool = False
 ) -> str:
     """A table as HTML.
 
@@ -127,7 +115,7 @@ def html_table(
         return f"<tr{kind}>" + "".join(f"<{tag}{c}>{cell}</{tag}>" for c, cell in zip(classes, cells)) + "</tr>"
 
     body = list(rows)
-    last = ' class="last"' if emphasise_last else ""
+    last = ' class="last"' if mark_last else ""
     lines = [line("td", cells, last if index == len(body) - 1 else "") for index, cells in enumerate(body)]
     head = line("th", columns) if any(columns) else ""
     return f'<div class="wide"><table>{head}{"".join(lines)}</table></div>'
@@ -140,7 +128,7 @@ def _results(summary: Summary) -> str:
         for row in result_rows(summary)
     )
     columns = ("", *(text for side in ("real simulator", "imagined") for text in (side, "", "95 % interval")))
-    table = html_table(columns, (tuple(map(escape, row)) for row in rows), numbers=range(1, 7), emphasise_last=True)
+    table = html_table(columns, (tuple(map(escape, row)) for row in rows), numbers=range(1, 7), mark_last=True)
     return table + (
         '<p class="faint">Intervals of rates: Wilson. Interval of the real difference: the same seeds before and after '
         "(Tango's score interval). Imagined success is what the world model claims; only real success counts.</p>"
@@ -163,26 +151,21 @@ def _acceptance(report: Mapping[str, Any]) -> str:
         return "<p>Not measured.</p>"
     rows = []
     for criterion in report["criteria"]:
-        passed = criterion["passed"]
-        mark = '<span class="good">passed</span>'
-        if not passed:
-            mark = f'<span class="bad">failed</span>: {escape(str(criterion["remedy"]))}'
-        rule = escape(f"{criterion['rule']} {_threshold(criterion)}")
+        mark = f'<span class="bad">failed</span>: {escape(str(criterion["remedy"]))}'
+        mark = '<span class="good">passed</span>' if criterion["passed"] else mark
+        threshold = "" if criterion["threshold"] is None else f"{float(criterion['threshold']):g}"
+        rule = escape(f"{criterion['rule']} {threshold}")
         rows.append((escape(str(criterion["name"])), _value(criterion["value"]), rule, mark))
     notes = "".join(f'<p class="faint">{escape(str(note))}</p>' for note in report.get("notes", ()))
+    metrics = [(escape(name), _value(value)) for name, value in report.get("metrics", {}).items()]
+    if metrics:
+        table = html_table(("metric", "value"), metrics)
+        notes += f"<details><summary>all numbers of the held-out rollouts</summary>{table}</details>"
     words = "Passed" if report["passed"] else "Failed: trained in it all the same"
     return (
         f"<p>{words}. Judged on {report['episodes']} held-out real episodes.</p>"
-        f"{html_table(('criterion', 'value', 'must be', ''), rows, numbers=(1,))}"
-        f"{notes}{_metrics(report.get('metrics', {}))}"
+        f"{html_table(('criterion', 'value', 'must be', ''), rows, numbers=(1,))}{notes}"
     )
-
-
-def _metrics(metrics: Mapping[str, Any]) -> str:
-    if not metrics:
-        return ""
-    table = html_table(("metric", "value"), ((escape(name), _value(value)) for name, value in metrics.items()))
-    return f"<details><summary>all numbers of the held-out rollouts</summary>{table}</details>"
 
 
 def _again(run_dir: Path, summary: Summary) -> str:
@@ -207,7 +190,3 @@ def _again(run_dir: Path, summary: Summary) -> str:
 
 def _value(value: Any) -> str:
     return "undefined" if value is None else f"{float(value):.3f}"
-
-
-def _threshold(criterion: Mapping[str, Any]) -> str:
-    return "" if criterion["threshold"] is None else f"{float(criterion['threshold']):g}"

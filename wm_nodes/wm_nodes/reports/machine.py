@@ -11,11 +11,12 @@ PACKAGES = ("wm_nodes", "torch", "numpy", "mani_skill", "sapien", "rclpy", "rosb
 
 def machine_facts() -> dict[str, str]:
     """Date, processor, usable cores, memory, system, Python and package versions, by name. No host or user name."""
+    kilobytes = _field("/proc/meminfo", "MemTotal").split()[:1]
     facts = {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "processor": _field("/proc/cpuinfo", "model name") or platform.processor() or platform.machine(),
         "cores": str(len(os.sched_getaffinity(0))),
-        "memory": _memory(),
+        "memory": f"{int(kilobytes[0]) / 2**20:.1f} GiB" if kilobytes else "unknown",
         "system": f"{_field('/etc/os-release', 'PRETTY_NAME', '=').strip(chr(34))} {platform.machine()}".strip(),
         "python": platform.python_version(),
     }
@@ -25,11 +26,6 @@ def machine_facts() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             continue
     return facts
-
-
-def _memory() -> str:
-    kilobytes = _field("/proc/meminfo", "MemTotal").split()[:1]
-    return f"{int(kilobytes[0]) / 2**20:.1f} GiB" if kilobytes else "unknown"
 
 
 def _field(path: str, name: str, separator: str = ":") -> str:

@@ -66,18 +66,14 @@ class Summary:
     reward: str = "endogenous"
     judge: str = ""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values; a number that is not finite becomes None."""
-        values: dict[str, Any] = plain(asdict(self))
-        for name in ("real_before", "real_after", "imagined_before", "imagined_after"):
-            values[name]["rate"] = getattr(self, name).rate
-        return values
 
-
-def write_summary(run_dir: Path, summary: Summary) -> Path:
-    """Write <run_dir>/summary.json, complete or not at all."""
-    path = Path(run_dir) / FILE_NAME
-    write_atomic(path, (json.dumps(summary.to_dict(), indent=1, allow_nan=False) + "\n").encode())
+def write_summary(run_dir: Path, summary: Any) -> Path:
+    """Write <run_dir>/summary.json, complete or not at all; a number that is not finite becomes null."""
+    path, values = Path(run_dir) / FILE_NAME, plain(asdict(summary))
+    for name, value in vars(summary).items():
+        if isinstance(value, SuccessRate):
+            values[name]["rate"] = value.rate
+    write_atomic(path, (json.dumps(values, indent=1, allow_nan=False) + "\n").encode())
     return path
 
 

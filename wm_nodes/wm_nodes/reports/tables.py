@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.table import Table
 
@@ -20,8 +20,7 @@ class Cell:
     interval: str
 
 
-@dataclass(frozen=True)
-class ResultRow:
+class ResultRow(NamedTuple):
     label: str
     real: Cell
     imagined: Cell
@@ -44,8 +43,7 @@ def verdict(summary: Summary) -> str:
     """One sentence: whether the real difference is above what chance explains."""
     if "low" not in summary.paired:
         return "The real difference was not measured on paired seeds."
-    points = 100 * float(summary.paired["difference"])
-    low, high = 100 * float(summary.paired["low"]), 100 * float(summary.paired["high"])
+    points, low, high = (100 * float(summary.paired[name]) for name in ("difference", "low", "high"))
     effect = f"{points:+.1f} points in the real simulator (95 % interval {low:+.1f} to {high:+.1f})"
     if low > 0:
         return f"The policy got better: {effect}."
@@ -58,10 +56,9 @@ def results_table(summary: Summary) -> Table:
     """The table for the terminal."""
     title = f"{summary.task}, preset {summary.preset}, seed {summary.seed}, reward {summary.reward}"
     table = make_table(title, ("success", "real simulator", "imagined"), caption=verdict(summary))
-    for row in result_rows(summary):
-        style = "bold" if row.label == "difference" else ""
-        table.add_row(row.label, *(f"{c.percent}   {c.count}\n[dim]{c.interval}" for c in (row.real, row.imagined)),
-                      style=style, end_section=True)
+    for label, *cells in result_rows(summary):
+        texts = (f"{cell.percent}   {cell.count}\n[dim]{cell.interval}" for cell in cells)
+        table.add_row(label, *texts, style="bold" if label == "difference" else "", end_section=True)
     return table
 
 

@@ -13,16 +13,3 @@
 Criteria, scales and answer forms are the public ones, the wording is ours: no prompt is copied. Numbers may differ from
 the authors' by that; quote them as "VideoAlign-style". Every failure is a reason, never a number.
 """
-
-from benchmarks.judge.comparisons.chat import ChatComparison, ComparisonReward, ScoredClip
-from benchmarks.judge.comparisons.protocols import PAIRWISE, POINTWISE, PairwiseProtocol, PointwiseProtocol
-
-__all__ = [
-    "PAIRWISE",
-    "POINTWISE",
-    "ChatComparison",
-    "ComparisonReward",
-    "PairwiseProtocol",
-    "PointwiseProtocol",
-    "ScoredClip",
-]

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from benchmarks.judge.comparisons.protocols import PairwiseProtocol, Parts, PointwiseProtocol
 from wm_nodes.judge.agent.profiles import uniform
@@ -18,35 +18,24 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class ScoredClip:
-    """value in [0, 1], NaN unless valid; parts in the protocol's own units. reason: why there is no number."""
+class ComparisonReward:
+    """value: of a clip, or the preference for the first of two, in [0, 1]; NaN without a number, `reason` says why.
+    parts: in the protocol's own units. consistent: of two clips in both orders, both named one winner."""
 
     value: float
     parts: Parts = field(default_factory=dict)
-    valid: bool = True
-    reason: str = ""
-    cost: Cost = field(default_factory=Cost)
-
-
-@dataclass(frozen=True)
-class ComparisonReward:
-    """preference: of the first clip, in [0, 1], NaN unless valid. With both_orders it is the mean over the orders, and
-    `consistent` says whether both named one winner.
-    """
-
-    preference: float
-    parts: Parts = field(default_factory=dict)
-    valid: bool = True
     reason: str = ""
     consistent: bool = True
     cost: Cost = field(default_factory=Cost)
 
+    @property
+    def valid(self) -> bool:
+        return not math.isnan(self.value)
+
 
 class ChatComparison:
-    """Asks a model that sees images. Belongs to the event loop of its transport.
-
-    Args:
-        timeout_s: per try. max_tokens: of an answer. seed: sent along; temperature is 0.
+    """Asks a model that sees images. Belongs to the event loop of its transport. timeout_s: per try. max_tokens: of an
+    answer. seed: sent along; temperature is 0.
     """
 
     def __init__(
@@ -54,33 +43,29 @@ class ChatComparison:
     ) -> None:
         self._transport, self._timeout_s, self._max_tokens, self._seed = transport, timeout_s, max_tokens, seed
 
-    async def score(self, protocol: PointwiseProtocol, clip: ClipRef, task: TaskSpec) -> ScoredClip:
+    async def score(self, protocol: PointwiseProtocol, clip: ClipRef, task: TaskSpec) -> ComparisonReward:
         """Score one clip by a pointwise protocol."""
         count = protocol.frames or max(2, math.ceil(clip.duration_s * protocol.fps))
         content = [*_images(clip, count), _text(protocol.question(task.instruction))]
         parts, reason, cost = await self.ask(content, protocol.read, count)
         if parts is None:
-            return ScoredClip(math.nan, {}, False, reason, cost)
-        return ScoredClip(protocol.value(parts), parts, cost=cost)
+            return ComparisonReward(math.nan, reason=reason, cost=cost)
+        return ComparisonReward(protocol.value(parts), parts, cost=cost)
 
     async def compare(
-        self, protocol: PairwiseProtocol, first: ClipRef, second: ClipRef, task: TaskSpec, *, both_orders: bool = True
+        self, protocol: PairwiseProtocol, first: ClipRef, second: ClipRef, task: TaskSpec
     ) -> ComparisonReward:
-        """Compare two clips of one instruction.
-
-        Args:
-            both_orders: ask twice, with the clips exchanged: models prefer a place. The published protocol asks once.
-        """
+        """Compare two clips of one instruction, in both orders, because models prefer a place; published: in one."""
         forward = await self._compare_once(protocol, first, second, task)
-        if not both_orders or not forward.valid:
+        if not forward.valid:
             return forward
         other = await self._compare_once(protocol, second, first, task)
         cost = forward.cost + other.cost
         if not other.valid:
-            return ComparisonReward(math.nan, {}, False, other.reason, cost=cost)
-        turned = 1 - other.preference
-        same = (forward.preference - 0.5) * (turned - 0.5) > 0
-        return ComparisonReward((forward.preference + turned) / 2, forward.parts, consistent=same, cost=cost)
+            return ComparisonReward(math.nan, reason=other.reason, cost=cost)
+        turned = 1 - other.value
+        same = (forward.value - 0.5) * (turned - 0.5) > 0
+        return ComparisonReward((forward.value + turned) / 2, forward.parts, consistent=same, cost=cost)
 
     async def ask(
         self, content: Sequence[Part], read: Callable[[str], T], num_images: int, system: str = ""
@@ -91,9 +76,7 @@ class ChatComparison:
             messages = [{"role": "system", "content": system}, *messages]
         cost, reason, began = Cost(), "", time.monotonic()
         for _ in range(TRIES):
-            body: dict[str, Any] = {
-                "messages": messages, "temperature": 0, "seed": self._seed, "max_tokens": self._max_tokens,
-            }
+            body = {"messages": messages, "temperature": 0, "seed": self._seed, "max_tokens": self._max_tokens}
             try:
                 answer = await self._transport.complete(body, timeout_s=self._timeout_s)
             except TransportError as error:
@@ -120,7 +103,7 @@ class ChatComparison:
         content = [*images, _text(protocol.question(task.instruction))]
         answer, reason, cost = await self.ask(content, protocol.read, len(images) // 2)
         if answer is None:
-            return ComparisonReward(math.nan, {}, False, reason, cost=cost)
+            return ComparisonReward(math.nan, reason=reason, cost=cost)
         preference, parts = answer
         return ComparisonReward(preference, parts, cost=cost)
 

@@ -67,22 +67,21 @@ class AnsweredQuestion:
         return self.said == self.question.answer
 
 
-def load_questions(folder: Path, category: str = CATEGORY) -> list[BenchQuestion]:
-    """Read the question files `<category>_*.json` of the published data set.
+def load_questions(folder: Path) -> list[BenchQuestion]:
+    """Read the question files `robot_*.json` of the published data set.
 
     Raises:
         ValueError: no such file, or one that is not of this form; names it.
     """
-    files = sorted(folder.glob(f"{category}_*.json"))
+    files = sorted(folder.glob(f"{CATEGORY}_*.json"))
     if not files:
-        raise ValueError(f"{folder} has no {category}_*.json; give the vqa folder of physical-ai-bench-predict")
+        raise ValueError(f"{folder} has no {CATEGORY}_*.json; give the vqa folder of physical-ai-bench-predict")
     return [question for path in files for question in _questions(path)]
 
 
 def _questions(path: Path) -> list[BenchQuestion]:
     try:
-        entries = json.loads(path.read_text())
-        return [_question(path.stem, entry) for entry in entries]
+        return [_question(path.stem, entry) for entry in json.loads(path.read_text())]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is no list of yes-or-no questions: {type(error).__name__}: {error}") from None
 
@@ -108,11 +107,7 @@ async def answer(judge: ChatComparison, question: BenchQuestion, clip: ClipRef) 
 
 
 def yes_or_no(text: str) -> Literal["yes", "no"]:
-    """The one of the two words that an answer holds.
-
-    Raises:
-        AnswerError: neither or both.
-    """
+    """The one of the two words that an answer holds. Raises AnswerError: neither or both."""
     words = set(re.findall(r"[a-z]+", strip_reasoning(text).lower())) & {"yes", "no"}
     if len(words) != 1:
         raise AnswerError(f"the answer must hold either yes or no, got {text[:80]!r}")
@@ -139,9 +134,12 @@ def consistency(features_TD: FloatArray) -> float:
     Raises:
         ValueError: fewer than two frames, or features that are zero or not finite.
     """
-    unit = _normalise(features_TD)
-    if len(unit) < 2:
-        raise ValueError(f"consistency needs at least 2 frames, got {len(unit)}")
+    norms = np.linalg.norm(features_TD, axis=1, keepdims=True)
+    if features_TD.ndim != 2 or not np.isfinite(norms).all() or not (norms > 0).all():
+        raise ValueError(f"features must be (T, D), finite and not zero, got shape {features_TD.shape}")
+    if len(features_TD) < 2:
+        raise ValueError(f"consistency needs at least 2 frames, got {len(features_TD)}")
+    unit = features_TD / norms
     return float(((unit[1:] @ unit[0]) + (unit[1:] * unit[:-1]).sum(1)).mean() / 2)
 
 
@@ -161,11 +159,3 @@ def summary(domain: float, quality: Mapping[str, float]) -> dict[str, float]:
         raise ValueError(f"Quality is the mean of eight metrics; missing: {missing}, unknown: {foreign}")
     mean = sum(quality.values()) / len(QUALITY)
     return {"domain": domain, "quality": mean, "overall": (domain + mean) / 2}
-
-
-def _normalise(features_TD: FloatArray) -> FloatArray:
-    norms = np.linalg.norm(features_TD, axis=1, keepdims=True)
-    if features_TD.ndim != 2 or not np.isfinite(norms).all() or not (norms > 0).all():
-        raise ValueError(f"features must be (T, D), finite and not zero, got shape {features_TD.shape}")
-    unit: FloatArray = features_TD / norms
-    return unit

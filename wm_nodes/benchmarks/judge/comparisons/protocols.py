@@ -24,7 +24,6 @@ class PointwiseProtocol:
     [0, 1]. frames: this many, evenly spaced; or None: `fps` per second of the clip, 2 at least.
     """
 
-    name: str
     question: Callable[[str], str]
     read: Callable[[str], Parts]
     value: Callable[[Parts], float]
@@ -36,7 +35,6 @@ class PointwiseProtocol:
 class PairwiseProtocol:
     """Which of two clips is better. read: preference of the first in [0, 1], and the parts it is made of."""
 
-    name: str
     question: Callable[[str], str]
     read: Callable[[str], tuple[float, Parts]]
     frames: int = 8
@@ -132,7 +130,10 @@ def read_unified(text: str) -> Parts:
         high = 10 if name == "Final Score" else 4
         if len(numbers) != 1:
             raise AnswerError(f"{name!r} is there {len(numbers)} times instead of once")
-        value = _number(numbers[0])
+        try:
+            value = float(numbers[0])
+        except ValueError:
+            raise AnswerError(f"{numbers[0]!r} is no number") from None
         if not 1 <= value <= high:
             raise AnswerError(f"{name} must be 1 to {high}, got {numbers[0]}")
         parts[name] = value
@@ -175,24 +176,10 @@ def _parse(model: type[Any], text: str) -> Any:
         raise AnswerError(str(error) or "no JSON object") from None
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise AnswerError(f"{text!r} is no number") from None
-
-
 POINTWISE = {
-    protocol.name: protocol
-    for protocol in (
-        PointwiseProtocol(
-            "videoalign", _video_align_question, _reader(_VideoAlign), lambda parts: sum(parts.values()) / 30, None
-        ),
-        PointwiseProtocol(
-            "unifiedreward", _unified_question, read_unified, lambda parts: (parts["Final Score"] - 1) / 9
-        ),
-        PointwiseProtocol("single", _single_question, _reader(_Single), lambda parts: parts["score"] / 10),
-    )
+    "videoalign": PointwiseProtocol(_video_align_question, _reader(_VideoAlign), lambda p: sum(p.values()) / 30, None),
+    "unifiedreward": PointwiseProtocol(_unified_question, read_unified, lambda p: (p["Final Score"] - 1) / 9),
+    "single": PointwiseProtocol(_single_question, _reader(_Single), lambda p: p["score"] / 10),
 }
 """By name. VideoAlign's public total is a sum of normalised regressions; over ratings, the sum of 0 to 10 over 30."""
-PAIRWISE = {"unifiedreward-flex": PairwiseProtocol("unifiedreward-flex", _flex_question, read_flex)}
+PAIRWISE = {"unifiedreward-flex": PairwiseProtocol(_flex_question, read_flex)}
