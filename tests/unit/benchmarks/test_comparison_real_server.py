@@ -13,7 +13,7 @@ from tiny_vlm import save_tiny_vlm, transformers_serve
 from benchmarks.judge.comparisons import POINTWISE, ChatComparison
 from benchmarks.judge.comparisons import pai_bench as pai
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
-from wm_nodes.judge.backends import ChatTransport, Endpoint
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint
 
 pytestmark = pytest.mark.slow
 

@@ -19,8 +19,8 @@ from benchmarks.judge.comparisons import PAIRWISE, POINTWISE, ChatComparison
 from benchmarks.judge.comparisons import pai_bench as pai
 from benchmarks.judge.comparisons.protocols import read_flex, read_unified
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
-from wm_nodes.judge.backends import ChatTransport, Endpoint, RetryPolicy
 from wm_nodes.judge.backends.schemas import AnswerError
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
 from wm_nodes.judge.dataset.rows import select_rows
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (20, 24, 32, 3), np.uint8)

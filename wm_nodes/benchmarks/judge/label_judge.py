@@ -9,20 +9,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    NUM_PLAN_LEVELS,
-    PLANNING,
-    Capabilities,
-    Component,
-    Cost,
-    Health,
-    Read,
-    ReadRequest,
-    Stage,
-    Vote,
-)
-from wm_nodes.judge.dataset.edits import TC, ClipTruth, Edit, planning_level
+from wm_nodes.judge.agent.types import NUM_PLAN_LEVELS, PLANNING, Component, Stage
+from wm_nodes.judge.dataset.edits.clips import TC, ClipTruth, Edit
+from wm_nodes.judge.dataset.edits.planning import planning_level
 
 SURE = 0.9
 """Probability that an answer gives to its level; the rest goes to the level beside it."""

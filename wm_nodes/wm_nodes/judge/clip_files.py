@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from wm_nodes.core.files import file_sha256
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.agent import ClipRef, TaskSpec, clip_ref
+from wm_nodes.judge.agent.types import ClipRef, TaskSpec, clip_ref
 from wm_nodes.judge.service import ClipJob
 
 LIST = "clips.jsonl"

@@ -19,8 +19,10 @@ from wm_nodes.config.load import judge_or_embedded
 from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
 from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
 from wm_nodes.core.types import BoolArray, FloatArray, Rollout, UInt8Array, UInt64Array
-from wm_nodes.judge.agent import TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import check_clips, check_judge, for_clips
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.reward import SUCCESS_UNKNOWN, RewardResult

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wm_nodes.judge.agent import ClipRef, Rubric, TaskSpec
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import ClipRef, TaskSpec
 from wm_nodes.judge.evidence.pictures import pictures_of
 from wm_nodes.judge.evidence.pixels import pixel_evidence
 from wm_nodes.judge.evidence.world_model import MODEL_EVIDENCE, model_evidence

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from wm_nodes.config.schema import AGENT
-from wm_nodes.judge.agent import Verdict
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward
 from wm_nodes.judge.service import JudgeService
 from wm_nodes.recording import Bag

@@ -20,11 +20,15 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import AGENT, JudgeConfig
-from wm_nodes.judge.agent import ClipRef, RewardAgent, Rubric, Status, TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
+from wm_nodes.judge.agent.judge import Cost, Health
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.scoring import skipped_stage
-from wm_nodes.judge.agent.types import GATED, Cost, Health, Provenance, content_hash
-from wm_nodes.judge.audit import AuditedAgent, AuditLog, write_exchange
+from wm_nodes.judge.agent.types import GATED, ClipRef, Status, TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Provenance, Verdict, content_hash
+from wm_nodes.judge.audit.log import AuditLog
+from wm_nodes.judge.audit.recording import AuditedAgent, write_exchange
 from wm_nodes.judge.backends.factory import OpenedJudge, check_judge, judges_of, make_judge
 from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.recording.reader import read_spec

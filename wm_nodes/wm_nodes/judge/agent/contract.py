@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from wm_nodes.judge.agent.types import Verdict
+from wm_nodes.judge.agent.verdict import Verdict
 
 MAX_INVALID_SHARE = 0.1
 """A round with more invalid clips pauses training."""

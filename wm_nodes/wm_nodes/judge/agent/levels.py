@@ -9,7 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wm_nodes.judge.agent.types import NUM_LEVELS, Component, ComponentScore, Read, Status, Vote
+from wm_nodes.judge.agent.judge import ComponentScore, Read, Vote
+from wm_nodes.judge.agent.types import NUM_LEVELS, Component, Status
 
 SUM_TOLERANCE = 1e-6
 

@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from wm_nodes.judge.agent.judge import Capabilities, Cost, MediaItem, Read, Vote
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import Capabilities, ClipRef, Cost, MediaItem, Read, TaskSpec, Verdict, Vote
+from wm_nodes.judge.agent.types import ClipRef, TaskSpec
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.log import AuditError
 from wm_nodes.judge.audit.media import MediaStore
 

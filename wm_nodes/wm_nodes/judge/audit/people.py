@@ -8,18 +8,9 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Sequence
 
+from wm_nodes.judge.agent.judge import Capabilities, Health, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import one_hot
-from wm_nodes.judge.agent.types import (
-    NUM_PLAN_LEVELS,
-    PLANNING,
-    Capabilities,
-    Health,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-    Vote,
-)
+from wm_nodes.judge.agent.types import NUM_PLAN_LEVELS, PLANNING, Stage, Status
 from wm_nodes.judge.audit.labels import HACK, HumanLabels, RowLabel, annotators
 
 SAID = {"pass": 4, "fail": 1}

@@ -6,18 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.judge.agent.judge import Capabilities, MediaItem, Read, Vote
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    Capabilities,
-    ClipRef,
-    MediaItem,
-    Read,
-    TaskSpec,
-    Verdict,
-    Vote,
-    content_hash,
-    media_sha,
-)
+from wm_nodes.judge.agent.types import ClipRef, TaskSpec, media_sha
+from wm_nodes.judge.agent.verdict import Verdict, content_hash
 from wm_nodes.judge.audit.entries import clip_from, rubric_from, task_from, typed
 from wm_nodes.judge.audit.log import NO_LINE, AuditError, Entry, faults, read_lines
 from wm_nodes.judge.audit.media import MediaStore

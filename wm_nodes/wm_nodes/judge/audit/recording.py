@@ -5,20 +5,11 @@ from collections.abc import Mapping
 from contextvars import ContextVar
 from typing import Any
 
+from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    Capabilities,
-    ClipRef,
-    Evidence,
-    Health,
-    Judge,
-    JudgeError,
-    Read,
-    ReadRequest,
-    TaskSpec,
-    Verdict,
-)
+from wm_nodes.judge.agent.types import ClipRef, Evidence, TaskSpec
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.entries import clip_body, plain, rubric_body, task_body
 from wm_nodes.judge.audit.log import AuditLog
 from wm_nodes.judge.audit.media import MediaStore

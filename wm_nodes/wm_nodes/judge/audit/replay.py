@@ -9,22 +9,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, Judge, JudgeError, MediaItem, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    Capabilities,
-    Component,
-    Cost,
-    Health,
-    Judge,
-    JudgeError,
-    MediaItem,
-    Read,
-    ReadRequest,
-    Verdict,
-    Vote,
-    content_hash,
-)
+from wm_nodes.judge.agent.types import Component
+from wm_nodes.judge.agent.verdict import Verdict, content_hash
 from wm_nodes.judge.audit.entries import typed
 from wm_nodes.judge.audit.log import AuditError, AuditLog
 from wm_nodes.judge.audit.reading import Ask, Failure, Record, RecordedEvaluation
@@ -142,10 +131,8 @@ async def reaggregate(
 
 
 async def judge_again(
-    record: Record,
-    evaluations: Iterable[RecordedEvaluation],
-    judge_of: Callable[[RecordedEvaluation], tuple[Judge, Rubric]],
-    log: AuditLog,
+    record: Record, evaluations: Iterable[RecordedEvaluation],
+    judge_of: Callable[[RecordedEvaluation], tuple[Judge, Rubric]], log: AuditLog,
 ) -> list[Verdict]:
     """Judge the clips of a log once more, each as its agent was set then, and write that into a log of its own.
 

@@ -12,19 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from wm_nodes.judge.agent.judge import Cost, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import map_back, one_hot, option_order
-from wm_nodes.judge.agent.types import (
-    NUM_LEVELS,
-    NUM_PLAN_LEVELS,
-    PLANNING,
-    Component,
-    Cost,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-    Vote,
-)
+from wm_nodes.judge.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING, Component, Stage, Status
 from wm_nodes.judge.backends.labels import label_options, option_probabilities
 from wm_nodes.judge.backends.prompts import LETTERS, Part, Prompts, prior_level, with_problem
 from wm_nodes.judge.backends.protocol import Completion
@@ -106,12 +96,8 @@ class CallCost:
     def add_answer(self, answer: ChatAnswer) -> None:
         usage = answer.completion.usage
         self.cost += Cost(
-            calls=1,
-            prompt_tokens=usage.prompt_tokens,
-            cached_tokens=usage.cached_tokens,
-            completion_tokens=usage.completion_tokens,
-            images=self._num_images,
-            wall_s=answer.wall_s,
+            calls=1, prompt_tokens=usage.prompt_tokens, cached_tokens=usage.cached_tokens,
+            completion_tokens=usage.completion_tokens, images=self._num_images, wall_s=answer.wall_s,
             retries=answer.tries - 1,
         )
 
@@ -126,10 +112,7 @@ class Caller:
     """
 
     def __init__(
-        self,
-        transport: ChatTransport,
-        prompts: Prompts,
-        options: ChatOptions,
+        self, transport: ChatTransport, prompts: Prompts, options: ChatOptions,
         on_exchange: Callable[[Exchange], None] = lambda exchange: None,
     ) -> None:
         self._on_exchange = on_exchange
@@ -205,9 +188,7 @@ class Caller:
     def _json_prompt(self, call: Call) -> Prompt:
         request = call.request
         form = AnswerFormat(
-            request.stage,
-            call.components,
-            [item.index for item in request.media if item.kind == "clip"],
+            request.stage, call.components, [item.index for item in request.media if item.kind == "clip"],
             problems=self._prompts.rubric.component_names,
             prior={score.component: level for score in request.prior if (level := prior_level(score)) is not None},
         )
@@ -260,13 +241,8 @@ def _answer_text(completion: Completion) -> str:
 def _read_of(finding: ComponentAnswer, vote: Vote) -> Read:
     count = NUM_PLAN_LEVELS if finding.component == PLANNING else NUM_LEVELS
     return Read(
-        finding.component,
-        one_hot(finding.level, count),
-        "json",
-        vote,
-        evidence_text=finding.evidence,
-        frames_cited=finding.frames,
-        focus=finding.focus,
+        finding.component, one_hot(finding.level, count), "json", vote, evidence_text=finding.evidence,
+        frames_cited=finding.frames, focus=finding.focus,
     )
 
 

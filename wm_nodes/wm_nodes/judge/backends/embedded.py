@@ -20,22 +20,9 @@ import numpy as np
 
 from wm_nodes.config.shipped import PRETRAINED
 from wm_nodes.core.types import FloatArray
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote, p_fail_of
-from wm_nodes.judge.agent.types import (
-    PLANNING,
-    Capabilities,
-    ClipRef,
-    Component,
-    Cost,
-    Evidence,
-    Health,
-    JudgeError,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-    TaskSpec,
-)
+from wm_nodes.judge.agent.types import PLANNING, ClipRef, Component, Evidence, Stage, Status, TaskSpec
 from wm_nodes.judge.evidence.clip import clip_evidence
 from wm_nodes.judge.evidence.head import HACK, TASK_COMPLETION, JudgeHead, components_of
 

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from wm_nodes.config.schema import JudgeConfig, OtherJudge, StageJudge
+from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import Judge, Stage
+from wm_nodes.judge.agent.types import Stage
 from wm_nodes.judge.backends.cache import VerdictCache
 from wm_nodes.judge.backends.calls import ChatOptions, Exchange
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit_reason

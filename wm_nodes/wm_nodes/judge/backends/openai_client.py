@@ -8,18 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    PLANNING,
-    Capabilities,
-    Cost,
-    Health,
-    JudgeError,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-)
+from wm_nodes.judge.agent.types import PLANNING, Stage, Status
 from wm_nodes.judge.backends.cache import VerdictCache, cache_key
 from wm_nodes.judge.backends.calls import (
     Call,
@@ -52,12 +43,8 @@ class OpenAIJudge:
     """
 
     def __init__(
-        self,
-        transport: ChatTransport,
-        rubric: Rubric,
-        options: ChatOptions | None = None,
-        cache: VerdictCache | None = None,
-        on_exchange: Callable[[Exchange], None] = lambda exchange: None,
+        self, transport: ChatTransport, rubric: Rubric, options: ChatOptions | None = None,
+        cache: VerdictCache | None = None, on_exchange: Callable[[Exchange], None] = lambda exchange: None,
     ) -> None:
         if len(transport.models) != 1:
             raise ValueError(f"a judge's endpoints must serve one model, got {', '.join(sorted(transport.models))}")

@@ -16,20 +16,9 @@ import cv2
 import numpy as np
 
 from wm_nodes.core.types import UInt8Array
+from wm_nodes.judge.agent.judge import ComponentScore, MediaItem, ReadRequest, Vote
 from wm_nodes.judge.agent.rubric import ComponentRubric, PlanningRubric, Rubric
-from wm_nodes.judge.agent.types import (
-    NUM_LEVELS,
-    PLANNING,
-    ClipRef,
-    Component,
-    ComponentScore,
-    MediaItem,
-    Profile,
-    ReadRequest,
-    Stage,
-    TaskSpec,
-    Vote,
-)
+from wm_nodes.judge.agent.types import NUM_LEVELS, PLANNING, ClipRef, Component, Profile, Stage, TaskSpec
 from wm_nodes.judge.backends.schemas import AnswerFormat
 
 Part = dict[str, Any]

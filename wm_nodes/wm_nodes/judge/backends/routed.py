@@ -4,8 +4,9 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 
+from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, Read, ReadRequest
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import GATED, PLANNING, Capabilities, Component, Health, Judge, Read, ReadRequest, Stage
+from wm_nodes.judge.agent.types import GATED, PLANNING, Component, Stage
 
 TRANSPORT = "routed"
 OPEN_BREAKERS = "open_breakers"

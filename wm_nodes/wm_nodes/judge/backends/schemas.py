@@ -70,13 +70,8 @@ class AnswerFormat:
     """
 
     def __init__(
-        self,
-        stage: Stage,
-        components: Sequence[Component],
-        shown: Iterable[int],
-        *,
-        problems: Sequence[Component] = (),
-        prior: Mapping[Component, int] | None = None,
+        self, stage: Stage, components: Sequence[Component], shown: Iterable[int], *,
+        problems: Sequence[Component] = (), prior: Mapping[Component, int] | None = None,
     ) -> None:
         self._components = tuple(components)
         self._shown = frozenset(shown)

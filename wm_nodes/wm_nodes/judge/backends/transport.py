@@ -125,11 +125,7 @@ class ChatTransport:
     """
 
     def __init__(
-        self,
-        endpoints: Sequence[Endpoint],
-        *,
-        retry: RetryPolicy | None = None,
-        probe_s: float = 10.0,
+        self, endpoints: Sequence[Endpoint], *, retry: RetryPolicy | None = None, probe_s: float = 10.0,
         jitter: random.Random | None = None,
     ) -> None:
         if not endpoints:
@@ -283,9 +279,7 @@ class ChatTransport:
         """A client without retries of its own. A loopback server is never reached through a proxy."""
         loopback = urlsplit(endpoint.base_url).hostname in _LOOPBACK
         return self._openai.AsyncOpenAI(
-            base_url=endpoint.base_url,
-            api_key=endpoint.api_key(),
-            max_retries=0,
+            base_url=endpoint.base_url, api_key=endpoint.api_key(), max_retries=0,
             timeout=self._openai.Timeout(None, connect=CONNECT_S),
             http_client=self._openai.DefaultAsyncHttpxClient(trust_env=not loopback),
         )

@@ -21,23 +21,11 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.judge.dataset.domain_randomization import RandomizedScene, draw_scene
-from wm_nodes.judge.dataset.edits import (
-    RECIPES,
-    Division,
-    LabelledClip,
-    Manifest,
-    Origin,
-    SceneStates,
-    SourceClip,
-    StateEdit,
-    children,
-    label_rendered,
-    manifest_of,
-    recorded,
-    stacks,
-    to_bytes,
-)
-from wm_nodes.judge.dataset.edits.manifest import Part
+from wm_nodes.judge.dataset.edits.clips import LabelledClip, Origin, SceneStates, SourceClip
+from wm_nodes.judge.dataset.edits.generator import children, stacks
+from wm_nodes.judge.dataset.edits.manifest import Division, Manifest, Part, manifest_of, to_bytes
+from wm_nodes.judge.dataset.edits.recipes import RECIPES, StateEdit, label_rendered
+from wm_nodes.judge.dataset.edits.truth import recorded
 from wm_nodes.judge.dataset.policy_camera import IMAGINED, PolicyCamera
 from wm_nodes.judge.dataset.rendering import (
     CAMERAS,
@@ -187,9 +175,7 @@ class ClipSource:
         else:
             camera, look = self._scenery(origin)
             sizes_m = states.half_sizes_m * states.scales
-            drawing = self.stage.draw(
-                states.robot_q, states.poses, sizes_m, states.tool, states.goal, camera, look
-            )
+            drawing = self.stage.draw(states.robot_q, states.poses, sizes_m, states.tool, states.goal, camera, look)
         return self._make_clip(drawing, states, origin)
 
     def _make_clip(self, drawing: Drawing, states: SceneStates, origin: Origin) -> SourceClip:

@@ -19,7 +19,8 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import clip_rules
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.dataset.edits import Origin, SceneStates, tc_level
+from wm_nodes.judge.dataset.edits.clips import Origin, SceneStates
+from wm_nodes.judge.dataset.edits.truth import tc_level
 from wm_nodes.judge.dataset.rendering import ClipStage, Drawing, EpisodeStates, SceneAppearance
 from wm_nodes.judge.evidence.window import Window
 from wm_nodes.world_model import WorldModels

@@ -4,8 +4,7 @@ from pathlib import Path
 
 from wm_nodes.judge.agent.types import ClipRef, TaskSpec
 from wm_nodes.judge.dataset.build import instruction_of
-from wm_nodes.judge.dataset.edits import Manifest, ManifestError
-from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
+from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestError, ManifestRow, Part
 from wm_nodes.judge.dataset.set_files import load_array, load_frames
 
 ROBOT = "panda"
@@ -26,9 +25,7 @@ def read_clip(folder: Path, row: ManifestRow) -> tuple[ClipRef, TaskSpec]:
     first = frames[0] if row.root == row.sha256 else load_frames(folder, row.root)[0]
     fps = float(load_array(folder, row.sha256, "fps"))
     clip = ClipRef(row.sha256[:16], row.sha256, frames, fps, "adversarial" if row.edits else "rollout")
-    return clip, TaskSpec(
-        instruction_of(row.origin), row.origin.task, ROBOT, first, camera_id=row.origin.camera
-    )
+    return clip, TaskSpec(instruction_of(row.origin), row.origin.task, ROBOT, first, camera_id=row.origin.camera)
 
 
 def select_rows(manifest: Manifest, part: Part, count: int | None = None) -> list[ManifestRow]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.types import media_sha
-from wm_nodes.judge.dataset.edits import LabelledClip, Manifest, ManifestError, from_bytes
+from wm_nodes.judge.dataset.edits.clips import LabelledClip
+from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestError, from_bytes
 
 MANIFEST = "manifest.jsonl"
 

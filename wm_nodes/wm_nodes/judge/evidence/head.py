@@ -252,10 +252,7 @@ def _network(network: _Network, part: str, arrays: Mapping[str, NDArray[Any]]) -
 
 
 def _check(
-    folder: Path,
-    names: tuple[str, ...],
-    questions: Mapping[str, tuple[HeadQuestion, ...]],
-    known: Familiarity,
+    folder: Path, names: tuple[str, ...], questions: Mapping[str, tuple[HeadQuestion, ...]], known: Familiarity,
     ranges: tuple[FloatArray, ...],
 ) -> None:
     """Every array has to fit the list of evidence."""

@@ -76,14 +76,9 @@ def object_evidence(scene: Scene, reference: UInt8Array, instruction: str) -> Nu
     target = target_of(masks[0], reference, instruction)
     place, known = fill_gaps(thing.centre), np.isfinite(thing.area)
     return {
-        **_shape(thing, gap, known),
-        **_outline(thing, known),
-        **_measure_reshaping(thing, place, gap, size),
-        **_measure_cover(masks, thing),
-        **_measure_touch(masks, thing, gap, size),
-        **_movement(place, known, size),
-        **_causes(place, known, gap, tool, size),
-        **_task(place, tool, target, size, instruction),
+        **_shape(thing, gap, known), **_outline(thing, known), **_measure_reshaping(thing, place, gap, size),
+        **_measure_cover(masks, thing), **_measure_touch(masks, thing, gap, size), **_movement(place, known, size),
+        **_causes(place, known, gap, tool, size), **_task(place, tool, target, size, instruction),
     }
 
 
@@ -282,10 +277,8 @@ def _causes(place: Floats, known: NDArray[np.bool_], gap: Floats, tool: Floats, 
         "after_touch_side": min(FAR, float(abs(after[1]))),
         "after_touch_rise": float(np.clip((loose[0] - loose.min()) / size, 0, FAR)),
         "tool_path": min(FAR, float(np.linalg.norm(sweep, axis=1).sum())),
-        "tool_net": min(FAR, float(np.linalg.norm(way) / size)),
-        "tool_passed": float(np.clip(beside.max(), -FAR, FAR)),
-        "slipped": float(np.clip(slip.sum(), -FAR, FAR)),
-        "tool_near_min": min(FAR, float(relative.min())),
+        "tool_net": min(FAR, float(np.linalg.norm(way) / size)), "tool_passed": float(np.clip(beside.max(), -FAR, FAR)),
+        "slipped": float(np.clip(slip.sum(), -FAR, FAR)), "tool_near_min": min(FAR, float(relative.min())),
     }
 
 

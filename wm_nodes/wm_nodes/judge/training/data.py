@@ -9,8 +9,7 @@ from pathlib import Path
 
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.types import TaskSpec
-from wm_nodes.judge.dataset.edits import Manifest, ManifestError
-from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
+from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestError, ManifestRow, Part
 from wm_nodes.judge.dataset.rows import read_clip
 from wm_nodes.judge.dataset.set_files import load_array, load_set
 

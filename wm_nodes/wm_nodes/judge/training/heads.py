@@ -13,17 +13,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.statistics import (
-    auroc,
-    balanced_accuracy,
-    expected_calibration_error,
-    recall_at,
-    wilson_of_share,
-)
+from wm_nodes.core.statistics import auroc, balanced_accuracy, expected_calibration_error, recall_at, wilson_of_share
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.judge.agent.levels import p_fail_of
 from wm_nodes.judge.agent.types import PLANNING
-from wm_nodes.judge.dataset.edits import COMPONENTS, TC
+from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.edits.planning import planning_level
 from wm_nodes.judge.evidence.head import (

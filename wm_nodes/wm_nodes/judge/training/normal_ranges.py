@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 
 from wm_nodes.core.types import Episode
-from wm_nodes.judge.agent import TaskSpec
 from wm_nodes.judge.agent.reflection import conflicting_evidence
 from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import TaskSpec
 from wm_nodes.judge.evidence.pictures import pictures_of
 from wm_nodes.judge.evidence.pixels import pixel_evidence
 from wm_nodes.judge.evidence.world_model import model_evidence

@@ -20,8 +20,8 @@ from tqdm import tqdm
 import wm_nodes.judge.evidence
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import FloatArray
-from wm_nodes.judge.dataset.edits import COMPONENTS, TC, Manifest
-from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part, to_bytes
+from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC
+from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestRow, Part, to_bytes
 from wm_nodes.judge.dataset.policy_camera import SEEN
 from wm_nodes.judge.dataset.set_files import load_frames
 from wm_nodes.judge.evidence.clip import measure_clip

@@ -17,9 +17,11 @@ from typing import Any
 from urllib.parse import quote
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.judge.agent.judge import Read
 from wm_nodes.judge.agent.levels import settle
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import GATED, PLANNING, Read, Verdict
+from wm_nodes.judge.agent.types import GATED, PLANNING
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.labels import FORMAT, HACK
 from wm_nodes.judge.audit.log import AuditError
 from wm_nodes.judge.audit.media import FOLDER

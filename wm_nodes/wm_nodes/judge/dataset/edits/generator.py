@@ -24,13 +24,8 @@ MOST_STACKED = 3
 
 
 def children(
-    parent: LabelledClip,
-    seed: int,
-    redraw: Redraw | None,
-    *,
-    names: Sequence[str] = tuple(RECIPES),
-    count: int | None = None,
-    skipped: Counter[str] | None = None,
+    parent: LabelledClip, seed: int, redraw: Redraw | None, *, names: Sequence[str] = tuple(RECIPES),
+    count: int | None = None, skipped: Counter[str] | None = None,
 ) -> Iterator[LabelledClip]:
     """Yield edited clips, no picture twice.
 
