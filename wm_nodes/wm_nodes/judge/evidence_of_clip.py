@@ -32,12 +32,7 @@ class ClipEvidence:
         self._one_at_a_time = threading.Lock()
 
     def check(self, rubric: Rubric) -> None:
-        """Refuse bands of evidence that is not measured here.
-
-        Raises:
-            ValueError: names the evidence and the remedy.
-            ModelFolderError: the world model cannot be loaded.
-        """
+        """Refuse bands of unmeasured evidence. Raises ValueError: names it and the remedy. ModelFolderError."""
         if unknown := sorted(set(rubric.evidence) - pixel_names() - set(MODEL_EVIDENCE)):
             raise ValueError(
                 f"rubric {rubric.version} has bands of {', '.join(unknown)}, which is not measured here; known: "

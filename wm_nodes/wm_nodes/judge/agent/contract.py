@@ -21,11 +21,7 @@ def pause_reason(verdicts: Sequence[Verdict]) -> str:
 
 
 def check_one_judge(verdicts: Sequence[Verdict], group_ids: Sequence[int]) -> None:
-    """Rewards of one group are compared, so one judge, model and rubric must have given them.
-
-    Raises:
-        ValueError: names the group and what was mixed.
-    """
+    """Refuse a group that several judges, models or rubrics judged. Raises ValueError: names the group and the mix."""
     seen: dict[int, tuple[str, ...]] = {}
     for verdict, group in zip(verdicts, group_ids, strict=True):
         p = verdict.provenance

@@ -178,11 +178,7 @@ class Judge(Protocol):
     def capabilities(self) -> Capabilities: ...
 
     async def read(self, request: ReadRequest) -> list[Read]:
-        """Answer every component once per vote. A component that failed has a Read with status ERROR and a reason.
-
-        Raises:
-            JudgeError: nothing at all could be answered.
-        """
+        """Answer every component once per vote; failed ones are ERROR with a reason. Raises JudgeError: all failed."""
         ...
 
     async def health(self) -> Health: ...

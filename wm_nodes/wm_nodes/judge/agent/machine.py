@@ -204,7 +204,8 @@ class _Run:
         rules = self.rubric.voting
         if self._audited or plan.level in rules.levels:
             return set(reads)
-        suspected = {self.rubric.evidence[name].component for name in self._conflicts()}
+        conflicts = reflection.conflicting_evidence(self.rubric, self.evidence)
+        suspected = {self.rubric.evidence[name].component for name in conflicts}
         looks = {name: self._score_read(first) for name, (first,) in reads.items()}
         return {name for name, look in looks.items() if look.margin < rules.clear_margin or name in suspected}
 
@@ -315,9 +316,6 @@ class _Run:
 
     def _stages_in_order(self) -> tuple[StageScore, ...]:
         return tuple(self.stages[stage] for stage in GATED)
-
-    def _conflicts(self) -> list[str]:
-        return reflection.conflicting_evidence(self.rubric, self.evidence)
 
     def _is_drawn(self, name: str) -> bool:
         """A seeded draw of the audit share, by clip content."""

@@ -19,10 +19,7 @@ SAID = {"pass": 4, "fail": 1}
 
 class HumanJudge:
     """Answers from exported labels, by the content of a clip. Vote j is the answer of person j, counted round among
-    those who were sure; it abstains where nobody was.
-
-    Raises:
-        AuditError: one person labelled an evaluation in two files.
+    those who were sure; it abstains where nobody was. Raises AuditError: one person labelled an evaluation twice.
     """
 
     def __init__(self, files: Sequence[HumanLabels]) -> None:

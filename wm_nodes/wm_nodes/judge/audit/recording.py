@@ -46,12 +46,14 @@ class AuditedAgent:
         return self._agent.judge
 
     async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
-        """Judge one clip; the verdict is on the disk when this returns.
-
-        Raises:
-            OSError: it cannot be written down; then there is no verdict.
-        """
-        evaluation = self._begin(clip, task, evidence or {})
+        """Judge one clip; the verdict is on the disk when this returns. Raises OSError: it cannot be written down."""
+        if clip.sha256 not in self._written:
+            self._log.append("clip", clip_body(clip, self._store))
+            self._written.add(clip.sha256)
+        evaluation = self._log.append("evaluation", {
+            "clip_id": clip.clip_id, "sha256": clip.sha256, "agent": self._line, "round": self.round_number,
+            "task": task_body(task, self._store), "evidence": plain(evidence or {}),
+        })
         token = _EVALUATION.set(evaluation)
         try:
             verdict = await self._agent.evaluate(clip, task, evidence)
@@ -59,18 +61,6 @@ class AuditedAgent:
             _EVALUATION.reset(token)
         self._log.append("verdict", {"evaluation": evaluation, "verdict": plain(verdict)}, sync=True)
         return verdict
-
-    def _begin(self, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> int:
-        if clip.sha256 not in self._written:
-            self._log.append("clip", clip_body(clip, self._store))
-            self._written.add(clip.sha256)
-        return self._log.append(
-            "evaluation",
-            {
-                "clip_id": clip.clip_id, "sha256": clip.sha256, "agent": self._line, "round": self.round_number,
-                "task": task_body(task, self._store), "evidence": plain(evidence),
-            },
-        )
 
 
 class RecordingJudge:

@@ -24,6 +24,8 @@ from wm_nodes.judge.backends.transport import ChatAnswer, ChatTransport, Transpo
 JSON_TRIES = 2
 MEASURED_CALLS = 200
 SEED_LIMIT = 2**31
+MIN_LABEL_MASS = 0.5
+"""A label read with less abstains, unless its answers are chosen by a grammar."""
 Exchange = Mapping[str, Any]
 """The texts of a request and the raw reply, as JSON values, for an audit log."""
 
@@ -32,23 +34,19 @@ Exchange = Mapping[str, Any]
 class ChatOptions:
     """json_timeout_s, label_timeout_s: per try. budget_s: all calls of one ReadRequest together, waits included.
 
-    max_answer_tokens: of a JSON answer; one that needs more has failed. structured: ask the server to enforce the
-    schema; the answer is checked either way. label_token_ids: token ids of A to E, where the server can be asked for
-    their probabilities by id. choice_grammar: label reads choose among the letters only, so that the label mass no
-    longer warns. min_label_mass: a label read with less abstains, unless choice_grammar. max_images: that the server
-    takes in one call. video: the dense profile goes as one video (vLLM, --limit-mm-per-prompt with a video), else as
-    images. repeat_share: of the calls that are asked twice, so that it is known how often a live server contradicts
-    itself; the first answer counts.
+    max_answer_tokens: of a JSON answer; one that needs more has failed. label_token_ids: token ids of A to E, where the
+    server can be asked for their probabilities by id. choice_grammar: label reads choose among the letters only, so
+    that the label mass no longer warns. max_images: that the server takes in one call. video: the dense profile goes as
+    one video (vLLM, --limit-mm-per-prompt with a video), else as images. repeat_share: of the calls that are asked
+    twice, so that it is known how often a live server contradicts itself; the first answer counts.
     """
 
     json_timeout_s: float = 120.0
     label_timeout_s: float = 60.0
     budget_s: float = 300.0
     max_answer_tokens: int = 1024
-    structured: bool = True
     label_token_ids: tuple[int, ...] = ()
     choice_grammar: bool = False
-    min_label_mass: float = 0.5
     max_images: int = 64
     video: bool = False
     repeat_share: float = 0.0
@@ -89,8 +87,10 @@ class Prompt:
 class CallCost:
     """Cost of one call with its retries and fallbacks. Requests without an answer count as retries only."""
 
-    def __init__(self, num_images: int) -> None:
-        self._num_images = num_images
+    def __init__(self, media: Sequence[Part]) -> None:
+        """media: parts of the messages as sent; the frames of a video count as images."""
+        videos = [str(part["video_url"]["url"]) for part in media if part["type"] == "video_url"]
+        self._num_images = sum(url.count(",") for url in videos) + sum(part["type"] == "image_url" for part in media)
         self.cost = Cost()
 
     def add_answer(self, answer: ChatAnswer) -> None:
@@ -167,8 +167,8 @@ class Caller:
         answer = await self._send(call, prompt.body, bill, options.label_timeout_s)
         probabilities, mass = option_probabilities(answer.completion, LETTERS[: len(order)])
         self.label_masses.append(mass)
-        if mass == 0 or (mass < options.min_label_mass and not options.choice_grammar):
-            reason = f"label mass {mass:.3f} is below {options.min_label_mass}"
+        if mass == 0 or (mass < MIN_LABEL_MASS and not options.choice_grammar):
+            reason = f"label mass {mass:.3f} is below {MIN_LABEL_MASS}"
             return Read(component, (), "label", call.vote, mass, Status.ABSTAIN, reason)
         label_mass = 1.0 if options.choice_grammar else mass
         return Read(component, map_back(probabilities, order), "label", call.vote, label_mass)
@@ -192,9 +192,7 @@ class Caller:
             problems=self._prompts.rubric.component_names,
             prior={score.component: level for score in request.prior if (level := prior_level(score)) is not None},
         )
-        fields: dict[str, Any] = {"max_tokens": self._options.max_answer_tokens}
-        if self._options.structured:
-            fields["response_format"] = form.response_format
+        fields = {"max_tokens": self._options.max_answer_tokens, "response_format": form.response_format}
         return Prompt(call, self._prompts.json_question(call.media, request, call.components, form), fields, form)
 
     def _label_prompt(self, call: Call, component: Component) -> Prompt:
@@ -221,12 +219,6 @@ def describe_request(call: Call, body: Mapping[str, Any]) -> dict[str, Any]:
 def sha_of(value: Any) -> str:
     """SHA-256, hexadecimal, of a value as canonical JSON."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
-
-
-def num_images(media: Sequence[Part]) -> int:
-    """Images, and frames of videos."""
-    videos = [str(part["video_url"]["url"]) for part in media if part["type"] == "video_url"]
-    return sum(url.count(",") for url in videos) + len([part for part in media if part["type"] == "image_url"])
 
 
 def _answer_text(completion: Completion) -> str:

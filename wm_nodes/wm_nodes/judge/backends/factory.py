@@ -43,11 +43,7 @@ def _single_judge(settings: JudgeConfig, other: OtherJudge) -> JudgeConfig:
 
 
 def check_judge(settings: JudgeConfig) -> None:
-    """Refuse settings that name no judge, before anything is made from them or written with them.
-
-    Raises:
-        ValueError: names the setting and the remedy; never repeats what may be a key.
-    """
+    """Refuse settings that name no judge. Raises ValueError: names setting and remedy, never what may be a key."""
     _check_one(settings)
     for kind, others in (("routes", settings.routes), ("fallbacks", settings.fallbacks)):
         for number, other in enumerate(others):

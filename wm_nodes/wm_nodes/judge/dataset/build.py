@@ -20,6 +20,7 @@ from wm_nodes.config.tasks import clip_rules, get_task
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
+from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M
 from wm_nodes.judge.dataset.domain_randomization import RandomizedScene, draw_scene
 from wm_nodes.judge.dataset.edits.clips import LabelledClip, Origin, SceneStates, SourceClip
 from wm_nodes.judge.dataset.edits.generator import children, stacks
@@ -34,7 +35,6 @@ from wm_nodes.judge.dataset.rendering import (
     EpisodeStates,
     SceneAppearance,
     View,
-    cube_half_sizes,
     record_states,
 )
 from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
@@ -118,8 +118,7 @@ were trained without that task."""
 class ClipSource:
     """Records clips of one task and renders edits of them. shapes, diverse: see SetPlan. It starts the simulator.
 
-    Raises:
-        NoRendererError: Vulkan finds no device.
+    Raises NoRendererError where Vulkan finds no device.
     """
 
     def __init__(
@@ -226,7 +225,7 @@ def instruction_of(origin: Origin) -> str:
 def scene_states(states: EpisodeStates, height: float = 1.0) -> SceneStates:
     """Convert an episode's states; the cube becomes a box of `height` times its height."""
     num_frames = len(states.poses)
-    half_sizes_m, poses = cube_half_sizes(1)[0], states.poses.copy()
+    half_sizes_m, poses = np.full((1, 3), CUBE_HALF_SIZE_M, np.float32), states.poses.copy()
     poses[..., 2] += (np.float32(height) - 1) * half_sizes_m[0, 2]  # it stands on the same table
     half_sizes_m[0, 2] *= np.float32(height)
     return SceneStates(

@@ -38,11 +38,7 @@ LOOK = SceneAppearance(num_clutter=0, tiled=False)
 
 
 def policy_window(config: SimulationConfig, side: int) -> Window:
-    """The part of the policy's pictures that a judge reads.
-
-    Raises:
-        ValueError: the configured scene has no such camera.
-    """
+    """The part of the policy's pictures that a judge reads. Raises ValueError: the scene has no such camera."""
     if SEEN not in config.cameras:
         raise ValueError(f"a judge of the loops' clips reads the camera {SEEN}, there are {', '.join(config.cameras)}")
     size, index = config.image_size, config.cameras.index(SEEN)

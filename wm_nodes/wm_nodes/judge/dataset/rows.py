@@ -13,13 +13,10 @@ MIN_TEST_CLIPS = 400
 
 
 def read_clip(folder: Path, row: ManifestRow) -> tuple[ClipRef, TaskSpec]:
-    """Read a clip and its task.
+    """Read a clip and its task. Raises ManifestError: a file is missing, damaged or holds another clip.
 
     The reference image is the first frame of the recorded clip, which a video model would be conditioned on. The task
     has no actions, because most edits do not follow from the robot's.
-
-    Raises:
-        ManifestError: a file is missing, damaged or holds another clip.
     """
     frames = load_frames(folder, row.sha256)
     first = frames[0] if row.root == row.sha256 else load_frames(folder, row.root)[0]
@@ -29,13 +26,7 @@ def read_clip(folder: Path, row: ManifestRow) -> tuple[ClipRef, TaskSpec]:
 
 
 def select_rows(manifest: Manifest, part: Part, count: int | None = None) -> list[ManifestRow]:
-    """The first `count` clips of a part in the order of their hashes, which is a random order.
-
-    The test split of a set is chosen_rows(manifest, "test"): frozen by the manifest, the same on every machine.
-
-    Raises:
-        ManifestError: the part has no clips.
-    """
+    """The first `count` clips of a part in the order of their hashes, a random one. Raises ManifestError: no clips."""
     rows = [row for row in manifest.rows if row.part == part][:count]
     if not rows:
         raise ManifestError(f"the set has no {part} clips; build it with more episodes")

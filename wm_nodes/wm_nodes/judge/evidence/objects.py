@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.evidence.pictures import TURN
 from wm_nodes.judge.evidence.segmentation import OBJECT, ROBOT
-from wm_nodes.judge.evidence.tracks import SMALLEST_PX, Track, track
+from wm_nodes.judge.evidence.tracks import SMALLEST_PX, Floats, Track, track
 
 FAR = 20.0
 """Largest length, in object sizes."""
@@ -27,7 +27,6 @@ RESHAPED_FRAMES = 3
 HUES_DEGREES = {"red": 0.0, "orange": 32.0, "yellow": 55.0, "green": 130.0, "blue": 225.0, "purple": 288.0}
 """Angle of r + g exp(2 pi i / 3) + b exp(4 pi i / 3) of the colours that instructions name."""
 
-Floats = NDArray[np.float64]
 Numbers = dict[str, float]
 
 

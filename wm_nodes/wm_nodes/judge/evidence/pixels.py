@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.evidence.pictures import TURN, ClipPictures, shrink
+from wm_nodes.judge.evidence.pictures import TURN, ClipPictures, Floats, shrink
 from wm_nodes.judge.evidence.quantiles import median, quantile
 
 COARSE = 24
@@ -24,7 +24,6 @@ DARKENED = 0.5
 DEAD_DETAIL = 0.45
 """A tile with less than this share of its reference detail has lost it."""
 
-Floats = NDArray[np.float32]
 Numbers = dict[str, float]
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import BoolArray, UInt8Array
-from wm_nodes.judge.evidence.objects import HUES_DEGREES
-from wm_nodes.judge.evidence.pictures import GRID, TURN, ClipPictures, shrink
+from wm_nodes.judge.evidence.objects import HUES_DEGREES, Numbers
+from wm_nodes.judge.evidence.pictures import GRID, TURN, ClipPictures, Floats, shrink
 from wm_nodes.judge.evidence.quantiles import median, quantile
 from wm_nodes.judge.evidence.registration import registration_evidence
 from wm_nodes.judge.evidence.segmentation import CLUTTER, OBJECT, ROBOT, SCENE
@@ -19,16 +19,10 @@ from wm_nodes.judge.evidence.tracks import SMALLEST_PX, second_areas
 TILES = 6
 CHANGED_LEVELS = 10.0
 
-Floats = NDArray[np.float32]
-Numbers = dict[str, float]
 
 
 def region_evidence(pictures: ClipPictures, masks: UInt8Array, instruction: str) -> Numbers:
-    """Evidence of one clip.
-
-    Args:
-        masks: uint8 (1 + T, H, W), the reference frame's first.
-    """
+    """Evidence of one clip. masks: uint8 (1 + T, H, W), the reference frame's first."""
     robot, thing = _means(pictures.colours, masks, (ROBOT, OBJECT))
     colours = [word for word in instruction.lower().split() if word in HUES_DEGREES]
     scene = np.stack([shrink(mask == SCENE, GRID) > 0.99 for mask in masks])

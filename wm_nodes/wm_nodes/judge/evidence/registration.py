@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.evidence.pictures import GRID, shrink
+from wm_nodes.judge.evidence.pictures import GRID, Floats, shrink
 
 BLUR_PX = 1.2
 """Of a picture of GRID x GRID."""
@@ -20,7 +20,6 @@ SOFT_LEVELS = 3.0
 WIDTH_PX = 96.0
 """Shifts are given in px of a picture this wide."""
 
-Floats = NDArray[np.float32]
 
 
 def registration_evidence(greys: UInt8Array, scene: NDArray[np.bool_]) -> dict[str, float]:

@@ -90,11 +90,7 @@ def _true_level(target: str, row: ManifestRow) -> int:
 def fit_questions(
     target: str, train: Examples, validation: Examples, settings: TreeSettings, seed: int
 ) -> tuple[HeadQuestion, ...]:
-    """Fit every question of a target.
-
-    Raises:
-        ValueError: a question has only one answer in the training part; names target and level.
-    """
+    """Fit every question of a target. Raises ValueError: training clips have only one answer; names target, level."""
     levels, held_out_levels = true_levels(target, train.rows), true_levels(target, validation.rows)
     known, held_out_known = levels != UNKNOWN, held_out_levels != UNKNOWN
     questions = []

@@ -75,11 +75,7 @@ def clip_rows(models: WorldModels, episodes: Iterator[Episode], stride: int) -> 
 
 
 def bands_of(rows: Sequence[tuple[Row, bool]], tail: float) -> dict[str, dict[str, float | str]]:
-    """A band per signal, with the share `tail` of its clips outside.
-
-    Raises:
-        ValueError: fewer than LEAST clips for a signal, or a tail that is no share.
-    """
+    """A band per signal, the share `tail` of its clips outside. Raises ValueError: too few clips, or no such share."""
     if not 0 <= tail < 0.5:
         raise ValueError(f"tail must be a share below 0.5, got {tail}")
     bands: dict[str, dict[str, float | str]] = {}

@@ -179,11 +179,7 @@ def edit_states(parent: LabelledClip, name: str, severity: Severity, seed: int) 
 
 
 def label_rendered(parent: LabelledClip, edited: StateEdit, clip: SourceClip) -> LabelledClip:
-    """Label the clip that was rendered from edited states.
-
-    Raises:
-        NotApplicableError: as apply.
-    """
+    """Label the clip that was rendered from edited states. Raises NotApplicableError: as apply."""
     return _make_child(parent, clip, edited.edit)
 
 
@@ -198,7 +194,8 @@ def _draw_amount(
 ) -> tuple[float, np.random.Generator]:
     if severity not in ("mild", "fail"):
         raise ValueError(f"severity must be mild or fail, got {severity!r}")
-    if severity == "fail" and recipe.on_defect and not _has_physics_failure(parent.labels):
+    defect = any(parent.labels.components.get(name) is False for name in PHYSICS)
+    if severity == "fail" and recipe.on_defect and not defect:
         raise NotApplicableError(f"{recipe.name} hides a physical defect, this clip has none; use a state recipe first")
     if severity == "fail" and recipe.on_success and parent.labels.tc_level < 4:
         raise NotApplicableError(f"{recipe.name} needs a completed task, got level {parent.labels.tc_level}")
@@ -253,6 +250,3 @@ def seen_share(before: SourceClip, after: SourceClip) -> float:
 def _truth_level(clip: SourceClip) -> int:
     return tc_level(clip.states, clip_rules(clip.origin.task).label)
 
-
-def _has_physics_failure(labels: ClipTruth) -> bool:
-    return any(labels.components.get(name) is False for name in PHYSICS)
