@@ -8,19 +8,10 @@ from typing import Any
 import numpy as np
 from scripted_judge import ScriptedJudge, make_clip, make_task
 
+from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, Read, ReadRequest
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
-from wm_nodes.judge.agent.types import (
-    Capabilities,
-    ClipRef,
-    Evidence,
-    Health,
-    Judge,
-    Read,
-    ReadRequest,
-    TaskSpec,
-    Verdict,
-    clip_ref,
-)
+from wm_nodes.judge.agent.types import ClipRef, Evidence, TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.log import AuditLog
 from wm_nodes.judge.audit.recording import AuditedAgent
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import FloatArray
-from wm_nodes.judge.dataset.edits import (
+from wm_nodes.judge.dataset.edits.clips import (
     BACKGROUND,
     DISTRACTOR,
     OBJECT,
@@ -18,10 +18,9 @@ from wm_nodes.judge.dataset.edits import (
     Origin,
     SceneStates,
     SourceClip,
-    StateEdit,
-    label_rendered,
-    recorded,
 )
+from wm_nodes.judge.dataset.edits.recipes import StateEdit, label_rendered
+from wm_nodes.judge.dataset.edits.truth import recorded
 
 FRAMES, SIDE = 20, 96
 PX_PER_M = 300

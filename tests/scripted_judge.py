@@ -4,24 +4,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import map_back, one_hot, option_order
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    PLANNING,
-    Capabilities,
-    ClipRef,
-    Component,
-    Cost,
-    Health,
-    JudgeError,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-    TaskSpec,
-    Vote,
-    clip_ref,
-)
+from wm_nodes.judge.agent.types import PLANNING, ClipRef, Component, Stage, Status, TaskSpec, clip_ref
 
 CLEAN, FLAWED, BORDERLINE, WRONG, UNUSABLE = (one_hot(level) for level in (4, 3, 2, 1, 0))
 GOOD, FAIR, POOR, INVALID = (one_hot(level, 4) for level in (3, 2, 1, 0))

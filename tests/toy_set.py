@@ -4,7 +4,9 @@ from pathlib import Path
 
 from pushed_box import push_clip, redrawn
 
-from wm_nodes.judge.dataset.edits import Division, LabelledClip, Manifest, children, manifest_of, to_bytes
+from wm_nodes.judge.dataset.edits.clips import LabelledClip
+from wm_nodes.judge.dataset.edits.generator import children
+from wm_nodes.judge.dataset.edits.manifest import Division, Manifest, manifest_of, to_bytes
 from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 
 NAMES = ("blur", "freeze", "ghost_motion", "occlude_patch", "flatten", "object_vanish", "dark")

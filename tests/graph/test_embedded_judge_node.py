@@ -13,7 +13,7 @@ from recording_samples import make_spec
 
 from wm_msgs.action import TrainVideo
 from wm_msgs.msg import ClipVerdict
-from wm_nodes.judge.audit import read_record
+from wm_nodes.judge.audit.reading import read_record
 from wm_nodes.judge.backends.embedded import shipped_heads
 from wm_nodes.judge.evidence.head import load_head, save_head
 

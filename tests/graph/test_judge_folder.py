@@ -18,8 +18,8 @@ from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.judge.agent import clip_ref
-from wm_nodes.judge.audit import read_record
+from wm_nodes.judge.agent.types import clip_ref
+from wm_nodes.judge.audit.reading import read_record
 from wm_nodes.judge.clip_files import AT_ONCE, LIST, list_sha256
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]

@@ -22,8 +22,8 @@ from wm_msgs.msg import ClipScores, ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric, StartRecording, StopRecording
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
-from wm_nodes.judge.agent import load_rubric
-from wm_nodes.judge.audit import read_record, verify
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.audit.reading import read_record, verify
 from wm_nodes.judge.rejudge import judge_bag
 from wm_nodes.judge.service import READS, JudgeService
 from wm_nodes.launching.scenarios import GRAPH_TOPICS, VERDICT_TOPIC, VIDEO_TOPICS

@@ -12,8 +12,8 @@ from judge_server import PickyServer, serving
 
 from wm_nodes.apps.cli import main
 from wm_nodes.apps.judge_clips import VERDICTS
-from wm_nodes.judge.agent import clip_ref
-from wm_nodes.judge.audit import read_record
+from wm_nodes.judge.agent.types import clip_ref
+from wm_nodes.judge.audit.reading import read_record
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:

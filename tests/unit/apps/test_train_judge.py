@@ -9,7 +9,9 @@ from evidence_table import EVIDENCE
 from pushed_box import push_clip, redrawn
 
 from wm_nodes.apps.cli import main
-from wm_nodes.judge.dataset.edits import Division, LabelledClip, children, manifest_of, to_bytes
+from wm_nodes.judge.dataset.edits.clips import LabelledClip
+from wm_nodes.judge.dataset.edits.generator import children
+from wm_nodes.judge.dataset.edits.manifest import Division, manifest_of, to_bytes
 from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 from wm_nodes.judge.evidence.segmentation import Segmenter
 from wm_nodes.judge.training.data import load_sets, rows_of, set_clips

@@ -14,7 +14,7 @@ from benchmarks.judge.comparisons import pai_bench as pai
 from benchmarks.judge.comparisons.chat import ChatComparison
 from benchmarks.judge.comparisons.protocols import POINTWISE
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
-from wm_nodes.judge.backends import ChatTransport, Endpoint
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint
 
 pytestmark = pytest.mark.slow
 

@@ -20,8 +20,8 @@ from benchmarks.judge.comparisons.chat import ChatComparison
 from benchmarks.judge.comparisons.protocols import PAIRWISE, POINTWISE, read_flex, read_unified
 from benchmarks.judge.line_file import LineFile
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
-from wm_nodes.judge.backends import ChatTransport, Endpoint, RetryPolicy
 from wm_nodes.judge.backends.schemas import AnswerError
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
 from wm_nodes.judge.dataset.rows import select_rows
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (20, 24, 32, 3), np.uint8)

@@ -8,7 +8,8 @@ from pushed_box import push_clip, redrawn
 
 from benchmarks.judge.fault_visibility import changed_px
 from wm_nodes.apps.cli import main
-from wm_nodes.judge.dataset.edits import Division, children, manifest_of, to_bytes
+from wm_nodes.judge.dataset.edits.generator import children
+from wm_nodes.judge.dataset.edits.manifest import Division, manifest_of, to_bytes
 from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
 
 DIVISION = Division(validation=0.0, test=0.0)

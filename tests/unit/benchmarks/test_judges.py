@@ -24,14 +24,18 @@ from benchmarks.judge.metrics import agreement, cost_row, missed_patterns, misse
 from benchmarks.judge.run import JudgeTrial, Outcome, judge_rows
 from benchmarks.judge.test_split_log import LOG_NAME, notice, read_evaluations, record_evaluation
 from wm_nodes.apps.cli import main
-from wm_nodes.judge.agent import RewardAgent, Verdict, load_rubric
+from wm_nodes.judge.agent.judge import Capabilities, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote, next_vote
+from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.profiles import profile_media
-from wm_nodes.judge.agent.types import Capabilities, Profile, ReadRequest, Stage
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import Profile, Stage
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
 from wm_nodes.judge.dataset.build import BENCHMARK, draw_origin, instruction_of
-from wm_nodes.judge.dataset.edits import ClipTruth, Edit, Manifest, ManifestError, Origin, planning_level
-from wm_nodes.judge.dataset.edits.clips import COMPONENTS
+from wm_nodes.judge.dataset.edits.clips import COMPONENTS, ClipTruth, Edit, Origin
+from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestError
+from wm_nodes.judge.dataset.edits.planning import planning_level
 from wm_nodes.judge.dataset.rows import read_clip, select_rows
 from wm_nodes.judge.dataset.set_files import load_set
 from wm_nodes.judge.decisions import PAPER, accepts, decisions_of, row_names

@@ -12,7 +12,7 @@ from judge_server import serving
 from benchmarks.judge.comparisons import pai_bench as pai
 from benchmarks.judge.pai_bench import metrics_of
 from wm_nodes.apps.cli import main
-from wm_nodes.judge.agent import clip_ref
+from wm_nodes.judge.agent.types import clip_ref
 from wm_nodes.judge.clip_files import read_video
 from wm_nodes.video_rl.frame_features import load_backbone
 

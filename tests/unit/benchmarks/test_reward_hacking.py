@@ -24,10 +24,12 @@ from benchmarks.judge.hacking import (
 from benchmarks.judge.label_judge import KnownClip, LabelJudge
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
-from wm_nodes.judge.agent import TaskSpec, load_rubric
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import TaskSpec
 from wm_nodes.judge.dataset.build import HELD_OUT, SetPlan, build, draw_origin
-from wm_nodes.judge.dataset.edits import LabelledClip, apply
+from wm_nodes.judge.dataset.edits.clips import LabelledClip
 from wm_nodes.judge.dataset.edits.generator import STATE_RECIPES, apply_edit
+from wm_nodes.judge.dataset.edits.recipes import apply
 
 RUBRIC = load_rubric(overrides={"voting": {"audit_share": 0.0}})
 PLAN = SearchPlan(generations=4, candidates=4)

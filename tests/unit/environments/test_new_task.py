@@ -13,7 +13,7 @@ from wm_nodes.environments.maniskill.episodes import planned_episode, scripted_e
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 from wm_nodes.environments.record import collect_plan, demonstration_plan
 from wm_nodes.judge.dataset.build import ClipSource
-from wm_nodes.judge.dataset.edits import tc_level
+from wm_nodes.judge.dataset.edits.truth import tc_level
 from wm_nodes.recording import read_episodes
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
 from wm_nodes.world_model.training.tokenizer import probe_targets

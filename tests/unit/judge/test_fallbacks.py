@@ -16,8 +16,10 @@ from scripted_judge import make_clip, make_task
 
 from wm_nodes.config.load import ConfigError, default_judge, dump_config, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
-from wm_nodes.judge.agent import Status, Verdict, check_one_judge, pause_reason
-from wm_nodes.judge.audit import read_record, verify
+from wm_nodes.judge.agent.contract import check_one_judge, pause_reason
+from wm_nodes.judge.agent.types import Status
+from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.audit.reading import read_record, verify
 from wm_nodes.judge.backends.embedded import shipped_heads
 from wm_nodes.judge.backends.factory import check_clips, check_judge, for_clips, judges_of
 from wm_nodes.judge.backends.limits import CircuitBreaker

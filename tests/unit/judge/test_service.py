@@ -21,8 +21,9 @@ from scripted_judge import make_clip, make_task
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import default_judge, dump_config, judge_overrides, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
-from wm_nodes.judge.agent import Status, Verdict
-from wm_nodes.judge.audit import read_record
+from wm_nodes.judge.agent.types import Status
+from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.audit.reading import read_record
 from wm_nodes.judge.backends.embedded import shipped_head
 from wm_nodes.judge.backends.factory import check_judge
 from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward, check_horizon, unjudged_reason

@@ -9,12 +9,14 @@ from evidence_table import EVIDENCE
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import task_names
-from wm_nodes.judge.agent import RewardAgent, load_rubric
-from wm_nodes.judge.agent.types import ClipRef, Stage, Status, TaskSpec, Verdict, clip_ref
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import ClipRef, Stage, Status, TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
 from wm_nodes.judge.backends.factory import check_judge, make_judge
 from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, instruction_of
-from wm_nodes.judge.dataset.edits import LabelledClip
+from wm_nodes.judge.dataset.edits.clips import LabelledClip
 from wm_nodes.judge.dataset.edits.generator import apply_edit
 from wm_nodes.judge.evidence.head import load_head
 from wm_nodes.judge.evidence.sequence import reading_names

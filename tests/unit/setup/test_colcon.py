@@ -14,7 +14,7 @@ from pathlib import Path
 import wm_nodes
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import PRETRAINED
-from wm_nodes.judge.agent import load_rubric
+from wm_nodes.judge.agent.rubric import load_rubric
 load_config("smoke"), load_rubric("robot")
 files = sorted(str(path.relative_to(PRETRAINED)) for path in PRETRAINED.rglob("*") if path.is_file())
 print(json.dumps([str(Path(wm_nodes.__file__).parent), files]))

@@ -8,7 +8,7 @@ of text per call. What a server billed is beside it, in Verdict.cost.
 import math
 from dataclasses import dataclass
 
-from wm_nodes.judge.agent.types import Capabilities, Health, Judge, Read, ReadRequest
+from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, Read, ReadRequest
 
 TOKEN_PX = 32
 TEXT_TOKENS = 250

@@ -24,11 +24,12 @@ from benchmarks.judge.test_split_log import judge_name, notice, record_evaluatio
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.config.load import load_config
-from wm_nodes.judge.agent import Judge, Rubric, TaskSpec, load_rubric
-from wm_nodes.judge.agent.types import Stage
-from wm_nodes.judge.dataset.edits import LabelledClip, Manifest
+from wm_nodes.judge.agent.judge import Judge
+from wm_nodes.judge.agent.rubric import Rubric, load_rubric
+from wm_nodes.judge.agent.types import Stage, TaskSpec
+from wm_nodes.judge.dataset.edits.clips import LabelledClip
 from wm_nodes.judge.dataset.edits.generator import SEVERITIES
-from wm_nodes.judge.dataset.edits.manifest import ManifestRow
+from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestRow
 from wm_nodes.judge.dataset.rows import MIN_TEST_CLIPS, select_rows
 from wm_nodes.judge.dataset.set_files import load_set
 

@@ -12,7 +12,7 @@ from rich.table import Table
 from benchmarks.judge.metrics import cost_row
 from benchmarks.judge.run import JudgeTrial, Outcome
 from wm_nodes.core.statistics import PairedDifference, paired_difference
-from wm_nodes.judge.agent import load_rubric
+from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import GATED, NUM_PLAN_LEVELS
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.decisions import OVERALL

@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from wm_nodes.judge.dataset.edits import RECIPES, Manifest
-from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
-from wm_nodes.judge.dataset.edits.recipes import SEEN_LEVELS
+from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestRow, Part
+from wm_nodes.judge.dataset.edits.recipes import RECIPES, SEEN_LEVELS
 from wm_nodes.judge.dataset.set_files import load_frames
 from wm_nodes.judge.training.data import load_sets, rows_of
 

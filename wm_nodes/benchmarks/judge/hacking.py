@@ -12,14 +12,16 @@ from pathlib import Path
 import numpy as np
 
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.judge.agent import Judge, ReadRequest, RewardAgent, Rubric, TaskSpec
+from wm_nodes.judge.agent.judge import Judge, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote, score_of
+from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.profiles import profile_media
-from wm_nodes.judge.agent.types import GATED, Status
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import GATED, Status, TaskSpec
 from wm_nodes.judge.dataset.build import instruction_of
-from wm_nodes.judge.dataset.edits import COMPONENTS, LabelledClip, NotApplicableError, apply
-from wm_nodes.judge.dataset.edits.clips import Severity
+from wm_nodes.judge.dataset.edits.clips import COMPONENTS, LabelledClip, NotApplicableError, Severity
 from wm_nodes.judge.dataset.edits.generator import FRAME_RECIPES, SEVERITIES
+from wm_nodes.judge.dataset.edits.recipes import apply
 from wm_nodes.judge.dataset.rows import ROBOT
 from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figure, style_axes
 from wm_nodes.video_rl.reward_hacking import HackedMetric, hacked_metrics

@@ -28,8 +28,10 @@ from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.types import BoolArray
 from wm_nodes.environments.record import collect_plan, scripted_plan
-from wm_nodes.judge.agent import RewardAgent, TaskSpec, Verdict, clip_ref, load_rubric
-from wm_nodes.judge.agent.types import GATED, Status
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import GATED, Status, TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import make_judge
 from wm_nodes.judge.decisions import OVERALL, accepts, decisions_of, match
 from wm_nodes.judge.episode_reward import episode_judge

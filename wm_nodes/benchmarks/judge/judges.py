@@ -10,11 +10,12 @@ from benchmarks.judge.comparisons.chat import ChatComparison
 from benchmarks.judge.label_judge import KnownClip, LabelJudge
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import JudgeConfig, StageJudge
-from wm_nodes.judge.agent import Judge, Rubric
-from wm_nodes.judge.backends import ChatTransport, Endpoint, RetryPolicy
+from wm_nodes.judge.agent.judge import Judge
+from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
 from wm_nodes.judge.backends.factory import make_judge
-from wm_nodes.judge.dataset.edits import Manifest
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
+from wm_nodes.judge.dataset.edits.manifest import Manifest
 from wm_nodes.judge.evidence.head import load_head
 
 NAMES = ("embedded", "openai", "simulator")

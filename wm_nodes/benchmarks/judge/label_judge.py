@@ -9,9 +9,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.judge.agent import types
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.dataset.edits import TC, ClipTruth, Edit, planning_level
+from wm_nodes.judge.agent.types import NUM_PLAN_LEVELS, PLANNING, Component, Stage
+from wm_nodes.judge.dataset.edits.clips import TC, ClipTruth, Edit
+from wm_nodes.judge.dataset.edits.planning import planning_level
 
 SURE = 0.9
 """Probability that an answer gives to its level; the rest goes to the level beside it."""
@@ -39,37 +41,37 @@ class LabelJudge:
         self._labels = hashlib.sha256(repr(sorted(clips.items())).encode()).hexdigest()[:8]
 
     @property
-    def capabilities(self) -> types.Capabilities:
-        names = frozenset({types.PLANNING, *self._rubric.component_names, *self._rubric.hack.patterns})
+    def capabilities(self) -> Capabilities:
+        names = frozenset({PLANNING, *self._rubric.component_names, *self._rubric.hack.patterns})
         model = f"labels {self._labels}, error {self._error:g}, seed {self._seed}"
-        return types.Capabilities("simulator labels", "none", model, "1", names, reasons=False, deterministic=True)
+        return Capabilities("simulator labels", "none", model, "1", names, reasons=False, deterministic=True)
 
-    async def health(self) -> types.Health:
-        return types.Health(True)
+    async def health(self) -> Health:
+        return Health(True)
 
-    async def read(self, request: types.ReadRequest) -> list[types.Read]:
+    async def read(self, request: ReadRequest) -> list[Read]:
         known = self.clips.get(request.clip.sha256)
         if known is None:
             raise ValueError(f"clip {request.clip.clip_id} has no labels; this judge knows the clips of its set only")
         return [self._read(request, known, name, vote) for name in request.components for vote in request.votes]
 
-    def _read(self, request: types.ReadRequest, known: KnownClip, name: str, vote: types.Vote) -> types.Read:
+    def _read(self, request: ReadRequest, known: KnownClip, name: str, vote: Vote) -> Read:
         rng = numpy_stream(self._seed, f"oracle/{request.clip.sha256}/{request.stage}/{name}/{vote.index}")
         errs = bool(rng.random() < self._error)
-        if name == types.PLANNING:
+        if name == PLANNING:
             level = planning_level(known.labels, known.edits)
             level = 2 if level is None else level
             if errs:
-                level += 1 if level + 1 < types.NUM_PLAN_LEVELS else -1
-            levels = _spread(level, types.NUM_PLAN_LEVELS)
+                level += 1 if level + 1 < NUM_PLAN_LEVELS else -1
+            levels = _spread(level, NUM_PLAN_LEVELS)
         else:
             levels = _spread(self._level(request.stage, known.labels, name, errs), 5)
-        cost = types.Cost(calls=1, images=len(request.media))
-        cited = (0,) if request.stage is types.Stage.REFLECT else ()
-        return types.Read(name, levels, vote.kind, vote, frames_cited=cited, cost=cost)
+        cost = Cost(calls=1, images=len(request.media))
+        cited = (0,) if request.stage is Stage.REFLECT else ()
+        return Read(name, levels, vote.kind, vote, frames_cited=cited, cost=cost)
 
-    def _level(self, stage: types.Stage, labels: ClipTruth, name: types.Component, errs: bool) -> int:
-        if stage is types.Stage.HACK:
+    def _level(self, stage: Stage, labels: ClipTruth, name: Component, errs: bool) -> int:
+        if stage is Stage.HACK:
             return CLEAN if (labels.pattern != name) != errs else 0
         if name == TC:
             return 4 - labels.tc_level if errs else labels.tc_level

@@ -8,9 +8,10 @@ import math
 from typing import Any
 
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import PLANNING, Verdict
-from wm_nodes.judge.dataset.edits import planning_level
+from wm_nodes.judge.agent.types import PLANNING
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
+from wm_nodes.judge.dataset.edits.planning import planning_level
 from wm_nodes.judge.decisions import OVERALL, STAGES
 
 Known = bool | int | None

@@ -13,8 +13,8 @@ from benchmarks.judge.run import Outcome
 from wm_nodes.core.statistics import auroc, recall_at, wilson_interval
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING
-from wm_nodes.judge.dataset.edits import SPLITS, TC
-from wm_nodes.judge.dataset.edits.manifest import ManifestRow
+from wm_nodes.judge.dataset.edits.clips import TC
+from wm_nodes.judge.dataset.edits.manifest import SPLITS, ManifestRow
 from wm_nodes.judge.decisions import OVERALL, PAPER, STAGES, match, row_names
 
 MIN_RECALL, MAX_FALSE_POSITIVES = 0.95, 0.05

@@ -26,8 +26,8 @@ from benchmarks.judge.comparisons.chat import ChatComparison
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.agent import ClipRef
-from wm_nodes.judge.backends import ChatTransport, Endpoint
+from wm_nodes.judge.agent.types import ClipRef
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint
 from wm_nodes.judge.clip_files import read_picture, read_video
 from wm_nodes.video_rl.frame_features import FrameFeatures, load_backbone
 

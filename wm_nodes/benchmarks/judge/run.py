@@ -11,9 +11,9 @@ from typing import Any
 from benchmarks.judge.call_counter import CallCounts, CountingJudge
 from benchmarks.judge.labels import pattern_scores
 from benchmarks.judge.line_file import LineFile
-from wm_nodes.judge.agent import RewardAgent, Rubric
-from wm_nodes.judge.agent.machine import Mode
-from wm_nodes.judge.agent.types import Capabilities, Cost, Judge
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Judge
+from wm_nodes.judge.agent.machine import Mode, RewardAgent
+from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.rows import read_clip
 from wm_nodes.judge.decisions import Decision, decisions_of

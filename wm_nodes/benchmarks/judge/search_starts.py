@@ -6,9 +6,9 @@ from benchmarks.judge.hacking import SearchStart
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.dataset.build import ClipSource
-from wm_nodes.judge.dataset.edits import Division, LabelledClip, ManifestError, NotApplicableError
+from wm_nodes.judge.dataset.edits.clips import LabelledClip, NotApplicableError
 from wm_nodes.judge.dataset.edits.generator import STATE_RECIPES, apply_edit
-from wm_nodes.judge.dataset.edits.manifest import ManifestRow
+from wm_nodes.judge.dataset.edits.manifest import Division, ManifestError, ManifestRow
 
 
 def hacking_starts(

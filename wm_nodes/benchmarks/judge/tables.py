@@ -6,7 +6,7 @@ from rich.table import Table
 
 from benchmarks.judge.hacking import Curve
 from benchmarks.judge.metrics import LabelAgreement, PatternRow
-from wm_nodes.judge.dataset.edits import COMPONENTS
+from wm_nodes.judge.dataset.edits.clips import COMPONENTS
 from wm_nodes.reports.console_table import decimal, make_table, percent, percent_interval
 
 

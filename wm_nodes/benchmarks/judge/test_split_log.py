@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from wm_nodes.core.files import write_atomic
-from wm_nodes.judge.agent.types import Capabilities
-from wm_nodes.judge.dataset.edits import Manifest
+from wm_nodes.judge.agent.judge import Capabilities
+from wm_nodes.judge.dataset.edits.manifest import Manifest
 
 LOG_NAME = "test_ledger.jsonl"
 PUBLISHED = Path(__file__).with_name("published_evaluations.json")

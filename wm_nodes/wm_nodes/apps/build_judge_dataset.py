@@ -20,7 +20,7 @@ from wm_nodes.apps.options import add_seed
 from wm_nodes.config.load import default_task, load_config
 from wm_nodes.config.tasks import task_names
 from wm_nodes.judge.dataset.build import BENCHMARK, SHAPES, SIDE_PX, SetPlan, build
-from wm_nodes.judge.dataset.edits import RECIPES
+from wm_nodes.judge.dataset.edits.recipes import RECIPES
 from wm_nodes.judge.dataset.policy_camera import PolicyCamera, policy_models
 from wm_nodes.judge.dataset.set_files import check_set
 from wm_nodes.world_model import load_model_folder

@@ -23,7 +23,8 @@ from tqdm import tqdm
 
 from wm_nodes.apps.options import add_json, add_judge, judge_settings
 from wm_nodes.config.load import judge_or_embedded, load_config
-from wm_nodes.judge.agent import Status, Verdict
+from wm_nodes.judge.agent.types import Status
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import for_clips
 from wm_nodes.judge.clip_files import AT_ONCE, read_job, read_list
 from wm_nodes.judge.service import ClipJob, JudgeService

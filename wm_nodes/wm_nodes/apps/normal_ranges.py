@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from wm_nodes.config.load import named_pack
 from wm_nodes.core.files import write_atomic
-from wm_nodes.judge.agent import load_rubric
+from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.training.normal_ranges import Row, bands_of, clip_rows, count_outside
 from wm_nodes.recording import read_episodes
 from wm_nodes.world_model import WorldModels, load_model_folder

@@ -28,7 +28,8 @@ from wm_nodes.config.schema import AGENT
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.files import write_atomic
-from wm_nodes.judge.agent import Status, Verdict
+from wm_nodes.judge.agent.types import Status
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import for_clips
 from wm_nodes.judge.episode_reward import episode_judge
 from wm_nodes.judge.evidence_of_clip import ClipEvidence

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from wm_nodes.core.files import file_sha256
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.agent import ClipRef, TaskSpec, clip_ref
+from wm_nodes.judge.agent.types import ClipRef, TaskSpec, clip_ref
 from wm_nodes.judge.service import ClipJob
 
 LIST = "clips.jsonl"
@@ -39,11 +39,7 @@ class ClipLine(BaseModel):
 
 
 def read_list(folder: Path) -> list[ClipLine]:
-    """The lines of clips.jsonl.
-
-    Raises:
-        ValueError: no such file, or a line that is none; names the line, the field and what is wrong.
-    """
+    """The lines of clips.jsonl. Raises ValueError: no such file, or a bad line; names line, field and problem."""
     path = folder / LIST
     if not path.is_file():
         raise ValueError(
@@ -64,11 +60,7 @@ def read_list(folder: Path) -> list[ClipLine]:
 
 
 def list_sha256(folder: Path, announced: str = "") -> str:
-    """SHA-256 of clips.jsonl.
-
-    Raises:
-        ValueError: it is not the announced one. OSError: it cannot be read.
-    """
+    """SHA-256 of clips.jsonl. Raises ValueError: it is not the announced one. OSError: it cannot be read."""
     path = folder / LIST
     digest = file_sha256(path)
     if announced and digest != announced:
@@ -77,11 +69,7 @@ def list_sha256(folder: Path, announced: str = "") -> str:
 
 
 def read_job(folder: Path, line: ClipLine) -> ClipJob:
-    """A clip with its pixels.
-
-    Raises:
-        ValueError: an unreadable file, or another content than its sha256; names the file.
-    """
+    """A clip with its pixels. Raises ValueError: an unreadable file, or another content than its sha256; names it."""
     path = folder / line.file
     clip = _read_frames(path, line.fps) if path.suffix == ".npy" else read_video(path)
     if line.sha256 and clip.sha256 != line.sha256:
@@ -93,18 +81,11 @@ def read_job(folder: Path, line: ClipLine) -> ClipJob:
 
 
 def read_video(path: Path) -> ClipRef:
-    """Every frame of a video, RGB.
-
-    Raises:
-        ValueError: no readable video of two frames or more.
-    """
+    """Every frame of a video, RGB. Raises ValueError: no readable video of two frames or more."""
     capture = cv2.VideoCapture(str(path))
     fps, frames = capture.get(cv2.CAP_PROP_FPS), []
-    while True:
-        there, frame = capture.read()
-        if not there:
-            break
-        frames.append(frame[..., ::-1])
+    while (read := capture.read())[0]:
+        frames.append(read[1][..., ::-1])
     capture.release()
     if len(frames) < 2 or not fps > 0:
         raise ValueError(f"{path} is no readable video: {len(frames)} frames at {fps:g} per second")

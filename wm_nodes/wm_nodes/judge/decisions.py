@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike
 
 from wm_nodes.core.statistics import balanced_accuracy, expected_calibration_error, kappa, wilson_of_share
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import PLANNING, Stage, Status, Verdict
-from wm_nodes.judge.dataset.edits import TC
+from wm_nodes.judge.agent.types import PLANNING, Stage, Status
+from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.dataset.edits.clips import TC
 
 OVERALL = "overall"
 STAGES = (Stage.VQ, Stage.IF, Stage.PC)

@@ -19,8 +19,10 @@ from wm_nodes.config.load import judge_or_embedded
 from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
 from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
 from wm_nodes.core.types import BoolArray, FloatArray, Rollout, UInt8Array, UInt64Array
-from wm_nodes.judge.agent import TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import check_clips, check_judge, for_clips
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.reward import SUCCESS_UNKNOWN, RewardResult
@@ -106,8 +108,7 @@ class PendingReward:
 def check_agent(config: RunConfig, *, trains: bool = True) -> None:
     """Refuse settings by which episodes of the configured scene could not be judged, before anything is made.
 
-    Args:
-        trains: rollouts of ppo.num_steps are trained on.
+    trains: rollouts of ppo.num_steps are trained on.
 
     Raises:
         ValueError, ConfigError: as check_judge, load_rubric, check_horizon and check_clips; fallbacks are named.
@@ -145,16 +146,7 @@ def _refuse_fallbacks(settings: JudgeConfig) -> None:
 
 
 def check_horizon(num_steps: int, max_episode_steps: int) -> None:
-    """Refuse rollouts that are shorter than an episode of full length.
-
-    Such episodes would never be judged: only those that end early would get a reward.
-
-    Args:
-        num_steps: lock-steps of a rollout, the first of them after a reset. max_episode_steps: of the environment.
-
-    Raises:
-        ValueError: num_steps is below max_episode_steps.
-    """
+    """Refuse rollouts shorter than an episode, of which only those that end early are judged. Raises ValueError."""
     if num_steps < max_episode_steps:
         raise ValueError(
             f"ppo.num_steps is {num_steps}, but an episode may take {max_episode_steps} steps: the reward agent judges "
@@ -186,10 +178,7 @@ def unjudged_reason(rollout: Rollout) -> str:
 class EpisodeReward:
     """Collects the lock-steps of one environment node into episodes and has each judged at its end.
 
-    cut: episodes that a reset ended before their last step, which are not judged.
-
-    Raises:
-        ValueError: the judge has fallbacks.
+    cut: episodes that a reset ended before their last step, unjudged. Raises ValueError: the judge has fallbacks.
     """
 
     name = AGENT

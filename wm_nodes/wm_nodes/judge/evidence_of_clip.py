@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wm_nodes.judge.agent import ClipRef, Rubric, TaskSpec
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import ClipRef, TaskSpec
 from wm_nodes.judge.evidence.pictures import pictures_of
 from wm_nodes.judge.evidence.pixels import pixel_evidence
 from wm_nodes.judge.evidence.world_model import MODEL_EVIDENCE, model_evidence
@@ -31,12 +32,7 @@ class ClipEvidence:
         self._one_at_a_time = threading.Lock()
 
     def check(self, rubric: Rubric) -> None:
-        """Refuse bands of evidence that is not measured here.
-
-        Raises:
-            ValueError: names the evidence and the remedy.
-            ModelFolderError: the world model cannot be loaded.
-        """
+        """Refuse bands of unmeasured evidence. Raises ValueError: names it and the remedy. ModelFolderError."""
         if unknown := sorted(set(rubric.evidence) - pixel_names() - set(MODEL_EVIDENCE)):
             raise ValueError(
                 f"rubric {rubric.version} has bands of {', '.join(unknown)}, which is not measured here; known: "

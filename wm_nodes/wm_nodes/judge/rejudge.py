@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from wm_nodes.config.schema import AGENT
-from wm_nodes.judge.agent import Verdict
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward
 from wm_nodes.judge.service import JudgeService
 from wm_nodes.recording import Bag
@@ -34,10 +34,7 @@ class JudgedBag:
 
 
 def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) -> JudgedBag:
-    """Judge every episode that ends in a live recording.
-
-    Args:
-        namespace: of the environment; None takes the only one.
+    """Judge every episode that ends in a live recording. namespace: of the environment; None takes the only one.
 
     Raises:
         BagError: an unusable bag. ValueError: the judge has fallbacks.
@@ -52,7 +49,12 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
                 model.forget()
                 session = step.session
             if not step.is_reset and step.valid.any():
-                waiting.append((step, model.add(_episode_step(step), steps.spec, step.session)))
+                goals, there = step.goals if step.goals is not None else ((), ())
+                lockstep = EpisodeStep(
+                    step.images, step.next_images, step.actions, step.episode_id, step.episode_step,
+                    step.terminated | step.truncated, step.valid, {n: goals[n] for n in np.flatnonzero(there).tolist()},
+                )
+                waiting.append((step, model.add(lockstep, steps.spec, step.session)))
     while waiting:
         step, pending = waiting.popleft()
         result = pending.result()
@@ -68,11 +70,3 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
             if not same or not np.array_equal(step.reward.valid[answered], result.valid[answered]):
                 judged.different.append(place)
     return judged
-
-
-def _episode_step(step: RecordedStep) -> EpisodeStep:
-    goals, there = step.goals if step.goals is not None else ((), ())
-    return EpisodeStep(
-        step.images, step.next_images, step.actions, step.episode_id, step.episode_step,
-        step.terminated | step.truncated, step.valid, {n: goals[n] for n in np.flatnonzero(there).tolist()},
-    )

@@ -20,11 +20,15 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import AGENT, JudgeConfig
-from wm_nodes.judge.agent import ClipRef, RewardAgent, Rubric, Status, TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
+from wm_nodes.judge.agent.judge import Cost, Health
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.scoring import skipped_stage
-from wm_nodes.judge.agent.types import GATED, Cost, Health, Provenance, content_hash
-from wm_nodes.judge.audit import AuditedAgent, AuditLog, write_exchange
+from wm_nodes.judge.agent.types import GATED, ClipRef, Status, TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Provenance, Verdict, content_hash
+from wm_nodes.judge.audit.log import AuditLog
+from wm_nodes.judge.audit.recording import AuditedAgent, write_exchange
 from wm_nodes.judge.backends.factory import OpenedJudge, check_judge, judges_of, make_judge
 from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.recording.reader import read_spec
@@ -216,9 +220,8 @@ class JudgeService:
             verdicts_by_index = dict[int, Verdict]()
             budget = _FallbackBudget(len(jobs), deadline) if slot is not slots[-1] else None
             on_verdict = done if budget is None else verdicts_by_index.__setitem__
-            ahead = (
-                1 if slot.failed_last_round and budget is not None else 0
-            )  # one clip tests whether the judge answers again and lets its circuit breaker close
+            # one clip tests whether the judge answers again and lets its circuit breaker close
+            ahead = int(slot.failed_last_round and budget is not None)
             verdicts = self._round(slot, jobs[:ahead], 0, deadline, check, on_verdict, budget)
             verdicts += self._round(slot, jobs[ahead:], ahead, deadline, check, on_verdict, budget)
             slot.failed_last_round = budget is not None and budget.over
@@ -362,9 +365,5 @@ def agent_scores(verdicts: Sequence[Verdict]) -> dict[str, Tensor]:
 
 
 def clip_fps(bag: Path, stride: int) -> float:
-    """Frames per second of clips that are cut from a bag at every `stride`-th frame.
-
-    Raises:
-        BagError: an unusable bag.
-    """
+    """Frames per second of clips cut from a bag at every `stride`-th frame. Raises BagError: an unusable bag."""
     return 1.0 / (read_spec(bag).control_period_s * stride)

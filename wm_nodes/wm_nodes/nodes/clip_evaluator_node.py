@@ -15,8 +15,9 @@ from wm_msgs.action import EvaluateClips
 from wm_msgs.msg import ClipScores, ClipVerdict
 from wm_nodes.config.load import judge_or_embedded, load_video_config
 from wm_nodes.config.schema import AGENT
-from wm_nodes.judge.agent import Verdict, check_one_judge
+from wm_nodes.judge.agent.contract import check_one_judge
 from wm_nodes.judge.agent.types import GATED
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import check_clips, for_clips
 from wm_nodes.judge.service import agent_scores, buffer_jobs, clip_fps
 from wm_nodes.nodes.judge import services

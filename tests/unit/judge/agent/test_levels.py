@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scripted_judge import BORDERLINE, CLEAN, FLAWED, UNUSABLE, WRONG, make_clip, make_task
 
+from wm_nodes.judge.agent.judge import ComponentScore, Read
 from wm_nodes.judge.agent.levels import (
     first_vote,
     map_back,
@@ -21,7 +22,7 @@ from wm_nodes.judge.agent.levels import (
     tally,
 )
 from wm_nodes.judge.agent.profiles import cited_media, contact_window, dense_indices, profile_media, static_indices
-from wm_nodes.judge.agent.types import ComponentScore, Profile, Read, Status, TaskSpec, clip_ref
+from wm_nodes.judge.agent.types import Profile, Status, TaskSpec, clip_ref
 
 distributions = st.lists(st.integers(0, 20), min_size=5, max_size=5).filter(any).map(
     lambda counts: tuple(count / sum(counts) for count in counts)

@@ -26,10 +26,12 @@ from scripted_judge import (
     make_task,
 )
 
-from wm_nodes.judge.agent import check_one_judge, pause_reason
+from wm_nodes.judge.agent.contract import check_one_judge, pause_reason
+from wm_nodes.judge.agent.judge import Capabilities, Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
-from wm_nodes.judge.agent.types import Capabilities, ClipRef, Profile, Read, ReadRequest, Stage, Status, Verdict
+from wm_nodes.judge.agent.types import ClipRef, Profile, Stage, Status
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.video_rl.group_advantages import trainable
 
 QUIET = {"voting": {"audit_share": 0.0}}

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from scripted_judge import BORDERLINE, CLEAN, COOKING, FAIR, GOOD, INVALID, UNUSABLE, WRONG
 
 from wm_nodes.config.load import ConfigError
+from wm_nodes.judge.agent.judge import ComponentScore, Read
 from wm_nodes.judge.agent.levels import first_vote, score
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.scoring import apply_caps, gate, plan_weights, reward, skipped_stage, stage_score
-from wm_nodes.judge.agent.types import GATED, ComponentScore, Read, Stage, StageScore, Status
+from wm_nodes.judge.agent.types import GATED, Stage, Status
+from wm_nodes.judge.agent.verdict import StageScore
 
 RUBRICS = {kind: load_rubric(overrides={"reward": {"gate": kind}}) for kind in ("hard", "soft", "lexicographic")}
 ROBOT = RUBRICS["hard"]

@@ -26,15 +26,19 @@ from scripted_judge import (
     make_task,
 )
 
+from wm_nodes.judge.agent.judge import Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import load_rubric
-from wm_nodes.judge.agent.types import Read, ReadRequest, Status, Verdict, clip_ref
+from wm_nodes.judge.agent.types import Status, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.entries import plain
 from wm_nodes.judge.audit.log import FILE_NAME, AuditError, AuditLog, read_lines
 from wm_nodes.judge.audit.reading import read_record, verify
 from wm_nodes.judge.audit.recording import AuditedAgent, write_exchange
 from wm_nodes.judge.audit.replay import replay_evaluation
-from wm_nodes.judge.backends import ChatTransport, Endpoint, OpenAIJudge, RetryPolicy, VerdictCache
+from wm_nodes.judge.backends.cache import VerdictCache
+from wm_nodes.judge.backends.openai_client import OpenAIJudge
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
 
 RUBRIC = load_rubric("robot")
 TABLES: dict[str, dict[str, Any]] = {

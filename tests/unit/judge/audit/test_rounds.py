@@ -14,10 +14,11 @@ from scripted_judge import CLEAN, FLAWED, WRONG, ScriptedJudge, clean_table
 
 from wm_nodes.apps.cli import main
 from wm_nodes.core.statistics import wilson_interval
-from wm_nodes.judge.agent import RewardAgent
+from wm_nodes.judge.agent.judge import Read, ReadRequest
 from wm_nodes.judge.agent.levels import next_vote
+from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
-from wm_nodes.judge.agent.types import Profile, Read, ReadRequest, Stage, Status
+from wm_nodes.judge.agent.types import Profile, Stage, Status
 from wm_nodes.judge.audit.adoption import Registry, RubricComparison, compare, decide
 from wm_nodes.judge.audit.agreement import AgreementRow, join_labels, report
 from wm_nodes.judge.audit.labels import FORMAT, read_labels

@@ -16,8 +16,8 @@ from scripted_judge import BORDERLINE, CLEAN, POOR, UNUSABLE, WRONG, FaultyJudge
 
 from setup.system import find_browser
 from wm_nodes.apps.cli import main
+from wm_nodes.judge.agent.judge import Read, ReadRequest
 from wm_nodes.judge.agent.rubric import load_rubric
-from wm_nodes.judge.agent.types import Read, ReadRequest
 from wm_nodes.judge.audit.labels import read_labels
 from wm_nodes.judge.audit.reading import read_record
 from wm_nodes.judge.audit.viewer import page as page_text

@@ -9,22 +9,15 @@ import pytest
 import torch
 from pushed_box import push_clip, redrawn
 
-from wm_nodes.judge.agent import RewardAgent, Rubric, load_rubric
+from wm_nodes.judge.agent.judge import JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote
-from wm_nodes.judge.agent.types import (
-    PLANNING,
-    JudgeError,
-    Profile,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-    TaskSpec,
-    Verdict,
-    clip_ref,
-)
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import Rubric, load_rubric
+from wm_nodes.judge.agent.types import PLANNING, Profile, Stage, Status, TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.embedded import EmbeddedJudge
-from wm_nodes.judge.dataset.edits import LabelledClip, apply, edit_states
+from wm_nodes.judge.dataset.edits.clips import LabelledClip
+from wm_nodes.judge.dataset.edits.recipes import apply, edit_states
 from wm_nodes.judge.evidence.clip import clip_evidence
 from wm_nodes.judge.evidence.head import HACK, Familiarity, HeadQuestion, JudgeHead, num_questions
 from wm_nodes.judge.evidence.segmentation import Segmenter

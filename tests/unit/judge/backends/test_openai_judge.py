@@ -17,33 +17,22 @@ from chat_server import ChatServer, Fault
 from scripted_judge import COOKING
 
 from wm_nodes.judge import backends
+from wm_nodes.judge.agent.judge import ComponentScore, Cost, JudgeError, MediaItem, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import first_vote, next_vote, option_order, state_of
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.profiles import profile_media
 from wm_nodes.judge.agent.rubric import load_rubric
-from wm_nodes.judge.agent.types import (
-    PLANNING,
-    ComponentScore,
-    Cost,
-    JudgeError,
-    MediaItem,
-    Profile,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-    TaskSpec,
-    Verdict,
-    Vote,
-    clip_ref,
-    content_hash,
-)
-from wm_nodes.judge.backends import ChatOptions, ChatTransport, Endpoint, OpenAIJudge, RetryPolicy, VerdictCache
+from wm_nodes.judge.agent.types import PLANNING, Profile, Stage, Status, TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict, content_hash
+from wm_nodes.judge.backends.cache import VerdictCache
+from wm_nodes.judge.backends.calls import ChatOptions
 from wm_nodes.judge.backends.labels import label_options, option_probabilities
+from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.plans import CallPlan
 from wm_nodes.judge.backends.prompts import data_uri
 from wm_nodes.judge.backends.protocol import Completion
 from wm_nodes.judge.backends.schemas import AnswerError, AnswerFormat, strip_reasoning
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
 
 RUBRIC = load_rubric()
 FRAMES = np.random.default_rng(0).integers(0, 256, (12, 8, 10, 3), np.uint8)

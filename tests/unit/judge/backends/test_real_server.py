@@ -20,12 +20,15 @@ from chat_server import Fault
 from fault_proxy import FaultProxy
 from tiny_vlm import save_tiny_vlm, transformers_serve
 
-from wm_nodes.judge.agent import JudgeError, RewardAgent
+from wm_nodes.judge.agent.judge import JudgeError, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote, next_vote
+from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.profiles import profile_media
 from wm_nodes.judge.agent.rubric import load_rubric
-from wm_nodes.judge.agent.types import Profile, ReadRequest, Stage, Status, TaskSpec, clip_ref
-from wm_nodes.judge.backends import ChatOptions, ChatTransport, Endpoint, OpenAIJudge, RetryPolicy, TransportError
+from wm_nodes.judge.agent.types import Profile, Stage, Status, TaskSpec, clip_ref
+from wm_nodes.judge.backends.calls import ChatOptions
+from wm_nodes.judge.backends.openai_client import OpenAIJudge
+from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy, TransportError
 
 pytestmark = pytest.mark.slow
 

@@ -12,9 +12,12 @@ from scripted_judge import CLEAN, COOKING, WRONG, ScriptedJudge, clean_table, ma
 
 from wm_nodes.config.load import ConfigError, default_judge, load_config
 from wm_nodes.config.schema import JudgeConfig
-from wm_nodes.judge.agent import RewardAgent, Rubric, Status, Verdict, load_rubric
+from wm_nodes.judge.agent.judge import Capabilities, Judge, Read, ReadRequest
 from wm_nodes.judge.agent.levels import next_vote
-from wm_nodes.judge.agent.types import GATED, Capabilities, Judge, Profile, Read, ReadRequest, Stage
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import Rubric, load_rubric
+from wm_nodes.judge.agent.types import GATED, Profile, Stage, Status
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import check_judge, judge_name, make_judge
 from wm_nodes.judge.backends.routed import RoutedJudge
 from wm_nodes.judge.service import ClipJob, JudgeService

@@ -35,8 +35,9 @@ from wm_nodes.judge.dataset.domain_randomization import (
     draw_scene,
     hue_degrees,
 )
-from wm_nodes.judge.dataset.edits import OBJECT, Origin, failed_physics
+from wm_nodes.judge.dataset.edits.clips import OBJECT, Origin
 from wm_nodes.judge.dataset.edits.manifest import Part
+from wm_nodes.judge.dataset.edits.truth import failed_physics
 from wm_nodes.judge.dataset.rendering import CAMERAS, SceneAppearance
 
 pytestmark = pytest.mark.rendering

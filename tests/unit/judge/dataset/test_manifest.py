@@ -10,23 +10,19 @@ from dataclasses import replace
 import pytest
 from pushed_box import push_clip, redrawn
 
-from wm_nodes.judge.dataset.edits import (
-    COMPONENTS,
-    RECIPES,
+from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC, LabelledClip, Origin
+from wm_nodes.judge.dataset.edits.generator import children
+from wm_nodes.judge.dataset.edits.manifest import (
     SPLITS,
-    TC,
     Division,
-    LabelledClip,
     Manifest,
     ManifestError,
-    Origin,
-    apply,
-    children,
     from_bytes,
     manifest_of,
     regenerate,
     to_bytes,
 )
+from wm_nodes.judge.dataset.edits.recipes import RECIPES, apply
 
 DIVISION = Division(cameras=("top",), scenes=("marble",), objects=("mug/red",), validation=0.2, test=0.3)
 NAMES = ("blur", "freeze", "ghost_motion", "occlude_patch", "flatten", "object_vanish")

@@ -11,10 +11,14 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import clip_rules, get_task
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.judge.agent import RewardAgent, TaskSpec, Verdict, clip_ref, load_rubric
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_heads
 from wm_nodes.judge.dataset.build import SIDE_PX, ClipSource, SetPlan
-from wm_nodes.judge.dataset.edits import OBJECT, tc_level
+from wm_nodes.judge.dataset.edits.clips import OBJECT
+from wm_nodes.judge.dataset.edits.truth import tc_level
 from wm_nodes.judge.dataset.policy_camera import (
     DECODED,
     DRAWN,

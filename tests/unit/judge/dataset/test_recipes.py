@@ -13,33 +13,24 @@ from pushed_box import FRAMES, draw, push_clip, pushing_states, redrawn
 from wm_nodes.config.tasks import clip_rules
 from wm_nodes.judge.agent.levels import one_hot, p_fail_of
 from wm_nodes.judge.agent.rubric import load_rubric
-from wm_nodes.judge.dataset.edits import (
+from wm_nodes.judge.dataset.edits import images
+from wm_nodes.judge.dataset.edits.clips import (
     BACKGROUND,
     COMPONENTS,
     DISTRACTOR,
     OBJECT,
     PHYSICS,
-    RECIPES,
     ROBOT,
     TC,
+    TC_PASS_LEVEL,
     ClipTruth,
     LabelledClip,
     NotApplicableError,
     SceneStates,
-    apply,
-    children,
-    edit_states,
-    failed_physics,
-    images,
-    recorded,
-    replay,
-    stacks,
-    tc_level,
 )
-from wm_nodes.judge.dataset.edits.clips import TC_PASS_LEVEL
-from wm_nodes.judge.dataset.edits.generator import apply_edit
-from wm_nodes.judge.dataset.edits.recipes import get_recipe
-from wm_nodes.judge.dataset.edits.truth import overlap_m, touched_nearby
+from wm_nodes.judge.dataset.edits.generator import apply_edit, children, replay, stacks
+from wm_nodes.judge.dataset.edits.recipes import RECIPES, apply, edit_states, get_recipe
+from wm_nodes.judge.dataset.edits.truth import failed_physics, overlap_m, recorded, tc_level, touched_nearby
 
 PUSH = clip_rules("push_cube").label
 TOUCHING = slice(7, 12)

@@ -13,17 +13,10 @@ from wm_nodes.config.tasks import clip_rules, success, task_names
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.judge.dataset import rendering
 from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, SetPlan, build, scene_states
-from wm_nodes.judge.dataset.edits import (
-    BACKGROUND,
-    DISTRACTOR,
-    OBJECT,
-    ROBOT,
-    ManifestError,
-    edit_states,
-    failed_physics,
-    regenerate,
-    tc_level,
-)
+from wm_nodes.judge.dataset.edits.clips import BACKGROUND, DISTRACTOR, OBJECT, ROBOT
+from wm_nodes.judge.dataset.edits.manifest import ManifestError, regenerate
+from wm_nodes.judge.dataset.edits.recipes import edit_states
+from wm_nodes.judge.dataset.edits.truth import failed_physics, tc_level
 from wm_nodes.judge.dataset.rendering import CAMERAS, SceneAppearance, record_states
 from wm_nodes.judge.dataset.set_files import check_set, clip_path, load_frames, load_set
 

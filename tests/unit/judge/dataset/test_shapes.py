@@ -9,7 +9,7 @@ import pytest
 
 from wm_nodes.config.load import load_config
 from wm_nodes.judge.dataset.build import BENCHMARK, HELD_OUT, STEADY, ClipSource, SetPlan, draw_origin, instruction_of
-from wm_nodes.judge.dataset.edits import OBJECT
+from wm_nodes.judge.dataset.edits.clips import OBJECT
 
 pytestmark = pytest.mark.rendering
 CONFIG = load_config("cpu").simulation

@@ -10,7 +10,8 @@ from evidence_table import EVIDENCE
 from pushed_box import HALF_M, draw, push_clip, pushing_states, redrawn
 
 from wm_nodes.core.types import FloatArray, UInt8Array
-from wm_nodes.judge.dataset.edits import LabelledClip, SourceClip, apply, edit_states
+from wm_nodes.judge.dataset.edits.clips import LabelledClip, SourceClip
+from wm_nodes.judge.dataset.edits.recipes import apply, edit_states
 from wm_nodes.judge.evidence.motion import motion_evidence, outline_of
 from wm_nodes.judge.evidence.objects import FAR, find_target, object_evidence, scene_of
 from wm_nodes.judge.evidence.pictures import pictures_of

@@ -12,7 +12,7 @@ from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.types import FloatArray
 from wm_nodes.judge.agent.levels import p_fail_of
 from wm_nodes.judge.agent.types import PLANNING
-from wm_nodes.judge.dataset.edits import COMPONENTS, TC, ClipTruth, Edit, Origin
+from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC, ClipTruth, Edit, Origin
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.evidence.head import (
     HACK,

@@ -17,9 +17,11 @@ from wm_nodes.config.load import default_judge
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.agent import TaskSpec, Verdict, clip_ref, load_rubric
 from wm_nodes.judge.agent.reflection import conflicting_evidence
-from wm_nodes.judge.audit import read_record
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.audit.reading import read_record
 from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.judge.training import normal_ranges

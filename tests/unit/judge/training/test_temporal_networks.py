@@ -10,7 +10,8 @@ from pushed_box import push_clip, redrawn
 
 from wm_nodes.core.statistics import auroc
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.dataset.edits import LabelledClip, edit_states
+from wm_nodes.judge.dataset.edits.clips import LabelledClip
+from wm_nodes.judge.dataset.edits.recipes import edit_states
 from wm_nodes.judge.evidence.motion import outline_of
 from wm_nodes.judge.evidence.objects import scene_of, target_of
 from wm_nodes.judge.evidence.segmentation import OBJECT

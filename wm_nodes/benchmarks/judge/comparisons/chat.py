@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from benchmarks.judge.comparisons.protocols import PairwiseProtocol, Parts, PointwiseProtocol
+from wm_nodes.judge.agent.judge import Cost
 from wm_nodes.judge.agent.profiles import uniform
-from wm_nodes.judge.agent.types import ClipRef, Cost, TaskSpec
+from wm_nodes.judge.agent.types import ClipRef, TaskSpec
 from wm_nodes.judge.backends.prompts import Part, data_uri, with_problem
 from wm_nodes.judge.backends.schemas import AnswerError
 from wm_nodes.judge.backends.transport import ChatTransport, TransportError

@@ -27,8 +27,9 @@ import numpy as np
 
 from benchmarks.judge.comparisons.chat import ChatComparison
 from wm_nodes.core.types import FloatArray
+from wm_nodes.judge.agent.judge import Cost
 from wm_nodes.judge.agent.profiles import uniform
-from wm_nodes.judge.agent.types import ClipRef, Cost
+from wm_nodes.judge.agent.types import ClipRef
 from wm_nodes.judge.backends.prompts import data_uri
 from wm_nodes.judge.backends.schemas import AnswerError, strip_reasoning
 

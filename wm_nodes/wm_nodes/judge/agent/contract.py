@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from wm_nodes.judge.agent.types import Verdict
+from wm_nodes.judge.agent.verdict import Verdict
 
 MAX_INVALID_SHARE = 0.1
 """A round with more invalid clips pauses training."""
@@ -21,11 +21,7 @@ def pause_reason(verdicts: Sequence[Verdict]) -> str:
 
 
 def check_one_judge(verdicts: Sequence[Verdict], group_ids: Sequence[int]) -> None:
-    """Rewards of one group are compared, so one judge, model and rubric must have given them.
-
-    Raises:
-        ValueError: names the group and what was mixed.
-    """
+    """Refuse a group that several judges, models or rubrics judged. Raises ValueError: names the group and the mix."""
     seen: dict[int, tuple[str, ...]] = {}
     for verdict, group in zip(verdicts, group_ids, strict=True):
         p = verdict.provenance

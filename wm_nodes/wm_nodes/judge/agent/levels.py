@@ -9,7 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wm_nodes.judge.agent.types import NUM_LEVELS, Component, ComponentScore, Read, Status, Vote
+from wm_nodes.judge.agent.judge import ComponentScore, Read, Vote
+from wm_nodes.judge.agent.types import NUM_LEVELS, Component, Status
 
 SUM_TOLERANCE = 1e-6
 
@@ -46,11 +47,7 @@ def map_back(options: Sequence[float], order: Sequence[int]) -> Levels:
 
 
 def one_hot(level: int, num_levels: int = NUM_LEVELS) -> Levels:
-    """A certain answer.
-
-    Raises:
-        ValueError: no such level.
-    """
+    """A certain answer. Raises ValueError: no such level."""
     if not 0 <= level < num_levels:
         raise ValueError(f"level must be 0 to {num_levels - 1}, got {level}")
     return tuple(float(index == level) for index in range(num_levels))
@@ -83,11 +80,7 @@ def state_of(read: Read, min_label_mass: float, num_levels: int = NUM_LEVELS) ->
 
 
 def pool(reads: Sequence[Read]) -> Levels:
-    """p = sum_j m_j p_j / sum_j m_j with m_j the label mass; exactly the same for any order of the reads.
-
-    Raises:
-        ValueError: no read has any label mass.
-    """
+    """p = sum_j m_j p_j / sum_j m_j, m_j the label mass; in any order of reads. Raises ValueError: no label mass."""
     mass = math.fsum(read.label_mass for read in reads)
     if not mass > 0:
         raise ValueError(f"no label mass in {len(reads)} reads; abstain instead of pooling")

@@ -15,6 +15,7 @@ from typing import Literal
 
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.agent import levels, reflection, scoring
+from wm_nodes.judge.agent.judge import ComponentScore, Cost, Judge, JudgeError, MediaItem, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.precheck import precheck
 from wm_nodes.judge.agent.profiles import DENSE_MAX, cited_media, profile_media
 from wm_nodes.judge.agent.rubric import Rubric
@@ -22,28 +23,22 @@ from wm_nodes.judge.agent.types import (
     GATED,
     NUM_PLAN_LEVELS,
     PLANNING,
-    Change,
     ClipRef,
     Component,
-    ComponentScore,
-    Cost,
     Evidence,
-    HackFlag,
-    Judge,
-    JudgeError,
-    MediaItem,
-    PlanResult,
     Profile,
-    Provenance,
-    Read,
-    ReadRequest,
-    Reflection,
     Stage,
-    StageScore,
     Status,
     TaskSpec,
+)
+from wm_nodes.judge.agent.verdict import (
+    Change,
+    HackFlag,
+    PlanResult,
+    Provenance,
+    Reflection,
+    StageScore,
     Verdict,
-    Vote,
     content_hash,
 )
 
@@ -55,15 +50,8 @@ class RewardAgent:
     """Judges clips one by one; calls of different clips may run at the same time."""
 
     def __init__(
-        self,
-        judge: Judge,
-        rubric: Rubric,
-        *,
-        mode: Mode = "reward",
-        seed: int = 0,
-        max_reads: int = 60,
-        budget_s: float = 300.0,
-        call_plan: CallPlan = "auto",
+        self, judge: Judge, rubric: Rubric, *, mode: Mode = "reward", seed: int = 0, max_reads: int = 60,
+        budget_s: float = 300.0, call_plan: CallPlan = "auto",
     ) -> None:
         """Join a judge and a rubric.
 
@@ -216,7 +204,8 @@ class _Run:
         rules = self.rubric.voting
         if self._audited or plan.level in rules.levels:
             return set(reads)
-        suspected = {self.rubric.evidence[name].component for name in self._conflicts()}
+        conflicts = reflection.conflicting_evidence(self.rubric, self.evidence)
+        suspected = {self.rubric.evidence[name].component for name in conflicts}
         looks = {name: self._score_read(first) for name, (first,) in reads.items()}
         return {name for name, look in looks.items() if look.margin < rules.clear_margin or name in suspected}
 
@@ -285,14 +274,8 @@ class _Run:
         return look.p_fail
 
     async def _ask(
-        self,
-        stage: Stage,
-        names: tuple[Component, ...],
-        vote: Vote,
-        profile: Profile,
-        *,
-        media: tuple[MediaItem, ...] | None = None,
-        prior: Sequence[ComponentScore] = (),
+        self, stage: Stage, names: tuple[Component, ...], vote: Vote, profile: Profile, *,
+        media: tuple[MediaItem, ...] | None = None, prior: Sequence[ComponentScore] = (),
     ) -> list[Read]:
         """One question to the judge, answered in the order of `names`. Raises _Stop(ERROR) where it is not."""
         images = self._media_of(profile) if media is None else media
@@ -333,9 +316,6 @@ class _Run:
 
     def _stages_in_order(self) -> tuple[StageScore, ...]:
         return tuple(self.stages[stage] for stage in GATED)
-
-    def _conflicts(self) -> list[str]:
-        return reflection.conflicting_evidence(self.rubric, self.evidence)
 
     def _is_drawn(self, name: str) -> bool:
         """A seeded draw of the audit share, by clip content."""

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.agent.types import ClipRef, MediaItem, Profile, TaskSpec
+from wm_nodes.judge.agent.judge import MediaItem
+from wm_nodes.judge.agent.types import ClipRef, Profile, TaskSpec
 
 STATIC_UNIFORM, NUM_BURSTS, BURST = 4, 2, 3
 INSTRUCTION_UNIFORM = 8

@@ -9,18 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wm_nodes.judge.agent.judge import ComponentScore, Read
 from wm_nodes.judge.agent.levels import score
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    NUM_PLAN_LEVELS,
-    Component,
-    ComponentScore,
-    Evidence,
-    PlanResult,
-    Read,
-    StageScore,
-    Status,
-)
+from wm_nodes.judge.agent.types import NUM_PLAN_LEVELS, Component, Evidence, Status
+from wm_nodes.judge.agent.verdict import PlanResult, StageScore
 
 MIN_CHANGE = 0.125
 """Half a level, in units of s: less is no change."""

@@ -7,17 +7,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from wm_nodes.judge.agent.judge import ComponentScore, Read
 from wm_nodes.judge.agent.rubric import PlanningRubric, Rubric
-from wm_nodes.judge.agent.types import (
-    GATED,
-    NUM_PLAN_LEVELS,
-    ComponentScore,
-    PlanResult,
-    Read,
-    Stage,
-    StageScore,
-    Status,
-)
+from wm_nodes.judge.agent.types import GATED, NUM_PLAN_LEVELS, Stage, Status
+from wm_nodes.judge.agent.verdict import PlanResult, StageScore
 
 OPEN_SOFT_GATE = 0.01
 """A soft gate below this counts as closed: what comes after could add no more than this."""

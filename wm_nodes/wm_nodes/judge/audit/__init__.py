@@ -6,23 +6,3 @@ with AuditLog(folder) as log:
 
 As a command: wm audit --help
 """
-
-from wm_nodes.judge.audit.log import AuditError, AuditLog
-from wm_nodes.judge.audit.people import HumanJudge
-from wm_nodes.judge.audit.reading import Record, read_record, verify
-from wm_nodes.judge.audit.recording import AuditedAgent, RecordingJudge, write_exchange
-from wm_nodes.judge.audit.replay import ReplayJudge, replay_evaluation
-
-__all__ = [
-    "AuditError",
-    "AuditLog",
-    "AuditedAgent",
-    "HumanJudge",
-    "Record",
-    "RecordingJudge",
-    "ReplayJudge",
-    "read_record",
-    "replay_evaluation",
-    "verify",
-    "write_exchange",
-]

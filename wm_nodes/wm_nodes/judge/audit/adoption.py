@@ -64,9 +64,7 @@ class AdoptionDecision:
     newest: RubricComparison
 
 
-def compare(
-    old: Record, new: Record, files: Sequence[HumanLabels], *, seed: int = 0, draws: int = DRAWS
-) -> RubricComparison:
+def compare(old: Record, new: Record, files: Sequence[HumanLabels], *, seed: int = 0) -> RubricComparison:
     """Measure two logs of the same clips against labels; clips are matched by content.
 
     Raises:
@@ -89,7 +87,7 @@ def compare(
     if not usable.any():
         raise AuditError("no component has labels that pass and labels that fail; label more clips")
     rng = numpy_stream(seed, "audit_adoption", len(shared))
-    counts = rng.multinomial(len(shared), np.full(len(shared), 1 / len(shared)), size=draws).astype(np.float64)
+    counts = rng.multinomial(len(shared), np.full(len(shared), 1 / len(shared)), size=DRAWS).astype(np.float64)
     drawn = [_balanced_accuracies(counts, truth[:, usable], hits[:, usable]) for hits in right]
     low, high = np.nanquantile(_row_means(drawn[1]) - _row_means(drawn[0]), (0.025, 0.975))
     rows = {name: (float(b), float(a)) for name, b, a in zip(names, before, after) if not math.isnan(b)}
@@ -133,11 +131,7 @@ class Registry:
     def record(
         self, decided: AdoptionDecision, rubrics: Mapping[str, Rubric], frozen_set: str, facts: Mapping[str, Any]
     ) -> None:
-        """Note a decision and put the rubric that is in force now into current.yaml.
-
-        Raises:
-            AuditError: the old version is not the one in force.
-        """
+        """Note a decision and write the rubric now in force. Raises AuditError: the old version was not in force."""
         if self.current not in ("", decided.old_version):
             raise AuditError(
                 f"{self.folder} has {self.current} in force, the old log was judged by {decided.old_version}; compare "

@@ -126,7 +126,8 @@ def join_labels(
 def report(judged: Sequence[LabelledEvaluation], round_number: int | None = None, *, weighted: bool = False) -> Report:
     """The numbers of one round, or of all."""
     chosen = [clip for clip in judged if round_number in (None, clip.evaluation.round_number)]
-    names = list(dict.fromkeys(name for clip in chosen for name in _row_names(clip.rubric)))
+    rubrics = [clip.rubric for clip in chosen]
+    names = dict.fromkeys(n for r in rubrics for n in (*row_names(r), *(HACK + name for name in r.hack.patterns)))
     people = list(dict.fromkeys(who for clip in chosen for who in clip.by))
     rows = [row for name in names if (row := _agreement_row(name, chosen)) is not None]
     return Report(round_number, len(chosen), people, rows, _measure_reflection(chosen), _cost(chosen), weighted)
@@ -155,10 +156,6 @@ def table(numbers: Report) -> Table:
     )
     title = f"agreement with people, {which}, {numbers.clips} clips"
     return make_table(title, columns, cells, caption=caption, no_wrap=("row",))
-
-
-def _row_names(rubric: Rubric) -> list[str]:
-    return [*row_names(rubric), *(HACK + name for name in rubric.hack.patterns)]
 
 
 def _agreement_row(name: str, clips: Sequence[LabelledEvaluation]) -> AgreementRow | None:

@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from wm_nodes.judge.agent.judge import Capabilities, Cost, MediaItem, Read, Vote
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import Capabilities, ClipRef, Cost, MediaItem, Read, TaskSpec, Verdict, Vote
+from wm_nodes.judge.agent.types import ClipRef, TaskSpec
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.log import AuditError
 from wm_nodes.judge.audit.media import MediaStore
 
@@ -49,11 +51,7 @@ def plain(value: Any) -> Any:
 
 
 def typed(kind: type, value: Any) -> Any:
-    """The dataclass of agent/types.py that `plain` made these JSON values of.
-
-    Raises:
-        AuditError: they do not fit, e.g. they are of another version.
-    """
+    """The dataclass that `plain` made these JSON values of. Raises AuditError: they do not fit (other version)."""
     try:
         return _ADAPTERS[kind].validate_python(value)
     except ValidationError as error:
@@ -69,11 +67,7 @@ def rubric_body(rubric: Rubric) -> dict[str, Any]:
 
 
 def rubric_from(value: Mapping[str, Any]) -> Rubric:
-    """The rubric of a rubric line.
-
-    Raises:
-        AuditError: it is another one than the line says, or of another version of the program.
-    """
+    """The rubric of a rubric line. Raises AuditError: it is another one, or of another version of the program."""
     try:
         rubric = Rubric.model_validate(json.loads(value["rubric"]))
     except ValidationError as error:
@@ -92,11 +86,7 @@ def clip_body(clip: ClipRef, store: MediaStore) -> dict[str, Any]:
 
 
 def clip_from(body: Mapping[str, Any], clip_id: str, store: MediaStore) -> ClipRef:
-    """The clip of a clip line, pixels included.
-
-    Raises:
-        AuditError: a picture is missing or was changed.
-    """
+    """The clip of a clip line, pixels included. Raises AuditError: a picture is missing or was changed."""
     names = body["frames"]
     frames = store.get(names) if isinstance(names, str) else np.stack([store.get(name) for name in names])
     return ClipRef(clip_id, body["sha256"], frames, float(body["fps"]), body["source"])

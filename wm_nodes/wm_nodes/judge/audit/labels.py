@@ -52,11 +52,7 @@ class HumanLabels(_FrozenModel):
 
 
 def read_labels(path: Path) -> HumanLabels:
-    """Read an exported file.
-
-    Raises:
-        AuditError: it cannot be read or is no such file; OSError: it is not there.
-    """
+    """Read an exported file. Raises AuditError: it cannot be read or is no such file; OSError: it is not there."""
     try:
         return HumanLabels.model_validate_json(Path(path).read_bytes())
     except ValidationError as error:
@@ -91,11 +87,7 @@ def known_answers(label: ClipLabel, rubric: Rubric) -> dict[str, Answer]:
 def find_evaluation(
     number: int, audit_id: str, evaluations: Mapping[int, RecordedEvaluation], source: str
 ) -> RecordedEvaluation:
-    """The evaluation that a label or a sample means.
-
-    Raises:
-        AuditError: the log does not hold it, or another one under its number.
-    """
+    """The evaluation that a label or a sample means. Raises AuditError: the log holds none or another one there."""
     evaluation = evaluations.get(number)
     verdict = None if evaluation is None else evaluation.verdict
     if evaluation is None or verdict is None or verdict.audit_id != audit_id:
@@ -104,11 +96,7 @@ def find_evaluation(
 
 
 def annotators(files: Sequence[HumanLabels]) -> list[str]:
-    """The names, once each, in order.
-
-    Raises:
-        AuditError: one person labelled one evaluation in two files.
-    """
+    """The names, once each, in order. Raises AuditError: one person labelled one evaluation in two files."""
     seen: set[tuple[str, str, int]] = set()
     for file in files:
         for label in file.labels:

@@ -127,11 +127,7 @@ class AuditLog:
 
 
 def read_lines(folder: Path) -> Iterator[Entry]:
-    """The lines of a log, each checked against the one before.
-
-    Raises:
-        AuditError: the first fault, with the command to look closer; another format.
-    """
+    """The lines of a log, each checked against the one before. Raises AuditError: the first fault; another format."""
     for entry in _check_lines(Path(folder) / FILE_NAME):
         if isinstance(entry, Fault):
             remedy = "run `recover`" if entry.torn else "run `verify` for all faults, and take a copy from before"
@@ -140,11 +136,7 @@ def read_lines(folder: Path) -> Iterator[Entry]:
 
 
 def faults(folder: Path) -> list[Fault]:
-    """All that is wrong with the lines of a log, in order; empty for a whole one.
-
-    Raises:
-        AuditError: there is no log.
-    """
+    """All that is wrong with a log's lines, in order; empty for a whole one. Raises AuditError: there is no log."""
     return [entry for entry in _check_lines(Path(folder) / FILE_NAME) if isinstance(entry, Fault)]
 
 
@@ -206,11 +198,7 @@ def redact(value: Any) -> tuple[Any, list[str]]:
 
 
 def lock_folder(folder: Path) -> IO[str]:
-    """Hold the folder's lock until the returned file is closed.
-
-    Raises:
-        AuditError: another process holds it.
-    """
+    """Hold the folder's lock until the returned file is closed. Raises AuditError: another process holds it."""
     file = open(folder / LOCK_NAME, "a+")  # noqa: SIM115  (closing it is giving the lock back)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -257,27 +245,21 @@ def _write_all(file: IO[bytes], data: bytes) -> None:
 
 def _check_lines(path: Path) -> Iterator[Entry | Fault]:
     """Every line as an Entry or, where something is wrong, a Fault."""
-    torn: list[Fault] = []
-    expected, previous = 1, str(NO_LINE)
-    for number, start, raw in _raw_lines(path):
-        entry, expected, previous = _parse(raw, number, start, expected, previous)
-        if isinstance(entry, Fault) and entry.torn:
-            torn.append(entry)
-            continue
-        yield from (replace(fault, torn=False) for fault in torn)  # a whole line behind it: no crash did that
-        torn = []
-        yield entry
-    yield from torn
-
-
-def _raw_lines(path: Path) -> Iterator[tuple[int, int, bytes]]:
     if not path.is_file():
         raise AuditError(f"{path} does not exist; name the folder of an audit log")
-    start = 0
+    torn: list[Fault] = []
+    start, expected, previous = 0, 1, str(NO_LINE)
     with open(path, "rb") as file:
         for number, raw in enumerate(file, 1):
-            yield number, start, raw
+            entry, expected, previous = _parse(raw, number, start, expected, previous)
             start += len(raw)
+            if isinstance(entry, Fault) and entry.torn:
+                torn.append(entry)
+                continue
+            yield from (replace(fault, torn=False) for fault in torn)  # a whole line behind it: no crash did that
+            torn = []
+            yield entry
+    yield from torn
 
 
 def _parse(raw: bytes, number: int, start: int, expected: int, previous: str) -> tuple[Entry | Fault, int, str]:

@@ -23,11 +23,7 @@ class MediaStore:
         self._folder = Path(log_folder) / FOLDER
 
     def put(self, array: NDArray[Any]) -> str:
-        """Store an array, unless it is there, and return its name.
-
-        Raises:
-            AuditError: it holds Python objects. OSError: e.g. a full disk.
-        """
+        """Store an array, unless it is there; return its name. Raises AuditError: Python objects. OSError: disk."""
         data, suffix = _encode(np.asarray(array))
         name = f"{hashlib.sha256(data).hexdigest()}.{suffix}"
         path = self.path(name)
@@ -40,11 +36,7 @@ class MediaStore:
         return name
 
     def get(self, name: str) -> NDArray[Any]:
-        """The array.
-
-        Raises:
-            AuditError: missing, or not what was stored.
-        """
+        """The array. Raises AuditError: missing, or not what was stored."""
         data = self._read_checked(name)
         if name.endswith(".npy"):
             array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
@@ -52,11 +44,7 @@ class MediaStore:
         return np.ascontiguousarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
 
     def path(self, name: str) -> Path:
-        """Where a file is. Names come from a log, so anything but a plain name is refused.
-
-        Raises:
-            AuditError: not such a name.
-        """
+        """Where a file is. Raises AuditError: not the plain name of a stored file; names come from a log."""
         stem, _, suffix = name.partition(".")
         if len(stem) != 64 or not set(stem) <= set("0123456789abcdef") or suffix not in ("png", "npy"):
             raise AuditError(f"{name!r} is no name of a stored picture")

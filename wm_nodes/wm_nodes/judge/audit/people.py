@@ -8,18 +8,9 @@ import hashlib
 from collections import defaultdict
 from collections.abc import Sequence
 
+from wm_nodes.judge.agent.judge import Capabilities, Health, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import one_hot
-from wm_nodes.judge.agent.types import (
-    NUM_PLAN_LEVELS,
-    PLANNING,
-    Capabilities,
-    Health,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-    Vote,
-)
+from wm_nodes.judge.agent.types import NUM_PLAN_LEVELS, PLANNING, Stage, Status
 from wm_nodes.judge.audit.labels import HACK, HumanLabels, RowLabel, annotators
 
 SAID = {"pass": 4, "fail": 1}
@@ -28,10 +19,7 @@ SAID = {"pass": 4, "fail": 1}
 
 class HumanJudge:
     """Answers from exported labels, by the content of a clip. Vote j is the answer of person j, counted round among
-    those who were sure; it abstains where nobody was.
-
-    Raises:
-        AuditError: one person labelled an evaluation in two files.
+    those who were sure; it abstains where nobody was. Raises AuditError: one person labelled an evaluation twice.
     """
 
     def __init__(self, files: Sequence[HumanLabels]) -> None:

@@ -6,18 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.judge.agent.judge import Capabilities, MediaItem, Read, Vote
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    Capabilities,
-    ClipRef,
-    MediaItem,
-    Read,
-    TaskSpec,
-    Verdict,
-    Vote,
-    content_hash,
-    media_sha,
-)
+from wm_nodes.judge.agent.types import ClipRef, TaskSpec, media_sha
+from wm_nodes.judge.agent.verdict import Verdict, content_hash
 from wm_nodes.judge.audit.entries import clip_from, rubric_from, task_from, typed
 from wm_nodes.judge.audit.log import NO_LINE, AuditError, Entry, faults, read_lines
 from wm_nodes.judge.audit.media import MediaStore
@@ -97,11 +89,7 @@ class Record:
         return self.rubrics[evaluation.agent.rubric_version]
 
     def clip(self, evaluation: RecordedEvaluation) -> ClipRef:
-        """With its pixels.
-
-        Raises:
-            AuditError: a picture is missing or was changed.
-        """
+        """With its pixels. Raises AuditError: a picture is missing or was changed."""
         return clip_from(self.clips[evaluation.sha256], evaluation.clip_id, self.store)
 
     def task(self, evaluation: RecordedEvaluation) -> TaskSpec:
@@ -109,11 +97,7 @@ class Record:
 
 
 def read_record(folder: Path) -> Record:
-    """Read a log, checking its chain.
-
-    Raises:
-        AuditError: a fault, named by its line; or a line that this version cannot read.
-    """
+    """Read a log, checking its chain. Raises AuditError: a fault, named by its line; a line of another version."""
     record = Record(Path(folder), {}, {}, {}, NO_LINE, 0)
     agents: dict[int, AgentLine] = {}
     asks: dict[int, Ask] = {}
@@ -194,13 +178,8 @@ def verify(folder: Path, *, pictures: bool = True, expected_head: str = "") -> V
     ids = sorted(e.verdict.audit_id for e in record.judged() if e.verdict)
     return VerifyReport(
         problems, record.num_lines, len(record.evaluations), len(record.evaluations) - len(ids), record.head,
-        content_hash_of(ids),
+        hashlib.sha256("".join(ids).encode()).hexdigest(),
     )
-
-
-def content_hash_of(ids: Sequence[str]) -> str:
-    """SHA-256, hexadecimal, of sorted audit ids."""
-    return hashlib.sha256("".join(ids).encode()).hexdigest()
 
 
 def _find_problems(record: Record, pictures: bool) -> Iterator[str]:

@@ -5,20 +5,11 @@ from collections.abc import Mapping
 from contextvars import ContextVar
 from typing import Any
 
+from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    Capabilities,
-    ClipRef,
-    Evidence,
-    Health,
-    Judge,
-    JudgeError,
-    Read,
-    ReadRequest,
-    TaskSpec,
-    Verdict,
-)
+from wm_nodes.judge.agent.types import ClipRef, Evidence, TaskSpec
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.entries import clip_body, plain, rubric_body, task_body
 from wm_nodes.judge.audit.log import AuditLog
 from wm_nodes.judge.audit.media import MediaStore
@@ -55,12 +46,14 @@ class AuditedAgent:
         return self._agent.judge
 
     async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
-        """Judge one clip; the verdict is on the disk when this returns.
-
-        Raises:
-            OSError: it cannot be written down; then there is no verdict.
-        """
-        evaluation = self._begin(clip, task, evidence or {})
+        """Judge one clip; the verdict is on the disk when this returns. Raises OSError: it cannot be written down."""
+        if clip.sha256 not in self._written:
+            self._log.append("clip", clip_body(clip, self._store))
+            self._written.add(clip.sha256)
+        evaluation = self._log.append("evaluation", {
+            "clip_id": clip.clip_id, "sha256": clip.sha256, "agent": self._line, "round": self.round_number,
+            "task": task_body(task, self._store), "evidence": plain(evidence or {}),
+        })
         token = _EVALUATION.set(evaluation)
         try:
             verdict = await self._agent.evaluate(clip, task, evidence)
@@ -68,18 +61,6 @@ class AuditedAgent:
             _EVALUATION.reset(token)
         self._log.append("verdict", {"evaluation": evaluation, "verdict": plain(verdict)}, sync=True)
         return verdict
-
-    def _begin(self, clip: ClipRef, task: TaskSpec, evidence: Evidence) -> int:
-        if clip.sha256 not in self._written:
-            self._log.append("clip", clip_body(clip, self._store))
-            self._written.add(clip.sha256)
-        return self._log.append(
-            "evaluation",
-            {
-                "clip_id": clip.clip_id, "sha256": clip.sha256, "agent": self._line, "round": self.round_number,
-                "task": task_body(task, self._store), "evidence": plain(evidence),
-            },
-        )
 
 
 class RecordingJudge:

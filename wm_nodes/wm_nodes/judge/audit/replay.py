@@ -9,22 +9,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, Judge, JudgeError, MediaItem, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    Capabilities,
-    Component,
-    Cost,
-    Health,
-    Judge,
-    JudgeError,
-    MediaItem,
-    Read,
-    ReadRequest,
-    Verdict,
-    Vote,
-    content_hash,
-)
+from wm_nodes.judge.agent.types import Component
+from wm_nodes.judge.agent.verdict import Verdict, content_hash
 from wm_nodes.judge.audit.entries import typed
 from wm_nodes.judge.audit.log import AuditError, AuditLog
 from wm_nodes.judge.audit.reading import Ask, Failure, Record, RecordedEvaluation
@@ -35,11 +24,7 @@ ReadKey = tuple[str, str, Component, Vote, tuple[MediaItem, ...]]
 
 
 class ReplayJudge:
-    """Answers from evaluations of one judge. Where a question was asked twice, the first answer counts.
-
-    Raises:
-        ValueError: no evaluation, or two judges.
-    """
+    """Answers from evaluations of one judge; the first answer to a question counts. Raises ValueError: no one judge."""
 
     def __init__(self, evaluations: Sequence[RecordedEvaluation]) -> None:
         judges = {evaluation.agent.capabilities.judge_id for evaluation in evaluations}
@@ -64,11 +49,7 @@ class ReplayJudge:
         return Health(True, "answers from an audit log")
 
     async def read(self, request: ReadRequest) -> list[Read]:
-        """The recorded answers, also to the same components asked together in another way.
-
-        Raises:
-            JudgeError: the question was never asked; or what the judge raised then, by its name.
-        """
+        """The recorded answers, however asked together. Raises JudgeError: never asked; or the recorded error."""
         sha, stage, media = request.clip.sha256, str(request.stage), request.media
         ask = self._asks.get((sha, stage, request.components, request.votes, media))
         if ask is not None:
@@ -142,10 +123,8 @@ async def reaggregate(
 
 
 async def judge_again(
-    record: Record,
-    evaluations: Iterable[RecordedEvaluation],
-    judge_of: Callable[[RecordedEvaluation], tuple[Judge, Rubric]],
-    log: AuditLog,
+    record: Record, evaluations: Iterable[RecordedEvaluation],
+    judge_of: Callable[[RecordedEvaluation], tuple[Judge, Rubric]], log: AuditLog,
 ) -> list[Verdict]:
     """Judge the clips of a log once more, each as its agent was set then, and write that into a log of its own.
 
@@ -168,11 +147,7 @@ async def judge_again(
 
 
 def check_questions(before: Rubric, after: Rubric) -> None:
-    """Refuse a rubric that would have put another question.
-
-    Raises:
-        AuditError: names what reads differently, or is new.
-    """
+    """Refuse a rubric that puts other questions. Raises AuditError: names what reads differently, or is new."""
     old, new = dict(_questions(before)), dict(_questions(after))
     if changed := [name for name, words in new.items() if old.get(name) != words]:
         raise AuditError(

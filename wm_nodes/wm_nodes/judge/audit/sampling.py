@@ -133,9 +133,7 @@ def write_sample(path: Path, sample: Sample) -> None:
 
 
 def read_sample(path: Path) -> Sample:
-    """Raises:
-    AuditError: no such file of a sample.
-    """
+    """Read a file that write_sample wrote. Raises AuditError: it is none."""
     try:
         return TypeAdapter(Sample).validate_json(Path(path).read_bytes())
     except ValidationError as error:

@@ -8,20 +8,3 @@
 A profile sends up to 32 images. Keys come from environment variables only (Endpoint.api_key_env). Label votes need a
 server with logprobs; `transformers serve` has none, so votes after the first are errors there.
 """
-
-from wm_nodes.core.optional import MissingPackageError
-from wm_nodes.judge.backends.cache import VerdictCache
-from wm_nodes.judge.backends.calls import ChatOptions
-from wm_nodes.judge.backends.openai_client import OpenAIJudge
-from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy, TransportError
-
-__all__ = [
-    "ChatOptions",
-    "ChatTransport",
-    "Endpoint",
-    "MissingPackageError",
-    "OpenAIJudge",
-    "RetryPolicy",
-    "TransportError",
-    "VerdictCache",
-]

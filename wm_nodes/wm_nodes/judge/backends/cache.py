@@ -13,7 +13,8 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from wm_nodes.judge.agent.types import Read, Status
+from wm_nodes.judge.agent.judge import Read
+from wm_nodes.judge.agent.types import Status
 
 _READS = TypeAdapter(tuple[Read, ...])
 

@@ -12,19 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from wm_nodes.judge.agent.judge import Cost, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import map_back, one_hot, option_order
-from wm_nodes.judge.agent.types import (
-    NUM_LEVELS,
-    NUM_PLAN_LEVELS,
-    PLANNING,
-    Component,
-    Cost,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-    Vote,
-)
+from wm_nodes.judge.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING, Component, Stage, Status
 from wm_nodes.judge.backends.labels import label_options, option_probabilities
 from wm_nodes.judge.backends.prompts import LETTERS, Part, Prompts, prior_level, with_problem
 from wm_nodes.judge.backends.protocol import Completion
@@ -34,6 +24,8 @@ from wm_nodes.judge.backends.transport import ChatAnswer, ChatTransport, Transpo
 JSON_TRIES = 2
 MEASURED_CALLS = 200
 SEED_LIMIT = 2**31
+MIN_LABEL_MASS = 0.5
+"""A label read with less abstains, unless its answers are chosen by a grammar."""
 Exchange = Mapping[str, Any]
 """The texts of a request and the raw reply, as JSON values, for an audit log."""
 
@@ -42,23 +34,19 @@ Exchange = Mapping[str, Any]
 class ChatOptions:
     """json_timeout_s, label_timeout_s: per try. budget_s: all calls of one ReadRequest together, waits included.
 
-    max_answer_tokens: of a JSON answer; one that needs more has failed. structured: ask the server to enforce the
-    schema; the answer is checked either way. label_token_ids: token ids of A to E, where the server can be asked for
-    their probabilities by id. choice_grammar: label reads choose among the letters only, so that the label mass no
-    longer warns. min_label_mass: a label read with less abstains, unless choice_grammar. max_images: that the server
-    takes in one call. video: the dense profile goes as one video (vLLM, --limit-mm-per-prompt with a video), else as
-    images. repeat_share: of the calls that are asked twice, so that it is known how often a live server contradicts
-    itself; the first answer counts.
+    max_answer_tokens: of a JSON answer; one that needs more has failed. label_token_ids: token ids of A to E, where the
+    server can be asked for their probabilities by id. choice_grammar: label reads choose among the letters only, so
+    that the label mass no longer warns. max_images: that the server takes in one call. video: the dense profile goes as
+    one video (vLLM, --limit-mm-per-prompt with a video), else as images. repeat_share: of the calls that are asked
+    twice, so that it is known how often a live server contradicts itself; the first answer counts.
     """
 
     json_timeout_s: float = 120.0
     label_timeout_s: float = 60.0
     budget_s: float = 300.0
     max_answer_tokens: int = 1024
-    structured: bool = True
     label_token_ids: tuple[int, ...] = ()
     choice_grammar: bool = False
-    min_label_mass: float = 0.5
     max_images: int = 64
     video: bool = False
     repeat_share: float = 0.0
@@ -99,19 +87,17 @@ class Prompt:
 class CallCost:
     """Cost of one call with its retries and fallbacks. Requests without an answer count as retries only."""
 
-    def __init__(self, num_images: int) -> None:
-        self._num_images = num_images
+    def __init__(self, media: Sequence[Part]) -> None:
+        """media: parts of the messages as sent; the frames of a video count as images."""
+        videos = [str(part["video_url"]["url"]) for part in media if part["type"] == "video_url"]
+        self._num_images = sum(url.count(",") for url in videos) + sum(part["type"] == "image_url" for part in media)
         self.cost = Cost()
 
     def add_answer(self, answer: ChatAnswer) -> None:
         usage = answer.completion.usage
         self.cost += Cost(
-            calls=1,
-            prompt_tokens=usage.prompt_tokens,
-            cached_tokens=usage.cached_tokens,
-            completion_tokens=usage.completion_tokens,
-            images=self._num_images,
-            wall_s=answer.wall_s,
+            calls=1, prompt_tokens=usage.prompt_tokens, cached_tokens=usage.cached_tokens,
+            completion_tokens=usage.completion_tokens, images=self._num_images, wall_s=answer.wall_s,
             retries=answer.tries - 1,
         )
 
@@ -126,10 +112,7 @@ class Caller:
     """
 
     def __init__(
-        self,
-        transport: ChatTransport,
-        prompts: Prompts,
-        options: ChatOptions,
+        self, transport: ChatTransport, prompts: Prompts, options: ChatOptions,
         on_exchange: Callable[[Exchange], None] = lambda exchange: None,
     ) -> None:
         self._on_exchange = on_exchange
@@ -184,8 +167,8 @@ class Caller:
         answer = await self._send(call, prompt.body, bill, options.label_timeout_s)
         probabilities, mass = option_probabilities(answer.completion, LETTERS[: len(order)])
         self.label_masses.append(mass)
-        if mass == 0 or (mass < options.min_label_mass and not options.choice_grammar):
-            reason = f"label mass {mass:.3f} is below {options.min_label_mass}"
+        if mass == 0 or (mass < MIN_LABEL_MASS and not options.choice_grammar):
+            reason = f"label mass {mass:.3f} is below {MIN_LABEL_MASS}"
             return Read(component, (), "label", call.vote, mass, Status.ABSTAIN, reason)
         label_mass = 1.0 if options.choice_grammar else mass
         return Read(component, map_back(probabilities, order), "label", call.vote, label_mass)
@@ -205,15 +188,11 @@ class Caller:
     def _json_prompt(self, call: Call) -> Prompt:
         request = call.request
         form = AnswerFormat(
-            request.stage,
-            call.components,
-            [item.index for item in request.media if item.kind == "clip"],
+            request.stage, call.components, [item.index for item in request.media if item.kind == "clip"],
             problems=self._prompts.rubric.component_names,
             prior={score.component: level for score in request.prior if (level := prior_level(score)) is not None},
         )
-        fields: dict[str, Any] = {"max_tokens": self._options.max_answer_tokens}
-        if self._options.structured:
-            fields["response_format"] = form.response_format
+        fields = {"max_tokens": self._options.max_answer_tokens, "response_format": form.response_format}
         return Prompt(call, self._prompts.json_question(call.media, request, call.components, form), fields, form)
 
     def _label_prompt(self, call: Call, component: Component) -> Prompt:
@@ -242,12 +221,6 @@ def sha_of(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def num_images(media: Sequence[Part]) -> int:
-    """Images, and frames of videos."""
-    videos = [str(part["video_url"]["url"]) for part in media if part["type"] == "video_url"]
-    return sum(url.count(",") for url in videos) + len([part for part in media if part["type"] == "image_url"])
-
-
 def _answer_text(completion: Completion) -> str:
     choice = completion.choices[0]
     if choice.finish_reason != "stop":
@@ -260,13 +233,8 @@ def _answer_text(completion: Completion) -> str:
 def _read_of(finding: ComponentAnswer, vote: Vote) -> Read:
     count = NUM_PLAN_LEVELS if finding.component == PLANNING else NUM_LEVELS
     return Read(
-        finding.component,
-        one_hot(finding.level, count),
-        "json",
-        vote,
-        evidence_text=finding.evidence,
-        frames_cited=finding.frames,
-        focus=finding.focus,
+        finding.component, one_hot(finding.level, count), "json", vote, evidence_text=finding.evidence,
+        frames_cited=finding.frames, focus=finding.focus,
     )
 
 

@@ -20,22 +20,9 @@ import numpy as np
 
 from wm_nodes.config.shipped import PRETRAINED
 from wm_nodes.core.types import FloatArray
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote, p_fail_of
-from wm_nodes.judge.agent.types import (
-    PLANNING,
-    Capabilities,
-    ClipRef,
-    Component,
-    Cost,
-    Evidence,
-    Health,
-    JudgeError,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-    TaskSpec,
-)
+from wm_nodes.judge.agent.types import PLANNING, ClipRef, Component, Evidence, Stage, Status, TaskSpec
 from wm_nodes.judge.evidence.clip import clip_evidence
 from wm_nodes.judge.evidence.head import HACK, TASK_COMPLETION, JudgeHead, components_of
 
@@ -109,12 +96,7 @@ class EmbeddedJudge:
         return "\n".join(lines)
 
     async def read(self, request: ReadRequest) -> list[Read]:
-        """Answer every component once per vote.
-
-        Raises:
-            JudgeError: the clip cannot be measured at all (PRECHECK refuses such clips before), or the head knows no
-                such component.
-        """
+        """Answer every component once per vote. Raises JudgeError: an unmeasurable clip, or no head for a component."""
         prefix = HACK if request.stage is Stage.HACK else ""
         if unknown := [name for name in request.components if prefix + name not in self._head.questions]:
             raise JudgeError(f"the embedded judge has no head for {', '.join(unknown)}")
@@ -139,11 +121,7 @@ class EmbeddedJudge:
         return Health(True, "", counts)
 
     def evidence(self, clip: ClipRef, task: TaskSpec) -> Evidence:
-        """The evidence of a clip by name; cached.
-
-        Raises:
-            ValueError: frames or reference frame of a wrong shape or type.
-        """
+        """The evidence of a clip by name; cached. Raises ValueError: frames or reference of a wrong shape or type."""
         key = hashlib.sha256(
             f"{clip.sha256} {task.instruction} {task.reference_frame.shape} ".encode() + task.reference_frame.tobytes()
         ).hexdigest()

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from wm_nodes.config.schema import JudgeConfig, OtherJudge, StageJudge
+from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import Judge, Stage
+from wm_nodes.judge.agent.types import Stage
 from wm_nodes.judge.backends.cache import VerdictCache
 from wm_nodes.judge.backends.calls import ChatOptions, Exchange
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit_reason
@@ -42,11 +43,7 @@ def _single_judge(settings: JudgeConfig, other: OtherJudge) -> JudgeConfig:
 
 
 def check_judge(settings: JudgeConfig) -> None:
-    """Refuse settings that name no judge, before anything is made from them or written with them.
-
-    Raises:
-        ValueError: names the setting and the remedy; never repeats what may be a key.
-    """
+    """Refuse settings that name no judge. Raises ValueError: names setting and remedy, never what may be a key."""
     _check_one(settings)
     for kind, others in (("routes", settings.routes), ("fallbacks", settings.fallbacks)):
         for number, other in enumerate(others):

@@ -5,21 +5,24 @@ from collections import deque
 from collections.abc import Callable
 from enum import Enum
 
+RAISE_AFTER = 50
+WINDOW = 20
+"""Calls that a circuit breaker looks back on."""
+
 
 class AdaptiveLimit:
-    """A semaphore whose size follows the server: halved when it is overloaded, one more after every 50 good answers.
+    """A semaphore whose size follows the server: halved when it is overloaded, one more after RAISE_AFTER good answers.
 
     Calls that were already under way at the last halving cannot halve again: 32 answers 429 to one burst are one sign
     of overload, not 32.
     """
 
-    def __init__(self, maximum: int = 32, *, raise_after: int = 50) -> None:
-        if maximum < 1 or raise_after < 1:
-            raise ValueError(f"maximum and raise_after must be >= 1, got {maximum} and {raise_after}")
+    def __init__(self, maximum: int = 32) -> None:
+        if maximum < 1:
+            raise ValueError(f"maximum must be >= 1, got {maximum}")
         self.limit = maximum
         self.in_flight = 0
-        self._maximum, self._raise_after = maximum, raise_after
-        self._good = 0
+        self._maximum, self._good = maximum, 0
         self._halvings = 0
         self._freed = asyncio.Condition()
 
@@ -44,7 +47,7 @@ class AdaptiveLimit:
 
     def record_success(self) -> None:
         self._good += 1
-        if self._good >= self._raise_after:
+        if self._good >= RAISE_AFTER:
             self._good = 0
             self.limit = min(self._maximum, self.limit + 1)
 
@@ -58,7 +61,7 @@ class Admission(Enum):
 
 
 class CircuitBreaker:
-    """Opens when more than half of the last `window` calls failed; then lets one probe through every `probe_s` seconds.
+    """Opens when more than half of the last WINDOW calls failed; then lets one probe through every `probe_s` seconds.
 
     A probe that succeeds closes it and forgets the failures. A probe that is never reported (its caller was cancelled)
     costs one `probe_s` and nothing more.
@@ -67,11 +70,11 @@ class CircuitBreaker:
         now: a monotonic clock, s.
     """
 
-    def __init__(self, now: Callable[[], float], *, window: int = 20, probe_s: float = 10.0) -> None:
-        if window < 1 or not probe_s > 0:
-            raise ValueError(f"window must be >= 1 call and probe_s > 0, got {window} and {probe_s}")
+    def __init__(self, now: Callable[[], float], *, probe_s: float = 10.0) -> None:
+        if not probe_s > 0:
+            raise ValueError(f"probe_s must be > 0, got {probe_s}")
         self._now, self._probe_s = now, probe_s
-        self._failed: deque[bool] = deque(maxlen=window)
+        self._failed: deque[bool] = deque(maxlen=WINDOW)
         self._next_probe: float | None = None
 
     @property

@@ -3,23 +3,14 @@
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import (
-    PLANNING,
-    Capabilities,
-    Cost,
-    Health,
-    JudgeError,
-    Read,
-    ReadRequest,
-    Stage,
-    Status,
-)
+from wm_nodes.judge.agent.types import PLANNING, Stage, Status
 from wm_nodes.judge.backends.cache import VerdictCache, cache_key
 from wm_nodes.judge.backends.calls import (
     Call,
@@ -29,7 +20,6 @@ from wm_nodes.judge.backends.calls import (
     Exchange,
     Prompt,
     describe_request,
-    num_images,
     sha_of,
 )
 from wm_nodes.judge.backends.plans import CallPlan
@@ -52,12 +42,8 @@ class OpenAIJudge:
     """
 
     def __init__(
-        self,
-        transport: ChatTransport,
-        rubric: Rubric,
-        options: ChatOptions | None = None,
-        cache: VerdictCache | None = None,
-        on_exchange: Callable[[Exchange], None] = lambda exchange: None,
+        self, transport: ChatTransport, rubric: Rubric, options: ChatOptions | None = None,
+        cache: VerdictCache | None = None, on_exchange: Callable[[Exchange], None] = lambda exchange: None,
     ) -> None:
         if len(transport.models) != 1:
             raise ValueError(f"a judge's endpoints must serve one model, got {', '.join(sorted(transport.models))}")
@@ -148,7 +134,10 @@ class OpenAIJudge:
         question = f"{prompt.sha} {call.vote!r}"
         key = cache_key(call.media_sha, question, self._rubric.version, self._model, TRANSPORT)
         known = None if self._cache is None else self._cache.get(key)
-        reads = await self._ask(call, prompt) if known is None else _cached_reads(known)
+        if known is None:
+            reads = await self._ask(call, prompt)
+        else:  # what they cost then, but no time
+            reads = [replace(read, cost=replace(read.cost, wall_s=0.0)) for read in known]
         cost = reads[0].cost
         if known is not None:
             self._on_exchange({**describe_request(call, prompt.body), "cached": True})
@@ -173,7 +162,7 @@ class OpenAIJudge:
         return [replace(reads[0], cost=reads[0].cost + again[0].cost), *reads[1:]]
 
     async def _ask(self, call: Call, prompt: Prompt) -> list[Read]:
-        bill = CallCost(num_images(call.media))
+        bill = CallCost(call.media)
         reads = await self._caller.answer(call, prompt, bill)
         self._counts["calls"] += bill.cost.calls
         self._counts["retries"] += bill.cost.retries
@@ -181,11 +170,6 @@ class OpenAIJudge:
             replace(read, prompt_sha=prompt.sha, media_sha=call.media_sha, cost=Cost() if index else bill.cost)
             for index, read in enumerate(reads)
         ]
-
-
-def _cached_reads(known: Sequence[Read]) -> list[Read]:
-    """Reads from the cache: what they cost then, but no time."""
-    return [replace(read, cost=replace(read.cost, wall_s=0.0)) for read in known]
 
 
 def _is_unanswered(reads: list[Read]) -> bool:

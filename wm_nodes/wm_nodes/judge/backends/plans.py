@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from wm_nodes.judge.agent.types import Cost
+from wm_nodes.judge.agent.judge import Cost
 
 Plan = Literal["fanout", "pack"]
 

@@ -16,20 +16,9 @@ import cv2
 import numpy as np
 
 from wm_nodes.core.types import UInt8Array
+from wm_nodes.judge.agent.judge import ComponentScore, MediaItem, ReadRequest, Vote
 from wm_nodes.judge.agent.rubric import ComponentRubric, PlanningRubric, Rubric
-from wm_nodes.judge.agent.types import (
-    NUM_LEVELS,
-    PLANNING,
-    ClipRef,
-    Component,
-    ComponentScore,
-    MediaItem,
-    Profile,
-    ReadRequest,
-    Stage,
-    TaskSpec,
-    Vote,
-)
+from wm_nodes.judge.agent.types import NUM_LEVELS, PLANNING, ClipRef, Component, Profile, Stage, TaskSpec
 from wm_nodes.judge.backends.schemas import AnswerFormat
 
 Part = dict[str, Any]
@@ -97,11 +86,7 @@ class Prompts:
         return self._messages(media, request, [_text(f"{component}: {question}\n{options}"), _text(rule)])
 
     def entry(self, stage: Stage, component: Component) -> ComponentRubric | PlanningRubric:
-        """What the rubric says of a component, a hacking pattern, or planning.
-
-        Raises:
-            ValueError: it says nothing.
-        """
+        """What the rubric says of a component, a hacking pattern, or planning. Raises ValueError: it says nothing."""
         if stage is Stage.PLAN and component == PLANNING:
             return self.rubric.planning
         known: dict[str, ComponentRubric] = (
@@ -159,11 +144,7 @@ class Prompts:
 
 
 def data_uri(image: UInt8Array) -> str:
-    """An RGB image, uint8 (H, W, 3), as a PNG data URI: lossless, and the same bytes for the same pixels.
-
-    Raises:
-        ValueError: not such an image.
-    """
+    """An RGB image, uint8 (H, W, 3), as a PNG data URI; equal pixels, equal bytes. Raises ValueError: no such image."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
     encoded = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))[1]

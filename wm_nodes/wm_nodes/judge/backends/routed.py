@@ -4,8 +4,9 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 
+from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, Read, ReadRequest
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import GATED, PLANNING, Capabilities, Component, Health, Judge, Read, ReadRequest, Stage
+from wm_nodes.judge.agent.types import GATED, PLANNING, Component, Stage
 
 TRANSPORT = "routed"
 OPEN_BREAKERS = "open_breakers"
@@ -56,11 +57,7 @@ class RoutedJudge:
         )
 
     async def read(self, request: ReadRequest) -> list[Read]:
-        """As Judge.read; a second look at components of several stages asks several judges, one after the other.
-
-        Raises:
-            JudgeError: one of them could not answer at all.
-        """
+        """As Judge.read; a second look may ask several judges in turn. Raises JudgeError: one could not answer."""
         if request.stage is not Stage.REFLECT:
             return await self._judge_of(request.stage).read(request)
         parts: dict[int, tuple[Judge, list[Component]]] = {}

@@ -70,13 +70,8 @@ class AnswerFormat:
     """
 
     def __init__(
-        self,
-        stage: Stage,
-        components: Sequence[Component],
-        shown: Iterable[int],
-        *,
-        problems: Sequence[Component] = (),
-        prior: Mapping[Component, int] | None = None,
+        self, stage: Stage, components: Sequence[Component], shown: Iterable[int], *,
+        problems: Sequence[Component] = (), prior: Mapping[Component, int] | None = None,
     ) -> None:
         self._components = tuple(components)
         self._shown = frozenset(shown)
@@ -93,11 +88,7 @@ class AnswerFormat:
         return {"type": "json_schema", "json_schema": {"name": self.name, "strict": True, "schema": schema}}
 
     def read(self, text: str) -> list[ComponentAnswer]:
-        """Read the answer: strip reasoning, parse, check the schema, check the sense; one finding per component.
-
-        Raises:
-            AnswerError: what is wrong, in one line.
-        """
+        """Parse an answer and check schema and sense; one finding per component. Raises AnswerError: what is wrong."""
         try:
             answer: Any = self.model.model_validate_json(strip_reasoning(text))
         except ValidationError as error:
@@ -186,11 +177,7 @@ class AnswerFormat:
 
 
 def strip_reasoning(text: str) -> str:
-    """Return what follows the model's reasoning, without a code fence around it.
-
-    Raises:
-        AnswerError: the reasoning never ended.
-    """
+    """What follows the model's reasoning, without a code fence. Raises AnswerError: the reasoning never ended."""
     _, end, rest = text.rpartition("</think>")
     if not end and "<think>" in text:
         raise AnswerError("the answer ends inside <think>")

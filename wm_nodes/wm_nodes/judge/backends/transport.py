@@ -43,10 +43,8 @@ class TransportError(RuntimeError):
 @dataclass(frozen=True)
 class Endpoint:
     """One server. base_url: with its /v1. model: the name the server knows. api_key_env: the environment variable that
-    holds the key, "" for a server that wants none; a key itself is never part of any setting.
-
-    Raises:
-        ValueError: a URL that is not http(s), or one with a user name or password in it.
+    holds the key, "" for a server that wants none; a key itself is never part of any setting. Raises ValueError: a URL
+    that is not http(s), or one with a user name or password in it.
     """
 
     base_url: str
@@ -65,11 +63,7 @@ class Endpoint:
             )
 
     def api_key(self) -> str:
-        """Return the key, or "none" for a server that wants none.
-
-        Raises:
-            ValueError: the variable is not set.
-        """
+        """Return the key, or "none" for a server that wants none. Raises ValueError: the variable is not set."""
         if not self.api_key_env:
             return "none"
         key = os.environ.get(self.api_key_env, "")
@@ -125,18 +119,16 @@ class ChatTransport:
     """
 
     def __init__(
-        self,
-        endpoints: Sequence[Endpoint],
-        *,
-        retry: RetryPolicy | None = None,
-        probe_s: float = 10.0,
+        self, endpoints: Sequence[Endpoint], *, retry: RetryPolicy | None = None, probe_s: float = 10.0,
         jitter: random.Random | None = None,
     ) -> None:
         if not endpoints:
             raise ValueError("a judge needs at least one endpoint, e.g. http://127.0.0.1:8000/v1")
         if len({endpoint.base_url for endpoint in endpoints}) < len(endpoints):
             raise ValueError(f"an endpoint is named twice in {[endpoint.base_url for endpoint in endpoints]}")
-        self._openai = _openai()
+        self._openai = optional_package(
+            "openai", needed_by="the OpenAI-compatible judge needs", requirements="judge.txt"
+        )
         self._retry = retry or RetryPolicy()
         self._jitter = jitter or random.Random()
         self._servers = [_Server(endpoint, self._client(endpoint), probe_s) for endpoint in endpoints]
@@ -200,8 +192,11 @@ class ChatTransport:
                 if failure.refused:
                     raise last from None
                 asked_s = failure.retry_after_s
-            if attempt + 1 < self._retry.tries and not self._has_untried(tried):
-                wait_s = max(self._wait_s(attempt), asked_s)
+            # a retry goes to another endpoint at once
+            untried = any(not s.breaker.is_open and s.endpoint.base_url not in tried for s in self._servers)
+            if attempt + 1 < self._retry.tries and not untried:
+                longest_s = min(self._retry.cap_s, self._retry.base_s * 2**attempt)
+                wait_s = max(self._jitter.uniform(0, longest_s), asked_s)
                 if deadline is not None and time.monotonic() + wait_s > deadline:
                     raise last.with_reason(f"the next try, in {wait_s:.1f} s, is past the deadline")
                 await asyncio.sleep(wait_s)
@@ -214,13 +209,6 @@ class ChatTransport:
             if admission is not Admission.NO:
                 return server, admission
         return None
-
-    def _has_untried(self, tried: set[str]) -> bool:
-        """Whether a retry can go to another endpoint at once."""
-        return any(not server.breaker.is_open and server.endpoint.base_url not in tried for server in self._servers)
-
-    def _wait_s(self, attempt: int) -> float:
-        return self._jitter.uniform(0, min(self._retry.cap_s, self._retry.base_s * 2**attempt))
 
     async def _try(
         self, server: _Server, admission: Admission, body: Mapping[str, Any], timeout_s: float, deadline: float | None
@@ -283,9 +271,7 @@ class ChatTransport:
         """A client without retries of its own. A loopback server is never reached through a proxy."""
         loopback = urlsplit(endpoint.base_url).hostname in _LOOPBACK
         return self._openai.AsyncOpenAI(
-            base_url=endpoint.base_url,
-            api_key=endpoint.api_key(),
-            max_retries=0,
+            base_url=endpoint.base_url, api_key=endpoint.api_key(), max_retries=0,
             timeout=self._openai.Timeout(None, connect=CONNECT_S),
             http_client=self._openai.DefaultAsyncHttpxClient(trust_env=not loopback),
         )
@@ -318,6 +304,3 @@ def retry_after_s(headers: Mapping[str, str]) -> float:
         return max(0.0, (moment - datetime.now(UTC)).total_seconds())
     return 0.0
 
-
-def _openai() -> Any:
-    return optional_package("openai", needed_by="the OpenAI-compatible judge needs", requirements="judge.txt")

@@ -20,24 +20,13 @@ from wm_nodes.config.tasks import clip_rules, get_task
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
+from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M
 from wm_nodes.judge.dataset.domain_randomization import RandomizedScene, draw_scene
-from wm_nodes.judge.dataset.edits import (
-    RECIPES,
-    Division,
-    LabelledClip,
-    Manifest,
-    Origin,
-    SceneStates,
-    SourceClip,
-    StateEdit,
-    children,
-    label_rendered,
-    manifest_of,
-    recorded,
-    stacks,
-    to_bytes,
-)
-from wm_nodes.judge.dataset.edits.manifest import Part
+from wm_nodes.judge.dataset.edits.clips import LabelledClip, Origin, SceneStates, SourceClip
+from wm_nodes.judge.dataset.edits.generator import children, stacks
+from wm_nodes.judge.dataset.edits.manifest import Division, Manifest, Part, manifest_of, to_bytes
+from wm_nodes.judge.dataset.edits.recipes import RECIPES, StateEdit, label_rendered
+from wm_nodes.judge.dataset.edits.truth import recorded
 from wm_nodes.judge.dataset.policy_camera import IMAGINED, PolicyCamera
 from wm_nodes.judge.dataset.rendering import (
     CAMERAS,
@@ -46,7 +35,6 @@ from wm_nodes.judge.dataset.rendering import (
     EpisodeStates,
     SceneAppearance,
     View,
-    cube_half_sizes,
     record_states,
 )
 from wm_nodes.judge.dataset.set_files import MANIFEST, clip_path, to_file
@@ -130,8 +118,7 @@ were trained without that task."""
 class ClipSource:
     """Records clips of one task and renders edits of them. shapes, diverse: see SetPlan. It starts the simulator.
 
-    Raises:
-        NoRendererError: Vulkan finds no device.
+    Raises NoRendererError where Vulkan finds no device.
     """
 
     def __init__(
@@ -187,9 +174,7 @@ class ClipSource:
         else:
             camera, look = self._scenery(origin)
             sizes_m = states.half_sizes_m * states.scales
-            drawing = self.stage.draw(
-                states.robot_q, states.poses, sizes_m, states.tool, states.goal, camera, look
-            )
+            drawing = self.stage.draw(states.robot_q, states.poses, sizes_m, states.tool, states.goal, camera, look)
         return self._make_clip(drawing, states, origin)
 
     def _make_clip(self, drawing: Drawing, states: SceneStates, origin: Origin) -> SourceClip:
@@ -240,7 +225,7 @@ def instruction_of(origin: Origin) -> str:
 def scene_states(states: EpisodeStates, height: float = 1.0) -> SceneStates:
     """Convert an episode's states; the cube becomes a box of `height` times its height."""
     num_frames = len(states.poses)
-    half_sizes_m, poses = cube_half_sizes(1)[0], states.poses.copy()
+    half_sizes_m, poses = np.full((1, 3), CUBE_HALF_SIZE_M, np.float32), states.poses.copy()
     poses[..., 2] += (np.float32(height) - 1) * half_sizes_m[0, 2]  # it stands on the same table
     half_sizes_m[0, 2] *= np.float32(height)
     return SceneStates(

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from wm_nodes.config.tasks import clip_rules
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.judge.dataset.edits import Origin
+from wm_nodes.judge.dataset.edits.clips import Origin
 from wm_nodes.judge.dataset.edits.manifest import Part
 from wm_nodes.judge.dataset.rendering import CAMERAS, Layout, SceneAppearance, View
 

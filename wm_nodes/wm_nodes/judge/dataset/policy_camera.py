@@ -19,7 +19,8 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import clip_rules
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.dataset.edits import Origin, SceneStates, tc_level
+from wm_nodes.judge.dataset.edits.clips import Origin, SceneStates
+from wm_nodes.judge.dataset.edits.truth import tc_level
 from wm_nodes.judge.dataset.rendering import ClipStage, Drawing, EpisodeStates, SceneAppearance
 from wm_nodes.judge.evidence.window import Window
 from wm_nodes.world_model import WorldModels
@@ -37,11 +38,7 @@ LOOK = SceneAppearance(num_clutter=0, tiled=False)
 
 
 def policy_window(config: SimulationConfig, side: int) -> Window:
-    """The part of the policy's pictures that a judge reads.
-
-    Raises:
-        ValueError: the configured scene has no such camera.
-    """
+    """The part of the policy's pictures that a judge reads. Raises ValueError: the scene has no such camera."""
     if SEEN not in config.cameras:
         raise ValueError(f"a judge of the loops' clips reads the camera {SEEN}, there are {', '.join(config.cameras)}")
     size, index = config.image_size, config.cameras.index(SEEN)

@@ -24,7 +24,6 @@ from wm_nodes.environments.maniskill.behaviours import turned
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import record_episode
 from wm_nodes.environments.maniskill.scenes import make_scene, render
-from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M
 
 View = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Eye and target of a camera, m, world frame."""
@@ -48,7 +47,7 @@ FINGERS = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
 MAX_ID = 30_000
 """Entities are never numbered twice, and ManiSkill gives the numbers as int16: beyond this the scene is new."""
 BACKGROUND, ROBOT, THING, CLUTTER = 0, 1, 2, 3
-"""Values of a mask, as wm_nodes.judge.dataset.edits numbers them."""
+"""Values of a mask, as dataset.edits.clips numbers them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,12 +116,10 @@ def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int, layout: 
     scene, frames = env.scene, list[dict[str, Any]]()
     touched = [False]
 
-    def force_n(link: str) -> float:
-        forces = scene.scene.get_pairwise_contact_forces(scene.agent.robot.links_map[link], scene.obj)
-        return float(forces.norm())
-
     def feel() -> None:
-        touched[0] |= any(force_n(link) > TOUCH_N for link in FINGERS)
+        fingers = [scene.agent.robot.links_map[name] for name in FINGERS]
+        forces = (scene.scene.get_pairwise_contact_forces(link, scene.obj) for link in fingers)
+        touched[0] |= any(float(force.norm()) > TOUCH_N for force in forces)
 
     def keep() -> None:
         q = scene.agent.robot.get_qpos()[0].numpy().astype(np.float32)
@@ -171,10 +168,7 @@ class _ClipScene(BaseEnv):  # type: ignore[misc]
 
 
 class ClipStage:
-    """Draws states of one task's scene; physics never runs.
-
-    Args:
-        policy: through the loops' own cameras in place of CAMERAS.
+    """Draws states of one task's scene; physics never runs. policy: through the loops' own cameras in place of CAMERAS.
 
     Raises:
         NoRendererError: Vulkan finds no device.
@@ -299,10 +293,6 @@ def _offset(layout: Layout, ahead_m: float, left_m: float) -> tuple[float, float
     cos, sin = np.cos(layout.heading_rad), np.sin(layout.heading_rad)
     x, y = layout.cube_m
     return x + cos * ahead_m - sin * left_m, y + sin * ahead_m + cos * left_m
-
-
-def cube_half_sizes(num_frames: int, num_things: int = 1) -> FloatArray:
-    return np.full((num_frames, num_things, 3), CUBE_HALF_SIZE_M, np.float32)
 
 
 def _mask(ids: NDArray[Any], labels: Mapping[int, int]) -> UInt8Array:

@@ -38,9 +38,7 @@ def measure_clip(
     scene = scene_of(masks)
     outline = outline_of(scene, pictures.colours)
     numbers = {
-        **pixel_evidence(pictures),
-        **object_evidence(scene, reference, instruction),
-        **motion_evidence(scene, outline),
+        **pixel_evidence(pictures), **object_evidence(scene, reference, instruction), **motion_evidence(scene, outline),
         **region_evidence(pictures, masks, instruction),
     }
     return numbers, object_sequence(scene, outline, pictures.colours, target_of(masks[0], reference, instruction))

@@ -24,7 +24,7 @@ from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.judge.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING
 from wm_nodes.judge.evidence.segmentation import Segmenter
 from wm_nodes.judge.evidence.sequence import TemporalNetwork
-from wm_nodes.judge.evidence.trees import Trees
+from wm_nodes.judge.evidence.trees import Floats, Trees
 from wm_nodes.judge.evidence.window import Window
 
 FORMAT = "embedded-judge-1"
@@ -38,7 +38,6 @@ HACK = "hack/"
 CLIP_AT = 6.0
 """Standardised evidence is cut here, so that one wild number does not make a clip foreign."""
 
-Floats = NDArray[np.float64]
 _Network = TypeVar("_Network", bound=nn.Module)
 
 
@@ -68,12 +67,9 @@ class Familiarity:
     precision: FloatArray
     limit: float
 
-    def standardised(self, rows: FloatArray) -> Floats:
-        return np.asarray(np.clip((rows - self.centre) / self.scale, -CLIP_AT, CLIP_AT), np.float64)
-
     def distance(self, rows: FloatArray) -> Floats:
         """(N,) of rows (N, F)."""
-        z = self.standardised(rows)
+        z = np.asarray(np.clip((rows - self.centre) / self.scale, -CLIP_AT, CLIP_AT), np.float64)
         return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", z, self.precision.astype(np.float64), z) / z.shape[1]))
 
 
@@ -110,29 +106,17 @@ class JudgeHead:
         return pictures if self.window is None else self.window.pictures(pictures)
 
     def row(self, evidence: Mapping[str, float]) -> FloatArray:
-        """(1, F) of named evidence.
-
-        Raises:
-            ValueError: other names than it was trained on; says which.
-        """
+        """(1, F) of named evidence. Raises ValueError: other names than it was trained on; says which."""
         if missing := sorted(set(self.names) - evidence.keys()):
             raise ValueError(f"the head needs evidence {', '.join(missing[:5])}, which is not given; train it anew")
         return np.array([[evidence[name] for name in self.names]], np.float32)
 
     def levels(self, target: str, row: FloatArray) -> tuple[float, ...]:
-        """Probability of each level of a target, worst first, of a row (1, F).
-
-        Raises:
-            KeyError: no head for this target.
-        """
+        """Probability of each level, worst first, of a row (1, F). Raises KeyError: no head for this target."""
         return levels_of(target, [float(p) for p in above_levels(self.questions, target, row)[:, 0]])
 
     def conformal(self, coverage: float) -> dict[str, tuple[float, float]]:
-        """(low, high) of p_fail per component at a coverage, learning.judge_fitting.conformal_limits.
-
-        Raises:
-            ValueError: not one of the coverages that were calibrated; names those.
-        """
+        """(low, high) of p_fail per component, see conformal_limits. Raises ValueError: coverage not calibrated."""
         kept: Mapping[str, Mapping[str, Sequence[float]]] = self.story.get("conformal", {})
         known = sorted({name for limits in kept.values() for name in limits})
         if f"{coverage:g}" not in known:
@@ -141,13 +125,13 @@ class JudgeHead:
         limits = {target: of[f"{coverage:g}"] for target, of in kept.items()}
         return {target: (float(low), float(high)) for target, (low, high) in limits.items()}
 
-    def evidence_text(self, target: str, row: FloatArray, limit: int = 3) -> str:
-        """The evidence that this target's trees ask most about and that lies outside of what clean clips show."""
+    def evidence_text(self, target: str, row: FloatArray) -> str:
+        """Up to three signals that the trees ask most about and that lie outside of what clean clips show."""
         weight = np.sum([q.trees.importance(len(self.names)) for q in self.questions[target]], 0)
         width = np.maximum(self.clean_high - self.clean_low, 1e-3 + 0.02 * np.abs(self.clean_high))
         outside = np.maximum(row[0] - self.clean_high, self.clean_low - row[0]) / width
         score = weight * np.clip(outside, 0, 3)
-        chosen = [int(i) for i in np.argsort(-score, kind="stable")[:limit] if score[i] > 0]
+        chosen = [int(i) for i in np.argsort(-score, kind="stable")[:3] if score[i] > 0]
         parts = [
             f"{self.names[i]} {row[0, i]:.3g} (clean {self.clean_low[i]:.3g} to {self.clean_high[i]:.3g})"
             for i in chosen
@@ -208,11 +192,7 @@ def save_head(folder: Path, head: JudgeHead) -> Path:
 
 
 def load_head(folder: Path) -> JudgeHead:
-    """Load and verify a judge's folder.
-
-    Raises:
-        ModelFolderError: names the file, what is wrong, and the remedy.
-    """
+    """Load and verify a judge's folder. Raises ModelFolderError: names the file, what is wrong, and the remedy."""
     manifest = read_manifest(folder, "judge", FORMAT, MANIFEST)
     data = read_model_file(folder / TENSORS, manifest["sha256"])
     try:
@@ -252,10 +232,7 @@ def _network(network: _Network, part: str, arrays: Mapping[str, NDArray[Any]]) -
 
 
 def _check(
-    folder: Path,
-    names: tuple[str, ...],
-    questions: Mapping[str, tuple[HeadQuestion, ...]],
-    known: Familiarity,
+    folder: Path, names: tuple[str, ...], questions: Mapping[str, tuple[HeadQuestion, ...]], known: Familiarity,
     ranges: tuple[FloatArray, ...],
 ) -> None:
     """Every array has to fit the list of evidence."""

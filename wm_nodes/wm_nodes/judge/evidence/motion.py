@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import BoolArray, UInt8Array
-from wm_nodes.judge.evidence.objects import FAR, TOUCH, Floats, Numbers, Scene, fill_gaps
+from wm_nodes.judge.evidence.objects import FAR, TOUCH, Numbers, Scene, fill_gaps
 from wm_nodes.judge.evidence.pictures import TURN
 from wm_nodes.judge.evidence.quantiles import median, quantile
 from wm_nodes.judge.evidence.segmentation import OBJECT, ROBOT
-from wm_nodes.judge.evidence.tracks import SMALLEST_PX
+from wm_nodes.judge.evidence.tracks import SMALLEST_PX, Floats
 
 AROUND_PX = 3
 """So far around the object's box its colour is looked for."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.evidence.pictures import TURN
 from wm_nodes.judge.evidence.segmentation import OBJECT, ROBOT
-from wm_nodes.judge.evidence.tracks import SMALLEST_PX, Track, track
+from wm_nodes.judge.evidence.tracks import SMALLEST_PX, Floats, Track, track
 
 FAR = 20.0
 """Largest length, in object sizes."""
@@ -27,7 +27,6 @@ RESHAPED_FRAMES = 3
 HUES_DEGREES = {"red": 0.0, "orange": 32.0, "yellow": 55.0, "green": 130.0, "blue": 225.0, "purple": 288.0}
 """Angle of r + g exp(2 pi i / 3) + b exp(4 pi i / 3) of the colours that instructions name."""
 
-Floats = NDArray[np.float64]
 Numbers = dict[str, float]
 
 
@@ -76,14 +75,9 @@ def object_evidence(scene: Scene, reference: UInt8Array, instruction: str) -> Nu
     target = target_of(masks[0], reference, instruction)
     place, known = fill_gaps(thing.centre), np.isfinite(thing.area)
     return {
-        **_shape(thing, gap, known),
-        **_outline(thing, known),
-        **_measure_reshaping(thing, place, gap, size),
-        **_measure_cover(masks, thing),
-        **_measure_touch(masks, thing, gap, size),
-        **_movement(place, known, size),
-        **_causes(place, known, gap, tool, size),
-        **_task(place, tool, target, size, instruction),
+        **_shape(thing, gap, known), **_outline(thing, known), **_measure_reshaping(thing, place, gap, size),
+        **_measure_cover(masks, thing), **_measure_touch(masks, thing, gap, size), **_movement(place, known, size),
+        **_causes(place, known, gap, tool, size), **_task(place, tool, target, size, instruction),
     }
 
 
@@ -282,10 +276,8 @@ def _causes(place: Floats, known: NDArray[np.bool_], gap: Floats, tool: Floats, 
         "after_touch_side": min(FAR, float(abs(after[1]))),
         "after_touch_rise": float(np.clip((loose[0] - loose.min()) / size, 0, FAR)),
         "tool_path": min(FAR, float(np.linalg.norm(sweep, axis=1).sum())),
-        "tool_net": min(FAR, float(np.linalg.norm(way) / size)),
-        "tool_passed": float(np.clip(beside.max(), -FAR, FAR)),
-        "slipped": float(np.clip(slip.sum(), -FAR, FAR)),
-        "tool_near_min": min(FAR, float(relative.min())),
+        "tool_net": min(FAR, float(np.linalg.norm(way) / size)), "tool_passed": float(np.clip(beside.max(), -FAR, FAR)),
+        "slipped": float(np.clip(slip.sum(), -FAR, FAR)), "tool_near_min": min(FAR, float(relative.min())),
     }
 
 

@@ -36,10 +36,7 @@ class ClipPictures:
 
 
 def pictures_of(frames: UInt8Array, reference: UInt8Array) -> ClipPictures:
-    """Average a clip.
-
-    Args:
-        frames: uint8 (T, H, W, 3), T >= 2. reference: uint8 (H, W, 3), what the clip had to start from.
+    """Average a clip. frames: uint8 (T, H, W, 3), T >= 2. reference: uint8 (H, W, 3), what the clip had to start from.
 
     Raises:
         ValueError: wrong shapes or types; names them.

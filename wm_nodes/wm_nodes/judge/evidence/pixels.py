@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.evidence.pictures import TURN, ClipPictures, shrink
+from wm_nodes.judge.evidence.pictures import TURN, ClipPictures, Floats, shrink
 from wm_nodes.judge.evidence.quantiles import median, quantile
 
 COARSE = 24
@@ -24,7 +24,6 @@ DARKENED = 0.5
 DEAD_DETAIL = 0.45
 """A tile with less than this share of its reference detail has lost it."""
 
-Floats = NDArray[np.float32]
 Numbers = dict[str, float]
 
 
@@ -32,12 +31,8 @@ def pixel_evidence(pictures: ClipPictures) -> Numbers:
     """Evidence of one clip."""
     coarse = np.stack([shrink(cells, COARSE) for cells in pictures.cells[1:]])
     return {
-        **_sharpness(pictures.greys),
-        **_exposure(pictures.planes),
-        **_colour(pictures.cells),
-        **_agreement(pictures.planes, pictures.away),
-        **_motion(coarse),
-        **_order(coarse),
+        **_sharpness(pictures.greys), **_exposure(pictures.planes), **_colour(pictures.cells),
+        **_agreement(pictures.planes, pictures.away), **_motion(coarse), **_order(coarse),
     }
 
 
@@ -71,12 +66,10 @@ def _exposure(planes: Floats) -> Numbers:
     bend = np.abs(np.diff(gain, 2)) if len(gain) > 2 else np.zeros(1)
     dark = ratio < DARKENED * gain[:, None, None]
     return {
-        "gain_mean": float(gain.mean()), "gain_min": float(gain.min()),
-        "gain_max": float(gain.max()), "gain_step": float(np.abs(np.diff(gain)).max()), "flicker": float(bend.mean()),
-        "flicker_max": float(bend.max()),
-        "light_contrast": float(light[1:].std((1, 2)).mean() / (light[0].std() + 1)),
-        "black_more": float((light[1:] < 10).mean() - (light[0] < 10).mean()),
-        "darkened_mean": float(dark.mean()),
+        "gain_mean": float(gain.mean()), "gain_min": float(gain.min()), "gain_max": float(gain.max()),
+        "gain_step": float(np.abs(np.diff(gain)).max()), "flicker": float(bend.mean()),
+        "flicker_max": float(bend.max()), "light_contrast": float(light[1:].std((1, 2)).mean() / (light[0].std() + 1)),
+        "black_more": float((light[1:] < 10).mean() - (light[0] < 10).mean()), "darkened_mean": float(dark.mean()),
         "darkened_start": float(dark[0].mean()), "darkened_low": quantile(ratio, 0.02),
     }
 
@@ -138,11 +131,9 @@ def _motion(coarse: Floats) -> Numbers:
         "motion_still_end": (len(energy) - 1 - last) / len(energy) if len(where) else 1.0,
         "motion_still_within": float(1 - inside.mean()),
         "motion_switches": float(np.abs(np.diff(moving.astype(int))).sum() / len(energy)),
-        "motion_jump": float(energy.max() / (typical + 0.2)),
-        "motion_jump_share": float(energy.max() / (total + 0.2)),
-        "motion_centre": float((energy * times).sum() / total) if total else 0.5,
-        "motion_net": net, "motion_directness": net / (total + 0.2),
-        "motion_bend": bend / (float(energy.mean()) + 0.2),
+        "motion_jump": float(energy.max() / (typical + 0.2)), "motion_jump_share": float(energy.max() / (total + 0.2)),
+        "motion_centre": float((energy * times).sum() / total) if total else 0.5, "motion_net": net,
+        "motion_directness": net / (total + 0.2), "motion_bend": bend / (float(energy.mean()) + 0.2),
     }
 
 

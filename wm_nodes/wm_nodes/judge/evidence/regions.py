@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import BoolArray, UInt8Array
-from wm_nodes.judge.evidence.objects import HUES_DEGREES
-from wm_nodes.judge.evidence.pictures import GRID, TURN, ClipPictures, shrink
+from wm_nodes.judge.evidence.objects import HUES_DEGREES, Numbers
+from wm_nodes.judge.evidence.pictures import GRID, TURN, ClipPictures, Floats, shrink
 from wm_nodes.judge.evidence.quantiles import median, quantile
 from wm_nodes.judge.evidence.registration import registration_evidence
 from wm_nodes.judge.evidence.segmentation import CLUTTER, OBJECT, ROBOT, SCENE
@@ -19,28 +19,16 @@ from wm_nodes.judge.evidence.tracks import SMALLEST_PX, second_areas
 TILES = 6
 CHANGED_LEVELS = 10.0
 
-Floats = NDArray[np.float32]
-Numbers = dict[str, float]
 
 
 def region_evidence(pictures: ClipPictures, masks: UInt8Array, instruction: str) -> Numbers:
-    """Evidence of one clip.
-
-    Args:
-        masks: uint8 (1 + T, H, W), the reference frame's first.
-    """
+    """Evidence of one clip. masks: uint8 (1 + T, H, W), the reference frame's first."""
     robot, thing = _means(pictures.colours, masks, (ROBOT, OBJECT))
     colours = [word for word in instruction.lower().split() if word in HUES_DEGREES]
     scene = np.stack([shrink(mask == SCENE, GRID) > 0.99 for mask in masks])
     return {
-        **_scene(pictures, scene),
-        **registration_evidence(pictures.greys, scene),
-        **_clutter(masks),
-        **_hue(thing),
-        **_paint(thing, "object"),
-        **_paint(robot, "robot"),
-        **_named_hue(thing, colours),
-        **_robot(masks == ROBOT),
+        **_scene(pictures, scene), **registration_evidence(pictures.greys, scene), **_clutter(masks), **_hue(thing),
+        **_paint(thing, "object"), **_paint(robot, "robot"), **_named_hue(thing, colours), **_robot(masks == ROBOT),
         "share_unsure": float((masks[1:] != _smooth(masks[1:])).mean()),
     }
 
@@ -68,15 +56,13 @@ def _scene(pictures: ClipPictures, open_cells: BoolArray) -> Numbers:
     texture_ratio = (_tiles(detail[1:] * both) + 0.1) / (_tiles(detail[0] * both) + 0.1)
     return {
         "scene_away_mean": float(mean.mean()), "scene_away_first": float(mean[0]), "scene_away_last": float(mean[-1]),
-        "scene_away_step": float(np.diff(mean).max()),
-        "scene_tile_away_low": quantile(tiles[-1], 0.3), "scene_changed": float(changed.mean()),
-        "scene_changed_last": float(changed[-1]), "scene_changed_first": float(changed[0]),
-        "scene_offset_last": float(offset[-1]), "scene_offset_max": float(offset.max()),
-        "scene_offset_step": float(np.abs(np.diff(offset)).max()), "scene_texture": float(texture.mean()),
-        "scene_texture_min": float(texture.min()),
+        "scene_away_step": float(np.diff(mean).max()), "scene_tile_away_low": quantile(tiles[-1], 0.3),
+        "scene_changed": float(changed.mean()), "scene_changed_last": float(changed[-1]),
+        "scene_changed_first": float(changed[0]), "scene_offset_last": float(offset[-1]),
+        "scene_offset_max": float(offset.max()), "scene_offset_step": float(np.abs(np.diff(offset)).max()),
+        "scene_texture": float(texture.mean()), "scene_texture_min": float(texture.min()),
         "scene_tile_texture": float(texture_ratio[parts].min()) if parts.any() else 1.0,
-        "scene_spread": float(np.array(spread).mean() / (spread0 + 1)),
-        "scene_share": float(share.mean()),
+        "scene_spread": float(np.array(spread).mean() / (spread0 + 1)), "scene_share": float(share.mean()),
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.evidence.pictures import GRID, shrink
+from wm_nodes.judge.evidence.pictures import GRID, Floats, shrink
 
 BLUR_PX = 1.2
 """Of a picture of GRID x GRID."""
@@ -20,7 +20,6 @@ SOFT_LEVELS = 3.0
 WIDTH_PX = 96.0
 """Shifts are given in px of a picture this wide."""
 
-Floats = NDArray[np.float32]
 
 
 def registration_evidence(greys: UInt8Array, scene: NDArray[np.bool_]) -> dict[str, float]:
@@ -39,13 +38,10 @@ def registration_evidence(greys: UInt8Array, scene: NDArray[np.bool_]) -> dict[s
     shift, total = np.hypot(steps[:, 0], steps[:, 1]) * scale, np.hypot(path[:, 0], path[:, 1]) * scale
     still = np.abs(images[1:] - images[0]).mean((1, 2))
     return {
-        "camera_start": float(np.hypot(start[0], start[1]) * scale),
-        "camera_shift": float(total[-1]),
-        "camera_turn": float(np.degrees(np.abs(path[-1, 2]))),
-        "camera_growth": float(np.abs(path[-1, 3])),
+        "camera_start": float(np.hypot(start[0], start[1]) * scale), "camera_shift": float(total[-1]),
+        "camera_turn": float(np.degrees(np.abs(path[-1, 2]))), "camera_growth": float(np.abs(path[-1, 3])),
         "camera_shake": float(np.median(shift)), "camera_shake_mean": float(shift.mean()),
-        "camera_turning": float(np.degrees(np.median(np.abs(steps[:, 2])))),
-        "camera_left": float(left[1:].mean()),
+        "camera_turning": float(np.degrees(np.median(np.abs(steps[:, 2])))), "camera_left": float(left[1:].mean()),
         "camera_difference": float(still[-1]),
     }
 

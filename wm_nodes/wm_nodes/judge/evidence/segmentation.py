@@ -1,6 +1,6 @@
 """What each pixel shows: scene, robot, the named object, clutter (RA-17). A U-Net.
 
-Shapes: N images, H W 3 image, C classes, in the order of the masks of reward/adversarial. Trained on simulator masks by
+Shapes: N images, H W 3 image, C classes, in the order of the masks of judge/dataset. Trained on simulator masks by
 wm_nodes/judge/training/train.py.
 """
 

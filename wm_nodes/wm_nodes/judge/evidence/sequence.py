@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.judge.evidence.motion import Outline
-from wm_nodes.judge.evidence.objects import Floats, Scene, Target, fill_gaps
+from wm_nodes.judge.evidence.objects import Scene, Target, fill_gaps
 from wm_nodes.judge.evidence.segmentation import OBJECT, ROBOT
-from wm_nodes.judge.evidence.tracks import SMALLEST_PX
+from wm_nodes.judge.evidence.tracks import SMALLEST_PX, Floats
 
 READS = ("interaction", "deformation", "geometry", "task_completion", "hack/physics")
 """The questions: does it pass, is it done or nearly, is the pattern absent."""
@@ -53,11 +53,7 @@ class ObjectSequence:
 
 
 def object_sequence(scene: Scene, outline: Outline, pictures: UInt8Array, target: Target | None) -> ObjectSequence:
-    """Follow the object.
-
-    Args:
-        pictures: uint8 (T, H, W, 3), the reference frame first.
-    """
+    """Follow the object. pictures: uint8 (T, H, W, 3), the reference frame first."""
     size, known = scene.size, np.isfinite(outline.area)
     place, hand = fill_gaps(outline.centre), fill_gaps(scene.tool)
     area0 = float(outline.area[known][0]) if known.any() else float(SMALLEST_PX)

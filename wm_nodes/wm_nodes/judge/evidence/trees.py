@@ -67,10 +67,7 @@ class Trees:
 def fit_trees(
     rows: FloatArray, labels: BoolArray, weights: Floats, settings: TreeSettings, rng: np.random.Generator
 ) -> Trees:
-    """Minimise the weighted logistic loss.
-
-    Args:
-        rows: (N, F), finite. labels: bool (N,). weights: (N,), >= 0.
+    """Minimise the weighted logistic loss. rows: (N, F), finite. labels: bool (N,). weights: (N,), >= 0.
 
     Raises:
         ValueError: shapes differ, rows are not finite, or only one answer occurs.

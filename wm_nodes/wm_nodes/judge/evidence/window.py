@@ -19,11 +19,7 @@ class Window:
     side: int
 
     def pictures(self, pictures: UInt8Array) -> UInt8Array:
-        """uint8 (..., side, side, 3) of pictures (..., height, width, 3).
-
-        Raises:
-            ValueError: pictures of another size.
-        """
+        """uint8 (..., side, side, 3) of pictures (..., height, width, 3). Raises ValueError: another size."""
         if pictures.shape[-3:] != (self.height, self.width, 3):
             raise ValueError(f"pictures must be {self.height} x {self.width} px of 3 colours, got {pictures.shape}")
         return self._scale(pictures[..., self.first : self.end, :], cv2.INTER_CUBIC)

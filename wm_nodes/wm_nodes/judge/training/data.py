@@ -9,8 +9,7 @@ from pathlib import Path
 
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.types import TaskSpec
-from wm_nodes.judge.dataset.edits import Manifest, ManifestError
-from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part
+from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestError, ManifestRow, Part
 from wm_nodes.judge.dataset.rows import read_clip
 from wm_nodes.judge.dataset.set_files import load_array, load_set
 
@@ -26,11 +25,7 @@ class SetClip:
 
 
 def load_sets(folders: Sequence[Path]) -> list[tuple[Path, Manifest]]:
-    """Read the manifests of sets that are used together.
-
-    Raises:
-        ManifestError: one is damaged, or they keep different things away from training. OSError: not there.
-    """
+    """Read sets that are used together. Raises ManifestError: damaged, or of different divisions. OSError."""
     sets = [(folder, load_set(folder)) for folder in folders]
     first = sets[0][1].division
     for folder, manifest in sets:
@@ -47,11 +42,7 @@ def rows_of(manifest: Manifest, parts: Sequence[Part]) -> list[ManifestRow]:
 
 
 def set_clips(sets: Sequence[tuple[Path, Manifest]], parts: Sequence[Part]) -> Iterator[SetClip]:
-    """Yield the clips of some parts of all sets.
-
-    Raises:
-        ManifestError: a file is missing or damaged.
-    """
+    """Yield the clips of some parts of all sets. Raises ManifestError: a file is missing or damaged."""
     for folder, manifest in sets:
         for row in rows_of(manifest, parts):
             clip, task = read_clip(folder, row)

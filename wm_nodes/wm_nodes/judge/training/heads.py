@@ -13,17 +13,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.statistics import (
-    auroc,
-    balanced_accuracy,
-    expected_calibration_error,
-    recall_at,
-    wilson_of_share,
-)
+from wm_nodes.core.statistics import auroc, balanced_accuracy, expected_calibration_error, recall_at, wilson_of_share
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.judge.agent.levels import p_fail_of
 from wm_nodes.judge.agent.types import PLANNING
-from wm_nodes.judge.dataset.edits import COMPONENTS, TC
+from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.edits.planning import planning_level
 from wm_nodes.judge.evidence.head import (
@@ -96,11 +90,7 @@ def _true_level(target: str, row: ManifestRow) -> int:
 def fit_questions(
     target: str, train: Examples, validation: Examples, settings: TreeSettings, seed: int
 ) -> tuple[HeadQuestion, ...]:
-    """Fit every question of a target.
-
-    Raises:
-        ValueError: a question has only one answer in the training part; names target and level.
-    """
+    """Fit every question of a target. Raises ValueError: training clips have only one answer; names target, level."""
     levels, held_out_levels = true_levels(target, train.rows), true_levels(target, validation.rows)
     known, held_out_known = levels != UNKNOWN, held_out_levels != UNKNOWN
     questions = []

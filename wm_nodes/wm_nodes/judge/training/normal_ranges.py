@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 
 from wm_nodes.core.types import Episode
-from wm_nodes.judge.agent import TaskSpec
 from wm_nodes.judge.agent.reflection import conflicting_evidence
 from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import TaskSpec
 from wm_nodes.judge.evidence.pictures import pictures_of
 from wm_nodes.judge.evidence.pixels import pixel_evidence
 from wm_nodes.judge.evidence.world_model import model_evidence
@@ -75,11 +75,7 @@ def clip_rows(models: WorldModels, episodes: Iterator[Episode], stride: int) -> 
 
 
 def bands_of(rows: Sequence[tuple[Row, bool]], tail: float) -> dict[str, dict[str, float | str]]:
-    """A band per signal, with the share `tail` of its clips outside.
-
-    Raises:
-        ValueError: fewer than LEAST clips for a signal, or a tail that is no share.
-    """
+    """A band per signal, the share `tail` of its clips outside. Raises ValueError: too few clips, or no such share."""
     if not 0 <= tail < 0.5:
         raise ValueError(f"tail must be a share below 0.5, got {tail}")
     bands: dict[str, dict[str, float | str]] = {}

@@ -15,8 +15,8 @@ from tqdm import trange
 
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.judge.dataset.edits import RECIPES
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
+from wm_nodes.judge.dataset.edits.recipes import RECIPES
 from wm_nodes.judge.dataset.policy_camera import IMAGINED
 from wm_nodes.judge.evidence.segmentation import Segmenter
 from wm_nodes.judge.training.data import SetClip

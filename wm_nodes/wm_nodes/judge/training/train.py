@@ -20,8 +20,8 @@ from tqdm import tqdm
 import wm_nodes.judge.evidence
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import FloatArray
-from wm_nodes.judge.dataset.edits import COMPONENTS, TC, Manifest
-from wm_nodes.judge.dataset.edits.manifest import ManifestRow, Part, to_bytes
+from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC
+from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestRow, Part, to_bytes
 from wm_nodes.judge.dataset.policy_camera import SEEN
 from wm_nodes.judge.dataset.set_files import load_frames
 from wm_nodes.judge.evidence.clip import measure_clip
@@ -183,7 +183,8 @@ def _keep(path: Path, **arrays: NDArray[Any]) -> None:
 def _key(rows: Sequence[ManifestRow], segmenter: Segmenter) -> str:
     """Hash of the clips, their reference frames and instructions, the segmenter's weights and the code."""
     shown = "".join(f"{row.sha256} {row.root} {row.origin.task} {row.origin.object_id}\n" for row in rows)
-    return hashlib.sha256(shown.encode() + _weights_digest(segmenter) + _code_digest()).hexdigest()[:16]
+    weights = hashlib.sha256(save(dict(segmenter.state_dict()))).digest()
+    return hashlib.sha256(shown.encode() + weights + _code_digest()).hexdigest()[:16]
 
 
 def _load_or_train_segmenter(
@@ -210,10 +211,6 @@ def _load_or_train_segmenter(
 def _describe_set(path: Path, manifest: Manifest) -> dict[str, Any]:
     parts = {part: sum(row.part == part for row in manifest.rows) for part in ("train", "validation", "test")}
     return {"set": path.name, "manifest_sha256": hashlib.sha256(to_bytes(manifest)).hexdigest(), "clips": parts}
-
-
-def _weights_digest(segmenter: Segmenter) -> bytes:
-    return hashlib.sha256(save(dict(segmenter.state_dict()))).digest()
 
 
 def _code_digest() -> bytes:

@@ -17,8 +17,9 @@ from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import ConfigError
 from wm_nodes.config.schema import JudgeConfig
-from wm_nodes.judge.agent import Status, Verdict, pause_reason
-from wm_nodes.judge.agent.types import GATED
+from wm_nodes.judge.agent.contract import pause_reason
+from wm_nodes.judge.agent.types import GATED, Status
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.clip_files import AT_ONCE, list_sha256, read_job, read_list
 from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.service import POLL_S, READS, ClipJob, JudgeService

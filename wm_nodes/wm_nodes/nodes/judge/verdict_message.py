@@ -5,8 +5,8 @@ from array import array
 from collections.abc import Iterable
 
 from wm_msgs.msg import ClipVerdict
-from wm_nodes.judge.agent import Status, Verdict
-from wm_nodes.judge.agent.types import GATED, Reflection
+from wm_nodes.judge.agent.types import GATED, Status
+from wm_nodes.judge.agent.verdict import Reflection, Verdict
 
 STATUS = {
     Status.OK: ClipVerdict.OK, Status.SKIPPED: ClipVerdict.SKIPPED, Status.ABSTAIN: ClipVerdict.ABSTAIN,

@@ -17,9 +17,11 @@ from typing import Any
 from urllib.parse import quote
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.judge.agent.judge import Read
 from wm_nodes.judge.agent.levels import settle
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import GATED, PLANNING, Read, Verdict
+from wm_nodes.judge.agent.types import GATED, PLANNING
+from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.labels import FORMAT, HACK
 from wm_nodes.judge.audit.log import AuditError
 from wm_nodes.judge.audit.media import FOLDER
@@ -54,7 +56,8 @@ def write_view(
 
 def page(title: str, data: Mapping[str, Any]) -> str:
     """The page. data: JSON values; what the script reads."""
-    style, script = (_read_part(name) for name in ("viewer.css", "viewer.js"))
+    folder = resources.files("wm_nodes.judge.audit.viewer")
+    style, script = ((folder / name).read_text() for name in ("viewer.css", "viewer.js"))
     policy = (
         f"default-src 'none'; img-src 'self' file:; style-src {_source_expression(style)}; "
         f"script-src {_source_expression(script)}; base-uri 'none'; form-action 'none'"
@@ -76,27 +79,16 @@ def _source_expression(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _read_part(name: str) -> str:
-    return (resources.files("wm_nodes.judge.audit.viewer") / name).read_text()
-
-
 def _describe_rubric(rubric: Rubric) -> dict[str, Any]:
     """What each row means, in the order of the page."""
-    entries = [(PLANNING, rubric.planning)]
-    rows = [{"name": name, "stage": "PLAN", "question": e.question, "levels": list(e.levels)} for name, e in entries]
-    for stage in GATED:
-        parts = rubric.stages[stage].components.items()
-        rows += [
-            {"name": name, "stage": str(stage), "question": entry.question, "levels": list(entry.levels)}
-            for name, entry in parts
-        ]
-    patterns = rubric.hack.patterns.items()
-    rows += [
-        {"name": HACK + name, "stage": "HACK", "question": entry.defect, "levels": list(entry.levels)}
-        for name, entry in patterns
+    entries: list[tuple[str, str, str, Sequence[str]]] = [
+        (PLANNING, "PLAN", rubric.planning.question, rubric.planning.levels),
+        *((n, str(stage), e.question, e.levels) for stage in GATED for n, e in rubric.stages[stage].components.items()),
+        *((HACK + name, "HACK", pattern.defect, pattern.levels) for name, pattern in rubric.hack.patterns.items()),
+        (OVERALL, "ALL", "Would you take this clip for a success?", ()),
     ]
-    whole = {"name": OVERALL, "stage": "ALL", "question": "Would you take this clip for a success?", "levels": []}
-    return {"rows": [*rows, whole], "thresholds": {str(stage): rubric.stages[stage].threshold for stage in GATED}}
+    rows = [{"name": name, "stage": stage, "question": q, "levels": list(levels)} for name, stage, q, levels in entries]
+    return {"rows": rows, "thresholds": {str(stage): rubric.stages[stage].threshold for stage in GATED}}
 
 
 def _describe_clip(record: Record, evaluation: RecordedEvaluation, chosen: SampledClip | None) -> dict[str, Any]:
@@ -135,20 +127,20 @@ def _describe_clip(record: Record, evaluation: RecordedEvaluation, chosen: Sampl
 
 def _describe_rows(evaluation: RecordedEvaluation, verdict: Verdict, rubric: Rubric) -> dict[str, Any]:
     """What the judge says of each row: value (True, False, a level, None), why, and the votes behind it."""
-    decisions = decisions_of(verdict)
+    values = {name: decision.value for name, decision in decisions_of(verdict).items()}
     asked = [(ask.stage, read) for ask in evaluation.asks for read in ask.reads]
     rows: dict[str, Any] = {}
     planning = [read for stage, read in asked if stage == "PLAN"]
     plan = verdict.plan
     rows[PLANNING] = {
-        "value": decisions[PLANNING].value if PLANNING in decisions else None, "why": plan.reason if plan else "",
+        "value": values.get(PLANNING), "why": plan.reason if plan else "",
         "decided_by": f"focus: {', '.join(plan.focus) or 'none'}" if plan else "", "frames": [],
         "votes": [_describe_vote(read) for read in planning],
     }
     for score in (score for stage in verdict.stages for score in stage.components):
         rows[score.component] = {
-            "value": decisions[score.component].value if score.component in decisions else None,
-            "s": _number(score.s), "p_fail": _number(score.p_fail), "margin": _number(score.margin),
+            "value": values.get(score.component), "s": _number(score.s), "p_fail": _number(score.p_fail),
+            "margin": _number(score.margin),
             "why": score.evidence_text, "decided_by": score.decided_by, "reason": score.reason,
             "frames": list(score.frames_cited), "votes": [_describe_vote(read) for read in score.votes],
         }
@@ -161,10 +153,7 @@ def _describe_rows(evaluation: RecordedEvaluation, verdict: Verdict, rubric: Rub
             "reason": "; ".join(look.reason for look in looks if look.reason), "frames": [],
             "votes": [_describe_vote(read) for read in reads],
         }
-    rows[OVERALL] = {
-        "value": decisions[OVERALL].value if OVERALL in decisions else None, "why": "", "decided_by": "all gates",
-        "frames": [], "votes": [],
-    }
+    rows[OVERALL] = {"value": values.get(OVERALL), "why": "", "decided_by": "all gates", "frames": [], "votes": []}
     return rows
 
 

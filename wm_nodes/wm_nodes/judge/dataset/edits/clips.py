@@ -6,7 +6,7 @@ one that the instruction names. The table top is z = 0.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,7 @@ Component = Literal[
 Pattern = Literal["occlusion", "motion", "background", "physics"]
 Severity = Literal["clean", "mild", "fail"]
 
-COMPONENTS: tuple[Component, ...] = (
-    "clarity", "brightness", "color", "temporal", "background", "objective", "robot", "viewpoint", "interaction",
-    "deformation", "geometry",
-)
+COMPONENTS: tuple[Component, ...] = get_args(Component)
 """What a clip is labelled on besides TC; the names of the robot rubric pack, in its order."""
 PHYSICS: tuple[Component, ...] = ("interaction", "deformation", "geometry")
 TC = "task_completion"

@@ -24,13 +24,8 @@ MOST_STACKED = 3
 
 
 def children(
-    parent: LabelledClip,
-    seed: int,
-    redraw: Redraw | None,
-    *,
-    names: Sequence[str] = tuple(RECIPES),
-    count: int | None = None,
-    skipped: Counter[str] | None = None,
+    parent: LabelledClip, seed: int, redraw: Redraw | None, *, names: Sequence[str] = tuple(RECIPES),
+    count: int | None = None, skipped: Counter[str] | None = None,
 ) -> Iterator[LabelledClip]:
     """Yield edited clips, no picture twice.
 
@@ -108,11 +103,7 @@ def _stack(clip: LabelledClip, rng: np.random.Generator) -> LabelledClip:
 
 
 def apply_edit(parent: LabelledClip, name: str, severity: Severity, seed: int, redraw: Redraw | None) -> LabelledClip:
-    """Apply one recipe of any kind.
-
-    Raises:
-        NotApplicableError: as recipes.apply, or a state recipe where nothing can be rendered.
-    """
+    """Apply one recipe of any kind. Raises NotApplicableError: as recipes.apply, or no renderer for a state recipe."""
     if get_recipe(name).kind != "S":
         return apply(parent, name, severity, seed)
     if redraw is None:

@@ -9,7 +9,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC, ClipTruth, Edit, LabelledClip, Origin
@@ -19,7 +19,7 @@ from wm_nodes.judge.dataset.edits.recipes import get_recipe, recipes_sha
 FORMAT = "adversarial-clips-1"
 Part = Literal["train", "validation", "test"]
 Split = Literal["iid", "new_object", "new_task", "new_camera", "new_scene", "hack"]
-SPLITS: tuple[Split, ...] = ("iid", "new_object", "new_task", "new_camera", "new_scene", "hack")
+SPLITS: tuple[Split, ...] = get_args(Split)
 Prevalence = dict[str, dict[str, dict[str, int]]]
 """split, or "all" -> component, task_completion or overall -> how many clips pass, fail, are unknown."""
 
@@ -92,11 +92,7 @@ class Manifest:
 
 
 def manifest_of(clips: Iterable[LabelledClip], division: Division) -> Manifest:
-    """Describe clips; equal pictures of equal labels count once.
-
-    Raises:
-        ManifestError: see check.
-    """
+    """Describe clips; equal pictures of equal labels count once. Raises ManifestError: see check."""
     rows: dict[str, ManifestRow] = {}
     for clip in clips:
         row = _row(clip, division)
@@ -161,11 +157,7 @@ def to_bytes(manifest: Manifest) -> bytes:
 
 
 def from_bytes(data: bytes) -> Manifest:
-    """Read and verify a manifest.
-
-    Raises:
-        ManifestError: damaged, of another format, counts that its clips do not have, or see check.
-    """
+    """Read and verify a manifest. Raises ManifestError: damaged, of another format, with false counts, or see check."""
     try:
         first, *lines = data.decode().splitlines(keepends=True)
         header = json.loads(first)
@@ -173,8 +165,8 @@ def from_bytes(data: bytes) -> Manifest:
             raise ManifestError(f"the manifest has format {header.get('format')!r}, not {FORMAT!r}; build it again")
         if (len(lines), _sha(lines)) != (header["clips"], header["clips_sha256"]):
             raise ManifestError(f"the manifest is damaged: {len(lines)} clips of another hash than it says; restore it")
-        division = Division(**{name: _as_tuple(value) for name, value in header["division"].items()})
-        manifest = Manifest(division, tuple(_read_row(json.loads(line)) for line in lines), header["recipes"])
+        stated: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in header["division"].items()}
+        manifest = Manifest(Division(**stated), tuple(_read_row(json.loads(line)) for line in lines), header["recipes"])
         counted = header["prevalence"]
     except ManifestError:
         raise
@@ -187,11 +179,7 @@ def from_bytes(data: bytes) -> Manifest:
 
 
 def regenerate(row: ManifestRow, root: LabelledClip, redraw: Redraw | None) -> LabelledClip:
-    """Make the clip of a row from its recorded clip, and verify it.
-
-    Raises:
-        ManifestError: other pixels, amounts or labels come out.
-    """
+    """Make a row's clip from its recorded clip and verify it. Raises ManifestError: other pixels, amounts or labels."""
     clip = replay(root, row.edits, redraw)
     description = (root.sha256, clip.sha256, clip.edits, clip.labels)
     if description != (row.root, row.sha256, row.edits, row.labels):
@@ -229,17 +217,10 @@ def _read_row(values: dict[str, Any]) -> ManifestRow:
     unknown, fails = values.pop("unknown"), values.pop("fails")
     if foreign := sorted({*unknown, *fails} - set(COMPONENTS)):
         raise ValueError(f"unknown components {foreign}")
-    labels = ClipTruth(
-        {name: name not in fails for name in COMPONENTS if name not in unknown},
-        values.pop("tc_level"),
-        values.pop("pattern"),
-    )
+    components = {name: name not in fails for name in COMPONENTS if name not in unknown}
+    labels = ClipTruth(components, values.pop("tc_level"), values.pop("pattern"))
     edits = tuple(Edit(**edit) for edit in values.pop("edits"))
     return ManifestRow(origin=Origin(**values.pop("origin")), edits=edits, labels=labels, **values)
-
-
-def _as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
 
 
 def _chain(row: ManifestRow) -> str:

@@ -62,7 +62,7 @@ def early_motion(states: SceneStates, frames: float, rng: np.random.Generator) -
 
 def teleport(states: SceneStates, distance_m: float, rng: np.random.Generator) -> SceneStates:
     """The object is so far to a side at once, from a frame on when nothing touches it."""
-    free = [t for t in range(2, len(states) - 1) if not _is_touched_near(states, t)]
+    free = [t for t in range(2, len(states) - 1) if not states.contact[max(0, t - 2) : t + 2].any()]
     if not free:
         raise NotApplicableError("the object is touched all through the clip")
     angle = rng.uniform(0, 2 * np.pi)
@@ -138,10 +138,6 @@ def _check_moved(states: SceneStates) -> None:
     way = float(np.linalg.norm(states.thing - states.thing[:1], axis=1).max())
     if way < MOVED_M:
         raise NotApplicableError(f"the object moves {100 * way:.1f} cm; {100 * MOVED_M:.0f} cm are needed")
-
-
-def _is_touched_near(states: SceneStates, frame: int) -> bool:
-    return bool(states.contact[max(0, frame - 2) : frame + 2].any())
 
 
 def _place_thing(states: SceneStates, centres: FloatArray) -> SceneStates:

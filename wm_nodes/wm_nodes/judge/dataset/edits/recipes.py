@@ -118,8 +118,7 @@ _ALL = (
            ("geometry",), pattern="physics"),
     Recipe("early_motion", "S", physics.early_motion, (0.05, 0.2), (3, 5), "frames", ("interaction",),
            pattern="physics"),
-    Recipe("teleport", "S", physics.teleport, (0.0015, 0.003), (0.045, 0.06), "m", ("interaction",),
-           pattern="physics"),
+    Recipe("teleport", "S", physics.teleport, (0.0015, 0.003), (0.045, 0.06), "m", ("interaction",), pattern="physics"),
     Recipe("sunk", "S", physics.sink, (0.001, 0.002), (0.014, 0.02), "m", ("geometry",), pattern="physics"),
     Recipe("pulled_in", "S", physics.pull_in, (0.02, 0.06), (0.65, 0.85), "of the way", ("geometry",),
            ("interaction",), pattern="physics"),
@@ -180,11 +179,7 @@ def edit_states(parent: LabelledClip, name: str, severity: Severity, seed: int) 
 
 
 def label_rendered(parent: LabelledClip, edited: StateEdit, clip: SourceClip) -> LabelledClip:
-    """Label the clip that was rendered from edited states.
-
-    Raises:
-        NotApplicableError: as apply.
-    """
+    """Label the clip that was rendered from edited states. Raises NotApplicableError: as apply."""
     return _make_child(parent, clip, edited.edit)
 
 
@@ -199,7 +194,8 @@ def _draw_amount(
 ) -> tuple[float, np.random.Generator]:
     if severity not in ("mild", "fail"):
         raise ValueError(f"severity must be mild or fail, got {severity!r}")
-    if severity == "fail" and recipe.on_defect and not _has_physics_failure(parent.labels):
+    defect = any(parent.labels.components.get(name) is False for name in PHYSICS)
+    if severity == "fail" and recipe.on_defect and not defect:
         raise NotApplicableError(f"{recipe.name} hides a physical defect, this clip has none; use a state recipe first")
     if severity == "fail" and recipe.on_success and parent.labels.tc_level < 4:
         raise NotApplicableError(f"{recipe.name} needs a completed task, got level {parent.labels.tc_level}")
@@ -254,6 +250,3 @@ def seen_share(before: SourceClip, after: SourceClip) -> float:
 def _truth_level(clip: SourceClip) -> int:
     return tc_level(clip.states, clip_rules(clip.origin.task).label)
 
-
-def _has_physics_failure(labels: ClipTruth) -> bool:
-    return any(labels.components.get(name) is False for name in PHYSICS)

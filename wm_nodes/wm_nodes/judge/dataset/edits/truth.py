@@ -30,8 +30,6 @@ SLIP_M = 0.01
 """And this much further, since nobody sees inside a frame."""
 RESHAPED = 0.1
 """A relative change of size beyond this is a deformation failure."""
-CONTACT_FRAMES = 1
-"""Contact this many frames before or after explains a motion: contact is sampled once per frame."""
 
 
 def tc_level(states: SceneStates, rule: TaskRule) -> int:
@@ -74,12 +72,11 @@ def recorded(clip: SourceClip) -> LabelledClip:
     return LabelledClip(clip, ClipTruth(dict.fromkeys(COMPONENTS, True), level))
 
 
-def touched_nearby(states: SceneStates, frames: int = CONTACT_FRAMES) -> NDArray[np.bool_]:
-    """(T,), contact within so many frames."""
+def touched_nearby(states: SceneStates) -> NDArray[np.bool_]:
+    """(T,), contact in a frame, before or after it, which explains a motion: contact is sampled once per frame."""
     near = states.contact.copy()
-    for shift in range(1, frames + 1):
-        near[shift:] |= states.contact[:-shift]
-        near[:-shift] |= states.contact[shift:]
+    near[1:] |= states.contact[:-1]
+    near[:-1] |= states.contact[1:]
     return near
 
 
