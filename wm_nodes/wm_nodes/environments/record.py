@@ -41,12 +41,8 @@ def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> Coll
 def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
     """MPLib demonstrations of the configured task, for SFT."""
     return CollectionPlan(
-        task=config.task,
-        simulation=config.simulation,
-        num_episodes=num_episodes,
-        first_seed=first_seed,
-        behaviours={"expert": 1.0},
-        end_on_success=True,
+        task=config.task, simulation=config.simulation, num_episodes=num_episodes, first_seed=first_seed,
+        behaviours={"expert": 1.0}, end_on_success=True,
     )
 
 

@@ -43,13 +43,8 @@ def demonstrations(episodes: Iterable[Episode], count: int) -> list[Episode]:
 
 
 def train_sft(
-    policy: ImagePolicy,
-    demos: Sequence[Episode],
-    config: SftConfig,
-    seed: int,
-    *,
-    reconstruct: Callable[[UInt8Array], UInt8Array] | None = None,
-    should_stop: Callable[[], bool] | None = None,
+    policy: ImagePolicy, demos: Sequence[Episode], config: SftConfig, seed: int, *,
+    reconstruct: Callable[[UInt8Array], UInt8Array] | None = None, should_stop: Callable[[], bool] | None = None,
     on_progress: Callable[[int, float], None] | None = None,
 ) -> SftResult:
     """Fit the actor's mean to the demonstrated actions in place; critic and log standard deviation stay.

@@ -46,14 +46,8 @@ class EvaluationResult:
 
 
 def evaluate(
-    policy: ImagePolicy,
-    env: Environment,
-    episodes: int,
-    first_seed: int,
-    deterministic: bool = True,
-    *,
-    should_stop: Callable[[], bool] | None = None,
-    on_progress: Callable[[int, int], None] | None = None,
+    policy: ImagePolicy, env: Environment, episodes: int, first_seed: int, deterministic: bool = True, *,
+    should_stop: Callable[[], bool] | None = None, on_progress: Callable[[int, int], None] | None = None,
 ) -> EvaluationResult:
     """Play one episode per seed. Environments that finish take the next seed, so none waits for the slowest.
 

@@ -71,15 +71,8 @@ class ImagePolicy(nn.Module):
     """
 
     def __init__(
-        self,
-        encoder: ImageEncoder,
-        state_dim: int,
-        action_dim: int,
-        config: PolicyConfig,
-        *,
-        seed: int = 0,
-        state_center: Sequence[float] | None = None,
-        state_scale: float | None = None,
+        self, encoder: ImageEncoder, state_dim: int, action_dim: int, config: PolicyConfig, *, seed: int = 0,
+        state_center: Sequence[float] | None = None, state_scale: float | None = None,
     ) -> None:
         super().__init__()
         self.encoder = encoder
@@ -144,11 +137,7 @@ class ImagePolicy(nn.Module):
 
     @torch.no_grad()
     def act(
-        self,
-        images: UInt8Array,
-        states: FloatArray,
-        generator: torch.Generator | None = None,
-        *,
+        self, images: UInt8Array, states: FloatArray, generator: torch.Generator | None = None, *,
         noise: FloatArray | None = None,
     ) -> PolicyOutput:
         """Choose actions for uint8 (B, H, W, 3) images and float32 (B, S) states.
@@ -174,8 +163,7 @@ class ImagePolicy(nn.Module):
         distribution = self.distribution(features_BF, states_BS)
         actions_BA = distribution.executed(noise_BA)
         return PolicyOutput(
-            _to_numpy(actions_BA),
-            _to_numpy(distribution.logprob(actions_BA)),
+            _to_numpy(actions_BA), _to_numpy(distribution.logprob(actions_BA)),
             _to_numpy(self.value(features_BF, states_BS)),
         )
 

@@ -75,9 +75,7 @@ class PpoLearner:
         ranks: this process's place among the learner's processes.
     """
 
-    def __init__(
-        self, policy: ImagePolicy, config: PpoConfig, *, seed: int, ranks: Ranks | None = None
-    ) -> None:
+    def __init__(self, policy: ImagePolicy, config: PpoConfig, *, seed: int, ranks: Ranks | None = None) -> None:
         self.policy, self.config, self.seed = policy, config, seed
         self.reference = policy.clone()
         self.ranks = ranks or Ranks()
@@ -85,10 +83,7 @@ class PpoLearner:
         critic = list(policy.critic.parameters())
         actor = [p for p in policy.parameters() if all(p is not c for c in critic)]
         self._optimizer = torch.optim.Adam(
-            [
-                {"params": actor, "lr": config.learning_rate},
-                {"params": critic, "lr": config.value_learning_rate},
-            ],
+            [{"params": actor, "lr": config.learning_rate}, {"params": critic, "lr": config.value_learning_rate}],
             eps=1e-5,
         )
 
@@ -159,12 +154,9 @@ class PpoLearner:
         if not all(bool(torch.isfinite(parameter).all()) for parameter in self.policy.parameters()):
             raise self._not_finite("weight")
         return PpoMetrics(
-            **{name: value / trained for name, value in totals.items()},
-            learning_rate=config.learning_rate,
+            **{name: value / trained for name, value in totals.items()}, learning_rate=config.learning_rate,
             explained_variance=explained_variance(samples.values, samples.returns, torch.ones(count, dtype=torch.bool)),
-            mean_advantage_std=float(samples.advantages.std(correction=0)),
-            epochs=trained / count,
-            samples=count,
+            mean_advantage_std=float(samples.advantages.std(correction=0)), epochs=trained / count, samples=count,
         )
 
     def _minibatch(self, samples: _Samples, index: Tensor, policy_frozen: bool) -> dict[str, float]:
@@ -234,13 +226,10 @@ class PpoLearner:
         advantages = masked_normalise(advantages, valid_TN)
         chosen = valid_TN.reshape(-1)
         return _Samples(
-            features=features[chosen],
-            states=states[chosen],
+            features=features[chosen], states=states[chosen],
             actions=torch.from_numpy(rollout.actions_TN).reshape(flat)[chosen],
-            logprobs=torch.from_numpy(rollout.logprobs_TN).reshape(-1)[chosen],
-            values=values.reshape(-1)[chosen],
-            advantages=advantages.reshape(-1)[chosen],
-            returns=returns.reshape(-1)[chosen],
+            logprobs=torch.from_numpy(rollout.logprobs_TN).reshape(-1)[chosen], values=values.reshape(-1)[chosen],
+            advantages=advantages.reshape(-1)[chosen], returns=returns.reshape(-1)[chosen],
         )
 
     def _next_values(self, rollout: Rollout) -> Tensor:
@@ -249,8 +238,7 @@ class PpoLearner:
         steps = rollout.valid_TN.shape[0]
         following = np.concatenate([rollout.values_TN[1:], np.zeros_like(rollout.values_TN[:1])])
         needed = (
-            rollout.valid_TN
-            & ~rollout.terminated_TN
+            rollout.valid_TN & ~rollout.terminated_TN
             & (rollout.truncated_TN | (np.arange(steps)[:, None] == steps - 1))
         )
         values = torch.from_numpy(np.where(rollout.valid_TN, following, 0.0).astype(np.float32))

@@ -74,13 +74,8 @@ def reward_input(step: RecordedStep) -> RewardInput:
         raise BagError(f"lock-step {step.step_id} lacks an image; it cannot be scored")
     goals, found = step.goals if step.goals is not None else (None, None)
     return RewardInput(
-        images=step.images,
-        next_images=step.next_images,
-        success_probability=step.success_probability,
-        valid=step.valid,
-        uncertainty=step.uncertainty,
-        goals=goals,
-        goal_found=found,
+        images=step.images, next_images=step.next_images, success_probability=step.success_probability,
+        valid=step.valid, uncertainty=step.uncertainty, goals=goals, goal_found=found,
     )
 
 

@@ -59,15 +59,8 @@ def action_noise(seed: int, policy_version: int, step: int, num_envs: int, actio
 
 
 def collect_rollout(
-    env: Environment,
-    policy: ImagePolicy,
-    reward: RewardModel,
-    steps: int,
-    seed: int,
-    policy_version: int,
-    *,
-    deterministic: bool = False,
-    should_stop: Callable[[], bool] | None = None,
+    env: Environment, policy: ImagePolicy, reward: RewardModel, steps: int, seed: int, policy_version: int, *,
+    deterministic: bool = False, should_stop: Callable[[], bool] | None = None,
 ) -> Rollout:
     """Reset all environments and make `steps` lock-steps.
 
@@ -121,12 +114,8 @@ def reward_input(
 ) -> RewardInput:
     """Return what a reward model needs of one lock-step. goals: env.goals() as of before the step."""
     return RewardInput(
-        images=observation.image,
-        next_images=result.observation.image,
-        success_probability=result.success_probability,
-        valid=result.valid,
-        uncertainty=result.uncertainty,
-        goals=None if goals is None else goals[0],
+        images=observation.image, next_images=result.observation.image, success_probability=result.success_probability,
+        valid=result.valid, uncertainty=result.uncertainty, goals=None if goals is None else goals[0],
         goal_found=None if goals is None else goals[1],
     )
 

@@ -105,11 +105,7 @@ class PolicyTraining(TrainingRun):
         return self.progress.updates
 
     def update(
-        self,
-        rollout: Rollout,
-        dropped: DroppedTransitions,
-        should_stop: Callable[[], bool],
-        *,
+        self, rollout: Rollout, dropped: DroppedTransitions, should_stop: Callable[[], bool], *,
         paid_at_end: bool = False,
     ) -> dict[str, float]:
         """Make one update and one new version; return the metrics.

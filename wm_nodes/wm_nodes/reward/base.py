@@ -96,12 +96,8 @@ def version_of(*parts: str) -> int:
 
 
 def assemble(
-    dense: FloatArray,
-    sparse: FloatArray,
-    step: RewardInput,
-    success: NDArray[np.uint8],
-    reasons: Mapping[str, BoolArray],
-    weights: Mapping[str, float],
+    dense: FloatArray, sparse: FloatArray, step: RewardInput, success: NDArray[np.uint8],
+    reasons: Mapping[str, BoolArray], weights: Mapping[str, float],
 ) -> RewardResult:
     """Join weighted terms into a result; a step is invalid where any of `reasons` holds or a term is not finite."""
     found = {**reasons, "reward is not finite": ~np.isfinite(dense) | ~np.isfinite(sparse)}
@@ -115,12 +111,7 @@ def assemble(
     nan = np.float32(np.nan)
     dense, sparse = (np.where(valid, term, nan).astype(np.float32) for term in (dense, sparse))
     return RewardResult(
-        total=dense + sparse,
-        dense=dense,
-        sparse=sparse,
-        valid=valid,
-        success=np.where(step.valid, success, SUCCESS_UNKNOWN).astype(np.uint8),
-        invalid_reason="; ".join(texts),
-        components={"dense": dense, "sparse": sparse},
-        weights=weights,
+        total=dense + sparse, dense=dense, sparse=sparse, valid=valid,
+        success=np.where(step.valid, success, SUCCESS_UNKNOWN).astype(np.uint8), invalid_reason="; ".join(texts),
+        components={"dense": dense, "sparse": sparse}, weights=weights,
     )

@@ -61,12 +61,8 @@ class EndogenousReward:
             crossed &= step.uncertainty <= config.uncertainty_limit
         success = np.where(unknown, SUCCESS_UNKNOWN, np.where(crossed, SUCCESS_YES, SUCCESS_NO)).astype(np.uint8)
         return assemble(
-            np.float32(config.dense_weight) * dense,
-            np.float32(config.sparse_weight) * crossed.astype(np.float32),
-            step,
-            success,
-            reasons,
-            {"dense": config.dense_weight, "sparse": config.sparse_weight},
+            np.float32(config.dense_weight) * dense, np.float32(config.sparse_weight) * crossed.astype(np.float32),
+            step, success, reasons, {"dense": config.dense_weight, "sparse": config.sparse_weight},
         )
 
     def _dense(self, step: RewardInput) -> tuple[FloatArray, BoolArray]:

@@ -34,10 +34,6 @@ class RuleReward:
         reached = step.success_probability > 0.5
         success = np.where(unknown, SUCCESS_UNKNOWN, np.where(reached, SUCCESS_YES, SUCCESS_NO)).astype(np.uint8)
         return assemble(
-            np.zeros(len(reached), np.float32),
-            np.float32(self._weight) * reached.astype(np.float32),
-            step,
-            success,
-            {"success probability is not finite": unknown},
-            {"dense": 0.0, "sparse": self._weight},
+            np.zeros(len(reached), np.float32), np.float32(self._weight) * reached.astype(np.float32), step, success,
+            {"success probability is not finite": unknown}, {"dense": 0.0, "sparse": self._weight},
         )

@@ -68,8 +68,6 @@ def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
     actions = episodes.actions.reshape(len(episodes), steps // stride, -1)
     return Clips(
         frames=torch.from_numpy(np.ascontiguousarray(episodes.images[:, ::stride])),
-        actions=torch.from_numpy(np.ascontiguousarray(actions)),
-        ground_truth=episodes.ground_truth[:, ::stride],
-        instructions=episodes.instructions,
-        task=episodes.tasks[0],
+        actions=torch.from_numpy(np.ascontiguousarray(actions)), ground_truth=episodes.ground_truth[:, ::stride],
+        instructions=episodes.instructions, task=episodes.tasks[0],
     )

@@ -11,13 +11,7 @@ from typing import Any
 from torch import nn
 
 from wm_nodes.config.schema import TokenizerConfig
-from wm_nodes.core.model_folder import (
-    MANIFEST,
-    ModelFolderError,
-    read_manifest,
-    read_model_file,
-    write_model_folder,
-)
+from wm_nodes.core.model_folder import MANIFEST, ModelFolderError, read_manifest, read_model_file, write_model_folder
 from wm_nodes.training.weights import WeightsError, load_weights, pack_weights
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.codec import PatchCodec

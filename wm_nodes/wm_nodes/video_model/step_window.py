@@ -38,15 +38,8 @@ def stochastic_steps(num_steps: int, settings: WindowConfig, iteration: int, see
 
 
 def select_steps(
-    times: Tensor,
-    stochastic: list[int],
-    num_samples: int,
-    *,
-    fraction: float,
-    select: Literal["random", "first", "tmin"],
-    min_s: float,
-    seed: int,
-    iteration: int,
+    times: Tensor, stochastic: list[int], num_samples: int, *, fraction: float,
+    select: Literal["random", "first", "tmin"], min_s: float, seed: int, iteration: int,
 ) -> Tensor:
     """Return which of the stochastic steps train, bool (N, S).
 

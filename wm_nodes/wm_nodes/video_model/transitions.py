@@ -28,16 +28,8 @@ class GaussianTransition(NamedTuple):
 
 
 def transition(
-    model: VelocityModel,
-    condition: Condition,
-    x_t: Tensor,
-    x_s: Tensor,
-    t: Tensor,
-    s: Tensor,
-    mask: Tensor | None,
-    settings: RolloutSettings,
-    *,
-    cfg: float,
+    model: VelocityModel, condition: Condition, x_t: Tensor, x_s: Tensor, t: Tensor, s: Tensor, mask: Tensor | None,
+    settings: RolloutSettings, *, cfg: float,
 ) -> GaussianTransition:
     """Return the normalised noise that leads from x_t to x_s under `model`.
 

@@ -49,15 +49,8 @@ class GroupAdvantages:
 
 
 def group_advantages(
-    rewards_N: Tensor,
-    group_ids_N: Tensor,
-    valid_N: Tensor,
-    *,
-    clip: float,
-    std_scope: StdScope = "group",
-    ddof: int = 0,
-    floor: float = 1e-6,
-    running: RunningStd | None = None,
+    rewards_N: Tensor, group_ids_N: Tensor, valid_N: Tensor, *, clip: float, std_scope: StdScope = "group",
+    ddof: int = 0, floor: float = 1e-6, running: RunningStd | None = None,
 ) -> GroupAdvantages:
     """Return A_i = clip((R_i - mean_g R) / std_g R, -clip, clip) (DD-13) over the valid videos of each group.
 
@@ -126,15 +119,8 @@ def trainable(valid_N: BoolArray, group_ids_N: NDArray[np.int64]) -> BoolArray:
 
 
 def mixed_advantages(
-    rewards: Mapping[str, Tensor],
-    weights: Mapping[str, float],
-    group_ids_N: Tensor,
-    valid_N: Tensor,
-    *,
-    clip: float,
-    std_scope: StdScope = "group",
-    ddof: int = 0,
-    floor: float = 1e-6,
+    rewards: Mapping[str, Tensor], weights: Mapping[str, float], group_ids_N: Tensor, valid_N: Tensor, *, clip: float,
+    std_scope: StdScope = "group", ddof: int = 0, floor: float = 1e-6,
 ) -> GroupAdvantages:
     """Return clip(sum_r w_r A_r / sum_r |w_r|) of rewards normalised one by one (DD-13a).
 

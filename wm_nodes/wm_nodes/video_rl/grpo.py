@@ -102,14 +102,8 @@ class GrpoLearner:
     """
 
     def __init__(
-        self,
-        model: nn.Module,
-        settings: GrpoConfig,
-        rollout: RolloutSettings,
-        *,
-        seed: int,
-        ranks: Ranks | None = None,
-        reward_weights: Mapping[str, float] | None = None,
+        self, model: nn.Module, settings: GrpoConfig, rollout: RolloutSettings, *, seed: int,
+        ranks: Ranks | None = None, reward_weights: Mapping[str, float] | None = None,
     ) -> None:
         if rollout.sampler.arm == "ode" or rollout.sampler.eta == 0:
             raise ValueError("an ODE rollout has no likelihood to train on; choose a stochastic arm and eta > 0")

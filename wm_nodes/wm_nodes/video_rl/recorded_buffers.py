@@ -288,8 +288,7 @@ def _joined(
     return RecordedClips(
         int(batch.iteration), int(batch.policy_version), contexts, int(batch.num_frames), batch.buffer_uri,
         batch.sha256, dict(zip(scores.names, values, strict=True)), torch.where(valid, total, torch.nan), valid,
-        picture, dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids,
-        judge_id,
+        picture, dict(zip(scores.names, map(float, scores.weights), strict=True)), audit_ids, judge_id,
     )
 
 

@@ -79,8 +79,7 @@ class ClipGenerator:
         steps = stochastic_steps(settings.num_steps, self.config.window, request.iteration, seed)
         condition = self._condition(rows)
         rollout = sample_videos(
-            self.folder.network, condition, initial_noise(self._shape(), drawn), seeds, settings, steps,
-            on_progress,
+            self.folder.network, condition, initial_noise(self._shape(), drawn), seeds, settings, steps, on_progress
         )
         return RolloutBuffer(
             rollout, condition, group, sample, {}, torch.ones(len(group), dtype=torch.bool),

@@ -158,8 +158,7 @@ def score(videos: Tensor, scenes: Scenes) -> Scores:
         task=torch.exp(-error[:, 1:] / 2).mean(1).double(),
         mass=(alpha[:, 1:].sum((2, 3)).mean(1) / alpha[:, 0].sum((1, 2)).clamp_min(1e-6)).double(),
         background=(wrong[:, :, 1:].sum((1, 2, 3, 4)) / (2 * away[:, :, 1:].sum((1, 2, 3, 4))).clamp_min(1)).double(),
-        obeyed=((travelled > MOVED_CELLS) & ~lost[:, -1]).double(),
-        consistency=torch.exp(-change / CHANGE).double(),
+        obeyed=((travelled > MOVED_CELLS) & ~lost[:, -1]).double(), consistency=torch.exp(-change / CHANGE).double(),
     )
 
 

@@ -128,9 +128,7 @@ class VideoRun(TrainingRun):
                 self.train(RolloutBuffer.from_bytes(data))
 
     def write_files(self) -> PackedWeights:
-        packed = save_weights(
-            self.network, self.run_dir / self.files.uri(self.version), {"version": str(self.version)}
-        )
+        packed = save_weights(self.network, self.run_dir / self.files.uri(self.version), {"version": str(self.version)})
         if self.learner.averaged:
             with self.learner.averaged_weights():
                 path = self.run_dir / AVERAGED_FILES.uri(self.version)

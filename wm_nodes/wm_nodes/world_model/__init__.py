@@ -7,14 +7,6 @@ from wm_nodes.world_model.text import TextModel, imagine_goals
 from wm_nodes.world_model.tokenizer import Tokenizer
 
 __all__ = [
-    "ActionModel",
-    "ImaginedEnvironment",
-    "TextModel",
-    "Tokenizer",
-    "WorldModels",
-    "imagine_goals",
-    "load_model_folder",
-    "load_starts",
-    "save_model_folder",
-    "save_refreshed_folder",
+    "ActionModel", "ImaginedEnvironment", "TextModel", "Tokenizer", "WorldModels", "imagine_goals", "load_model_folder",
+    "load_starts", "save_model_folder", "save_refreshed_folder",
 ]

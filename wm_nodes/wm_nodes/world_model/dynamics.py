@@ -94,34 +94,20 @@ class ActionModel(FrameModel):
     """WM_act: the environment of the policy."""
 
     def __init__(
-        self,
-        config: WorldModelConfig,
-        *,
-        num_tokens: int,
-        latent_dim: int,
-        action_dim: int,
-        state_dim: int,
+        self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, action_dim: int, state_dim: int,
         num_tasks: int,
     ) -> None:
         super().__init__(config, num_tokens, latent_dim, num_tasks)
         self.condition = ActionCondition(action_dim, state_dim, config.width)
 
     def forward(
-        self,
-        latents_BTSD: Tensor,
-        actions_BTA: Tensor,
-        states_BTP: Tensor,
-        next_states_BTP: Tensor,
+        self, latents_BTSD: Tensor, actions_BTA: Tensor, states_BTP: Tensor, next_states_BTP: Tensor,
         caches: Caches | None = None,
     ) -> Prediction:
         return self.predict(latents_BTSD, self.condition(actions_BTA, states_BTP, next_states_BTP), caches)
 
     def advance(
-        self,
-        latents_NSD: Tensor,
-        actions_NA: Tensor,
-        states_NP: Tensor,
-        next_states_NP: Tensor,
+        self, latents_NSD: Tensor, actions_NA: Tensor, states_NP: Tensor, next_states_NP: Tensor,
         caches: list[RingCache],
     ) -> tuple[Tensor, Tensor]:
         """One environment step: latents (N, S, D) of the next frame and its done logits (N, K, J)."""

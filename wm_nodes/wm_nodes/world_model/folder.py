@@ -59,17 +59,9 @@ class WorldModels:
 
 
 def save_model_folder(
-    folder: Path,
-    tokenizer: Tokenizer,
-    action: ActionModel | TokenActionModel,
-    text: TextModel | None,
-    *,
-    tokenizer_config: TokenizerConfig,
-    world_model_config: WorldModelConfig,
-    simulation: SimulationConfig,
-    tasks: tuple[str, ...],
-    story: Mapping[str, Any],
-    probe: PositionProbe | None = None,
+    folder: Path, tokenizer: Tokenizer, action: ActionModel | TokenActionModel, text: TextModel | None, *,
+    tokenizer_config: TokenizerConfig, world_model_config: WorldModelConfig, simulation: SimulationConfig,
+    tasks: tuple[str, ...], story: Mapping[str, Any], probe: PositionProbe | None = None,
 ) -> Path:
     """Write the models as float16 and the manifest; `story`: data, seeds, commands, metrics, machine, date."""
     modules: dict[str, nn.Module | None] = {"tokenizer": tokenizer, "action": action, "text": text, "probe": probe}

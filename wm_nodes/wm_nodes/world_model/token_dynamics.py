@@ -32,13 +32,7 @@ class TokenActionModel(nn.Module):
     """WM_act over discrete tokens; stands in for ActionModel in the imagined environment."""
 
     def __init__(
-        self,
-        config: WorldModelConfig,
-        *,
-        num_tokens: int,
-        latent_dim: int,
-        action_dim: int,
-        state_dim: int,
+        self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, action_dim: int, state_dim: int,
         num_tasks: int,
     ) -> None:
         super().__init__()
@@ -56,11 +50,7 @@ class TokenActionModel(nn.Module):
         self.condition = ActionCondition(action_dim, state_dim, width)
 
     def forward(
-        self,
-        bits_BTSD: Tensor,
-        next_bits_BTSD: Tensor,
-        decided_BTS: Tensor,
-        condition_BTND: Tensor,
+        self, bits_BTSD: Tensor, next_bits_BTSD: Tensor, decided_BTS: Tensor, condition_BTND: Tensor,
         caches: Caches | None = None,
     ) -> TokenPrediction:
         """Predict frame t + 1 from frames 0..t and the decided tokens of frame t + 1."""
@@ -77,12 +67,7 @@ class TokenActionModel(nn.Module):
         return TokenPrediction(logits, self.done(tokens, register)[0])
 
     def advance(
-        self,
-        bits_NSD: Tensor,
-        actions_NA: Tensor,
-        states_NP: Tensor,
-        next_states_NP: Tensor,
-        caches: list[RingCache],
+        self, bits_NSD: Tensor, actions_NA: Tensor, states_NP: Tensor, next_states_NP: Tensor, caches: list[RingCache]
     ) -> tuple[Tensor, Tensor]:
         """One environment step: bits (N, S, D) of the next frame, K passes of argmax and a commit pass, and its done
         logits (N, K, J)."""

@@ -97,13 +97,9 @@ class ManiSkillEnvironment:
             truncated[i] = not terminated[i] and self._steps[i] >= self.spec.max_episode_steps
             self._ended[i] = terminated[i] or truncated[i]
         return StepResult(
-            observation=self.current(),
-            terminated=terminated,
-            truncated=truncated,
+            observation=self.current(), terminated=terminated, truncated=truncated,
             success_probability=self._task.success(self._truth).astype(np.float32),
-            uncertainty=np.zeros(num_envs, np.float32),
-            ground_truth=self._truth.copy(),
-            valid=valid,
+            uncertainty=np.zeros(num_envs, np.float32), ground_truth=self._truth.copy(), valid=valid,
         )
 
     def goals(self) -> tuple[UInt8Array, BoolArray] | None:

@@ -30,11 +30,9 @@ class DemonstrationPlanner:
         self._env = env
         agent = env.scene.agent
         self._planner = mplib.Planner(
-            urdf=agent.urdf_path,
-            srdf=agent.urdf_path.replace(".urdf", ".srdf"),
+            urdf=agent.urdf_path, srdf=agent.urdf_path.replace(".urdf", ".srdf"),
             user_link_names=[link.get_name() for link in agent.robot.get_links()],
-            user_joint_names=[joint.get_name() for joint in agent.robot.get_active_joints()],
-            move_group=TOOL_LINK,
+            user_joint_names=[joint.get_name() for joint in agent.robot.get_active_joints()], move_group=TOOL_LINK,
         )
         self._planner.set_base_pose(np.hstack([ROBOT_BASE, [1.0, 0.0, 0.0, 0.0]]))
         self._tool_index = self._planner.user_link_names.index(TOOL_LINK)

@@ -82,13 +82,9 @@ def _registered(scene: Callable[[], type[BaseEnv]], mixins: tuple[type[BaseEnv],
 def make(scene: str, config: SimulationConfig, **options: Any) -> gym.Env[Any, Any]:
     """Build a scene of ours or of ManiSkill; options are ManiSkill's."""
     return gym.make(
-        scene,
-        obs_mode="rgb",
-        control_mode="pd_ee_target_delta_pos",
-        sim_backend="physx_cpu",
+        scene, obs_mode="rgb", control_mode="pd_ee_target_delta_pos", sim_backend="physx_cpu",
         render_backend=render_backend(config.render_device),
-        sim_config={"sim_freq": SIMULATION_HZ, "control_freq": _control_frequency(config.control_hz)},
-        **options,
+        sim_config={"sim_freq": SIMULATION_HZ, "control_freq": _control_frequency(config.control_hz)}, **options,
     )
 
 

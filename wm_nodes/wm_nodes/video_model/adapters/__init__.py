@@ -20,18 +20,7 @@ from wm_nodes.video_model.adapters.velocity import PublicVelocity, normalised_cf
 from wm_nodes.video_model.adapters.wan import WanVelocity
 
 __all__ = [
-    "CosmosVelocity",
-    "LoadSettings",
-    "MissingPackageError",
-    "ModelFolder",
-    "PublicVelocity",
-    "PublicVideoModel",
-    "TextEncoder",
-    "VideoCodec",
-    "WanVelocity",
-    "add_lora",
-    "load_lora",
-    "load_public_model",
-    "normalised_cfg",
+    "CosmosVelocity", "LoadSettings", "MissingPackageError", "ModelFolder", "PublicVelocity", "PublicVideoModel",
+    "TextEncoder", "VideoCodec", "WanVelocity", "add_lora", "load_lora", "load_public_model", "normalised_cfg",
     "save_lora",
 ]

@@ -37,14 +37,8 @@ class CosmosVelocity(PublicVelocity):
     cfg_convention: ClassVar[CfgConvention] = "conditional"
 
     def __init__(
-        self,
-        transformer: nn.Module,
-        null_text: Tensor | None = None,
-        *,
-        version: CosmosVersion = "2.5",
-        fps: int | None = None,
-        action_dim: int = 0,
-        autocast: torch.dtype | None = None,
+        self, transformer: nn.Module, null_text: Tensor | None = None, *, version: CosmosVersion = "2.5",
+        fps: int | None = None, action_dim: int = 0, autocast: torch.dtype | None = None,
     ) -> None:
         config: Any = transformer.config
         width = 3 * config.num_attention_heads * config.attention_head_dim
@@ -79,9 +73,7 @@ class CosmosVelocity(PublicVelocity):
             out = self.transformer(
                 hidden_states=with_conditioning(x, condition.frames).to(dtype),
                 timestep=times.to(dtype if self.version == "2" else torch.float32)[:, None, :, None, None],
-                encoder_hidden_states=text,
-                condition_mask=self._extra_channels(x, K, dtype),
-                fps=self.fps,
+                encoder_hidden_states=text, condition_mask=self._extra_channels(x, K, dtype), fps=self.fps,
                 return_dict=False,
             )[0]
         velocity: Tensor = out.float()

@@ -18,10 +18,7 @@ from wm_nodes.video_model.adapters.wan import GivenFrames, WanVelocity
 
 Precision = Literal["float32", "bfloat16", "float16"]
 WAN = ("WanPipeline", "WanImageToVideoPipeline")
-COSMOS: dict[str, CosmosVersion] = {
-    "Cosmos2VideoToWorldPipeline": "2",
-    "Cosmos2_5_PredictBasePipeline": "2.5",
-}
+COSMOS: dict[str, CosmosVersion] = {"Cosmos2VideoToWorldPipeline": "2", "Cosmos2_5_PredictBasePipeline": "2.5"}
 COSMOS2_FPS = 16
 
 

@@ -25,14 +25,8 @@ class TextEncoder:
     """
 
     def __init__(
-        self,
-        encoder: Any,
-        tokenizer: Any,
-        style: TextStyle,
-        *,
-        device: str | torch.device = "cpu",
-        offload: bool = False,
-        max_tokens: int = MAX_TOKENS,
+        self, encoder: Any, tokenizer: Any, style: TextStyle, *, device: str | torch.device = "cpu",
+        offload: bool = False, max_tokens: int = MAX_TOKENS,
     ) -> None:
         self.encoder, self.tokenizer, self.style = encoder.requires_grad_(False).eval(), tokenizer, style
         self.device, self.offload, self.max_tokens = torch.device(device), offload, max_tokens
@@ -53,11 +47,7 @@ class TextEncoder:
     def _t5(self, prompts: list[str]) -> Tensor:
         texts = [_cleaned(prompt) for prompt in prompts] if self.style == "wan" else prompts
         tokens = self.tokenizer(
-            texts,
-            padding="max_length",
-            max_length=self.max_tokens,
-            truncation=True,
-            return_attention_mask=True,
+            texts, padding="max_length", max_length=self.max_tokens, truncation=True, return_attention_mask=True,
             return_tensors="pt",
         )
         present = tokens.attention_mask.to(self.device)
@@ -78,13 +68,8 @@ class TextEncoder:
             for role, text in (("system", system), ("user", prompt))
         ]
         ids = self.tokenizer.apply_chat_template(
-            turns,
-            tokenize=True,
-            add_generation_prompt=False,
-            add_vision_id=False,
-            max_length=self.max_tokens,
-            truncation=True,
-            padding="max_length",
+            turns, tokenize=True, add_generation_prompt=False, add_vision_id=False, max_length=self.max_tokens,
+            truncation=True, padding="max_length",
         )
         return torch.tensor(ids if isinstance(ids, list) else ids["input_ids"], dtype=torch.long)
 

@@ -47,12 +47,7 @@ class PublicVelocity(nn.Module):
     cfg_convention: ClassVar[CfgConvention]
 
     def __init__(
-        self,
-        transformer: nn.Module,
-        null_text: Tensor | None,
-        *,
-        action_dim: int,
-        action_width: int,
+        self, transformer: nn.Module, null_text: Tensor | None, *, action_dim: int, action_width: int,
         autocast: torch.dtype | None,
     ) -> None:
         super().__init__()

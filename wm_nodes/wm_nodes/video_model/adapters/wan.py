@@ -39,17 +39,9 @@ class WanVelocity(PublicVelocity):
     cfg_convention: ClassVar[CfgConvention] = "unconditional"
 
     def __init__(
-        self,
-        transformer: nn.Module,
-        null_text: Tensor | None = None,
-        *,
-        frames: GivenFrames = "none",
-        continuation: Continuation | None = None,
-        low_noise: nn.Module | None = None,
-        boundary: float = 0.0,
-        time_scale: float = 1000.0,
-        action_dim: int = 0,
-        autocast: torch.dtype | None = None,
+        self, transformer: nn.Module, null_text: Tensor | None = None, *, frames: GivenFrames = "none",
+        continuation: Continuation | None = None, low_noise: nn.Module | None = None, boundary: float = 0.0,
+        time_scale: float = 1000.0, action_dim: int = 0, autocast: torch.dtype | None = None,
     ) -> None:
         config: Any = transformer.config
         width = config.num_attention_heads * config.attention_head_dim
@@ -97,10 +89,8 @@ class WanVelocity(PublicVelocity):
         embedder = network.condition_embedder.time_embedder
         with self._precision(x.device), self._steered(embedder, condition, drop, cells, x):
             out = network(
-                hidden_states=self._inputs(x, t, condition).to(dtype),
-                timestep=(told * self.time_scale).float(),
-                encoder_hidden_states=text,
-                return_dict=False,
+                hidden_states=self._inputs(x, t, condition).to(dtype), timestep=(told * self.time_scale).float(),
+                encoder_hidden_states=text, return_dict=False,
             )[0]
         velocity: Tensor = out.float()
         return velocity

@@ -74,11 +74,8 @@ def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEp
     latents = torch.cat(pieces).clone().reshape(*episodes.images.shape[:2], *pieces[0].shape[1:])
     change = (latents[:, 1:].float() - latents[:, :1].float()).abs().mean(-1).mean((0, 1))
     return LatentEpisodes(
-        images=torch.from_numpy(episodes.images),
-        latents=latents,
-        mean_change_S=change,
-        states=torch.from_numpy(episodes.states),
-        actions=torch.from_numpy(episodes.actions),
+        images=torch.from_numpy(episodes.images), latents=latents, mean_change_S=change,
+        states=torch.from_numpy(episodes.states), actions=torch.from_numpy(episodes.actions),
         success=torch.from_numpy(episodes.success),
         truth=torch.from_numpy(probe_targets(episodes.ground_truth, episodes.tasks[0])),
         step_mask=torch.from_numpy(episodes.step_mask),
@@ -86,15 +83,8 @@ def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEp
 
 
 def train_action_model(
-    tokenizer: Tokenizer,
-    episodes: EpisodeArrays | LatentEpisodes,
-    config: RunConfig,
-    seed: int,
-    run_dir: Path | None,
-    *,
-    progress: bool = True,
-    model: ActionModel | None = None,
-    done_loss: str = "bce",
+    tokenizer: Tokenizer, episodes: EpisodeArrays | LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None,
+    *, progress: bool = True, model: ActionModel | None = None, done_loss: str = "bce",
 ) -> tuple[ActionModel, dict[str, float]]:
     """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
 
@@ -135,12 +125,8 @@ def new_action_model(tokenizer: Tokenizer, data: LatentEpisodes, config: RunConf
     """A freshly initialised model whose state normalisation fits the data."""
     with initial_weights(seed, "action_model_init"):
         model = ActionModel(
-            config.world_model,
-            num_tokens=tokenizer.num_tokens,
-            latent_dim=tokenizer.latent_dim,
-            action_dim=data.actions.shape[-1],
-            state_dim=data.states.shape[-1],
-            num_tasks=data.success.shape[-1],
+            config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
+            action_dim=data.actions.shape[-1], state_dim=data.states.shape[-1], num_tasks=data.success.shape[-1],
         )
     fit_state_range(model.condition, data)
     return model
@@ -159,11 +145,7 @@ def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> 
 
 
 def unroll(
-    model: ActionModel,
-    tokenizer: Tokenizer,
-    data: LatentEpisodes,
-    index: Tensor,
-    rollout_steps: int,
+    model: ActionModel, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, rollout_steps: int,
     generator: torch.Generator,
 ) -> RolloutTerms:
     """Roll the model out over whole episodes `index`, on its own predictions between real frames."""
@@ -196,13 +178,8 @@ def unroll(
 
 
 def rollout_losses(
-    terms: RolloutTerms,
-    tokenizer: Tokenizer,
-    data: LatentEpisodes,
-    index: Tensor,
-    head_mask_BK: Tensor,
-    config: RunConfig,
-    done_loss: str = "bce",
+    terms: RolloutTerms, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, head_mask_BK: Tensor,
+    config: RunConfig, done_loss: str = "bce",
 ) -> dict[str, Tensor]:
     """The training losses (RS-2 for continuous latents, RS-3, RS-4) over the recorded steps."""
     target = data.latents[index].float()
@@ -218,19 +195,14 @@ def rollout_losses(
     losses["position"] = probe_loss(tokenizer, terms.positions.flatten(0, 1), truth)
     settings = config.world_model
     losses["loss"] = (
-        losses["latent"]
-        + settings.done_weight * losses["done"]
+        losses["latent"] + settings.done_weight * losses["done"]
         + settings.state_weight * (losses["state"] + losses["position"])
     )
     return losses
 
 
 def decoded_losses(
-    terms: RolloutTerms,
-    tokenizer: Tokenizer,
-    data: LatentEpisodes,
-    index: Tensor,
-    config: RunConfig,
+    terms: RolloutTerms, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, config: RunConfig,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
     """What the policy will see: DECODED_FRAMES predicted frames of each episode are decoded and encoded again.

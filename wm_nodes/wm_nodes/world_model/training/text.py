@@ -69,8 +69,7 @@ def train_text_model(
         terms["state"] = probe_loss(tokenizer, tokenizer.read_state_normalised(latents.flatten(0, 1)), known)
         terms["position"] = probe_loss(tokenizer, positions.flatten(0, 1), known)
         terms["loss"] = (
-            terms["latent"]
-            + settings.done_weight * terms["done"]
+            terms["latent"] + settings.done_weight * terms["done"]
             + settings.state_weight * (terms["state"] + terms["position"])
         )
         return terms

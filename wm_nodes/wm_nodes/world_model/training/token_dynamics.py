@@ -23,12 +23,7 @@ the model meets errors of its own kind."""
 
 
 def train_token_model(
-    tokenizer: Tokenizer,
-    data: LatentEpisodes,
-    config: RunConfig,
-    seed: int,
-    run_dir: Path | None,
-    *,
+    tokenizer: Tokenizer, data: LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None, *,
     progress: bool = True,
 ) -> tuple[TokenActionModel, dict[str, float]]:
     """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics."""
@@ -55,11 +50,7 @@ def train_token_model(
 
 
 def token_losses(
-    model: TokenActionModel,
-    data: LatentEpisodes,
-    index: Tensor,
-    head_mask_BK: Tensor,
-    generator: torch.Generator,
+    model: TokenActionModel, data: LatentEpisodes, index: Tensor, head_mask_BK: Tensor, generator: torch.Generator,
     done_weight: float,
 ) -> dict[str, Tensor]:
     """Losses of whole episodes with a random part of every next frame masked."""

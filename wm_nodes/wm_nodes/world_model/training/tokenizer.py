@@ -25,12 +25,7 @@ PROBE_WEIGHT = 0.1
 
 
 def train_tokenizer(
-    episodes: EpisodeArrays,
-    config: RunConfig,
-    seed: int,
-    run_dir: Path | None,
-    *,
-    progress: bool = True,
+    episodes: EpisodeArrays, config: RunConfig, seed: int, run_dir: Path | None, *, progress: bool = True
 ) -> tuple[Tokenizer, dict[str, float]]:
     """Train on every recorded frame; returns the tokenizer (averaged weights) and its last metrics.
 
@@ -68,8 +63,7 @@ def train_tokenizer(
             terms["entropy"] = entropy_loss(features)
             terms["commitment"] = (features - latents.detach()).square().mean()
             terms["loss"] = (
-                terms["loss"]
-                + settings.entropy_weight * terms["entropy"]
+                terms["loss"] + settings.entropy_weight * terms["entropy"]
                 + settings.commitment_weight * terms["commitment"]
             )
         terms["psnr_db"] = -10 * error.detach().square().mean().log10()

@@ -90,10 +90,7 @@ def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig
 
 
 def accept_world_model(
-    models: WorldModels,
-    heldout: EpisodeArrays,
-    config: RunConfig,
-    imagined: tuple[int, int] | None = None,
+    models: WorldModels, heldout: EpisodeArrays, config: RunConfig, imagined: tuple[int, int] | None = None,
     real: tuple[int, int] | None = None,
 ) -> AcceptanceReport:
     """Judge a world model for config.task.
@@ -112,10 +109,7 @@ def accept_world_model(
 
 
 def criteria_of(
-    metrics: Mapping[str, float],
-    config: RunConfig,
-    num_steps: int,
-    imagined: tuple[int, int] | None,
+    metrics: Mapping[str, float], config: RunConfig, num_steps: int, imagined: tuple[int, int] | None,
     real: tuple[int, int] | None,
 ) -> tuple[tuple[Criterion, ...], tuple[str, ...]]:
     """Criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model."""

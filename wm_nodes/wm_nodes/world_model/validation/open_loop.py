@@ -84,11 +84,7 @@ def imagine(
 
 
 def evaluate_rollouts(
-    tokenizer: Tokenizer,
-    model: ActionModel | TokenActionModel,
-    episodes: EpisodeArrays,
-    *,
-    threshold: float = 0.7,
+    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays, *, threshold: float = 0.7,
     probe: PositionProbe | None = None,
 ) -> dict[str, float]:
     """Metrics by name (see docs/metrics.md); positions in cm, PSNR in dB, `_hNN` at step NN.

@@ -14,11 +14,6 @@ def scene() -> Any:
 
 
 TASK = replace(
-    push_cube.TASK,
-    instruction="pull the blue cube into the red target",
-    scene=scene,
-    settings={},
-    model_tasks=(),
-    weak_policies=(WeakPolicy(4, 4, 0.3),),
-    clips=replace(clip_rules("push_cube"), any_heading=False),
+    push_cube.TASK, instruction="pull the blue cube into the red target", scene=scene, settings={}, model_tasks=(),
+    weak_policies=(WeakPolicy(4, 4, 0.3),), clips=replace(clip_rules("push_cube"), any_heading=False),
 )

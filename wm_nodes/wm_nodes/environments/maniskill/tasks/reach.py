@@ -38,7 +38,6 @@ TASK = Task(
     clips=ClipRules(
         TaskRule("tool", TOLERANCE_M, above_thing_m=table_top.HOVER_HEIGHT_M),
         behaviours={"hover": 0.6, "hover_noisy": 0.3, "near_miss": 0.1},
-        policy_behaviours={"hover": 0.45, "hover_noisy": 0.3, "near_miss": 0.15, "random": 0.1},
-        any_height=False,
+        policy_behaviours={"hover": 0.45, "hover_noisy": 0.3, "near_miss": 0.15, "random": 0.1}, any_height=False,
     ),
 )
