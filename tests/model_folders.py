@@ -23,7 +23,4 @@ def make_model_folder(folder: Path, config: RunConfig | None = None) -> Path:
             config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
             action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),
         )
-    return save_model_folder(
-        folder, tokenizer, action, None, tokenizer_config=config.tokenizer, world_model_config=config.world_model,
-        simulation=config.simulation, tasks=tasks, story={"made": {"seed": 0}},
-    )
+    return save_model_folder(folder, tokenizer, action, None, config, tasks=tasks, story={"made": {"seed": 0}})

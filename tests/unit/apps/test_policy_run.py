@@ -1,6 +1,7 @@
 """What a resumed run finds: kept evaluations, shares of the updates, joined metrics."""
 
 import json
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def test_every_round_but_the_first_has_a_seed_of_its_own() -> None:
 def test_metrics_of_consecutive_trainings_are_counted_on(tmp_path: Path) -> None:
     folders = [tmp_path / "1", tmp_path / "2"]
     for folder in folders:
-        with MetricsWriter(folder, tensorboard=False) as writer:
+        with closing(MetricsWriter(folder, tensorboard=False)) as writer:
             for step in (1, 2):
                 writer.write("ppo", step, {"loss_policy": 0.5})
     for _ in range(2):

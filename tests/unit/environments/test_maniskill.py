@@ -197,11 +197,11 @@ def test_every_task_has_an_instruction_of_known_words() -> None:
 def test_collection_writes_bags_and_does_not_collect_again(tmp_path: Path) -> None:
     config = CONFIG.model_copy(update={"data": CONFIG.data.model_copy(update={"num_workers": 1})})
     plan = demonstration_plan(config, 2, 600_000)
-    bags = collect_plan(plan, config, tmp_path, progress=False)
+    bags = collect_plan(plan, config, tmp_path)
     written = [path.stat().st_mtime_ns for path in sorted(bags[0].iterdir())]
     episodes = list(read_episodes(bags[0]))
     assert [episode.seed for episode in episodes] == [600_000, 600_001]
     assert all(episode.behaviour == "expert" and episode.success[-1] for episode in episodes)
     other = dataclasses.replace(plan, num_episodes=2)
-    assert collect_plan(other, config, tmp_path, progress=False) == bags
+    assert collect_plan(other, config, tmp_path) == bags
     assert [path.stat().st_mtime_ns for path in sorted(bags[0].iterdir())] == written

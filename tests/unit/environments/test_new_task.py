@@ -101,7 +101,7 @@ def test_it_is_simulated_demonstrated_and_scripted_in_a_scene_of_its_own() -> No
 
 def test_its_demonstrations_are_recorded_and_what_a_world_model_probes_is_found_by_name(tmp_path: Path) -> None:
     config = load_config("smoke", {"task": "nudge", "data.num_workers": 1})
-    bags = collect_plan(demonstration_plan(config, 1, 600_000), config, tmp_path, progress=False)
+    bags = collect_plan(demonstration_plan(config, 1, 600_000), config, tmp_path)
     (episode,) = read_episodes(bags[0])
     assert (episode.task, episode.instruction, episode.behaviour) == ("nudge", "nudge the blue cube", "expert")
     assert episode.success[-1] and episode.ground_truth.shape[1] == 12

@@ -13,7 +13,6 @@ from wm_nodes.config.schema import SftConfig
 from wm_nodes.core.types import Episode, UInt8Array
 from wm_nodes.policy_rl.behaviour_cloning import demonstrations, train_sft
 from wm_nodes.policy_rl.evaluation import evaluate
-from wm_nodes.policy_rl.rollouts import Canceled
 
 
 def settings(**changes: float) -> SftConfig:
@@ -98,10 +97,8 @@ def test_only_successful_expert_episodes_are_demonstrations() -> None:
         demonstrations([failed, noisy, DEMOS[2]], 3)
 
 
-def test_other_data_and_a_stop_are_refused_and_heard() -> None:
+def test_other_data_are_refused() -> None:
     with pytest.raises(ValueError, match="noisy"):
         train_sft(toy_policy(), [replace(DEMOS[0], behaviour="noisy")], settings(), 0)
     with pytest.raises(ValueError, match="got 0"):
         train_sft(toy_policy(), [], settings(), 0)
-    with pytest.raises(Canceled, match="iteration 0"):
-        train_sft(toy_policy(), DEMOS[:2], settings(), 0, should_stop=lambda: True)

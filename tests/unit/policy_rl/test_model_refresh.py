@@ -36,7 +36,7 @@ def bags(config: RunConfig, model_dir: Path, tmp_path_factory: pytest.TempPathFa
     weights = folder / "policy.safetensors"
     policy = make_policy(config, model_dir)
     save_weights(policy, weights, {"tokenizer_sha256": policy.encoder.sha256})
-    return model_refresh.collect_round(config, model_dir, weights, folder, 2, progress=False)
+    return model_refresh.collect_round(config, model_dir, weights, folder, 2)
 
 
 def test_a_round_collects_noisy_whole_episodes_on_seeds_of_its_own(bags: tuple[list[Path], list[Path]]) -> None:
@@ -54,7 +54,7 @@ def test_a_refresh_changes_the_action_model_and_nothing_else(
     other = config.model_copy(
         update={"world_model": config.world_model.model_copy(update={"num_done_heads": 7, "batch_size": 2})}
     )
-    folder = refresh_model(other, model_dir, bags[0], tmp_path / "model", number=1, progress=False)
+    folder = refresh_model(other, model_dir, bags[0], tmp_path / "model", number=1)
     old, new = load_model_folder(model_dir), load_model_folder(folder)
     assert new.tokenizer_sha256 == old.tokenizer_sha256 and new.sha256 != old.sha256
     assert (folder / "tokenizer.safetensors").read_bytes() == (model_dir / "tokenizer.safetensors").read_bytes()
@@ -63,7 +63,7 @@ def test_a_refresh_changes_the_action_model_and_nothing_else(
     assert new.manifest["refreshed"][0]["source_sha256"] == old.sha256
     assert old.manifest["sha256"]["action"] != new.manifest["sha256"]["action"]
     written = (folder / "manifest.json").stat().st_mtime_ns
-    assert refresh_model(other, model_dir, bags[0], folder, number=1, progress=False) == folder
+    assert refresh_model(other, model_dir, bags[0], folder, number=1) == folder
     assert (folder / "manifest.json").stat().st_mtime_ns == written
 
 

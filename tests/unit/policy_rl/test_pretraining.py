@@ -9,7 +9,7 @@ import torch
 
 from wm_nodes.config.load import load_config
 from wm_nodes.environments.maniskill import collection
-from wm_nodes.policy_rl.pretraining import _tokenizer_folder, make_model
+from wm_nodes.policy_rl.pretraining import _make_tokenizer_folder, make_model
 from wm_nodes.recording import read_episodes
 from wm_nodes.world_model import Tokenizer, load_model_folder, load_starts
 
@@ -19,7 +19,8 @@ def test_the_untrained_model_beside_a_tokenizer_is_that_of_the_seed(tmp_path: Pa
     tokenizer = Tokenizer(config.tokenizer, 64, 128)
     for name in ("a", "b"):
         torch.rand(5)
-        files.append((_tokenizer_folder(config, tmp_path / name, tokenizer) / "action_model.safetensors").read_bytes())
+        folder = _make_tokenizer_folder(config, tmp_path / name, tokenizer)
+        files.append((folder / "action_model.safetensors").read_bytes())
     assert files[0] == files[1]
 
 
@@ -34,7 +35,7 @@ def test_a_model_from_scratch_is_collected_in_parallel_and_resumed_where_it_stop
         "data.behaviours": {"expert": 1.0}, "data.num_workers": 2, "tokenizer.num_iterations": 4,
         "world_model.num_iterations": 4, "sft.num_iterations": 2,
     })
-    folder = make_model(config, tmp_path, progress=False, command="a test")
+    folder = make_model(config, tmp_path, command="a test")
     models = load_model_folder(folder)
     assert models.tasks == ("pull_cube",) and models.text is not None
     assert len(load_starts(folder / "starts.safetensors")[0]) == 4
@@ -53,6 +54,6 @@ def test_a_model_from_scratch_is_collected_in_parallel_and_resumed_where_it_stop
     kept = {path: path.stat().st_mtime_ns for path in shards[0].iterdir()}
     for lost in (folder, shards[1]):  # as if stopped while it collected
         shutil.rmtree(lost)
-    make_model(config, tmp_path, progress=False)
+    make_model(config, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept and shards[1].is_dir()
     assert {path.name: path.read_bytes() for path in folder.glob("*.safetensors")} == files

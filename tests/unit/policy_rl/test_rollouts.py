@@ -11,7 +11,6 @@ from wm_nodes.config.load import load_config
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.rollouts import (
     TRAINING_SEED_LIMIT,
-    Canceled,
     action_noise,
     collect_rollout,
     reset_seeds,
@@ -85,16 +84,7 @@ def test_streams_differ_by_seed_version_and_step() -> None:
     np.testing.assert_array_equal(action_noise(0, 1, 2, 4, 3), action_noise(0, 1, 2, 4, 3))
 
 
-def test_deterministic_rollout_executes_the_clamped_mean() -> None:
-    policy = toy_policy()
-    rollout = collect_rollout(ReachToy(2, 0), policy, RuleReward(), 2, 0, 1, deterministic=True)
-    expected = policy.act(rollout.images_TN[0], rollout.states_TN[0]).actions
-    np.testing.assert_array_equal(rollout.actions_TN[0], expected)
-
-
-def test_a_stopped_rollout_raises_and_too_few_steps_are_refused() -> None:
-    with pytest.raises(Canceled, match="lock-step 0 of 5"):
-        collect_rollout(ReachToy(2, 0), toy_policy(), RuleReward(), 5, 0, 1, should_stop=lambda: True)
+def test_too_few_steps_are_refused() -> None:
     with pytest.raises(ValueError, match="steps must be >= 1, got 0"):
         collect_rollout(ReachToy(2, 0), toy_policy(), RuleReward(), 0, 0, 1)
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RewardConfig
@@ -189,11 +188,6 @@ def test_pixel_and_encoder_distances_match_numbers_worked_by_hand() -> None:
     np.testing.assert_allclose(encode(grey(0), grey(25)), [2.5])
 
 
-def test_a_calibrated_distance_is_one_on_average_between_starts_and_goals() -> None:
-    def encode(images: torch.Tensor) -> torch.Tensor:
-        return images.float().mean((1, 2))
-
-    calibrated = EncoderDistance.calibrated(encode, grey(0, 0), grey(10, 30))
-    np.testing.assert_allclose(calibrated(grey(0, 0), grey(10, 30)), [0.5, 1.5])
+def test_a_scale_of_zero_is_refused() -> None:
     with pytest.raises(ValueError, match="scale must be finite and > 0, got 0"):
-        EncoderDistance.calibrated(encode, grey(0), grey(0))
+        EncoderDistance(lambda images: images.float(), scale=0.0)

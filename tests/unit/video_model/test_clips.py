@@ -17,7 +17,7 @@ from wm_nodes.video_model.clips import Clips, cut_clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
-from wm_nodes.video_rl.reference_reward import mixed, score_clips
+from wm_nodes.video_rl.reference_reward import mix_rewards, score_clips
 from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
 
@@ -117,9 +117,9 @@ def test_a_clip_equal_to_its_recording_has_full_scores_and_a_shifted_object_lose
 
 def test_rewards_are_mixed_by_weight_and_an_unknown_one_is_named() -> None:
     values = {"tracking": torch.tensor([1.0, 2.0]), "scenery": torch.tensor([0.1, 0.2])}
-    assert torch.allclose(mixed(values, {"tracking": 2.0, "scenery": -1.0}), torch.tensor([1.9, 3.8]).double())
+    assert torch.allclose(mix_rewards(values, {"tracking": 2.0, "scenery": -1.0}), torch.tensor([1.9, 3.8]).double())
     with pytest.raises(ValueError, match="beauty"):
-        mixed(values, {"beauty": 1.0})
+        mix_rewards(values, {"beauty": 1.0})
 
 
 @pytest.mark.parametrize("preset", preset_names(VIDEO))

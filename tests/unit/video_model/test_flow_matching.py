@@ -89,7 +89,7 @@ def test_a_trained_model_obeys_its_actions_and_without_them_knows_only_the_mean(
     torch.manual_seed(0)
     model = VideoNetwork(NetworkSettings(1, ACTION_DIM, width=16, depth=2))
     settings = FlowMatchingConfig(num_iterations=400, learning_rate=3e-3, drop=0.2)
-    train_video_model(model, lambda i: commanded(16, i), settings, seed=0, run_dir=None, progress=False)
+    train_video_model(model, lambda i: commanded(16, i), settings, seed=0, run_dir=None)
     latents, condition = commanded(64, -1)
     noise = torch.randn(latents.shape, generator=torch_stream(0, "test_noise"))
     x = torch.cat([condition.frames, noise[:, :, 1:]], 2)

@@ -301,8 +301,8 @@ def test_a_transition_carries_gradient_in_its_noise_only() -> None:
     buffer = toy_buffer(model, settings)
     new = first_transition(buffer, settings, 1, model)
     assert new.zeta.requires_grad and new.zeta.shape == (8, 3 * 3 * 5 * 7)
-    assert not any(getattr(new, name).requires_grad for name in ("std", "slope", "mask", "sigma_base"))
-    assert new.std.shape == new.slope.shape == new.mask.shape == new.zeta.shape and new.sigma_base.shape == (8,)
+    assert not any(getattr(new, name).requires_grad for name in ("std", "slope", "sigma_base"))
+    assert new.std.shape == new.slope.shape == new.zeta.shape and new.sigma_base.shape == (8,)
     assert not buffer.rollout.states.requires_grad and not buffer.rollout.mask.requires_grad
 
 

@@ -64,7 +64,7 @@ def all_rows(buffer: RolloutBuffer) -> Rows:
 
 
 def known(values: list[float]) -> GroupAdvantages:
-    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0, 0)
+    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0)
 
 
 SIGNAL = known([1.5, -0.5, 0.25, -1.0, 2.0, -2.0, 0.1, 0.7])

@@ -17,7 +17,7 @@ from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl.reference_reward import ClipScores, more_is_better
 from wm_nodes.video_rl.training_run import VIDEO_FILES, VideoRun, evaluated_uri, progress
-from wm_nodes.video_rl.validation import alarm_text, alarms_of, hacked_now
+from wm_nodes.video_rl.validation import alarm_text, alarms_of, find_hacked_now
 
 ROLLOUT = toy_rollout_settings(micro_batch=8)
 SCORES = set(ClipScores.__dataclass_fields__)
@@ -54,24 +54,24 @@ def lines(rewards: list[float | None], **scores: list[float]) -> list[dict[str, 
 
 def test_an_error_that_grows_while_the_reward_rises_is_named_with_both_slopes() -> None:
     rising = [0.1, 0.2, 0.3]
-    (alarm,) = hacked_now(lines(rising, object_cm=[5.0, 6.0, 7.0], tracking=[0.1, 0.2, 0.3]), window=3)
+    (alarm,) = find_hacked_now(lines(rising, object_cm=[5.0, 6.0, 7.0], tracking=[0.1, 0.2, 0.3]), window=3)
     assert (alarm.metric, alarm.proxy_slope, alarm.true_slope) == ("object_cm", pytest.approx(0.1), pytest.approx(-1.0))
     assert "reward rises by 0.1 per evaluation while held-out scores get worse: object_cm by 1;" in alarm_text([alarm])
-    assert not hacked_now(lines(rising, object_cm=[7.0, 6.0, 5.0], tracking=[0.1, 0.2, 0.3]), window=3)
-    assert not hacked_now(lines(rising[::-1], object_cm=[5.0, 6.0, 7.0]), window=3)
-    assert not hacked_now(lines(rising[:2], object_cm=[5.0, 6.0]), window=3)
+    assert not find_hacked_now(lines(rising, object_cm=[7.0, 6.0, 5.0], tracking=[0.1, 0.2, 0.3]), window=3)
+    assert not find_hacked_now(lines(rising[::-1], object_cm=[5.0, 6.0, 7.0]), window=3)
+    assert not find_hacked_now(lines(rising[:2], object_cm=[5.0, 6.0]), window=3)
 
 
 def test_the_object_that_moves_too_far_is_as_wrong_as_the_one_that_stays() -> None:
     assert more_is_better("motion", [0.5, 1.0, 1.5]).tolist() == [-0.5, 0.0, -0.5]
-    (alarm,) = hacked_now(lines([1, 2, 3], motion=[1.0, 1.2, 1.4]), window=3)
+    (alarm,) = find_hacked_now(lines([1, 2, 3], motion=[1.0, 1.2, 1.4]), window=3)
     assert alarm.true_slope == pytest.approx(-0.2)
 
 
 def test_the_reward_of_an_evaluation_is_the_mean_over_the_buffers_since_the_one_before() -> None:
     rows = [{"section": "grpo", "step": i + 1, "reward_mean": float(r)} for i, r in enumerate([1, 3, 2, 4, 5, 3])]
     rows += [{"section": "heldout", "step": step, "psnr_db": 20.0 - step} for step in (2, 4, 6)]
-    (alarm,) = hacked_now(rows, window=3)  # rewards 2, 3, 4
+    (alarm,) = find_hacked_now(rows, window=3)  # rewards 2, 3, 4
     assert alarm.proxy_slope == pytest.approx(1.0) and alarm.true_slope == pytest.approx(-2.0)
 
 
@@ -79,8 +79,8 @@ def test_a_missing_value_takes_its_score_out_and_a_missing_reward_its_evaluation
     known: list[float | None] = [1.0, 2.0, 3.0]
     rows = lines(known, psnr_db=[3.0, 2.0, 1.0], tracking=[3.0, 2.0, 1.0])
     rows[3]["psnr_db"] = None
-    assert [alarm.metric for alarm in hacked_now(rows, window=3)] == ["tracking"]
-    assert not hacked_now(lines([1.0, None, 3.0], tracking=[3.0, 2.0, 1.0]), window=3)
+    assert [alarm.metric for alarm in find_hacked_now(rows, window=3)] == ["tracking"]
+    assert not find_hacked_now(lines([1.0, None, 3.0], tracking=[3.0, 2.0, 1.0]), window=3)
 
 
 class Falling:

@@ -15,7 +15,7 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
-from wm_nodes.world_model.validation.acceptance import AcceptanceReport, accept_world_model, criteria_of
+from wm_nodes.world_model.validation.acceptance import AcceptanceReport, accept_world_model, apply_criteria
 
 TASKS = ("reach", "push_cube")
 GOOD = {
@@ -35,7 +35,7 @@ def settings(task: str = "push_cube", **changes: object) -> RunConfig:
 
 
 def judged(metrics: dict[str, float], config: RunConfig, imagined=(40, 100), real=(80, 200)) -> AcceptanceReport:  # type: ignore[no-untyped-def]
-    criteria, notes = criteria_of(metrics, config, 16, imagined, real)
+    criteria, notes = apply_criteria(metrics, config, 16, imagined, real)
     return AcceptanceReport(config.task, 96, criteria, metrics, notes)
 
 
@@ -136,7 +136,7 @@ def test_episodes_without_ground_truth_are_refused(untrained: WorldModels, heldo
 def test_episodes_labelled_for_other_tasks_than_the_models_are_refused(
     untrained: WorldModels, heldout: EpisodeArrays
 ) -> None:
-    with pytest.raises(ValueError, match="labelled for push_cube, reach, the world model judges reach, push_cube"):
+    with pytest.raises(ValueError, match="labelled for push_cube, reach, the world model knows reach, push_cube"):
         accept_world_model(untrained, replace(heldout, tasks=("push_cube", "reach")), settings())
 
 

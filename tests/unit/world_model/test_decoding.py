@@ -149,14 +149,11 @@ def test_a_token_model_learns_a_scene_and_imagines_it_behind_the_environment_int
         "world_model.num_iterations": 60, "world_model.batch_size": 16, "world_model.learning_rate": 3e-3,
     })
     episodes = stack_episodes([episode(i) for i in range(60)], ("push_cube",), success)
-    tokenizer, _ = train_tokenizer(episodes, config, 0, None, progress=False)
+    tokenizer, _ = train_tokenizer(episodes, config, 0, None)
     data = tokenise_episodes(tokenizer, episodes)
-    model, metrics = train_token_model(tokenizer, data, config, 0, tmp_path, progress=False)
+    model, metrics = train_token_model(tokenizer, data, config, 0, tmp_path)
     assert metrics["accuracy"] > 0.5
-    folder = save_model_folder(
-        tmp_path / "model", tokenizer, model, None, tokenizer_config=config.tokenizer,
-        world_model_config=config.world_model, simulation=config.simulation, tasks=("push_cube",), story={},
-    )
+    folder = save_model_folder(tmp_path / "model", tokenizer, model, None, config, tasks=("push_cube",), story={})
     models = load_model_folder(folder)
     assert isinstance(models.action, TokenActionModel)
     results = evaluate_rollouts(models.tokenizer, models.action, episodes.select(range(8)))

@@ -22,7 +22,7 @@ def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
 
 def test_a_trained_probe_reads_positions_of_episodes_it_has_not_seen(tmp_path: Path) -> None:
     config = load_config("base", {"tokenizer.num_iterations": 500, "tokenizer.batch_size": 32})
-    probe, metrics = train_position_probe(arrays(120), config, 0, tmp_path, progress=False)
+    probe, metrics = train_position_probe(arrays(120), config, 0, tmp_path)
     assert metrics["error_m"] < 0.02
     unseen = arrays(16, 10_000)
     truth = probe_targets(unseen.ground_truth, "push_cube")
@@ -36,7 +36,7 @@ def test_episodes_without_ground_truth_are_refused() -> None:
     known = arrays(2)
     unknown = EpisodeArrays(**{**known.__dict__, "ground_truth": np.full_like(known.ground_truth, np.nan)})
     with pytest.raises(ValueError, match="no recorded frame has ground truth"):
-        train_position_probe(unknown, load_config("base", {}), 0, None, progress=False)
+        train_position_probe(unknown, load_config("base", {}), 0, None)
 
 
 def test_enlarged_images_are_read_as_they_are_and_another_shape_is_refused() -> None:

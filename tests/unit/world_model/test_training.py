@@ -14,7 +14,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
-from wm_nodes.training.loop import LoopSettings, TrainingLoop
+from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.training.dynamics import (
     RolloutTerms,
     bootstrap_masks,
@@ -97,35 +97,38 @@ def test_episodes_of_different_cameras_are_refused() -> None:
 
 
 def test_a_resumed_run_takes_the_same_steps_as_one_that_was_not_stopped(tmp_path: Path) -> None:
-    def loop(folder: Path | None, seconds: float = 0.0) -> TrainingLoop:
+    def loop(folder: Path | None) -> TrainingLoop:
         torch.manual_seed(0)
-        model = torch.nn.Linear(3, 2)
-        return TrainingLoop("toy", model, LoopSettings(30, 0.1, max_seconds=seconds), folder)
+        return TrainingLoop("toy", torch.nn.Linear(3, 2), 30, 0.1, folder)
 
-    def loss_of(made: TrainingLoop):  # type: ignore[no-untyped-def]
+    def loss_of(made: TrainingLoop, stop_at: int = 30):  # type: ignore[no-untyped-def]
         def loss(iteration: int) -> dict[str, torch.Tensor]:
+            if iteration == stop_at:
+                made.save()
+                raise KeyboardInterrupt
             x = torch.randn(4, 3, generator=torch.Generator().manual_seed(iteration))
             return {"loss": made.model(x).square().mean()}
 
         return loss
 
     whole = loop(None)
-    whole.run(loss_of(whole), progress=False)
-    first = loop(tmp_path, seconds=1e-9)
-    first.run(loss_of(first), progress=False)
-    assert 0 < first.iteration < 30
+    whole.run(loss_of(whole))
+    first = loop(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        first.run(loss_of(first, stop_at=7))
+    assert first.iteration == 7
     second = loop(tmp_path)
     assert second.iteration == first.iteration
-    second.run(loss_of(second), progress=False)
+    second.run(loss_of(second))
     assert second.model.weight.equal(whole.model.weight)
     lines = [json.loads(line) for line in (tmp_path / "metrics_toy.jsonl").read_text().splitlines()]
     assert lines[-1]["iteration"] == 30
 
 
 def test_a_checkpoint_of_another_architecture_is_one_clear_error(tmp_path: Path) -> None:
-    TrainingLoop("toy", torch.nn.Linear(3, 2), LoopSettings(1, 0.1), tmp_path).save()
+    TrainingLoop("toy", torch.nn.Linear(3, 2), 1, 0.1, tmp_path).save()
     with pytest.raises(ValueError, match="another architecture"):
-        TrainingLoop("toy", torch.nn.Linear(4, 2), LoopSettings(1, 0.1), tmp_path)
+        TrainingLoop("toy", torch.nn.Linear(4, 2), 1, 0.1, tmp_path)
 
 
 def test_auc_counts_ties_half_and_detection_counts_episodes() -> None:
@@ -138,7 +141,7 @@ def test_auc_counts_ties_half_and_detection_counts_episodes() -> None:
 
 def test_decoded_losses_are_smallest_for_the_true_latents_and_reach_the_predictions_only() -> None:
     config, episodes = config_of(tokenizer__num_iterations=40), arrays(12)
-    tokenizer, _ = train_tokenizer(episodes, config, 0, None, progress=False)
+    tokenizer, _ = train_tokenizer(episodes, config, 0, None)
     tokenizer.requires_grad_(False)
     data = tokenise_episodes(tokenizer, episodes)
     index = torch.arange(12)
@@ -158,10 +161,10 @@ def test_decoded_losses_are_smallest_for_the_true_latents_and_reach_the_predicti
 
 
 def test_a_finished_stage_still_tells_its_last_metrics(tmp_path: Path) -> None:
-    made = TrainingLoop("toy", torch.nn.Linear(3, 2), LoopSettings(3, 0.1), tmp_path)
-    metrics = made.run(lambda i: {"loss": made.model.weight.square().sum()}, progress=False)
-    again = TrainingLoop("toy", torch.nn.Linear(3, 2), LoopSettings(3, 0.1), tmp_path)
-    assert again.run(lambda i: {}, progress=False) == metrics
+    made = TrainingLoop("toy", torch.nn.Linear(3, 2), 3, 0.1, tmp_path)
+    metrics = made.run(lambda i: {"loss": made.model.weight.square().sum()})
+    again = TrainingLoop("toy", torch.nn.Linear(3, 2), 3, 0.1, tmp_path)
+    assert again.run(lambda i: {}) == metrics
 
 
 def test_every_model_of_one_seed_has_equal_weights_whatever_the_global_generator_did_before() -> None:
@@ -174,13 +177,13 @@ def test_every_model_of_one_seed_has_equal_weights_whatever_the_global_generator
     episodes = replace(episodes, behaviours=("expert",) * len(episodes))
 
     def trained() -> dict[str, torch.Tensor]:
-        tokenizer, _ = train_tokenizer(episodes, config, 3, None, progress=False)
+        tokenizer, _ = train_tokenizer(episodes, config, 3, None)
         data = tokenise_episodes(tokenizer, episodes)
-        action, _ = train_action_model(tokenizer, data, config, 3, None, progress=False)
+        action, _ = train_action_model(tokenizer, data, config, 3, None)
         text, _ = train_text_model(
-            tokenizer, action, episodes, data, ("push the square", "reach it"), config, 3, None, progress=False
+            tokenizer, action, episodes, data, ("push the square", "reach it"), config, 3, None
         )
-        probe, _ = train_position_probe(episodes, config, 3, None, progress=False)
+        probe, _ = train_position_probe(episodes, config, 3, None)
         models = {"tokenizer": tokenizer, "action": action, "text": text, "probe": probe}
         return {f"{kind}.{name}": t.clone() for kind, model in models.items() for name, t in model.state_dict().items()}
 
@@ -198,10 +201,10 @@ def test_every_model_of_one_seed_has_equal_weights_whatever_the_global_generator
 @pytest.mark.slow
 def test_rollouts_of_a_trained_model_follow_pushed_objects_better_than_copying_the_first_frame() -> None:
     config, training = config_of(tokenizer__num_iterations=100, world_model__num_iterations=60), arrays(120)
-    tokenizer, tokenizer_metrics = train_tokenizer(training, config, 0, None, progress=False)
+    tokenizer, tokenizer_metrics = train_tokenizer(training, config, 0, None)
     assert tokenizer_metrics["psnr_db"] > 22
     data = tokenise_episodes(tokenizer, training)
-    model, _ = train_action_model(tokenizer, data, config, 0, None, progress=False)
+    model, _ = train_action_model(tokenizer, data, config, 0, None)
     metrics = evaluate_rollouts(tokenizer, model, arrays(32, 10_000), threshold=0.5)
     assert metrics["tool_ratio_h12"] < 0.6
     assert metrics["object_moved_ratio_h12"] < 0.7

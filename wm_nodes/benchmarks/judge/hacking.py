@@ -24,7 +24,7 @@ from wm_nodes.judge.dataset.edits.generator import FRAME_RECIPES, SEVERITIES
 from wm_nodes.judge.dataset.edits.recipes import apply
 from wm_nodes.judge.dataset.rows import ROBOT
 from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figure, style_axes
-from wm_nodes.video_rl.reward_hacking import HackedMetric, hacked_metrics
+from wm_nodes.video_rl.reward_hacking import HackedMetric, find_hacked_metrics
 
 Proxy = Callable[[LabelledClip, TaskSpec], Awaitable[float | None]]
 """A reward in [0, 1] that is climbed; None where it gives none (that clip is not taken)."""
@@ -184,7 +184,7 @@ def curve(name: str, climbs: Sequence[Climb]) -> Curve:
     truth = np.mean([search.truth for search in climbs], 0).tolist()
     used = [edit for search in climbs for edit in search.edits]
     ranked = sorted(set(used), key=lambda edit: (-used.count(edit), edit))
-    alarms = hacked_metrics(proxy, {"truth": truth}, window=len(proxy)) if len(proxy) >= 3 else []
+    alarms = find_hacked_metrics(proxy, {"truth": truth}, window=len(proxy)) if len(proxy) >= 3 else []
     known = [search for search in climbs if not math.isnan(search.clean)]
     pairs = [(search.proxy[0] >= search.clean, search.proxy[-1] >= search.clean) for search in known]
     before, wins = np.mean(pairs, 0).tolist() if pairs else (math.nan, math.nan)

@@ -80,8 +80,7 @@ def random_model(config: RunConfig, folder: Path) -> Path:
     words = vocabulary_of(tuple(get_task(task).instruction for task in tasks))
     text = TextModel(config.world_model, vocabulary=words, **sizes)
     return save_model_folder(
-        folder, tokenizer, action, text, tokenizer_config=config.tokenizer, world_model_config=config.world_model,
-        simulation=config.simulation, tasks=tasks, story={"data": "none: random weights for benchmarks"},
+        folder, tokenizer, action, text, config, tasks=tasks, story={"data": "none: random weights for benchmarks"}
     )
 
 

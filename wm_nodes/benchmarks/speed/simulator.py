@@ -168,7 +168,7 @@ def rate_episode(env: Environment, reward: RewardModel, block: int) -> float:
         imagined = env.goals()
         goals = None if imagined is None else (imagined[0], np.ones_like(imagined[1]))
         result = env.step(actions)
-        reward.evaluate(reward_input(observation, result, goals))
+        reward.evaluate(reward_input(observation.image, result.observation.image, result, goals))
         observation = result.observation
         steps += int(result.valid.sum())
     return steps / (time.perf_counter() - start)

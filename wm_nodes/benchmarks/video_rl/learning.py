@@ -11,9 +11,9 @@ from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup
 from benchmarks.video_rl.sources import DiscSource, TrainingSource
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.reward_hacking import hacked_metrics
+from wm_nodes.video_rl.reward_hacking import find_hacked_metrics
 from wm_nodes.video_rl.train import Request, post_train
-from wm_nodes.video_rl.training_run import flat_metrics
+from wm_nodes.video_rl.training_run import flatten_metrics
 
 MIN_EVALUATIONS = 4
 DRIFTS = "background"
@@ -31,7 +31,7 @@ def train_sampler(
     evaluations, buffers = [{"iteration": 0, **_means(before)}], list[dict[str, float]]()
     with clocked(source, "request", "sample", "score") as rollout, clocked(learner, "train") as train:
         for iteration, (buffer, report) in enumerate(post_train(learner, source, plan.iterations), 1):
-            buffers.append({**flat_metrics(report), **source.measure(buffer)})
+            buffers.append({**flatten_metrics(report), **source.measure(buffer)})
             if iteration % plan.eval_every == 0 or iteration == plan.iterations:
                 after = source.validate()
                 evaluations.append({"iteration": iteration, **_means(after)})
@@ -66,7 +66,7 @@ def hacked(evaluations: list[dict[str, float]], proxy: str) -> list[str]:
         "mass": [-abs(row["mass"] - 1) for row in evaluations],
         "background": [-row["background"] for row in evaluations],
     }
-    alarmed = hacked_metrics([row[proxy] for row in evaluations], truths, window=len(evaluations))
+    alarmed = find_hacked_metrics([row[proxy] for row in evaluations], truths, window=len(evaluations))
     return [alarm.metric for alarm in alarmed]
 
 

@@ -25,7 +25,7 @@ from wm_nodes.video_rl.pretraining import BEFORE
 from wm_nodes.video_rl.reference_reward import more_is_better
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.video_rl.training_run import evaluated_uri
-from wm_nodes.video_rl.validation import SECTION, alarm_text, alarms_of, kept_scores
+from wm_nodes.video_rl.validation import SECTION, alarm_text, alarms_of, load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 AFTER = Path("evaluations") / "after.json"
@@ -46,8 +46,8 @@ def conclude(
     uri = evaluated_uri(version, config)
     if version:
         load_weights(trained.network, (run_dir / uri).read_bytes())
-    before = kept_scores(run_dir / BEFORE, base_folder, heldout, probe, config)
-    after = kept_scores(run_dir / AFTER, trained, heldout, probe, config)
+    before = load_or_measure_scores(run_dir / BEFORE, base_folder, heldout, probe, config)
+    after = load_or_measure_scores(run_dir / AFTER, trained, heldout, probe, config)
     watched = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []
     summary = ClipSummary(
         task=config.task, preset=preset, seed=config.seed, iterations=iterations, version=version,

@@ -27,7 +27,7 @@ FORMER_NAMES = {"gate": "acceptance", "rounds": "model_refresh"}
 EMBEDDED = "embedded"
 """JudgeConfig.kind of the judge in this process."""
 REWARDS = ("reference", AGENT)
-"""What the video model can be paid for: its scores against the recording, or a judge's verdicts."""
+"""Rewards of the video model: its scores against the recording, or a judge's verdicts."""
 
 Config = TypeVar("Config", RunConfig, VideoRlConfig)
 
@@ -82,7 +82,7 @@ def default_judge() -> JudgeConfig:
 
 
 def reward_overrides(reward: str | None) -> dict[str, Any]:
-    """The setting of loop 2 that one of REWARDS stands for: the weights of the rewards; None: none."""
+    """Return the setting of loop 2 for one of REWARDS: the weights of the rewards; {} for None."""
     if reward is None:
         return {}
     return {"rewards": {AGENT: 1.0} if reward == AGENT else read_preset("base", VIDEO)["rewards"]}
@@ -94,24 +94,24 @@ def named_pack(rubric: str) -> str:
 
 
 def judge_overrides(endpoints: str = "", model: str = "", api_key_env: str = "", rubric: str = "") -> dict[str, Any]:
-    """The dotted settings that a user's words for the judge stand for; empty words stand for none.
+    """Return the dotted settings of the judge for command-line values; empty values set nothing.
 
     Args:
         endpoints: base URLs, separated by commas; EMBEDDED, or the folder of a trained judge, for one without a server.
         rubric: a pack's name, or a file, from then on by its full path.
     """
-    here: dict[str, str] = {}
+    embedded: dict[str, str] = {}
     if endpoints == EMBEDDED or (endpoints and Path(endpoints).is_dir()):
-        here = {"kind": EMBEDDED, "folder": "" if endpoints == EMBEDDED else str(Path(endpoints).absolute())}
-    urls = [] if here else [url.strip() for url in endpoints.split(",") if url.strip()]
-    found = {"endpoints": urls, "model": model, "api_key_env": api_key_env, "rubric": named_pack(rubric), **here}
-    return {f"judge.{name}": value for name, value in found.items() if value}
+        embedded = {"kind": EMBEDDED, "folder": "" if endpoints == EMBEDDED else str(Path(endpoints).absolute())}
+    urls = [] if embedded else [url.strip() for url in endpoints.split(",") if url.strip()]
+    values = {"endpoints": urls, "model": model, "api_key_env": api_key_env, "rubric": named_pack(rubric), **embedded}
+    return {f"judge.{name}": value for name, value in values.items() if value}
 
 
 def judge_or_embedded(judge: JudgeConfig) -> JudgeConfig:
-    """The judge's settings; where they name nobody, those of the embedded judge, which needs nothing."""
-    nobody = judge.kind != EMBEDDED and not judge.endpoints and not judge.model
-    return judge.model_copy(update={"kind": EMBEDDED}) if nobody else judge
+    """Return the judge's settings; where they name no judge, those of the embedded one, which needs nothing."""
+    unnamed = judge.kind != EMBEDDED and not judge.endpoints and not judge.model
+    return judge.model_copy(update={"kind": EMBEDDED}) if unnamed else judge
 
 
 def dump_config(config: SettingsSection) -> str:
@@ -121,7 +121,7 @@ def dump_config(config: SettingsSection) -> str:
 
 def with_current_names(text: str) -> str:
     """The YAML text of a configuration, with sections that were renamed since by their names of today."""
-    return re.sub(f"^({'|'.join(FORMER_NAMES)}):", lambda found: FORMER_NAMES[found[1]] + ":", text, flags=re.MULTILINE)
+    return re.sub(f"^({'|'.join(FORMER_NAMES)}):", lambda match: FORMER_NAMES[match[1]] + ":", text, flags=re.MULTILINE)
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -181,10 +181,10 @@ def _set_dotted(values: dict[str, Any], dotted: str, value: Any) -> None:
 def refusal(error: ValidationError, where: str) -> ConfigError:
     """One error that names every refused value. where: the file that explains the settings."""
     lines = []
-    for found in error.errors():
-        text = f"  {'.'.join(map(str, found['loc']))}: {found['msg'].removeprefix('Value error, ')}"
-        names_values = found["type"] == "value_error" and not isinstance(found["input"], (str, int, float))
-        lines.append(text if names_values else f"{text} (got {found['input']!r})")
+    for row in error.errors():
+        text = f"  {'.'.join(map(str, row['loc']))}: {row['msg'].removeprefix('Value error, ')}"
+        names_values = row["type"] == "value_error" and not isinstance(row["input"], (str, int, float))
+        lines.append(text if names_values else f"{text} (got {row['input']!r})")
     return ConfigError(f"settings refused; see {where}:\n" + "\n".join(lines))
 
 

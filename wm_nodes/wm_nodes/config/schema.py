@@ -134,13 +134,13 @@ class OtherJudge(SettingsSection):
 
 
 class StageJudge(OtherJudge):
-    """Who reads some stages of every clip."""
+    """A judge of some stages of every clip."""
 
     stages: Annotated[list[Literal["PLAN", "VQ", "IF", "TC", "PC", "HACK"]], Field(min_length=1)]
 
 
 class JudgeConfig(SettingsSection):
-    """The reward agent: who judges, by which rubric, and how much it may take (reward/agent, reward/judges)."""
+    """The reward agent: its judge, its rubric, and its limits of time and calls (judge/agent, judge/backends)."""
 
     kind: Literal["openai", "embedded"]
     """openai: a server that speaks chat completions, such as vLLM; embedded: a judge in this process, from `folder`."""
@@ -161,7 +161,7 @@ class JudgeConfig(SettingsSection):
     call_plan: Literal["auto", "pack", "fanout"]
     """One call per stage (pack) or per component (fanout); auto: by the measured cache, not repeatable bit by bit."""
     robot: str
-    """What the judge is told about the robot."""
+    """Description of the robot in the judge's prompt."""
     concurrency: PositiveInt
     """Clips judged at the same time."""
     max_in_flight: PositiveInt
@@ -242,7 +242,7 @@ class PpoConfig(SettingsSection):
 
 class AcceptanceConfig(SettingsSection):
     num_episodes: PositiveInt
-    """Held-out real episodes the model is judged on."""
+    """Held-out real episodes that acceptance is measured on."""
     object_error_ratio: PositiveFloat
     """Full-horizon object error must be below this share of the error of copying the first frame."""
     tool_error_ratio: PositiveFloat

@@ -160,7 +160,7 @@ def _files() -> dict[str, str]:
     Raises:
         ValueError: a package is missing, or two have the same task.
     """
-    found: dict[str, str] = {}
+    packages: dict[str, str] = {}
     for package in (*PACKAGES, *filter(None, (part.strip() for part in os.environ.get(VARIABLE, "").split(",")))):
         try:
             folders = importlib.import_module(package).__path__
@@ -169,7 +169,7 @@ def _files() -> dict[str, str]:
         for module in pkgutil.iter_modules(folders):
             if module.name.startswith("_"):
                 continue
-            if module.name in found:
-                raise ValueError(f"task {module.name!r} is in {found[module.name]} and in {package}; rename one")
-            found[module.name] = package
-    return found
+            if module.name in packages:
+                raise ValueError(f"task {module.name!r} is in {packages[module.name]} and in {package}; rename one")
+            packages[module.name] = package
+    return packages

@@ -1,4 +1,4 @@
-"""Files that are either the old one or the new one, never half of it; and what is in one."""
+"""Atomic writing and hashing of files."""
 
 import hashlib
 import os
@@ -31,5 +31,5 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 
 def file_sha256(path: Path) -> str:
-    """Of its bytes. Raises OSError."""
+    """Return the sha256 of the file's bytes. Raises OSError."""
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -63,16 +63,12 @@ class EnvironmentSpec:
     @cached_property
     def spec_hash(self) -> str:
         """sha256 over every field: two sides with equal hashes agree on shapes, units and order."""
-        return _hash(asdict(self))
-
-    def policy_hash(self) -> str:
-        """sha256 over what a policy depends on; equal for an imagined and a simulated environment of one scene."""
-        fields = asdict(self)
-        return _hash({k: fields[k] for k in POLICY_FIELDS})
+        text = json.dumps({name: _round_to_sent(value) for name, value in asdict(self).items()}, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
 
 
 def as_sent(value: float) -> float:
-    """The shortest decimal that names the same float32: what a number is after a trip through a message or a bag."""
+    """Return the shortest decimal of the same float32: the number after a trip through a message or a bag."""
     return float(str(np.float32(value)))
 
 
@@ -80,19 +76,14 @@ def differences(
     found: EnvironmentSpec, expected: EnvironmentSpec, names: Sequence[str] = POLICY_FIELDS
 ) -> list[tuple[str, Any, Any]]:
     """Return (field, found, expected) for the named fields that disagree, as values that were sent."""
-    pairs = [(name, _sent(getattr(found, name)), _sent(getattr(expected, name))) for name in names]
-    return [(name, is_, should) for name, is_, should in pairs if is_ != should]
+    rows = [(name, *(_round_to_sent(getattr(spec, name)) for spec in (found, expected))) for name in names]
+    return [row for row in rows if row[1] != row[2]]
 
 
-def _sent(value: Any) -> Any:
+def _round_to_sent(value: Any) -> Any:
     if isinstance(value, float):
         return as_sent(value)
-    return tuple(_sent(item) for item in value) if isinstance(value, (tuple, list)) else value
-
-
-def _hash(fields: dict[str, Any]) -> str:
-    text = json.dumps({name: _sent(value) for name, value in fields.items()}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return tuple(_round_to_sent(item) for item in value) if isinstance(value, (tuple, list)) else value
 
 
 def simulation_spec(task: str, config: SimulationConfig, num_envs: int) -> EnvironmentSpec:

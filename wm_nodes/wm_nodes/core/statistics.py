@@ -108,8 +108,8 @@ def balanced_accuracy(labels: ArrayLike, answers: ArrayLike, weights: ArrayLike 
     Returns:
         In [0, 1]; 0.5 for an answer that ignores the clip. NaN where the labels are all passes or all fails.
     """
-    truth, said, weight = _aligned(labels, answers, weights)
-    return float((_share(said[truth], weight[truth]) + _share(~said[~truth], weight[~truth])) / 2)
+    truth, passed, weight = _align(labels, answers, weights)
+    return float((_share(passed[truth], weight[truth]) + _share(~passed[~truth], weight[~truth])) / 2)
 
 
 def kappa(
@@ -154,7 +154,7 @@ def expected_calibration_error(
         ValueError: lengths differ, or a probability is outside [0, 1].
     """
     truth, probability = np.asarray(labels, np.bool_), np.asarray(p_pass, np.float64)
-    _, _, weight = _aligned(truth, truth, weights)
+    _, _, weight = _align(truth, truth, weights)
     if probability.shape != truth.shape or not ((probability >= 0) & (probability <= 1)).all():
         raise ValueError(f"p_pass must hold {len(truth)} probabilities in [0, 1], got {probability}")
     if len(truth) == 0:
@@ -188,10 +188,10 @@ def recall_at(present: ArrayLike, scores: ArrayLike, false_positives: float) -> 
         present: bool (N,). scores: (N,), higher where something is thought to be there. false_positives: in [0, 1).
     """
     there, values = np.asarray(present, np.bool_), np.asarray(scores, np.float64)
-    mine, others = values[there], np.sort(values[~there])[::-1]
-    if not len(mine) or not len(others):
+    positives, others = values[there], np.sort(values[~there])[::-1]
+    if not len(positives) or not len(others):
         return NAN
-    return float((mine > others[int(false_positives * len(others))]).mean())
+    return float((positives > others[int(false_positives * len(others))]).mean())
 
 
 def effective_size(weights: ArrayLike) -> float:
@@ -207,7 +207,7 @@ def wilson_of_share(correct: ArrayLike, weights: ArrayLike | None = None) -> tup
     With equal weights this is Wilson's interval; with unequal ones an approximation that ignores what a stratified
     sample gains over a random one.
     """
-    right, _, weight = _aligned(correct, correct, weights)
+    right, _, weight = _align(correct, correct, weights)
     if weights is None:
         return (_share(right, weight), *wilson_interval(int(right.sum()), len(right)))
     share, size = _share(right, weight), effective_size(weight)
@@ -251,14 +251,14 @@ def _share(chosen: NDArray[np.bool_], weight: NDArray[np.float64]) -> float:
     return min(1.0, float(weight[chosen].sum()) / total) if total else NAN
 
 
-def _aligned(
+def _align(
     labels: ArrayLike, answers: ArrayLike, weights: ArrayLike | None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[Any]]:
-    truth, said = np.asarray(labels, np.bool_), np.asarray(answers, np.bool_)
+    truth, passed = np.asarray(labels, np.bool_), np.asarray(answers, np.bool_)
     weight = np.ones(len(truth)) if weights is None else np.asarray(weights, np.float64)
-    if truth.ndim != 1 or truth.shape != said.shape or truth.shape != weight.shape or not (weight >= 0).all():
+    if truth.ndim != 1 or truth.shape != passed.shape or truth.shape != weight.shape or not (weight >= 0).all():
         raise ValueError(
-            f"labels, answers and weights >= 0 must be rows of one length, got {truth.shape}, {said.shape} and "
+            f"labels, answers and weights >= 0 must be rows of one length, got {truth.shape}, {passed.shape} and "
             f"{weight.shape}"
         )
-    return truth, said, weight
+    return truth, passed, weight

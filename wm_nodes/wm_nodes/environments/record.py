@@ -1,4 +1,4 @@
-"""Simulator episodes into bags: joins the simulation's collector with the recording's writer."""
+"""Simulator episodes into bags: the collector of environments/maniskill with the writer of recording."""
 
 from pathlib import Path
 
@@ -13,22 +13,13 @@ TRAINING_SEEDS, HELDOUT_SEEDS = 0, 500_000
 """First reset seeds of the training and the held-out episodes; evaluation seeds start at evaluation.first_seed."""
 
 
-def collect_training_data(config: RunConfig, folder: Path, *, progress: bool = True) -> list[Path]:
-    """Scripted and planned episodes for the world model: `folder`/train bags."""
-    return collect_plan(scripted_plan(config, config.data.num_episodes, TRAINING_SEEDS), config, folder, progress)
-
-
-def collect_heldout_data(config: RunConfig, folder: Path, *, progress: bool = True) -> list[Path]:
-    """The same behaviours on seeds that are never trained on, for the acceptance of a model."""
-    return collect_plan(scripted_plan(config, config.data.num_heldout, HELDOUT_SEEDS), config, folder, progress)
-
-
 def acceptance_plan(config: RunConfig) -> CollectionPlan:
-    """The held-out episodes that decide about accepting a model."""
+    """Return the plan of the held-out episodes that decide about accepting a model."""
     return scripted_plan(config, min(config.acceptance.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
 
 
 def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
+    """Return the plan of episodes of the scripted behaviours, for the world model that serves the configured task."""
     return CollectionPlan(
         task=model_tasks(config.task)[-1],  # one scene and one data set for all tasks of a model
         simulation=config.simulation,
@@ -39,7 +30,7 @@ def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> Coll
 
 
 def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
-    """MPLib demonstrations of the configured task, for SFT."""
+    """Return the plan of MPLib demonstrations of the configured task, for behaviour cloning."""
     return CollectionPlan(
         task=config.task, simulation=config.simulation, num_episodes=num_episodes, first_seed=first_seed,
         behaviours={"expert": 1.0}, end_on_success=True,
@@ -47,21 +38,21 @@ def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int) ->
 
 
 def first_frames_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
-    """Episodes of one step: first frames to imagine from."""
+    """Return the plan of episodes of one step: first frames to imagine from."""
     one_step = config.simulation.model_copy(update={"max_episode_steps": 1})
     return CollectionPlan(config.task, one_step, num_episodes, first_seed, behaviours={"random": 1.0})
 
 
-def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path, progress: bool = True) -> list[Path]:
-    return collect(folder, plan, write_shard, num_workers=config.data.num_workers, progress=progress)
+def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path) -> list[Path]:
+    """Collect the plan's episodes into bags below `folder`; see collect."""
+    return collect(folder, plan, write_shard, num_workers=config.data.num_workers)
 
 
 def write_shard(path: Path, plan: CollectionPlan, episodes: list[Episode]) -> None:
     """Write one shard's episodes into a bag that is renamed to `path` when complete."""
     spec = simulation_spec(plan.task, plan.simulation, 1)
     custom = {"wm.seeds": f"{episodes[0].seed}..{episodes[-1].seed}"}
-    with EpisodeBagWriter(
-        path, spec, run_id=path.parent.name, custom=custom, start_ns=1, discard_partial=True
-    ) as writer:
+    run_id = path.parent.name
+    with EpisodeBagWriter(path, spec, run_id=run_id, custom=custom, start_ns=1, discard_partial=True) as writer:
         for episode in episodes:
             writer.write(episode)

@@ -31,7 +31,7 @@ from wm_nodes.ros.worker import Work
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
-from wm_nodes.video_rl.reference_reward import mixed, score_clips
+from wm_nodes.video_rl.reference_reward import mix_rewards, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.world_model import load_model_folder
 
@@ -128,7 +128,7 @@ class ClipEvaluatorNode(ManagedNode):
         ).named()
         if self._agent is not None:
             scores |= agent_scores(verdicts)
-        total = mixed(scores, self._config.rewards)
+        total = mix_rewards(scores, self._config.rewards)
         valid = torch.isfinite(total)
         message = ClipScores(
             iteration=buffer.iteration, buffer_sha256=sha256, num_clips=len(buffer), names=list(scores),

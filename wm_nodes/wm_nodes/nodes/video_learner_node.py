@@ -29,7 +29,7 @@ from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
-from wm_nodes.video_rl.reference_reward import rewarded
+from wm_nodes.video_rl.reference_reward import attach_rewards
 from wm_nodes.video_rl.training_run import VideoRun
 from wm_nodes.video_rl.validation import alarm_text, validation_scores
 
@@ -197,7 +197,7 @@ def with_scores(buffer: RolloutBuffer, scores: ClipScores) -> RolloutBuffer:
     values = torch.from_numpy(convert.from_field(scores.values, np.float64).reshape(len(names), count).copy())
     total = torch.from_numpy(convert.from_field(scores.total, np.float64).copy())
     valid = torch.from_numpy(convert.from_field(scores.valid, np.uint8).copy()).bool()
-    return rewarded(buffer, dict(zip(names, values, strict=True)), torch.where(valid, total, torch.nan))
+    return attach_rewards(buffer, dict(zip(names, values, strict=True)), torch.where(valid, total, torch.nan))
 
 
 def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun:

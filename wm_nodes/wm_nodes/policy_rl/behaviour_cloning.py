@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import torch
@@ -11,7 +12,6 @@ from wm_nodes.config.schema import SftConfig
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.types import Episode, UInt8Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.rollouts import Canceled
 
 EXPERT = "expert"
 
@@ -30,47 +30,39 @@ def demonstrations(episodes: Iterable[Episode], count: int) -> list[Episode]:
     Raises:
         ValueError: there are fewer.
     """
-    found: list[Episode] = []
-    for episode in episodes:
-        if episode.behaviour == EXPERT and bool(episode.success.any()):
-            found.append(episode)
-            if len(found) == count:
-                return found
-    raise ValueError(
-        f"sft.num_demonstrations is {count}, but the data hold {len(found)} successful {EXPERT} episodes; collect more "
-        "or ask for fewer"
-    )
+    successful = (episode for episode in episodes if episode.behaviour == EXPERT and bool(episode.success.any()))
+    demos = list(islice(successful, count))
+    if len(demos) < count:
+        raise ValueError(
+            f"sft.num_demonstrations is {count}, but the data hold {len(demos)} successful {EXPERT} episodes; collect "
+            "more or ask for fewer"
+        )
+    return demos
 
 
 def train_sft(
     policy: ImagePolicy, demos: Sequence[Episode], config: SftConfig, seed: int, *,
-    reconstruct: Callable[[UInt8Array], UInt8Array] | None = None, should_stop: Callable[[], bool] | None = None,
-    on_progress: Callable[[int, float], None] | None = None,
+    reconstruct: Callable[[UInt8Array], UInt8Array] | None = None,
 ) -> SftResult:
     """Fit the actor's mean to the demonstrated actions in place; critic and log standard deviation stay.
 
     Steps after the first success are left out: an episode ends there when a policy acts. The demonstrations also set
     the policy's feature normalisation. Every image counts once, and with `reconstruct` (the tokenizer's decode of
-    encode, uint8 (B, H, W, 3)) once more as the world model will show it.
+    encode, uint8 (B, H, W, 3)) once more as the world model will show it. `seed` draws the batches (stream `sft`).
     With one seed and one number of torch threads the result is bit-identical on a CPU.
 
-    Args:
-        seed: of the batches (stream `sft`).
-        on_progress: called with (iterations done, loss) about a hundred times.
-
     Raises:
-        Canceled: should_stop returned True; the policy is then half trained.
         ValueError: no demonstrations, or one that is not the expert's.
     """
     others = {episode.behaviour for episode in demos} - {EXPERT}
     if not demos or others:
-        raise ValueError(
-            f"behaviour cloning needs {EXPERT} demonstrations only, got {len(demos)} with {sorted(others)}"
-        )
-    steps = [_steps_to_success(episode) for episode in demos]
-    images = np.concatenate([episode.images[:count] for episode, count in zip(demos, steps, strict=True)])
-    states_BS = _tensor([episode.states[:count] for episode, count in zip(demos, steps, strict=True)], policy)
-    actions_BA = _tensor([episode.actions[:count] for episode, count in zip(demos, steps, strict=True)], policy)
+        raise ValueError(f"behaviour cloning needs {EXPERT} demonstrations, got {len(demos)} with {sorted(others)}")
+    steps = [int(demo.success.argmax()) if demo.success.any() else demo.num_steps for demo in demos]
+    images, states, actions = (
+        np.concatenate([getattr(demo, name)[:count] for demo, count in zip(demos, steps, strict=True)])
+        for name in ("images", "states", "actions")
+    )
+    states_BS, actions_BA = (torch.from_numpy(a.astype(np.float32)).to(policy.device) for a in (states, actions))
     features = [policy.features(images)]
     if reconstruct is not None:
         features.append(policy.features(reconstruct(images)))
@@ -80,10 +72,7 @@ def train_sft(
     optimizer = torch.optim.Adam(policy.actor.parameters(), lr=config.learning_rate)
     generator = torch_stream(seed, "sft")
     losses = np.zeros(config.num_iterations, np.float32)
-    report_every = max(1, config.num_iterations // 100)
     for iteration in range(config.num_iterations):
-        if should_stop is not None and should_stop():
-            raise Canceled(f"behaviour cloning stopped at iteration {iteration} of {config.num_iterations}")
         index = torch.randint(len(features_BF), (config.batch_size,), generator=generator).to(policy.device)
         mean_BA = policy.distribution(features_BF[index], states_BS[index]).mean_BA
         loss = (mean_BA - actions_BA[index]).square().mean()
@@ -91,14 +80,4 @@ def train_sft(
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         losses[iteration] = float(loss.detach())
-        if on_progress is not None and (iteration + 1) % report_every == 0:
-            on_progress(iteration + 1, float(losses[iteration]))
     return SftResult(losses, len(features_BF))
-
-
-def _steps_to_success(episode: Episode) -> int:
-    return int(episode.success.argmax()) if episode.success.any() else episode.num_steps
-
-
-def _tensor(arrays: list[NDArray[np.float32]], policy: ImagePolicy) -> torch.Tensor:
-    return torch.from_numpy(np.concatenate(arrays).astype(np.float32)).to(policy.device)

@@ -11,7 +11,6 @@ from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.statistics import wilson_interval
 from wm_nodes.core.types import BoolArray, Environment, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.rollouts import Canceled
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class EvaluationResult:
 
 def evaluate(
     policy: ImagePolicy, env: Environment, episodes: int, first_seed: int, deterministic: bool = True, *,
-    should_stop: Callable[[], bool] | None = None, on_progress: Callable[[int, int], None] | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, successes: None,
 ) -> EvaluationResult:
     """Play one episode per seed. Environments that finish take the next seed, so none waits for the slowest.
 
@@ -55,10 +54,9 @@ def evaluate(
     which environment played an episode.
 
     Args:
-        on_progress: called with (episodes done, successes).
+        on_progress: called with (episodes done, successes); may raise to stop.
 
     Raises:
-        Canceled: should_stop, asked before every lock-step, returned True.
         ValueError: episodes < 1.
     """
     if episodes < 1:
@@ -71,16 +69,12 @@ def evaluate(
     done = 0
     observation = env.reset(None, _seeds(first_seed, playing))
     while done < episodes:
-        if should_stop is not None and should_stop():
-            raise Canceled(f"evaluation stopped after {done} of {episodes} episodes")
         noise = None
         if not deterministic:
-            noise = np.stack(
-                [
-                    _noise(first_seed + max(int(episode), 0), int(step), env.spec.action_dim)
-                    for episode, step in zip(playing, observation.episode_step, strict=True)
-                ]
-            )
+            noise = np.stack([
+                _noise(first_seed + max(int(episode), 0), int(step), env.spec.action_dim)
+                for episode, step in zip(playing, observation.episode_step, strict=True)
+            ])
         result = env.step(policy.act(observation.image, observation.state, noise=noise).actions)
         observation = result.observation
         ended = (result.terminated | result.truncated) & result.valid & (playing >= 0)
@@ -98,8 +92,7 @@ def evaluate(
             mask = np.zeros(num_envs, np.bool_)
             mask[refilled] = True
             observation = env.reset(mask, _seeds(first_seed, playing))
-        if on_progress is not None:
-            on_progress(done, int(success.sum()))
+        on_progress(done, int(success.sum()))
     low, high = wilson_interval(int(success.sum()), episodes)
     return EvaluationResult(success, length, first_seed, low, high)
 

@@ -20,44 +20,42 @@ from wm_nodes.world_model import ImaginedEnvironment, WorldModels, load_model_fo
 STATE_DIM, ACTION_DIM = 3, 3
 
 
-@functools.lru_cache(maxsize=4)
-def models_of(model_dir: Path) -> WorldModels:
-    """The models of a folder, loaded once per process."""
-    return load_model_folder(model_dir)
+models_of: Callable[[Path], WorldModels] = functools.lru_cache(maxsize=4)(load_model_folder)
+"""Return the models of a folder, loaded once per process."""
 
 
 def make_encoder(model_dir: Path) -> ImageEncoder:
-    """The tokenizer as the policy's frozen image encoder: latents flattened to (B, S D)."""
+    """Return the tokenizer as the policy's frozen image encoder: latents flattened to (B, S D)."""
     models = models_of(Path(model_dir))
     tokenizer = models.tokenizer
 
-    def function(images: Tensor) -> Tensor:
+    def encode(images: Tensor) -> Tensor:
         return tokenizer.encode(images).flatten(1).clone()
 
-    return ImageEncoder(function, tokenizer.num_tokens * tokenizer.latent_dim, models.tokenizer_sha256)
+    return ImageEncoder(encode, tokenizer.num_tokens * tokenizer.latent_dim, models.tokenizer_sha256)
 
 
 def make_policy(config: RunConfig, model_dir: Path) -> ImagePolicy:
-    """A policy with fresh weights."""
+    """Return a policy with fresh weights."""
     return ImagePolicy(make_encoder(model_dir), STATE_DIM, ACTION_DIM, config.policy, seed=config.seed)
 
 
 def load_policy(config: RunConfig, model_dir: Path, weights: Path) -> ImagePolicy:
-    """A policy with weights from a file.
+    """Return a policy with weights from a file.
 
     Raises:
         ValueError: the weights belong to another architecture or to another tokenizer.
     """
     policy = make_policy(config, model_dir)
     metadata = load_weights(policy, Path(weights).read_bytes())
-    made_for = metadata.get("tokenizer_sha256", "")
-    if made_for and made_for != policy.encoder.sha256:
-        raise ValueError(f"{weights} was trained on another tokenizer (sha256 {made_for[:12]}) than {model_dir} holds")
+    sha256 = metadata.get("tokenizer_sha256", "")
+    if sha256 and sha256 != policy.encoder.sha256:
+        raise ValueError(f"{weights} was trained on another tokenizer (sha256 {sha256[:12]}) than {model_dir} holds")
     return policy
 
 
 def make_reconstruct(model_dir: Path) -> Callable[[UInt8Array], UInt8Array]:
-    """Images as the world model shows them: decode(encode(x))."""
+    """Return the function that gives images as the world model shows them: decode(encode(x))."""
     tokenizer = models_of(Path(model_dir)).tokenizer
 
     def reconstruct(images: UInt8Array) -> UInt8Array:
@@ -69,7 +67,7 @@ def make_reconstruct(model_dir: Path) -> Callable[[UInt8Array], UInt8Array]:
 
 
 def make_endogenous_reward(config: RunConfig, model_dir: Path) -> EndogenousReward:
-    """Reward RS-8 with the distance of the frozen tokenizer's features.
+    """Return reward RS-8 with the distance of the frozen tokenizer's features.
 
     Raises:
         ValueError: reward.mode progress, whose golden trajectories no environment publishes: env/goal holds one frame.
@@ -79,29 +77,24 @@ def make_endogenous_reward(config: RunConfig, model_dir: Path) -> EndogenousRewa
             "reward.mode progress needs golden trajectories, and environments publish the goal frame only; choose "
             "delta or abs, or set reward.dense_weight to 0 (EndogenousReward itself takes RewardInput.golden)"
         )
-    models = models_of(Path(model_dir))
-
-    def features(images: Tensor) -> Tensor:
-        return models.tokenizer.encode(images).flatten(1)
-
-    return EndogenousReward(config.reward, EncoderDistance(features, identity=models.tokenizer_sha256[:16]))
+    encoder = make_encoder(model_dir)
+    return EndogenousReward(config.reward, EncoderDistance(encoder.function, identity=encoder.sha256[:16]))
 
 
 def make_imagined_environment(
     config: RunConfig, model_dir: Path, starts_file: Path, *, num_envs: int, seed: int
 ) -> ImaginedEnvironment:
-    """The world model as an environment for config.task.
+    """Return the world model as an environment for config.task.
 
     Raises:
         ValueError: the folder was trained for another scene than the configuration describes.
     """
     models = models_of(Path(model_dir))
-    made_for = models.simulation
     for name in ("cameras", "image_size", "control_hz", "max_action_m", "workspace_low_m", "workspace_high_m"):
-        wanted, found = getattr(config.simulation, name), getattr(made_for, name)
-        if wanted != found:
+        wanted, trained = getattr(config.simulation, name), getattr(models.simulation, name)
+        if wanted != trained:
             raise ValueError(
-                f"{model_dir} was trained with simulation.{name} = {found}, the configuration says {wanted}; change "
+                f"{model_dir} was trained with simulation.{name} = {trained}, the configuration says {wanted}; change "
                 "the configuration or train another model"
             )
     spec = simulation_spec(config.task, config.simulation, num_envs)
@@ -114,7 +107,7 @@ def make_imagined_environment(
 def policy_actor(
     config: RunConfig, model_dir: Path, weights: Path, noise: float | None = 0.0
 ) -> Callable[[Observation, int], FloatArray]:
-    """act(observation of one slot, episode seed) -> action (A,), for collecting with a policy in a worker process.
+    """Return act(observation of one slot, episode seed) -> action (A,), for collecting with a policy in a worker.
 
     noise: standard deviation of the action noise, normalised units; None: the policy's own, as in training. Its stream
         is (seed, step).
@@ -124,13 +117,10 @@ def policy_actor(
 
     def act(observation: Observation, seed: int) -> FloatArray:
         stream = numpy_stream(seed, "exploration", int(observation.episode_step[0]))
-        if noise is None:
-            own = stream.standard_normal((1, ACTION_DIM)).astype(np.float32)
-            sampled: FloatArray = policy.act(observation.image, observation.state, noise=own).actions[0]
-            return sampled
-        action = policy.act(observation.image, observation.state).actions[0]
-        draw = stream.normal(0, noise, action.shape)
-        executed: FloatArray = np.clip(action + draw, -1, 1).astype(np.float32)
-        return executed
+        own = stream.standard_normal((1, ACTION_DIM)).astype(np.float32) if noise is None else None
+        action: FloatArray = policy.act(observation.image, observation.state, noise=own).actions[0]
+        if noise is not None:
+            action = np.clip(action + stream.normal(0, noise, action.shape), -1, 1).astype(np.float32)
+        return action
 
     return act

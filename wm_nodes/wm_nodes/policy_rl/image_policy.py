@@ -4,7 +4,7 @@ The encoder is frozen, shared with the world model, and not part of the weights:
 one message.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import cast
@@ -63,23 +63,20 @@ class ImagePolicy(nn.Module):
 
     Args:
         encoder: frozen; see ImageEncoder.
-        state_dim: S. The state is shifted and scaled by fixed constants.
+        state_dim: S. With S = 3 the state is a tool position in m, shifted and scaled by TOOL_CENTER_M, TOOL_SCALE_M.
         action_dim: A.
         config: sizes and the initial log standard deviation.
         seed: of the initial weights (stream `policy_init`).
-        state_center, state_scale: per-dimension constants; default for S = 3 a tool position in m, else 0 and 1.
     """
 
     def __init__(
         self, encoder: ImageEncoder, state_dim: int, action_dim: int, config: PolicyConfig, *, seed: int = 0,
-        state_center: Sequence[float] | None = None, state_scale: float | None = None,
     ) -> None:
         super().__init__()
         self.encoder = encoder
         self.state_dim, self.action_dim, self.config = state_dim, action_dim, config
         is_tool = state_dim == len(TOOL_CENTER_M)
-        center = state_center if state_center is not None else TOOL_CENTER_M if is_tool else (0.0,) * state_dim
-        scale = state_scale if state_scale is not None else TOOL_SCALE_M if is_tool else 1.0
+        center, scale = (TOOL_CENTER_M, TOOL_SCALE_M) if is_tool else ((0.0,) * state_dim, 1.0)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stream_seed(seed, "policy_init"))
             self.actor = _Network(encoder.feature_dim, state_dim, action_dim, config, output_gain=0.01)
@@ -128,12 +125,11 @@ class ImagePolicy(nn.Module):
 
     def distribution(self, features_BF: Tensor, states_BS: Tensor) -> DiagonalGaussian:
         """Return the action distribution; the mean is not squashed."""
-        mean_BA = self.actor(*self._normalised(features_BF, states_BS))
-        return DiagonalGaussian(mean_BA, self.log_std_A)
+        return DiagonalGaussian(self.actor(*self._normalise(features_BF, states_BS)), self.log_std_A)
 
     def value(self, features_BF: Tensor, states_BS: Tensor) -> Tensor:
         """Return the critic's values, (B,)."""
-        return cast(Tensor, self.critic(*self._normalised(features_BF, states_BS))).squeeze(-1)
+        return cast(Tensor, self.critic(*self._normalise(features_BF, states_BS))).squeeze(-1)
 
     @torch.no_grad()
     def act(
@@ -167,7 +163,7 @@ class ImagePolicy(nn.Module):
             _to_numpy(self.value(features_BF, states_BS)),
         )
 
-    def _normalised(self, features_BF: Tensor, states_BS: Tensor) -> tuple[Tensor, Tensor]:
+    def _normalise(self, features_BF: Tensor, states_BS: Tensor) -> tuple[Tensor, Tensor]:
         scaled_BF = (features_BF - self._buffer("feature_shift_F")) / self._buffer("feature_scale_F")
         scaled_BS = (states_BS - self._buffer("state_shift_S")) / self._buffer("state_scale_S")
         return scaled_BF.clamp(-_FEATURE_LIMIT, _FEATURE_LIMIT), scaled_BS

@@ -1,4 +1,4 @@
-"""What a run needs besides a world model: first frames to imagine from, and the weak policy that RL starts from."""
+"""Prepare what a run needs besides a world model: first frames to imagine from, the weak policy that RL starts from."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,14 +19,14 @@ from wm_nodes.training.weights import save_weights
 
 STARTS = "starts.safetensors"
 MAX_STARTS, MODEL_STARTS = 512, 64
-"""First frames kept for a run, and beside a model, from which a launch file imagines unless it is told otherwise."""
+"""Most first frames of a run, and of those beside a model, from which a launch file imagines by default."""
 NUM_STARTS = 256
 DEMONSTRATION_SEEDS, START_SEEDS = 600_000, 700_000
 SEEDS_PER_RUN = 1000
 
 
 def num_starts(config: RunConfig) -> int:
-    """First frames of a run, which are also the episodes that imagined success is measured on."""
+    """Return the number of first frames of a run; imagined success is measured on as many episodes."""
     return min(NUM_STARTS, 8 * config.evaluation.episodes)
 
 
@@ -60,15 +60,12 @@ def train_weak_policy(config: RunConfig, model_dir: Path, demo_bags: Iterable[Pa
 
 
 def start_files(run_dir: Path) -> tuple[Path, Path]:
-    """Where prepare_start puts a run's first frames and its weak policy."""
+    """Return the paths of a run's first frames and of its weak policy, as prepare_start writes them."""
     return run_dir / STARTS, run_dir / "policies" / "weak.safetensors"
 
 
 def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Path, Path]:
-    """Demonstrations, first frames and the weak policy of a run: (starts.safetensors, policies/weak.safetensors).
-
-    What is there already is kept.
-    """
+    """Collect demonstrations and first frames and train the weak policy, as far as missing; return start_files()."""
     spare = max(3, config.sft.num_demonstrations // 3)
     plan = demonstration_plan(
         config, config.sft.num_demonstrations + spare, DEMONSTRATION_SEEDS + SEEDS_PER_RUN * config.seed

@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+HUBER_DELTA = 10.0
+
 
 def clipped_policy_loss(logprobs_B: Tensor, old_logprobs_B: Tensor, advantages_B: Tensor, *, clip: float) -> Tensor:
     """Return -min(rho A, clamp(rho, 1 - clip, 1 + clip) A), rho = exp(logprob - old logprob) (RS-10b), shape (B,).
@@ -19,19 +21,16 @@ def clipped_policy_loss(logprobs_B: Tensor, old_logprobs_B: Tensor, advantages_B
     return -torch.minimum(ratio_B * advantages_B, clipped_B * advantages_B)
 
 
-def value_loss(
-    values_B: Tensor, old_values_B: Tensor, returns_B: Tensor, *, clip: float, huber_delta: float = 10.0
-) -> Tensor:
-    """Return the Huber loss of the critic (RS-10c), shape (B,): half the squared error up to huber_delta.
+def value_loss(values_B: Tensor, old_values_B: Tensor, returns_B: Tensor, *, clip: float) -> Tensor:
+    """Return the Huber loss of the critic (RS-10c), shape (B,): half the squared error up to HUBER_DELTA, then linear.
 
     With clip > 0 it is the larger of this loss and that of values kept within clip of old_values_B. clip 0: off.
-    huber_delta: math.inf gives half the squared error everywhere.
     """
-    plain_B = _huber(values_B - returns_B, huber_delta)
+    plain_B = _huber(values_B - returns_B)
     if clip == 0:
         return plain_B
-    kept_B = old_values_B + (values_B - old_values_B).clamp(-clip, clip)
-    return torch.maximum(plain_B, _huber(kept_B - returns_B, huber_delta))
+    limited_B = old_values_B + (values_B - old_values_B).clamp(-clip, clip)
+    return torch.maximum(plain_B, _huber(limited_B - returns_B))
 
 
 def approximate_kl(logprobs_B: Tensor, old_logprobs_B: Tensor) -> Tensor:
@@ -45,7 +44,5 @@ def clip_fraction(logprobs_B: Tensor, old_logprobs_B: Tensor, *, clip: float) ->
     return ((torch.exp(logprobs_B - old_logprobs_B) - 1).abs() > clip).to(logprobs_B.dtype)
 
 
-def _huber(error_B: Tensor, delta: float) -> Tensor:
-    if delta == float("inf"):
-        return 0.5 * error_B.square()
-    return F.huber_loss(error_B, torch.zeros_like(error_B), delta=delta, reduction="none")
+def _huber(error_B: Tensor) -> Tensor:
+    return F.huber_loss(error_B, torch.zeros_like(error_B), delta=HUBER_DELTA, reduction="none")

@@ -58,8 +58,7 @@ class RefreshDecision:
             return f"no worse than the old model in {len(self.rows)} numbers on held-out episodes"
         return "worse: " + ", ".join(
             f"{row.name} on {row.episodes} episodes {_text(row.old)} -> {_text(row.new)}"
-            for row in self.rows
-            if row.worse
+            for row in self.rows if row.worse
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -79,7 +78,7 @@ def check_refreshable(model_dir: Path) -> None:
 
 
 def collect_round(
-    config: RunConfig, model_dir: Path, weights: Path, folder: Path, number: int, *, progress: bool = True
+    config: RunConfig, model_dir: Path, weights: Path, folder: Path, number: int
 ) -> tuple[list[Path], list[Path]]:
     """Simulator episodes of a policy with its own exploration noise: (bags to train on, bags held out).
 
@@ -98,22 +97,20 @@ def collect_round(
             model_tasks(config.task)[-1], config.simulation, episodes, first_seed + SEEDS_PER_ROUND * (number - 1), {},
             make_policy=partial(policy_actor, config, model_dir, weights, None), policy_version=number,
         )
-        bags.append(collect_plan(plan, config, folder / name, progress))
+        bags.append(collect_plan(plan, config, folder / name))
     return bags[0], bags[1]
 
 
-def collect_replay(config: RunConfig, run_dir: Path, *, progress: bool = True) -> tuple[list[Path], list[Path]]:
+def collect_replay(config: RunConfig, run_dir: Path) -> tuple[list[Path], list[Path]]:
     """Scripted simulator episodes of a run, collected once: (replay for every refresh, held out as for acceptance)."""
     replay = scripted_plan(config, config.model_refresh.replay_episodes, TRAINING_SEEDS)
     return (
-        collect_plan(replay, config, run_dir / "bags" / "replay", progress),
-        collect_plan(acceptance_plan(config), config, run_dir / "bags" / "heldout", progress),
+        collect_plan(replay, config, run_dir / "bags" / "replay"),
+        collect_plan(acceptance_plan(config), config, run_dir / "bags" / "heldout"),
     )
 
 
-def refresh_model(
-    config: RunConfig, model_dir: Path, bags: Sequence[Path], folder: Path, *, number: int = 1, progress: bool = True
-) -> Path:
+def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], folder: Path, *, number: int = 1) -> Path:
     """Go on training the action model of `model_dir` on the bags' episodes; write the new model to `folder`.
 
     Trained on whole rollouts of simulation.max_episode_steps steps. A finished folder is kept; an interrupted training
@@ -130,8 +127,7 @@ def refresh_model(
     settings = WorldModelConfig.model_validate(manifest["world_model"]).model_copy(
         update={
             "num_iterations": config.model_refresh.refresh_iterations,
-            "learning_rate": config.model_refresh.learning_rate,
-            "rollout_steps": [config.simulation.max_episode_steps],
+            "learning_rate": config.model_refresh.learning_rate, "rollout_steps": [config.simulation.max_episode_steps],
         }
     )
     training = config.model_copy(
@@ -146,17 +142,14 @@ def refresh_model(
     episodes = stack_episodes(recorded, models.tasks, num_steps=config.simulation.max_episode_steps)
     action, metrics = train_action_model(
         models.tokenizer, episodes, training, config.seed + number, folder.with_name(f"{folder.name}_training"),
-        model=action.requires_grad_(True), progress=progress,
+        model=action.requires_grad_(True),
     )
     refreshed = {
         "source_sha256": models.sha256, "round": number, "episodes": len(episodes), "metrics": metrics,
         "model_refresh": config.model_refresh.model_dump(),
     }
-    earlier = list(manifest.get("refreshed", []))
-    save_refreshed_folder(
-        folder, model_dir, action, WorldModelConfig.model_validate(manifest["world_model"]),
-        {"refreshed": [*earlier, refreshed]},
-    )
+    story = {"refreshed": [*manifest.get("refreshed", []), refreshed]}
+    save_refreshed_folder(folder, model_dir, action, story)
     load_model_folder(folder)
     return folder
 
@@ -164,11 +157,7 @@ def refresh_model(
 def compare_models(
     old: WorldModels, new: WorldModels, heldout: Mapping[str, EpisodeArrays], config: RunConfig
 ) -> RefreshDecision:
-    """Judge both models on the same held-out real episodes with the numbers of its acceptance.
-
-    Args:
-        heldout: e.g. {"policy": ..., "scripted": ...}, episodes neither model was trained on.
-    """
+    """Compare both models on held-out real episodes, by the name of their kind, in the numbers of model acceptance."""
     rows = []
     for name, episodes in heldout.items():
         numbers = [_numbers(model_metrics(models, episodes, config), config, episodes.num_steps)

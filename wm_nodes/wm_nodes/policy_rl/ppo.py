@@ -22,13 +22,7 @@ from wm_nodes.policy_rl.advantages import explained_variance, gae, masked_normal
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.losses import approximate_kl, clip_fraction, clipped_policy_loss, value_loss
 from wm_nodes.policy_rl.rollouts import Canceled
-from wm_nodes.training.checkpoint import (
-    optimizer_tensors,
-    read_checkpoint,
-    restore_optimizer,
-    section,
-    write_checkpoint,
-)
+from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import check_same_layout
 
@@ -96,20 +90,22 @@ class PpoLearner:
             ValueError: no valid sample, or samples whose log_prob or value is unknown (NaN).
         """
         before = {name: tensor.clone() for name, tensor in self.policy.state_dict().items()}
-        optimizer_before = {name: t.clone() for name, t in optimizer_tensors(self._optimizer).items()}
+        optimizer_before = {name: t.clone() for name, t in checkpoint.optimizer_tensors(self._optimizer).items()}
         try:
             metrics = self._update(rollout, should_stop)
         except (Canceled, FloatingPointError):
             self.policy.load_state_dict(before)
-            restore_optimizer(self._optimizer, optimizer_before)
+            checkpoint.restore_optimizer(self._optimizer, optimizer_before)
             raise
         self.updates += 1
         return metrics
 
     def save(self, path: Path) -> None:
         """Write optimiser, reference policy and counters, atomically."""
-        sections = {"optimizer": optimizer_tensors(self._optimizer), "reference": self.reference.state_dict()}
-        write_checkpoint(path, sections, {"updates": str(self.updates), "seed": str(self.seed)})
+        sections = {
+            "optimizer": checkpoint.optimizer_tensors(self._optimizer), "reference": self.reference.state_dict()
+        }
+        checkpoint.write_checkpoint(path, sections, {"updates": str(self.updates), "seed": str(self.seed)})
 
     def load(self, path: Path) -> None:
         """Continue exactly from save().
@@ -117,15 +113,13 @@ class PpoLearner:
         Raises:
             ValueError: the file is of another architecture or seed.
         """
-        tensors, metadata = read_checkpoint(path)
+        tensors, metadata = checkpoint.read_checkpoint(path)
         if int(metadata["seed"]) != self.seed:
-            raise ValueError(
-                f"{path} was made with seed {metadata['seed']}, this run has {self.seed}; use a new run folder"
-            )
-        reference = section(tensors, "reference.")
+            raise ValueError(f"{path} has seed {metadata['seed']}, this run has {self.seed}; use a new run folder")
+        reference = checkpoint.section(tensors, "reference.")
         check_same_layout(self.reference.state_dict(), reference, what=str(path))
         self.reference.load_state_dict(reference)
-        restore_optimizer(self._optimizer, section(tensors, "optimizer."))
+        checkpoint.restore_optimizer(self._optimizer, checkpoint.section(tensors, "optimizer."))
         self.updates = int(metadata["updates"])
 
     def _update(self, rollout: Rollout, should_stop: Callable[[], bool] | None) -> PpoMetrics:
@@ -204,9 +198,7 @@ class PpoLearner:
         steps, num_envs = rollout.valid_TN.shape
         valid_TN = torch.from_numpy(rollout.valid_TN)
         if not bool(valid_TN.any()):
-            raise ValueError(
-                "the rollout has no valid transition: every reward or step was invalid; see the reward's reason"
-            )
+            raise ValueError("the rollout has no valid transition: no valid reward or step; see the reward's reason")
         unknown = rollout.valid_TN & ~(np.isfinite(rollout.logprobs_TN) & np.isfinite(rollout.values_TN))
         if unknown.any():
             raise ValueError(

@@ -11,16 +11,10 @@ import torch
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, model_tasks
+from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.environments.maniskill.collection import CollectionPlan
-from wm_nodes.environments.record import (
-    HELDOUT_SEEDS,
-    TRAINING_SEEDS,
-    collect_heldout_data,
-    collect_plan,
-    collect_training_data,
-    demonstration_plan,
-)
+from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, demonstration_plan, scripted_plan
 from wm_nodes.policy_rl.factories import ACTION_DIM, STATE_DIM, policy_actor
 from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, STARTS, train_weak_policy, write_starts
 from wm_nodes.recording import read_episodes
@@ -44,36 +38,38 @@ def load_arrays(bags: list[Path], config: RunConfig) -> EpisodeArrays:
     return stack_episodes(episodes, model_tasks(config.task), num_steps=config.simulation.max_episode_steps)
 
 
-def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, command: str = "") -> Path:
+def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     """Collect, train tokenizer, action model and text model, measure on held-out episodes; returns run_dir/model.
 
     tokenizer.kind lfq has no text model, so no goals: set reward.dense_weight to 0 there.
     """
     folder = run_dir / "model"
-    if (folder / "manifest.json").exists():
+    if (folder / MANIFEST).exists():
         return folder
-    bags = collect_training_data(config, run_dir / "data" / "train", progress=progress)
-    heldout_bags = collect_heldout_data(config, run_dir / "data" / "heldout", progress=progress)
+    bags = collect_plan(
+        scripted_plan(config, config.data.num_episodes, TRAINING_SEEDS), config, run_dir / "data" / "train"
+    )
+    heldout_bags = collect_plan(
+        scripted_plan(config, config.data.num_heldout, HELDOUT_SEEDS), config, run_dir / "data" / "heldout"
+    )
     episodes = load_arrays(bags, config)
-    tokenizer, tokenizer_metrics = train_tokenizer(episodes, config, config.seed, run_dir, progress=progress)
+    tokenizer, tokenizer_metrics = train_tokenizer(episodes, config, config.seed, run_dir)
     if config.data.policy_episodes:
-        policy_bags = _policy_bags(config, run_dir, tokenizer, progress)
+        policy_bags = _collect_policy_bags(config, run_dir, tokenizer)
         episodes = EpisodeArrays.concatenate([episodes, load_arrays(policy_bags, config)])
-    probe, probe_metrics = train_position_probe(episodes, config, config.seed, run_dir, progress=progress)
+    probe, probe_metrics = train_position_probe(episodes, config, config.seed, run_dir)
     data = tokenise_episodes(tokenizer, episodes)
     action: ActionModel | TokenActionModel
     text, text_metrics = None, dict[str, float]()
     if config.tokenizer.kind == "lfq":
-        action, action_metrics = train_token_model(tokenizer, data, config, config.seed, run_dir, progress=progress)
+        action, action_metrics = train_token_model(tokenizer, data, config, config.seed, run_dir)
     else:
-        first, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir, progress=progress)
+        action, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir)
         golden = episodes.select(np.flatnonzero(np.isin(episodes.behaviours, demonstrators())))
         texts = tuple(get_task(task).instruction for task in model_tasks(config.task))
         text, text_metrics = train_text_model(
-            tokenizer, first, golden, tokenise_episodes(tokenizer, golden), texts, config, config.seed, run_dir,
-            progress=progress,
+            tokenizer, action, golden, tokenise_episodes(tokenizer, golden), texts, config, config.seed, run_dir
         )
-        action = first
     story: dict[str, Any] = {
         "made": {
             "command": command, "date": date.today().isoformat(), "seed": config.seed, "torch": torch.__version__,
@@ -89,20 +85,17 @@ def make_model(config: RunConfig, run_dir: Path, *, progress: bool = True, comma
             "tokenizer": tokenizer_metrics, "action": action_metrics, "text": text_metrics, "probe": probe_metrics,
         },
     }
-    arguments: dict[str, Any] = {
-        "tokenizer_config": config.tokenizer, "world_model_config": config.world_model, "simulation": config.simulation,
-        "tasks": model_tasks(config.task),
-    }
-    models = WorldModels(tokenizer, action, text, model_tasks(config.task), config.simulation, {}, probe)
+    tasks = model_tasks(config.task)
+    models = WorldModels(tokenizer, action, text, tasks, config.simulation, {}, probe)
     story["heldout"] = model_metrics(models, load_arrays(heldout_bags, config), config)
     write_starts(bags, folder / STARTS, MODEL_STARTS)
-    save_model_folder(folder, tokenizer, action, text, story=story, probe=probe, **arguments)
+    save_model_folder(folder, tokenizer, action, text, config, tasks=tasks, story=story, probe=probe)
     load_model_folder(folder)
     return folder
 
 
-def _policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer, progress: bool) -> list[Path]:
-    """Simulator episodes of a few policies cloned from a few demonstrations, acting with exploration noise.
+def _collect_policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer) -> list[Path]:
+    """Collect simulator episodes of a few policies cloned from a few demonstrations, acting with exploration noise.
 
     They need the tokenizer only, so they are collected before the action model is trained and belong to its data.
     """
@@ -111,32 +104,29 @@ def _policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer, progres
     for policy, task in sorted(weak, key=lambda pair: pair[0].number):
         number, sft = policy.number, config.sft.model_copy(update={"num_demonstrations": policy.demonstrations})
         chosen = config.model_copy(update={"task": task, "sft": sft})
-        folder = _tokenizer_folder(config, run_dir, tokenizer)
+        folder = _make_tokenizer_folder(config, run_dir, tokenizer)
         weights = run_dir / "policies" / f"weak_{number}.safetensors"
         if not weights.exists():
             plan = demonstration_plan(chosen, policy.demonstrations + 3, POLICY_SEEDS + 1000 * number)
-            train_weak_policy(chosen, folder, collect_plan(plan, config, run_dir / "data" / "demos", progress), weights)
+            train_weak_policy(chosen, folder, collect_plan(plan, config, run_dir / "data" / "demos"), weights)
         plan = CollectionPlan(
             model_tasks(config.task)[-1], config.simulation, config.data.policy_episodes,
             POLICY_SEEDS + 10_000 * (number + 1), {},
             make_policy=partial(policy_actor, chosen, folder, weights, policy.noise),
         )
-        bags += collect_plan(plan, config, run_dir / "data" / "policy", progress)
+        bags += collect_plan(plan, config, run_dir / "data" / "policy")
     return bags
 
 
-def _tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenizer) -> Path:
-    """A model folder for policies, which read the tokenizer alone: its action model is untrained."""
+def _make_tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenizer) -> Path:
+    """Make a model folder for policies, which read the tokenizer alone: its action model is untrained."""
     folder = run_dir / "tokenizer_only"
-    if not (folder / "manifest.json").exists():
+    if not (folder / MANIFEST).exists():
         tasks = model_tasks(config.task)
         with initial_weights(config.seed, "action_model_init"):
             untrained = action_model_class(config.tokenizer.kind)(
                 config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
                 action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),
             )
-        save_model_folder(
-            folder, tokenizer, untrained, None, tokenizer_config=config.tokenizer,
-            world_model_config=config.world_model, simulation=config.simulation, tasks=tasks, story={},
-        )
+        save_model_folder(folder, tokenizer, untrained, None, config, tasks=tasks, story={})
     return folder

@@ -9,18 +9,16 @@ from numpy.typing import NDArray
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.policy_rl.factories import make_endogenous_reward
+from wm_nodes.policy_rl.rollouts import reward_input
 from wm_nodes.recording import Bag, BagError
-from wm_nodes.recording.lockstep import LockSteps, RecordedReward, RecordedStep
+from wm_nodes.recording.lockstep import LockSteps, RecordedReward
 from wm_nodes.recording.rollouts import recorded_reward_name
-from wm_nodes.reward import RewardInput, RewardModel, RewardResult, RuleReward
+from wm_nodes.reward import RewardModel, RewardResult, RuleReward
 
 
 @dataclass
 class RescoreReport:
-    """What was compared. different: one line per lock-step whose rewards are not bit-equal.
-
-    unrewarded, without_images: recorded lock-steps that could not be compared.
-    """
+    """different: a line per lock-step whose rewards are not bit-equal. unrewarded, without_images: not compared."""
 
     compared: int = 0
     different: list[str] = field(default_factory=list)
@@ -60,7 +58,8 @@ def rescore_bag(path: Path, model: RewardModel, *, namespace: str | None = None)
                 report.without_images += 1
                 continue
             report.compared += 1
-            wrong = _differences(step.reward, model.evaluate(reward_input(step)))
+            given = reward_input(step.images, step.next_images, step, step.goals)
+            wrong = _differences(step.reward, model.evaluate(given))
             if wrong:
                 report.different.append(f"step_id {step.step_id}: {', '.join(wrong)}")
     if not report.compared:
@@ -68,19 +67,8 @@ def rescore_bag(path: Path, model: RewardModel, *, namespace: str | None = None)
     return report
 
 
-def reward_input(step: RecordedStep) -> RewardInput:
-    """What the reward evaluator was given for this lock-step. Needs both images."""
-    if step.images is None or step.next_images is None:
-        raise BagError(f"lock-step {step.step_id} lacks an image; it cannot be scored")
-    goals, found = step.goals if step.goals is not None else (None, None)
-    return RewardInput(
-        images=step.images, next_images=step.next_images, success_probability=step.success_probability,
-        valid=step.valid, uncertainty=step.uncertainty, goals=goals, goal_found=found,
-    )
-
-
 def recorded_model(bag: Path, config_file: str | None = None, model_dir: Path | None = None) -> RewardModel:
-    """The reward model of the run that a bag lies in.
+    """Build the reward model of the run that a bag lies in.
 
     Args:
         config_file: default: config.yaml two folders above the bag.

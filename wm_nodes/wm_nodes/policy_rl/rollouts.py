@@ -5,16 +5,15 @@ column of the rollout is invalid there. Seeds of resets and action noise depend 
 only.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from wm_nodes.core.seeding import numpy_stream, torch_stream
-from wm_nodes.core.types import BoolArray, Environment, FloatArray, Observation, Rollout, StepResult, UInt64Array
+from wm_nodes.core.types import BoolArray, Environment, FloatArray, Rollout, UInt8Array, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.reward import RewardInput, RewardModel
 
@@ -23,7 +22,7 @@ TRAINING_SEED_LIMIT = 1_000_000
 
 
 class Canceled(Exception):
-    """The caller's should_stop said so; nothing half-done was kept."""
+    """The caller's should_stop returned True; nothing has changed."""
 
 
 @dataclass(frozen=True)
@@ -59,19 +58,11 @@ def action_noise(seed: int, policy_version: int, step: int, num_envs: int, actio
 
 
 def collect_rollout(
-    env: Environment, policy: ImagePolicy, reward: RewardModel, steps: int, seed: int, policy_version: int, *,
-    deterministic: bool = False, should_stop: Callable[[], bool] | None = None,
+    env: Environment, policy: ImagePolicy, reward: RewardModel, steps: int, seed: int, policy_version: int
 ) -> Rollout:
-    """Reset all environments and make `steps` lock-steps.
+    """Reset all environments and make `steps` lock-steps. Raises ValueError for steps < 1.
 
-    Args:
-        seed: root of the streams `reset` and `action_noise`.
-        policy_version: learner step whose weights act.
-        should_stop: asked before every lock-step.
-
-    Raises:
-        Canceled: should_stop returned True.
-        ValueError: steps < 1.
+    seed: root of the streams `reset` and `action_noise`. policy_version: learner step whose weights act.
     """
     if steps < 1:
         raise ValueError(f"steps must be >= 1, got {steps}; see ppo.num_steps in presets/policy/base.yaml")
@@ -80,13 +71,11 @@ def collect_rollout(
     ended = np.zeros(num_envs, np.bool_)
     columns: dict[str, list[NDArray[Any]]] = {}
     for step in range(steps):
-        if should_stop is not None and should_stop():
-            raise Canceled(f"rollout stopped at lock-step {step} of {steps}")
-        noise = None if deterministic else action_noise(seed, policy_version, step, num_envs, action_dim)
+        noise = action_noise(seed, policy_version, step, num_envs, action_dim)
         output = policy.act(observation.image, observation.state, noise=noise)
         goals = env.goals()
         result = env.step(output.actions)
-        judged = reward.evaluate(reward_input(observation, result, goals))
+        rewards = reward.evaluate(reward_input(observation.image, result.observation.image, result, goals))
         row: dict[str, NDArray[Any]] = {
             "images_TN": observation.image,
             "states_TN": observation.state,
@@ -95,10 +84,10 @@ def collect_rollout(
             "actions_TN": output.actions,
             "logprobs_TN": output.logprobs,
             "values_TN": output.values,
-            "rewards_TN": judged.total,
+            "rewards_TN": rewards.total,
             "terminated_TN": result.terminated & result.valid,
             "truncated_TN": result.truncated & result.valid,
-            "valid_TN": result.valid & judged.valid,
+            "valid_TN": result.valid & rewards.valid,
         }
         for name, array in row.items():
             columns.setdefault(name, []).append(array)
@@ -109,22 +98,32 @@ def collect_rollout(
     return Rollout(policy_version=policy_version, **{name: np.stack(rows) for name, rows in columns.items()})
 
 
+class StepOutcome(Protocol):
+    """What StepResult and recording.lockstep.RecordedStep say of a lock-step; see StepResult."""
+
+    @property
+    def success_probability(self) -> FloatArray: ...
+    @property
+    def valid(self) -> BoolArray: ...
+    @property
+    def uncertainty(self) -> FloatArray: ...
+
+
 def reward_input(
-    observation: Observation, result: StepResult, goals: tuple[NDArray[np.uint8], BoolArray] | None
+    images: UInt8Array, next_images: UInt8Array, step: StepOutcome, goals: tuple[UInt8Array, BoolArray] | None
 ) -> RewardInput:
     """Return what a reward model needs of one lock-step. goals: env.goals() as of before the step."""
+    frames, known = goals if goals is not None else (None, None)
     return RewardInput(
-        images=observation.image, next_images=result.observation.image, success_probability=result.success_probability,
-        valid=result.valid, uncertainty=result.uncertainty, goals=None if goals is None else goals[0],
-        goal_found=None if goals is None else goals[1],
+        images, next_images, step.success_probability, step.valid, step.uncertainty, goals=frames, goal_found=known
     )
 
 
 def terminate_at_episode_end(rollout: Rollout) -> Rollout:
-    """The rollout as PPO must see it where an episode is paid once, at its last step: no value lies beyond that step.
+    """Return the rollout with truncated episodes as terminated ones, for rewards that come once, at the last step.
 
-    A truncated episode got its verdict as a terminated one did. The critic's value on top of it would pay it twice, and
-    an episode that fails until its time is over could be worth more than one that succeeds.
+    A truncated episode has its whole reward then. Bootstrapping with the critic's value would count it twice, and an
+    episode that fails until its time is over could be worth more than one that succeeds.
     """
     ended = rollout.terminated_TN | rollout.truncated_TN
     return replace(rollout, terminated_TN=ended, truncated_TN=np.zeros_like(ended))

@@ -36,13 +36,13 @@ class DroppedTransitions:
 
 
 class Learner(Protocol):
-    """What the learner node needs of an algorithm; learning.ppo.PpoLearner is one."""
+    """What the learner node needs of an algorithm; ppo.PpoLearner is one."""
 
     def update(self, rollout: Rollout, *, should_stop: Callable[[], bool] | None = None) -> Any:
         """Train on one rollout; return metrics, a mapping or a dataclass of numbers.
 
-        Raises learning.rollouts.Canceled when should_stop said so; the weights are then as they were before.
-        Raises FloatingPointError when a loss, gradient or weight is not finite; likewise.
+        Raises rollouts.Canceled when should_stop returned True, and FloatingPointError when a loss, gradient or weight
+        is not finite; the weights are then as they were before.
         """
         ...
 
@@ -120,7 +120,7 @@ class PolicyTraining(TrainingRun):
         began = time.perf_counter()
         trained = terminate_at_episode_end(rollout) if paid_at_end else rollout
         broadcast_rollout(trained, self.ranks)
-        found = self.learner.update(trained, should_stop=should_stop)
+        learner_metrics = self.learner.update(trained, should_stop=should_stop)
         statistics = rollout_statistics(rollout)
         progress = self.progress
         progress.updates += 1
@@ -131,10 +131,9 @@ class PolicyTraining(TrainingRun):
         progress.dropped_stale += dropped.stale
         progress.mean_return, progress.success_rate = statistics.mean_return, statistics.success_rate
         self.save()
-        metrics = _numbers(found)
-        metrics["update_s"] = time.perf_counter() - began
-        metrics |= {"episodes": float(statistics.episodes), "cut_episodes": float(statistics.cut)}
-        return metrics
+        seconds = time.perf_counter() - began
+        counts = {"episodes": float(statistics.episodes), "cut_episodes": float(statistics.cut)}
+        return _read_numbers(learner_metrics) | {"update_s": seconds} | counts
 
     def follow(self) -> None:
         while (rollout := broadcast_rollout(None, self.ranks)) is not None:
@@ -180,8 +179,7 @@ def restore(policy: ImagePolicy, learner: Learner, checkpoint: Path) -> Progress
         return Progress(**content["progress"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"checkpoint {checkpoint} does not fit: {error}; go on with the configuration it was made by, or begin "
-            "anew in another run_dir"
+            f"checkpoint {checkpoint} does not fit: {error}; go on with its configuration, or begin in another run_dir"
         ) from None
 
 
@@ -190,6 +188,6 @@ def barrier(ranks: Ranks) -> None:
         torch.distributed.barrier()
 
 
-def _numbers(found: Any) -> dict[str, float]:
-    values = asdict(found) if is_dataclass(found) and not isinstance(found, type) else dict(found)
+def _read_numbers(metrics: Any) -> dict[str, float]:
+    values = asdict(metrics) if is_dataclass(metrics) and not isinstance(metrics, type) else dict(metrics)
     return {name: float(value) for name, value in values.items() if isinstance(value, (int, float, np.number))}

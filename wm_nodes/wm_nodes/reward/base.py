@@ -100,10 +100,10 @@ def assemble(
     reasons: Mapping[str, BoolArray], weights: Mapping[str, float],
 ) -> RewardResult:
     """Join weighted terms into a result; a step is invalid where any of `reasons` holds or a term is not finite."""
-    found = {**reasons, "reward is not finite": ~np.isfinite(dense) | ~np.isfinite(sparse)}
+    reasons = {**reasons, "reward is not finite": ~np.isfinite(dense) | ~np.isfinite(sparse)}
     valid = step.valid.copy()
     texts: list[str] = []
-    for reason, where in found.items():
+    for reason, where in reasons.items():
         hit = valid & where
         if hit.any():
             texts.append(f"{reason} (environments {np.flatnonzero(hit).tolist()})")

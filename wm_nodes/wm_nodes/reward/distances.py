@@ -18,7 +18,7 @@ BATCH = 32
 
 
 class Distance(Protocol):
-    """Perc(a, b): uint8 (N, H, W, 3) twice -> float32 (N,), >= 0. `name` tells which one judged."""
+    """Perc(a, b): uint8 (N, H, W, 3) twice -> float32 (N,), >= 0. `name` identifies it."""
 
     @property
     def name(self) -> str: ...
@@ -44,7 +44,7 @@ pixel_l1: Distance = _PixelL1()
 class EncoderDistance:
     """Mean absolute difference of encoder features, divided by `scale`.
 
-    encoder: uint8 tensor (N, H, W, 3) -> (N, F). scale: the distance that counts as 1, see `calibrated`.
+    encoder: uint8 tensor (N, H, W, 3) -> (N, F). scale: the distance that counts as 1.
     identity: names the encoder, e.g. the start of its sha256.
     Features of the last CACHED_IMAGES images are kept: goals come back every step, and one step's image is the next
     step's first.
@@ -57,14 +57,7 @@ class EncoderDistance:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"scale must be finite and > 0, got {self.scale}; calibrate on differing images")
-
-    @classmethod
-    def calibrated(
-        cls, encoder: Callable[[Tensor], Tensor], starts: UInt8Array, goals: UInt8Array, identity: str = ""
-    ) -> "EncoderDistance":
-        """Scale such that the mean distance from starts to goals, uint8 (N, H, W, 3), is 1."""
-        return cls(encoder, float(cls(encoder)(starts, goals).mean()), identity)
+            raise ValueError(f"scale must be finite and > 0, got {self.scale}")
 
     @property
     def name(self) -> str:
@@ -82,14 +75,14 @@ class EncoderDistance:
         if new:
             for (key, _), feature in zip(new, self._encode(images[[index for _, index in new]]), strict=True):
                 self._known[key] = feature
-        found = torch.stack([self._known[key] for key in keys])
+        features = torch.stack([self._known[key] for key in keys])
         for key in list(self._known)[: max(0, len(self._known) - CACHED_IMAGES)]:
             del self._known[key]
-        return found
+        return features
 
     def _encode(self, images: UInt8Array) -> Tensor:
-        """Features in batches of one size, the last one filled up: an image's features must not depend on how many
-        others were new, or a recorded reward could not be given again bit by bit."""
+        """Encode in batches of one size, the last one filled up, so that an image's features do not depend on how many
+        others were new: a recorded reward is computed again bit by bit."""
         missing = -len(images) % BATCH
         filled = np.concatenate([images, np.zeros((missing, *images.shape[1:]), np.uint8)])
         parts = [self.encoder(torch.from_numpy(filled[i : i + BATCH])).float() for i in range(0, len(filled), BATCH)]

@@ -1,6 +1,4 @@
-"""The reward that the world model gives itself: goal distance plus done signal. Shapes: N environments, K golden
-frames. RS-5, RS-7, RS-8.
-"""
+"""The world model's own reward: goal distance plus done signal (RS-5, RS-7, RS-8). Shapes: N environments, K frames."""
 
 from typing import Any
 
@@ -35,8 +33,7 @@ class EndogenousReward:
     """
 
     def __init__(self, config: RewardConfig, distance: Distance) -> None:
-        self._config = config
-        self._distance = distance
+        self._config, self._distance = config, distance
 
     @property
     def name(self) -> str:
@@ -71,38 +68,36 @@ class EndogenousReward:
         reference = step.golden if self._config.mode == "progress" else step.goals
         if reference is None:
             return np.zeros(count, np.float32), np.ones(count, np.bool_)
-        found = np.ones(count, np.bool_) if step.goal_found is None else step.goal_found
-        judged = np.flatnonzero(step.valid & found)
+        has_goal = np.ones(count, np.bool_) if step.goal_found is None else step.goal_found
+        rows = np.flatnonzero(step.valid & has_goal)
         dense = np.zeros(count, np.float32)
-        if len(judged):
-            dense[judged] = (
-                self._progress(step, judged) if self._config.mode == "progress" else self._goal(step, judged)
-            )
-        return dense, ~found
+        if len(rows):
+            dense[rows] = self._progress(step, rows) if self._config.mode == "progress" else self._goal(step, rows)
+        return dense, ~has_goal
 
-    def _goal(self, step: RewardInput, judged: NDArray[np.intp]) -> FloatArray:
+    def _goal(self, step: RewardInput, rows: NDArray[np.intp]) -> FloatArray:
         assert step.goals is not None  # checked by _dense
-        goals = step.goals[judged]
-        after: FloatArray = 1 - self._distance(step.next_images[judged], goals)
+        goals = step.goals[rows]
+        after: FloatArray = 1 - self._distance(step.next_images[rows], goals)
         if self._config.mode == "abs":
             return after
-        before = 1 - self._distance(step.images[judged], goals)
-        return self._clipped(after - before)
+        before = 1 - self._distance(step.images[rows], goals)
+        return self._clip(after - before)
 
-    def _progress(self, step: RewardInput, judged: NDArray[np.intp]) -> FloatArray:
+    def _progress(self, step: RewardInput, rows: NDArray[np.intp]) -> FloatArray:
         assert step.golden is not None and step.golden_lengths is not None  # checked by _dense and RewardInput
-        golden, lengths = step.golden[judged], step.golden_lengths[judged]
+        golden, lengths = step.golden[rows], step.golden_lengths[rows]
         num_frames = golden.shape[1]
         frames = golden.reshape(-1, *golden.shape[2:])
         beyond = np.arange(num_frames)[None, :] >= lengths[:, None]
         progress: list[NDArray[np.float64]] = []
-        for images in (step.images[judged], step.next_images[judged]):
+        for images in (step.images[rows], step.next_images[rows]):
             distances = self._distance(np.repeat(images, num_frames, axis=0), frames).reshape(-1, num_frames)
             nearest = np.where(beyond, np.inf, distances).argmin(1)
             progress.append(nearest / (lengths - 1))
-        return self._clipped(progress[1] - progress[0])
+        return self._clip(progress[1] - progress[0])
 
-    def _clipped(self, change: NDArray[Any]) -> FloatArray:
+    def _clip(self, change: NDArray[Any]) -> FloatArray:
         limit = self._config.dense_clip
         clipped: FloatArray = change.clip(-limit, limit).astype(np.float32)
         return clipped

@@ -8,23 +8,17 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from wm_nodes.training.checkpoint import (
-    optimizer_tensors,
-    read_checkpoint,
-    restore_optimizer,
-    section,
-    write_checkpoint,
-)
+from wm_nodes.training import checkpoint
 
 CHECKPOINT_PERIOD_S = 240.0
 WARMUP_FRACTION = 0.03
+WEIGHT_DECAY, MAX_GRAD_NORM = 0.01, 1.0
 EMA_DECAY = 0.998
 METRICS_EVERY = 20
 
@@ -32,31 +26,19 @@ LossFunction = Callable[[int], dict[str, Tensor]]
 """iteration -> named terms; "loss" is minimised, the others are logged."""
 
 
-@dataclass(frozen=True)
-class LoopSettings:
-    """max_seconds: stop early (with a checkpoint) after this much wall time; 0: never."""
-
-    num_iterations: int
-    learning_rate: float
-    weight_decay: float = 0.01
-    max_grad_norm: float = 1.0
-    max_seconds: float = 0.0
-
-
 class TrainingLoop:
     """Trains `model` in place; `averaged` is its exponential moving average, the weights to keep.
 
     Args:
+        peak: learning rate after the warm-up.
         run_dir: metrics_<name>.jsonl and checkpoints go here; an existing checkpoint is resumed. None: neither.
     """
 
-    def __init__(self, name: str, model: nn.Module, settings: LoopSettings, run_dir: Path | None) -> None:
-        self.name, self.model, self.settings, self.run_dir = name, model, settings, run_dir
+    def __init__(self, name: str, model: nn.Module, num_iterations: int, peak: float, run_dir: Path | None) -> None:
+        self.name, self.model, self.num_iterations, self.peak, self.run_dir = name, model, num_iterations, peak, run_dir
         self.iteration = 0
-        self.optimizer = torch.optim.AdamW(
-            [p for p in model.parameters() if p.requires_grad],
-            lr=settings.learning_rate, betas=(0.9, 0.95), weight_decay=settings.weight_decay, fused=True,
-        )
+        trained = [p for p in model.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.AdamW(trained, lr=peak, betas=(0.9, 0.95), weight_decay=WEIGHT_DECAY, fused=True)
         self.averaged = {name: tensor.detach().clone() for name, tensor in model.state_dict().items()}
         if self.checkpoint_path is not None and self.checkpoint_path.exists():
             self._resume(self.checkpoint_path)
@@ -67,30 +49,28 @@ class TrainingLoop:
 
     def learning_rate(self, iteration: int) -> float:
         """Linear warm-up, then a half cosine down to 2 % of the peak."""
-        warmup = max(1, int(WARMUP_FRACTION * self.settings.num_iterations))
+        warmup = max(1, int(WARMUP_FRACTION * self.num_iterations))
         if iteration < warmup:
-            return self.settings.learning_rate * (iteration + 1) / warmup
-        share = (iteration - warmup) / max(1, self.settings.num_iterations - warmup)
-        return self.settings.learning_rate * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * share)))
+            return self.peak * (iteration + 1) / warmup
+        share = (iteration - warmup) / max(1, self.num_iterations - warmup)
+        return self.peak * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * share)))
 
-    def run(self, loss_function: LossFunction, *, progress: bool = True) -> dict[str, float]:
+    def run(self, loss_function: LossFunction) -> dict[str, float]:
         """Train to the last iteration, load the averaged weights into the model, and return the last metrics."""
         start = last_saved = time.monotonic()
-        metrics = self._logged()
-        bar = tqdm(total=self.settings.num_iterations, initial=self.iteration, desc=self.name, disable=not progress)
+        metrics = self._read_last_metrics()
+        bar = tqdm(total=self.num_iterations, initial=self.iteration, desc=self.name)
         self.model.train()
-        while self.iteration < self.settings.num_iterations:
+        while self.iteration < self.num_iterations:
             terms = self._step(loss_function)
             bar.update()
-            if self.iteration % METRICS_EVERY == 0 or self.iteration == self.settings.num_iterations:
+            if self.iteration % METRICS_EVERY == 0 or self.iteration == self.num_iterations:
                 metrics = {key: float(value) for key, value in terms.items()}
                 bar.set_postfix({key: f"{value:.4f}" for key, value in metrics.items()}, refresh=False)
                 self._log(metrics, time.monotonic() - start)
             if time.monotonic() - last_saved > CHECKPOINT_PERIOD_S:
                 self.save()
                 last_saved = time.monotonic()
-            if 0 < self.settings.max_seconds < time.monotonic() - start:
-                break
         bar.close()
         self.save()
         self.model.load_state_dict(self.averaged)
@@ -102,7 +82,7 @@ class TrainingLoop:
             group["lr"] = self.learning_rate(self.iteration)
         terms = loss_function(self.iteration)
         terms["loss"].backward()  # type: ignore[no-untyped-call]
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.settings.max_grad_norm)
+        norm = nn.utils.clip_grad_norm_(self.model.parameters(), MAX_GRAD_NORM)
         if not torch.isfinite(norm):
             raise FloatingPointError(
                 f"{self.name}: gradient is not finite at iteration {self.iteration}; lower the learning rate"
@@ -125,29 +105,29 @@ class TrainingLoop:
             return
         sections = {
             "model": self.model.state_dict(), "averaged": self.averaged,
-            "optimizer": optimizer_tensors(self.optimizer),
+            "optimizer": checkpoint.optimizer_tensors(self.optimizer),
         }
-        write_checkpoint(self.checkpoint_path, sections, {"iteration": str(self.iteration)})
+        checkpoint.write_checkpoint(self.checkpoint_path, sections, {"iteration": str(self.iteration)})
 
     def _resume(self, path: Path) -> None:
-        tensors, metadata = read_checkpoint(path)
+        tensors, metadata = checkpoint.read_checkpoint(path)
         try:
-            self.model.load_state_dict(section(tensors, "model."))
+            self.model.load_state_dict(checkpoint.section(tensors, "model."))
         except RuntimeError as error:
             raise ValueError(
                 f"{path} belongs to another architecture or configuration; give a fresh run folder, or delete the file "
                 f"to start over ({error})"
             ) from None
-        self.averaged = {key: value.clone() for key, value in section(tensors, "averaged.").items()}
-        restore_optimizer(self.optimizer, section(tensors, "optimizer."))
+        self.averaged = {key: value.clone() for key, value in checkpoint.section(tensors, "averaged.").items()}
+        checkpoint.restore_optimizer(self.optimizer, checkpoint.section(tensors, "optimizer."))
         self.iteration = int(metadata["iteration"])
 
-    def _logged(self) -> dict[str, float]:
-        """The last metrics of a run that is resumed; empty at its start."""
+    def _read_last_metrics(self) -> dict[str, float]:
+        """Return the last metrics of a run that is resumed; {} at its start."""
         path = None if self.run_dir is None else self.run_dir / f"metrics_{self.name}.jsonl"
         if self.iteration == 0 or path is None or not path.exists():
             return {}
-        last: dict[str, float] = json.loads(path.read_text().splitlines()[-1])
+        last = json.loads(path.read_text().splitlines()[-1])
         return {key: value for key, value in last.items() if key not in ("iteration", "seconds")}
 
     def _log(self, metrics: Mapping[str, float], seconds: float) -> None:

@@ -4,7 +4,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from wm_nodes.core.files import write_atomic
@@ -48,14 +47,6 @@ class MetricsWriter:
         self._file.close()
         if self._board is not None:
             self._board.close()  # type: ignore[no-untyped-call]
-
-    def __enter__(self) -> "MetricsWriter":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def join_metrics(folders: Sequence[Path], run_dir: Path) -> None:

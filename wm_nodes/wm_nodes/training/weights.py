@@ -5,13 +5,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.training.checkpoint import metadata_of
 
 INLINE_LIMIT_BYTES = 1 << 20
 """Weights up to this size travel inside PolicyVersion.inline_data."""
@@ -35,7 +35,8 @@ class PackedWeights:
 
 def arch_hash(tensors: Mapping[str, Tensor]) -> str:
     """Return the sha256 over sorted names, shapes and dtypes of a state dictionary."""
-    return hashlib.sha256(json.dumps(_layout(tensors)).encode()).hexdigest()
+    layout = [(name, *_shape_and_dtype(tensors[name])) for name in sorted(tensors)]
+    return hashlib.sha256(json.dumps(layout).encode()).hexdigest()
 
 
 def pack_weights(module: nn.Module, metadata: Mapping[str, str] | None = None) -> PackedWeights:
@@ -52,18 +53,15 @@ def unpack_weights(data: bytes, *, sha256: str | None = None) -> tuple[dict[str,
     Raises:
         WeightsError: damaged or foreign data; says what was expected and found.
     """
-    found = hashlib.sha256(data).hexdigest()
-    if sha256 is not None and found != sha256:
-        raise WeightsError(f"weights have sha256 {found}, expected {sha256}; transfer or write them again")
+    actual = hashlib.sha256(data).hexdigest()
+    if sha256 is not None and actual != sha256:
+        raise WeightsError(f"weights have sha256 {actual}, expected {sha256}; transfer or write them again")
     try:
-        tensors = load(data)
-        length = int.from_bytes(data[:8], "little")
-        header: dict[str, Any] = json.loads(data[8 : 8 + length])
+        tensors, text = load(data), metadata_of(data).get(_METADATA_KEY)
     except (SafetensorError, ValueError) as error:
         raise WeightsError(f"weights are no safetensors file or are cut short ({len(data)} bytes): {error}") from None
-    text = header.get("__metadata__", {}).get(_METADATA_KEY)
     if text is None:
-        raise WeightsError("weights carry no wm_nodes metadata; write them with learning.weights.pack_weights")
+        raise WeightsError("weights carry no wm_nodes metadata; write them with training.weights.pack_weights")
     metadata: dict[str, str] = json.loads(text)
     if metadata.get("arch_hash") != arch_hash(tensors):
         raise WeightsError(f"weights say arch_hash {metadata.get('arch_hash')}, but hold {arch_hash(tensors)}")
@@ -93,24 +91,16 @@ def check_same_layout(expected: Mapping[str, Tensor], found: Mapping[str, Tensor
     """Raise WeightsError that names the first parameter, in sorted order, that is missing, extra or of another kind."""
     for name in sorted(set(expected) | set(found)):
         if name not in found:
-            raise WeightsError(
-                f"{what} of another architecture: {name} is missing; use the configuration it was made by"
-            )
-        if name not in expected:
-            raise WeightsError(
-                f"{what} of another architecture: {name} is unknown; use the configuration it was made by"
-            )
-        (_, shape, dtype), (_, other_shape, other_dtype) = _entry(name, expected[name]), _entry(name, found[name])
-        if (shape, dtype) != (other_shape, other_dtype):
-            raise WeightsError(
-                f"{what} of another architecture: {name} is {other_dtype}{other_shape}, expected {dtype}{shape}; "
-                "use the configuration it was made by"
-            )
+            problem = "is missing"
+        elif name not in expected:
+            problem = "is unknown"
+        else:
+            (shape, dtype), (other_shape, other_dtype) = (_shape_and_dtype(t[name]) for t in (expected, found))
+            problem = f"is {other_dtype}{other_shape}, expected {dtype}{shape}"
+            if (shape, dtype) == (other_shape, other_dtype):
+                continue
+        raise WeightsError(f"{what} of another architecture: {name} {problem}; use the configuration it was made by")
 
 
-def _layout(tensors: Mapping[str, Tensor]) -> list[tuple[str, list[int], str]]:
-    return [_entry(name, tensors[name]) for name in sorted(tensors)]
-
-
-def _entry(name: str, tensor: Tensor) -> tuple[str, list[int], str]:
-    return name, list(tensor.shape), str(tensor.dtype).removeprefix("torch.")
+def _shape_and_dtype(tensor: Tensor) -> tuple[list[int], str]:
+    return list(tensor.shape), str(tensor.dtype).removeprefix("torch.")

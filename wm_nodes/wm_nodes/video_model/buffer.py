@@ -14,6 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
+from wm_nodes.training.checkpoint import metadata_of
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout
 
@@ -110,9 +111,7 @@ class RolloutBuffer:
         """Raises RolloutBufferError where the bytes are no rollout buffer, or a truncated one."""
         try:
             tensors: dict[str, Any] = load(data)
-            header = json.loads(
-                json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"][_METADATA_KEY]
-            )
+            header = json.loads(metadata_of(data)[_METADATA_KEY])
             tensors.setdefault("rollout.zeta", None)  # absent where only seeds are kept
             rollout = {name: tensors[f"rollout.{name}"] for name in _ROLLOUT_TENSORS}
             rewards = sorted(name for name in tensors if name.startswith("reward."))

@@ -41,13 +41,13 @@ class Clips:
         )
 
     def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:
-        """The first frames, the actions and the instruction."""
+        """Return the first frames, the actions and the instruction."""
         first = codec.encode(self.frames[:, :num_conditioning])
         return Condition(first, self.actions, hashed_words(self.instructions, text_dim))
 
 
 def load_clips(bags: Sequence[Path], stride: int) -> Clips:
-    """The episodes of the bags, in order, as clips.
+    """Load the episodes of the bags, in order, as clips.
 
     Raises:
         BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, or of different sizes.
@@ -57,7 +57,7 @@ def load_clips(bags: Sequence[Path], stride: int) -> Clips:
 
 
 def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
-    """Every stride-th frame of each episode, from its first one.
+    """Cut every stride-th frame of each episode, from its first one.
 
     Raises:
         ValueError: the episodes' steps are no multiple of the stride.

@@ -1,4 +1,4 @@
-"""Pictures to latents and back: principal components of square patches.
+"""Codec of pictures by principal components of square patches.
 
 Shapes: B clips, F frames, H W 3 image, p patch side, C components, h = H / p, w = W / p.
 
@@ -37,7 +37,7 @@ class PatchCodec(nn.Module):
         self.register_buffer("scale", torch.ones(channels))
 
     def settings(self) -> dict[str, Any]:
-        """What __init__ takes, as JSON."""
+        """Return the arguments of __init__, as JSON."""
         return {"patch": self.patch, "channels": self.channels}
 
     @torch.no_grad()
@@ -64,8 +64,7 @@ class PatchCodec(nn.Module):
         """
         B, F = frames.shape[:2]
         parts = torch.split(frames.reshape(-1, *frames.shape[2:]), ENCODE_BATCH)  # type: ignore[no-untyped-call]
-        rows = [(self._patches(part) - self.mean) @ self.basis.T / self.scale for part in parts]
-        latents = torch.cat(rows)
+        latents = torch.cat([(self._patches(part) - self.mean) @ self.basis.T / self.scale for part in parts])
         return latents.view(B, F, *latents.shape[1:]).permute(0, 4, 1, 2, 3).contiguous()
 
     @torch.no_grad()
@@ -88,8 +87,6 @@ class PatchCodec(nn.Module):
         N, H, W, _ = frames.shape
         p = self.patch
         if frames.dtype != torch.uint8 or H % p or W % p:
-            raise ValueError(
-                f"frames must be uint8 with a height and width that {p} divides, got {frames.dtype} of {H} x {W}"
-            )
+            raise ValueError(f"frames must be uint8 with sides that {p} divides, got {frames.dtype} of {H} x {W}")
         cut = frames.view(N, H // p, p, W // p, p, 3).permute(0, 1, 3, 2, 4, 5)
         return cut.reshape(N, H // p, W // p, -1).float() / 255

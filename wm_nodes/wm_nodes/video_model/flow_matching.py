@@ -13,7 +13,7 @@ from torch import Tensor
 
 from wm_nodes.config.video import FlowMatchingConfig
 from wm_nodes.core.seeding import torch_stream
-from wm_nodes.training.loop import LoopSettings, TrainingLoop
+from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.video_model import Condition, VideoNetwork
 from wm_nodes.video_model.kernels import with_conditioning
 
@@ -25,16 +25,15 @@ Batches = Callable[[int], tuple[Tensor, Condition]]
 
 def train_video_model(
     model: VideoNetwork, batches: Batches, settings: FlowMatchingConfig, *, seed: int, run_dir: Path | None,
-    progress: bool = True,
 ) -> dict[str, float]:
     """Train in place to the last iteration (resuming run_dir's checkpoint), ending with the averaged weights."""
-    loop = TrainingLoop("video_model", model, LoopSettings(settings.num_iterations, settings.learning_rate), run_dir)
+    loop = TrainingLoop("video_model", model, settings.num_iterations, settings.learning_rate, run_dir)
 
     def loss(iteration: int) -> dict[str, Tensor]:
         latents, condition = batches(iteration)
         return {"loss": flow_matching_loss(model, latents, condition, settings.drop, seed, iteration)}
 
-    return loop.run(loss, progress=progress)
+    return loop.run(loss)
 
 
 def flow_matching_loss(

@@ -54,23 +54,19 @@ def load_video_folder(folder: Path) -> VideoFolder:
     manifest = read_manifest(folder, "video model", FORMAT)
     network = VideoNetwork(NetworkSettings(**manifest["network"]))
     _load(Path(folder) / NETWORK, network, manifest["sha256"][NETWORK])
-    codec = _codec(Path(folder), manifest["sha256"][CODEC], **manifest["codec"])
+    codec = _load_codec(Path(folder), manifest["sha256"][CODEC], **manifest["codec"])
     return VideoFolder(codec, network, manifest["clip"], manifest)
 
 
-def _codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Codec:
+def _load_codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Codec:
     if kind == "tokenizer" and not (folder / CODEC).is_file() and (folder.parent / MANIFEST).is_file():
         shared = codec_of_world_model(folder.parent)
         if pack_weights(shared).sha256 != sha256:
-            text = f"{folder} was made with another tokenizer than that of {folder.parent}; train it anew"
-            raise ModelFolderError(text)
+            raise ModelFolderError(f"{folder} has another tokenizer than that of {folder.parent}; train it anew")
         return shared
-    codec: Codec
-    if kind == "patch":
-        codec = PatchCodec(**settings)
-    else:
-        config = TokenizerConfig.model_validate(settings["config"])
-        codec = TokenizerCodec(config, settings["height"], settings["width"])
+    if kind == "tokenizer":
+        settings["config"] = TokenizerConfig.model_validate(settings["config"])
+    codec: Codec = PatchCodec(**settings) if kind == "patch" else TokenizerCodec(**settings)
     _load(folder / CODEC, codec, sha256)
     return codec
 

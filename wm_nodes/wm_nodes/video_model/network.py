@@ -85,7 +85,7 @@ class VideoNetwork(nn.Module):
         return _around_last_given(out, x, t, condition, self.settings.change_std) if self.settings.change_std else out
 
     def condition_parameters(self) -> list[nn.Parameter]:
-        """What says how time, actions and instruction act: their layers, and each block's scale and shift."""
+        """Return the weights of time, actions and instruction: their layers, and each block's scale and shift."""
         inputs = ("action.", "text.", "time.")
         return [p for name, p in self.named_parameters() if name.startswith(inputs) or ".film." in name]
 
@@ -103,13 +103,13 @@ class VideoNetwork(nn.Module):
         return film
 
     def _check(self, x: Tensor, condition: Condition) -> None:
-        found = (x.shape[1], condition.actions.shape[2], condition.actions.shape[1] + 1)
+        given = (x.shape[1], condition.actions.shape[2], condition.actions.shape[1] + 1)
         wanted = (self.settings.channels, self.settings.action_dim, x.shape[2])
-        if found != wanted:
+        if given != wanted:
             raise ValueError(
                 f"this video model takes {wanted[0]} latent channels and {wanted[1]} action values for every frame but "
-                f"the first ({wanted[2] - 1} actions for {wanted[2]} frames); got {found[0]} channels, {found[1]} "
-                f"values, {found[2] - 1} actions"
+                f"the first ({wanted[2] - 1} actions for {wanted[2]} frames); got {given[0]} channels, {given[1]} "
+                f"values, {given[2] - 1} actions"
             )
         if self.settings.text_dim and condition.text.shape[1:][-1] != self.settings.text_dim:
             raise ValueError(f"text must have {self.settings.text_dim} values, got {condition.text.shape[-1]}")
@@ -142,7 +142,7 @@ def time_features(times: Tensor) -> Tensor:
 
 
 def _last_given(x: Tensor, condition: Condition) -> Tensor:
-    """The newest given frame beside every frame, whatever the reach of the temporal convolutions; zeros without one."""
+    """Return the newest given frame for every frame, beyond the reach of temporal convolutions; zeros without one."""
     if condition.num_conditioning == 0:
         return torch.zeros_like(x)
     return condition.frames[:, :, -1:].to(x.dtype).expand_as(x)

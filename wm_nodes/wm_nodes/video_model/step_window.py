@@ -33,7 +33,7 @@ def stochastic_steps(num_steps: int, settings: WindowConfig, iteration: int, see
     elif settings.strategy == "progressive":
         start = (iteration // settings.period) % (last_start + 1)
     else:
-        start = _decayed_start(iteration, settings, last_start, num_steps)
+        start = _find_decayed_start(iteration, settings, last_start, num_steps)
     return list(range(start, start + settings.size))
 
 
@@ -61,17 +61,14 @@ def select_steps(
     count = min(len(candidates), max(1, int(fraction * S)))
     for sample in range(num_samples):
         generator = torch_stream(seed, "step_selection", iteration, sample)
-        order = (
-            torch.randperm(len(candidates), generator=generator)
-            if select == "random"
-            else torch.arange(len(candidates))
-        )
+        random = select == "random"
+        order = torch.randperm(len(candidates), generator=generator) if random else torch.arange(len(candidates))
         chosen[sample, candidates[order[:count]]] = True
     return chosen
 
 
-def _decayed_start(iteration: int, settings: WindowConfig, last_start: int, num_steps: int) -> int:
-    """Where a window stands that stays ever shorter, by Mix-GRPO's formulas; it starts anew after its last place."""
+def _find_decayed_start(iteration: int, settings: WindowConfig, last_start: int, num_steps: int) -> int:
+    """Return the start of a window that stays ever shorter (Mix-GRPO's formulas) and begins again after the last."""
     period, least = settings.period, max(1, settings.period // LEAST_STAY)
 
     def stay(start: int) -> int:

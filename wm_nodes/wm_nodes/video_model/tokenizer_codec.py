@@ -36,9 +36,8 @@ class TokenizerCodec(nn.Module):
         self.channels, self.patch = config.latent_dim, config.patch_px
 
     def settings(self) -> dict[str, Any]:
-        """What __init__ takes, as JSON."""
-        size = {"height": self.tokenizer.height, "width": self.tokenizer.width}
-        return {"config": self.config.model_dump(), **size}
+        """Return the arguments of __init__, as JSON."""
+        return {"config": self.config.model_dump(), "height": self.tokenizer.height, "width": self.tokenizer.width}
 
     def encode(self, frames: Tensor) -> Tensor:
         """Return latents (B, C, F, h, w) of uint8 frames (B, F, H, W, 3).
@@ -47,7 +46,7 @@ class TokenizerCodec(nn.Module):
             ValueError: not uint8, or a size that the patch does not divide.
         """
         B, count, H, W = frames.shape[:4]
-        tokenizer = self._at(H, W)
+        tokenizer = self._resize(H, W)
         parts = torch.split(frames.flatten(0, 1), BATCH)  # type: ignore[no-untyped-call]
         tokens = torch.cat([tokenizer.encode(part) for part in parts])
         grid = tokens.view(B, count, *tokenizer.grid, self.channels)
@@ -62,14 +61,14 @@ class TokenizerCodec(nn.Module):
         B, channels, count, h, w = latents.shape
         if channels != self.channels:
             raise ValueError(f"this codec has {self.channels} channels, got latents of {channels}")
-        tokenizer = self._at(h * self.patch, w * self.patch)
+        tokenizer = self._resize(h * self.patch, w * self.patch)
         tokens = tokenizer.normalise(latents.float().permute(0, 2, 3, 4, 1).reshape(B * count, h * w, channels))
         parts = torch.split(tokens, BATCH)  # type: ignore[no-untyped-call]
         frames = torch.cat([tokenizer.decode(part) for part in parts])
         return frames.view(B, count, *frames.shape[1:]).clone()
 
-    def _at(self, height: int, width: int) -> Tokenizer:
-        """The tokenizer for pictures of this size; of another than its own, one that shares the convolutions."""
+    def _resize(self, height: int, width: int) -> Tokenizer:
+        """Return the tokenizer for pictures of this size; where it is not its own, one that shares the convolutions."""
         own = self.tokenizer
         if (height, width) == (own.height, own.width):
             return own
@@ -81,11 +80,11 @@ class TokenizerCodec(nn.Module):
 
 
 def codec_of_world_model(folder: Path) -> TokenizerCodec:
-    """The tokenizer of a world-model folder. Raises ModelFolderError."""
-    found = load_model_folder(folder)
-    config = TokenizerConfig.model_validate(found.manifest["tokenizer"])
-    codec = TokenizerCodec(config, found.tokenizer.height, found.tokenizer.width)
-    codec.tokenizer.load_state_dict(found.tokenizer.state_dict())
+    """Return the tokenizer of a world-model folder as a codec. Raises ModelFolderError."""
+    models = load_model_folder(folder)
+    config = TokenizerConfig.model_validate(models.manifest["tokenizer"])
+    codec = TokenizerCodec(config, models.tokenizer.height, models.tokenizer.width)
+    codec.tokenizer.load_state_dict(models.tokenizer.state_dict())
     return codec.eval()
 
 

@@ -1,9 +1,9 @@
-"""What the current weights say about stored transitions (DD-1).
+"""The Gaussian of stored transitions under the current weights (DD-1).
 
 Shapes: M transitions, C channels, F latent frames, H W grid, K given frames, U = C (F - K) H W generated elements.
 """
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -12,18 +12,15 @@ from wm_nodes.video_model.kernels import StepContext, step, with_conditioning
 from wm_nodes.video_model.network import VelocityModel, guided_velocity
 from wm_nodes.video_model.sampling import RolloutSettings, normalised_noise
 
-MaskSource = Literal["cached", "recompute"]
-
 
 class GaussianTransition(NamedTuple):
-    """zeta: (x_s - mean) / std under the weights given, (M, U), carries the gradient. std, slope (d mean / d v) and
-    mask: (M, U), constants. sigma_base: (M,).
+    """zeta: (x_s - mean) / std under the weights given, (M, U), with gradient; the others have none. std, slope
+    (d mean / d v): (M, U). sigma_base: (M,).
     """
 
     zeta: Tensor
     std: Tensor
     slope: Tensor
-    mask: Tensor
     sigma_base: Tensor
 
 
@@ -44,8 +41,8 @@ def transition(
     v = guided_velocity(model, x, t, condition, cfg).float()
     law = step(x, v, t, s, context, settings.sampler)
     zeta = normalised_noise(x_s.float(), law, K)
-    std, slope, mask_used = (_elements(value, zeta, K) for value in (law.std, law.slope, law.mask))
-    return GaussianTransition(zeta.flatten(1), std, slope, mask_used, law.sigma_base)
+    std, slope = (_elements(value, zeta, K) for value in (law.std, law.slope))
+    return GaussianTransition(zeta.flatten(1), std, slope, law.sigma_base)
 
 
 def _elements(value: Tensor, like: Tensor, num_conditioning: int) -> Tensor:

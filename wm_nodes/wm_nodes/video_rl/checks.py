@@ -1,4 +1,4 @@
-"""What must hold on any video model before GRPO trains it. Each check states what it found, and what to do if it fails.
+"""Checks of a video model before GRPO trains it; each states what it measured, and what to do if it fails.
 
 Shapes: N videos (a few), C channels, F latent frames, H W latent grid.
 """
@@ -63,26 +63,26 @@ def examine(
     model.eval()
     sampled = sample_videos(model, condition, noise, seeds, rollout)
     if not bool(sampled.latents.isfinite().all()):
-        return [_not_finite(sampled)]
-    buffer, asked = _buffer(sampled, condition, rollout), [p.requires_grad for p in model.parameters()]
+        return [_report_not_finite(sampled)]
+    buffer, trainable = _make_buffer(sampled, condition, rollout), [p.requires_grad for p in model.parameters()]
     try:
-        learner = GrpoLearner(model, _still(grpo, rollout), rollout, seed=seed)
-        first = _first_update(learner, buffer)
+        learner = GrpoLearner(model, _without_updates(grpo, rollout), rollout, seed=seed)
+        first = _check_first_update(learner, buffer)
     finally:
-        for parameter, trains in zip(model.parameters(), asked, strict=True):
+        for parameter, trains in zip(model.parameters(), trainable, strict=True):
             parameter.requires_grad_(trains)
             parameter.grad = None
         model.eval()
     return [
         *first,
-        _ode(model, condition, noise, seeds, rollout),
-        _mask(sampled, condition.num_conditioning, rollout),
-        _round_trip(buffer),
-        _memory(learner, sampled, buffer_videos or len(seeds)),
+        _check_ode(model, condition, noise, seeds, rollout),
+        _check_mask(sampled, condition.num_conditioning, rollout),
+        _check_round_trip(buffer),
+        _measure_memory(learner, sampled, buffer_videos or len(seeds)),
     ]
 
 
-def _not_finite(sampled: VideoRollout) -> CheckResult:
+def _report_not_finite(sampled: VideoRollout) -> CheckResult:
     broken = int((~sampled.latents.isfinite()).flatten(1).any(1).sum())
     return CheckResult(
         "sampled videos are finite", False, f"{broken} of {len(sampled.latents)} are not",
@@ -90,8 +90,10 @@ def _not_finite(sampled: VideoRollout) -> CheckResult:
     )
 
 
-def _ode(model: nn.Module, condition: Condition, noise: Tensor, seeds: Tensor, rollout: RolloutSettings) -> CheckResult:
-    """The sampler's own arm at eta = 0, at every step, and the ODE rollout, against plain Euler sums x + (s - t) v."""
+def _check_ode(
+    model: nn.Module, condition: Condition, noise: Tensor, seeds: Tensor, rollout: RolloutSettings
+) -> CheckResult:
+    """Compare every step of the arm at eta = 0, and the ODE rollout, with plain Euler sums x + (s - t) v."""
     quiet, given = replace(rollout.sampler, eta=0.0), condition.frames.float()
     context = StepContext(given, float(rollout.times[1]))
     x, error, spread = with_conditioning(noise.float(), given), 0.0, 0.0
@@ -100,9 +102,10 @@ def _ode(model: nn.Module, condition: Condition, noise: Tensor, seeds: Tensor, r
             times, ends = t.expand(len(x)), s.expand(len(x))
             v = guided_velocity(model, x, times, condition, rollout.cfg).float()
             law, euler = step(x, v, times, ends, context, quiet), with_conditioning(x + float(s - t) * v, given)
-            error = max(error, _off(with_conditioning(law.mean, given), euler))
+            error = max(error, _relative_error(with_conditioning(law.mean, given), euler))
             spread, x = max(spread, float(law.std.max())), euler
-    error = max(error, _off(sample_videos(model, condition, noise, seeds, rollout, []).latents, x))
+    by_ode = sample_videos(model, condition, noise, seeds, rollout, []).latents
+    error = max(error, _relative_error(by_ode, x))
     return CheckResult(
         "eta = 0 is the Euler ODE step", error < ODE_LIMIT and spread == 0,
         f"{rollout.sampler.arm}: largest relative difference {error:.1e}, deviation {spread:.1g}",
@@ -110,11 +113,11 @@ def _ode(model: nn.Module, condition: Condition, noise: Tensor, seeds: Tensor, r
     )
 
 
-def _off(found: Tensor, wanted: Tensor) -> float:
-    return float((found - wanted).abs().max() / wanted.abs().max())
+def _relative_error(actual: Tensor, expected: Tensor) -> float:
+    return float((actual - expected).abs().max() / expected.abs().max())
 
 
-def _mask(sampled: VideoRollout, num_conditioning: int, rollout: RolloutSettings) -> CheckResult:
+def _check_mask(sampled: VideoRollout, num_conditioning: int, rollout: RolloutSettings) -> CheckResult:
     name = "the mask is not flat"
     if rollout.sampler.arm != "dyndiff":
         return CheckResult(name, True, f"arm {rollout.sampler.arm} has none", "")
@@ -128,17 +131,17 @@ def _mask(sampled: VideoRollout, num_conditioning: int, rollout: RolloutSettings
     )
 
 
-def _round_trip(buffer: RolloutBuffer) -> CheckResult:
+def _check_round_trip(buffer: RolloutBuffer) -> CheckResult:
     again = RolloutBuffer.from_bytes(buffer.to_bytes())
     equal, size = again.to_bytes() == buffer.to_bytes(), f"{buffer.num_bytes / MIB:.1f} MiB"
     return CheckResult("a saved buffer comes back equal", equal, size, "report this as a bug")
 
 
-def _memory(learner: GrpoLearner, sampled: VideoRollout, videos: int) -> CheckResult:
-    """What each KL anchor keeps beside the weights, for a buffer of so many videos."""
+def _measure_memory(learner: GrpoLearner, sampled: VideoRollout, videos: int) -> CheckResult:
+    """Measure what each KL anchor keeps beside the weights, for a buffer of `videos` videos."""
     weights = sum(p.nbytes for p in learner.parameters)
-    kept, scale = sampled.zeta, videos / len(sampled.latents) / MIB
-    noise = "only seeds" if kept is None else f"{kept.nbytes * scale:.2f} MiB of noise"
+    zeta, scale = sampled.zeta, videos / len(sampled.latents) / MIB
+    noise = "only seeds" if zeta is None else f"{zeta.nbytes * scale:.2f} MiB of noise"
     text = (
         f"frozen, moving: {weights / MIB:.2f} MiB of weights that train; buffer: {noise} and "
         f"{sampled.mask.nbytes * scale:.2f} MiB of masks for {videos} videos; dual: both; lora_off: nothing; chosen: "
@@ -148,14 +151,14 @@ def _memory(learner: GrpoLearner, sampled: VideoRollout, videos: int) -> CheckRe
 
 
 def _limits(rollout: RolloutSettings) -> tuple[float, float]:
-    """Of the ratio's distance from 1, and of the KL."""
+    """Return the limits of the ratio's distance from 1, and of the KL."""
     if rollout.noise_store == "zeta_bfloat16":
         return ROUNDED_RATIO_LIMIT, ROUNDED_KL_LIMIT
     return RATIO_LIMIT, KL_LIMIT
 
 
-def _still(grpo: GrpoConfig, rollout: RolloutSettings) -> GrpoConfig:
-    """Of one update that moves nothing, whose clipped transitions are those off the limit of the ratio."""
+def _without_updates(grpo: GrpoConfig, rollout: RolloutSettings) -> GrpoConfig:
+    """Settings of one update that changes no weight; a transition beyond the ratio's limit counts as clipped."""
     limit, _ = _limits(rollout)
     return grpo.with_values(
         updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0, ratio_norm=False,
@@ -164,13 +167,13 @@ def _still(grpo: GrpoConfig, rollout: RolloutSettings) -> GrpoConfig:
     )
 
 
-def _first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[CheckResult, CheckResult]:
+def _check_first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[CheckResult, CheckResult]:
     (update,) = learner.train(buffer.with_rewards({"total": torch.arange(len(buffer), dtype=torch.float64)})).updates
     ratio_limit, kl_limit = _limits(learner.rollout)
-    off, outside = abs(update.ratio_mean - 1), update.clip_low_share + update.clip_high_share
+    error, outside = abs(update.ratio_mean - 1), update.clip_low_share + update.clip_high_share
     return CheckResult(
-        "ratio is 1 on the first update", off < ratio_limit and outside == 0,
-        f"mean ratio differs from 1 by {off:.1e}, {outside:.0%} of the transitions by more than {ratio_limit:g}",
+        "ratio is 1 on the first update", error < ratio_limit and outside == 0,
+        f"mean ratio differs from 1 by {error:.1e}, {outside:.0%} of the transitions by more than {ratio_limit:g}",
         "make rollout and training pass alike: rollout.cfg and grpo.cfg, dtype, micro_batch, dropout off, attention "
         "kernels; noise_store zeta",
     ), CheckResult(
@@ -179,7 +182,7 @@ def _first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[CheckRes
     )
 
 
-def _buffer(sampled: VideoRollout, condition: Condition, rollout: RolloutSettings) -> RolloutBuffer:
+def _make_buffer(sampled: VideoRollout, condition: Condition, rollout: RolloutSettings) -> RolloutBuffer:
     count = len(sampled.latents)
     return RolloutBuffer(
         sampled, condition, torch.zeros(count, dtype=torch.int64), torch.arange(count), {},

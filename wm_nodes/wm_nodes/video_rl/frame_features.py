@@ -1,4 +1,4 @@
-"""Features of pictures for diversity (DD-19): which ones measured is part of every number, so each has a name.
+"""Features of pictures for diversity (DD-19). Each kind has a name, which is reported with every number.
 
 Shapes: N frames, H W 3 image, D features. A backbone comes from a local folder; nothing is downloaded.
 """
@@ -82,14 +82,14 @@ class BackboneFeatures:
     @torch.no_grad()
     def __call__(self, frames: Tensor) -> Tensor:
         parts = torch.split(frames, BATCH)  # type: ignore[no-untyped-call]
-        return torch.cat([self._pooled(part) for part in parts])
+        return torch.cat([self._pool(part) for part in parts])
 
-    def _pooled(self, frames: Tensor) -> Tensor:
+    def _pool(self, frames: Tensor) -> Tensor:
         pixels = frames.permute(0, 3, 1, 2).float() / 255
         pixels = F.interpolate(pixels, (self._size, self._size), mode="bicubic", antialias=True).clamp(0, 1)
-        found: Any = self._model(pixel_values=(pixels - self._mean) / self._std)
-        pooled: Tensor | None = getattr(found, "pooler_output", None)
-        return (found.last_hidden_state[:, 0] if pooled is None else pooled).float()
+        output: Any = self._model(pixel_values=(pixels - self._mean) / self._std)
+        pooled: Tensor | None = getattr(output, "pooler_output", None)
+        return (output.last_hidden_state[:, 0] if pooled is None else pooled).float()
 
 
 def load_backbone(folder: Path) -> BackboneFeatures:
@@ -116,6 +116,6 @@ def load_backbone(folder: Path) -> BackboneFeatures:
     if not isinstance(size, int):
         raise ValueError(f"{folder} holds a {model.config.model_type}, which takes no pictures; give a vision model")
     path = folder / "preprocessor_config.json"
-    found = json.loads(path.read_text()) if path.is_file() else {}
-    mean, std = found.get("image_mean", IMAGENET_MEAN), found.get("image_std", IMAGENET_STD)
+    settings = json.loads(path.read_text()) if path.is_file() else {}
+    mean, std = settings.get("image_mean", IMAGENET_MEAN), settings.get("image_std", IMAGENET_STD)
     return BackboneFeatures(model, size, tuple(mean), tuple(std), f"{model.config.model_type} of {folder.name}")

@@ -6,7 +6,6 @@ Computed in float64: in float32 a group of equal rewards gets advantages of up t
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -37,15 +36,14 @@ class RunningStd:
 
 @dataclass(frozen=True)
 class GroupAdvantages:
-    """advantages_N: float64, 0 where nothing is known. kept_N: bool, videos that train: their reward is valid and their
-    group's rewards differ. num_groups, num_zero_std, num_invalid: groups; groups without any spread; invalid videos.
+    """advantages_N: float64, 0 where there is none. kept_N: bool, videos that train: their reward is valid and their
+    group's rewards differ. num_groups, num_zero_std: groups; groups without any spread.
     """
 
     advantages_N: Tensor
     kept_N: Tensor
     num_groups: int
     num_zero_std: int
-    num_invalid: int
 
 
 def group_advantages(
@@ -104,7 +102,7 @@ def group_advantages(
     elif std_scope == "running" and running is not None and running.std > 0:
         stds = torch.full_like(stds, running.std)
     advantages = (deviations / stds).clamp(-clip, clip)
-    return GroupAdvantages(advantages, kept, len(groups), num_zero, int((~valid).sum()))
+    return GroupAdvantages(advantages, kept, len(groups), num_zero)
 
 
 def trainable(valid_N: BoolArray, group_ids_N: NDArray[np.int64]) -> BoolArray:
@@ -133,15 +131,17 @@ def mixed_advantages(
     unknown = sorted(set(weights) - set(rewards))
     if unknown or not weights:
         raise ValueError(f"no advantages of unknown rewards {unknown}; weigh some of {', '.join(sorted(rewards))}")
-    one = partial(group_advantages, clip=math.inf, std_scope=std_scope, ddof=ddof, floor=floor)
-    parts = {name: one(rewards[name], group_ids_N, valid_N) for name in weights}
+    parts = {
+        name: group_advantages(
+            rewards[name], group_ids_N, valid_N, clip=math.inf, std_scope=std_scope, ddof=ddof, floor=floor
+        )
+        for name in weights
+    }
     total = sum(abs(weight) for weight in weights.values())
     mixed = torch.stack([weight * parts[name].advantages_N for name, weight in weights.items()]).sum(0) / total
     kept = torch.stack([part.kept_N for part in parts.values()]).any(0)
     groups, spread = _groups(group_ids_N), set(_groups(group_ids_N[kept]))
-    return GroupAdvantages(
-        mixed.clamp(-clip, clip), kept, len(groups), len(groups) - len(spread), int((~valid_N.bool()).sum())
-    )
+    return GroupAdvantages(mixed.clamp(-clip, clip), kept, len(groups), len(groups) - len(spread))
 
 
 def best_of_n(advantages_N: Tensor, group_ids_N: Tensor, kept_N: Tensor, n: int) -> Tensor:

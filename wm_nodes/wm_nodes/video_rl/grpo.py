@@ -11,7 +11,7 @@ import json
 import time
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,7 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.video import GrpoConfig
-from wm_nodes.training.checkpoint import (
-    optimizer_tensors,
-    read_checkpoint,
-    restore_optimizer,
-    section,
-    write_checkpoint,
-)
+from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.video_model.buffer import RolloutBuffer
@@ -71,11 +65,12 @@ class UpdateReport:
 
 @dataclass(frozen=True)
 class BufferReport:
-    """What one buffer gave. updates: one report per optimizer step, in order (index 0 is on-policy); none where the
-    rewards differ in no group. skipped: such buffers in a row, up to this one. dropped_groups: those with fewer valid
-    videos than group_advantages.trainable asks for; they are in zero_std_ratio too. raw_rewards: mean of each score
-    beside the total over the videos that have it, NaN where none has. step_noise: noise_share of each stochastic
-    sampler step.
+    """The training on one buffer.
+
+    updates: one report per optimizer step, in order (index 0 is on-policy); none where the rewards differ in no group.
+    skipped: such buffers in a row, up to this one. dropped_groups: those with fewer valid videos than trainable() asks
+    for; they are in zero_std_ratio too. raw_rewards: mean of each score beside the total over the videos that have it,
+    NaN where none has. step_noise: noise_share of each stochastic sampler step.
     """
 
     updates: tuple[UpdateReport, ...]
@@ -129,7 +124,8 @@ class GrpoLearner:
         )
         self._running = RunningStd()
         self._terms = GrpoTerms(model, settings, rollout)
-        self.averaged = {name: p.detach().clone() for name, p in _trained(model)} if settings.ema_decay > 0 else {}
+        trained = _trained_parameters(model) if settings.ema_decay > 0 else ()
+        self.averaged = {name: p.detach().clone() for name, p in trained}
 
     def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Make `updates_per_buffer` optimizer steps; nothing has changed when it raises.
@@ -196,13 +192,13 @@ class GrpoLearner:
         own = self.ranks.share(torch.arange(total))
         for index in torch.split(own, self.settings.micro_batch):  # type: ignore[no-untyped-call]
             start, part = time.perf_counter(), rows.part(index)
-            found = self._terms.ratio(buffer, part)
-            ratio, signal = found.log_ratio, advantages.advantages_N[part.videos].to(device, torch.float32)
+            terms = self._terms.ratio(buffer, part)
+            ratio, signal = terms.log_ratio, advantages.advantages_N[part.videos].to(device, torch.float32)
             objective = clipped_objective(ratio, signal, **limits)
             if weights is not None:
                 objective = objective * weights[part.positions].to(device)
             forward_end = time.perf_counter()
-            kl = self._terms.kl(found, buffer, part, self.version)
+            kl = self._terms.kl(terms, buffer, part, self.version)
             kl_end = time.perf_counter()
             loss = (self.settings.kl.beta * kl - objective).sum() / total
             loss.backward()  # type: ignore[no-untyped-call]
@@ -220,8 +216,8 @@ class GrpoLearner:
         return dict(zip(sums, values.tolist(), strict=True))
 
     def averaged_weights(self) -> AbstractContextManager[None]:
-        """A context in which the model has its averaged weights, for evaluation; without EMA, its own."""
-        return _Swapped(self.model, self.averaged) if self.averaged else nullcontext()
+        """Return a context in which the model has its averaged weights, for evaluation; without EMA, its own."""
+        return _swap_weights(self.model, self.averaged) if self.averaged else nullcontext()
 
     # internals
 
@@ -232,17 +228,12 @@ class GrpoLearner:
         def signal(values: Tensor) -> Tensor:
             return win_rates(values, buffer.group_ids, trains) if settings.source == "win_rate" else values
 
+        shared: dict[str, Any] = {name: getattr(settings, name) for name in ("clip", "std_scope", "ddof", "floor")}
         if settings.mix == "advantage":
-            return mixed_advantages(
-                {name: signal(values) for name, values in buffer.rewards.items()}, self.reward_weights,
-                buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope, ddof=settings.ddof,
-                floor=settings.floor,
-            )
-        return group_advantages(
-            signal(rewards), buffer.group_ids, trains, clip=settings.clip, std_scope=settings.std_scope,
-            ddof=settings.ddof, floor=settings.floor,
-            running=self._running if settings.std_scope == "running" else None,
-        )
+            values = {name: signal(value) for name, value in buffer.rewards.items()}
+            return mixed_advantages(values, self.reward_weights, buffer.group_ids, trains, **shared)
+        running = self._running if settings.std_scope == "running" else None
+        return group_advantages(signal(rewards), buffer.group_ids, trains, **shared, running=running)
 
     def _passes(self, buffer: RolloutBuffer, kept: Tensor) -> Iterator[Rows]:
         chosen = select_steps(
@@ -274,7 +265,7 @@ class GrpoLearner:
         self._optimizer.step()
         self.version += 1
         decay = min(self.settings.ema_decay, (1 + self.version) / (10 + self.version))
-        for name, parameter in _trained(self.model):
+        for name, parameter in _trained_parameters(self.model):
             if name in self.averaged:
                 self.averaged[name].lerp_(parameter.detach(), 1 - decay)
         total = len(rows.videos)
@@ -286,11 +277,11 @@ class GrpoLearner:
         )
 
     def _snapshot(self) -> dict[str, Any]:
-        """In the host's memory: what a failed train() puts back."""
+        """Copy to the host's memory what a failed train() puts back."""
         return {
-            "model": {name: _kept(p) for name, p in _trained(self.model)},
-            "optimizer": {key: _kept(value) for key, value in optimizer_tensors(self._optimizer).items()},
-            "averaged": {name: _kept(value) for name, value in self.averaged.items()},
+            "model": {name: _copy_to_cpu(p) for name, p in _trained_parameters(self.model)},
+            "optimizer": {k: _copy_to_cpu(v) for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
+            "averaged": {name: _copy_to_cpu(value) for name, value in self.averaged.items()},
             "anchor": self._terms.anchor,  # replaced, never changed
             "running": copy.copy(self._running),
             "version": self.version,
@@ -298,7 +289,7 @@ class GrpoLearner:
 
     def _restore(self, before: dict[str, Any]) -> None:
         _set_trained(self.model, before["model"])
-        restore_optimizer(self._optimizer, before["optimizer"])
+        checkpoint.restore_optimizer(self._optimizer, before["optimizer"])
         for name, value in before["averaged"].items():
             self.averaged[name].copy_(value)
         self._terms.anchor, self.version, self._running = before["anchor"], before["version"], before["running"]
@@ -308,12 +299,12 @@ class GrpoLearner:
     def save(self, path: Path, *, iteration: int) -> None:
         """Write everything that train() depends on, atomically: trained weights, EMA, anchor, optimizer, counters."""
         sections = {
-            "model": dict(_trained(self.model)), "averaged": self.averaged, "anchor": self._terms.anchor,
-            "optimizer": optimizer_tensors(self._optimizer),
+            "model": dict(_trained_parameters(self.model)), "averaged": self.averaged, "anchor": self._terms.anchor,
+            "optimizer": checkpoint.optimizer_tensors(self._optimizer),
         }
         header = {"version": self.version, "seed": self.seed, "iteration": iteration, "skipped": self.skipped}
         header |= {f.name: getattr(self._running, f.name) for f in fields(self._running)}
-        write_checkpoint(path, sections, {"grpo": json.dumps(header)})
+        checkpoint.write_checkpoint(path, sections, {"grpo": json.dumps(header)})
 
     def load(self, path: Path) -> int:
         """Continue exactly from save(); return its iteration.
@@ -322,44 +313,43 @@ class GrpoLearner:
             ValueError: the file is damaged, or of another architecture, seed, KL anchor or EMA.
         """
         try:
-            tensors, metadata = read_checkpoint(path)
+            tensors, metadata = checkpoint.read_checkpoint(path)
             header = json.loads(metadata["grpo"])
         except (SafetensorError, KeyError, ValueError) as error:
             raise WeightsError(f"{path} is no complete checkpoint of GRPO ({error}); use a new run folder") from error
         if header["seed"] != self.seed:
-            raise ValueError(
-                f"{path} was made with seed {header['seed']}, this run has {self.seed}; use a new run folder"
-            )
-        weights = section(tensors, "model.")
-        check_same_layout(dict(_trained(self.model)), weights, what=str(path))
+            raise ValueError(f"{path} has seed {header['seed']}, this run has {self.seed}; use a new run folder")
+        weights = checkpoint.section(tensors, "model.")
+        check_same_layout(dict(_trained_parameters(self.model)), weights, what=str(path))
         own = {"averaged.": (self.averaged, "ema_decay"), "anchor.": (self._terms.anchor, "kl.anchor")}
-        for prefix, (kept, knob) in own.items():
-            if bool(kept) != bool(section(tensors, prefix)):
-                raise ValueError(f"{path} was made with another grpo.{knob}; resume with its settings")
+        for prefix, (values, setting) in own.items():
+            if bool(values) != bool(checkpoint.section(tensors, prefix)):
+                raise ValueError(f"{path} was made with another grpo.{setting}; resume with its settings")
         _set_trained(self.model, weights)
         device = next(self.model.parameters()).device
-        self.averaged = {name: value.to(device) for name, value in section(tensors, "averaged.").items()}
-        self._terms.anchor = {name: value.to(device) for name, value in section(tensors, "anchor.").items()}
-        restore_optimizer(self._optimizer, section(tensors, "optimizer."))
+        self.averaged, self._terms.anchor = (
+            {name: value.to(device) for name, value in checkpoint.section(tensors, prefix).items()} for prefix in own
+        )
+        checkpoint.restore_optimizer(self._optimizer, checkpoint.section(tensors, "optimizer."))
         self._running = RunningStd(header["sum_of_squares"], header["count"])
         self.version, self.skipped = header["version"], header.get("skipped", 0)  # older files have skipped none
         return int(header["iteration"])
 
 
 def _train_condition(model: nn.Module) -> None:
-    found: Any = getattr(model, "condition_parameters", None)
-    if found is None:
+    condition_parameters: Any = getattr(model, "condition_parameters", None)
+    if condition_parameters is None:
         raise ValueError(
             f"grpo.trains condition is of the embedded video model; {type(model).__name__} takes grpo.trains all, or a "
             "LoRA adapter"
         )
     model.requires_grad_(False)
-    for parameter in found():
+    for parameter in condition_parameters():
         parameter.requires_grad_(True)
 
 
 def mixed_reward(buffer: RolloutBuffer) -> Tensor:
-    """The reward that trains, float64 (N,): the buffer's `total`, or its only reward."""
+    """Return the reward that trains, float64 (N,): the buffer's `total`, or its only reward."""
     if "total" in buffer.rewards:
         return buffer.rewards["total"]
     if len(buffer.rewards) == 1:
@@ -367,29 +357,26 @@ def mixed_reward(buffer: RolloutBuffer) -> Tensor:
     raise ValueError(f"the buffer holds rewards {', '.join(buffer.rewards) or '(none)'} and no `total`; mix them first")
 
 
-class _Swapped(AbstractContextManager[None]):
-    """The model with other values of its trained parameters, for a while."""
-
-    def __init__(self, model: nn.Module, values: dict[str, Tensor]) -> None:
-        self._model, self._values = model, values
-
-    def __enter__(self) -> None:
-        self._own = {name: p.detach().clone() for name, p in _trained(self._model)}
-        _set_trained(self._model, self._values)
-
-    def __exit__(self, *_: object) -> None:
-        _set_trained(self._model, self._own)
+@contextmanager
+def _swap_weights(model: nn.Module, values: dict[str, Tensor]) -> Iterator[None]:
+    """Give the trained parameters other values within the context."""
+    own = {name: p.detach().clone() for name, p in _trained_parameters(model)}
+    _set_trained(model, values)
+    try:
+        yield
+    finally:
+        _set_trained(model, own)
 
 
-def _trained(model: nn.Module) -> Iterator[tuple[str, Tensor]]:
+def _trained_parameters(model: nn.Module) -> Iterator[tuple[str, Tensor]]:
     return ((name, p) for name, p in model.named_parameters() if p.requires_grad)
 
 
-def _kept(tensor: Tensor) -> Tensor:
+def _copy_to_cpu(tensor: Tensor) -> Tensor:
     return tensor.detach().to("cpu", copy=True)
 
 
 @torch.no_grad()
 def _set_trained(model: nn.Module, values: dict[str, Tensor]) -> None:
-    for name, parameter in _trained(model):
+    for name, parameter in _trained_parameters(model):
         parameter.copy_(values[name])

@@ -1,6 +1,5 @@
 """From clips to a video model: codec, flow matching, held-out scores. Resumable; what is finished is kept."""
 
-from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
 from wm_nodes.video_model.tokenizer_codec import Codec, codec_of_world_model
 from wm_nodes.video_rl.reference_reward import score_clips
-from wm_nodes.video_rl.validation import kept_scores
+from wm_nodes.video_rl.validation import evaluated_contexts, load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 CODEC_FRAMES = 2000
@@ -30,7 +29,7 @@ BEFORE = Path("evaluations") / "before.json"
 
 def make_video_model(
     config: VideoRlConfig, clips: Clips, heldout: Clips, probe: PositionProbe, run_dir: Path, *,
-    shipped: VideoFolder | None = None, progress: bool = True, command: str = "",
+    shipped: VideoFolder | None = None, command: str = "",
 ) -> VideoFolder:
     """The shipped video model, or without one a model trained on the clips, with its held-out scores.
 
@@ -45,18 +44,19 @@ def make_video_model(
         return load_video_folder(folder)
     story: dict[str, Any]
     if shipped is not None:
-        made = shipped
-        story = {"shipped": {name: made.manifest[name] for name in ("command", "date", "seed", "episodes", "training")}}
+        model, kept = shipped, ("command", "date", "seed", "episodes", "training")
+        story = {"shipped": {name: model.manifest[name] for name in kept}}
     else:
-        made, losses = _trained(config, clips, run_dir, progress)
+        model, losses = _train(config, clips, run_dir)
         story = {
             "command": command, "date": date.today().isoformat(), "seed": config.seed, "task": config.task,
             "episodes": len(clips), "training": losses,
         }
-    scores = kept_scores(run_dir / BEFORE, made, heldout, probe, config)
+    scores = load_or_measure_scores(run_dir / BEFORE, model, heldout, probe, config)
     story["model"] = config.model.model_dump()
-    story["heldout"] = {**_means(scores), **_baselines(made, heldout, probe, config)}
-    save_video_folder(folder, made.codec, made.network, made.clip, story)
+    means = {name: sum(values) / len(values) for name, values in scores.items()}
+    story["heldout"] = means | _score_baselines(model, heldout, probe, config)
+    save_video_folder(folder, model.codec, model.network, model.clip, story)
     return load_video_folder(folder)
 
 
@@ -68,16 +68,14 @@ def shipped_video_model(config: VideoRlConfig) -> VideoFolder | None:
         return None
     if not (folder / MANIFEST).is_file():
         return None
-    found = load_video_folder(folder)
-    return found if found.manifest["model"] == config.model.model_dump() else None
+    shipped = load_video_folder(folder)
+    return shipped if shipped.manifest["model"] == config.model.model_dump() else None
 
 
-def _trained(
-    config: VideoRlConfig, clips: Clips, run_dir: Path, progress: bool
-) -> tuple[VideoFolder, dict[str, float]]:
-    """Codec and network, and the last training losses."""
+def _train(config: VideoRlConfig, clips: Clips, run_dir: Path) -> tuple[VideoFolder, dict[str, float]]:
+    """Fit the codec and train the network; return both, and the last training losses."""
     settings, K = config.model, config.model.num_conditioning
-    codec = _codec(config, clips)
+    codec = _make_codec(config, clips)
     latents, condition = codec.encode(clips.frames), clips.condition(codec, K, settings.text_dim)
     sizes = NetworkSettings(
         codec.channels, clips.actions.shape[2], settings.text_dim, settings.width, settings.depth,
@@ -91,30 +89,30 @@ def _trained(
         rows = torch.from_numpy(drawn)
         return latents[rows], condition.rows(rows)
 
-    losses = train_video_model(network, batch, settings.training, seed=config.seed, run_dir=run_dir, progress=progress)
+    losses = train_video_model(network, batch, settings.training, seed=config.seed, run_dir=run_dir)
     return VideoFolder(codec, network, {"stride": settings.stride, "num_conditioning": K}, {}), losses
 
 
-def _baselines(folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig) -> dict[str, float]:
-    """Mean scores of what needs no sampling. `copy_*`: of repeating the first frame. `codec_psnr_db`: of the codec."""
-    some = heldout.select(torch.arange(min(config.evaluation.contexts, len(heldout))))
+def _score_baselines(
+    folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
+) -> dict[str, float]:
+    """Return mean scores without sampling. `copy_*`: of repeating the first frame. `codec_psnr_db`: of the codec."""
+    contexts = evaluated_contexts(heldout, config)
     K = folder.clip["num_conditioning"]
-    copied = some.frames[:, :1].expand_as(some.frames)
-    coded = folder.codec.decode(folder.codec.encode(some.frames))
-    found = {f"copy_{name}": float(v.mean()) for name, v in score_clips(copied, some, probe, K).named().items()}
-    return found | {"codec_psnr_db": float(score_clips(coded, some, probe, K).psnr_db.mean())}
+    copied = contexts.frames[:, :1].expand_as(contexts.frames)
+    coded = folder.codec.decode(folder.codec.encode(contexts.frames))
+    scores = {f"copy_{name}": float(v.mean()) for name, v in score_clips(copied, contexts, probe, K).named().items()}
+    return scores | {"codec_psnr_db": float(score_clips(coded, contexts, probe, K).psnr_db.mean())}
 
 
-def _means(scores: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    return {name: sum(values) / len(values) for name, values in scores.items()}
-
-
-def _codec(config: VideoRlConfig, clips: Clips) -> Codec:
+def _make_codec(config: VideoRlConfig, clips: Clips) -> Codec:
     settings = config.model
     if settings.codec == "tokenizer":
-        return codec_of_world_model(Path(shipped_model(config.task)))
+        return codec_of_world_model(shipped_model(config.task))
     codec = PatchCodec(settings.patch, settings.channels)
-    codec.fit(_some_frames(clips, config.seed))
+    frames = clips.frames.flatten(0, 1)
+    drawn = numpy_stream(config.seed, "codec_frames").choice(len(frames), min(CODEC_FRAMES, len(frames)), replace=False)
+    codec.fit(frames[torch.from_numpy(drawn)])
     return codec
 
 
@@ -124,9 +122,3 @@ def change_std(latents: Tensor, num_conditioning: int) -> float:
         return float(latents.square().mean().sqrt())
     given = latents[:, :, num_conditioning - 1 : num_conditioning]
     return float((latents[:, :, num_conditioning:] - given).square().mean().sqrt())
-
-
-def _some_frames(clips: Clips, seed: int) -> Tensor:
-    frames = clips.frames.flatten(0, 1)
-    count = min(CODEC_FRAMES, len(frames))
-    return frames[torch.from_numpy(numpy_stream(seed, "codec_frames").choice(len(frames), count, replace=False))]

@@ -72,33 +72,32 @@ class GrpoTerms:
             self.move_anchor()
 
     def move_anchor(self) -> None:
-        """The anchor becomes the model as it is."""
+        """Make the model's current parameters the anchor."""
         named = self.model.named_parameters()
         self.anchor = {name: p.detach().clone() for name, p in named if p.requires_grad}
 
     def ratio(self, buffer: RolloutBuffer, rows: Rows) -> Pass:
-        """Run the current weights; the logarithm of DD-15, or of DD-15b with ratio_norm."""
+        """Run the current weights and take the logarithm of DD-15, or of DD-15b with ratio_norm."""
         cached = self.settings.mask_source == "cached"
         new = self._transition(self.model, buffer, rows, self._mask(buffer, rows) if cached else None)
         old_zeta = _stored_zeta(buffer, rows).to(new.zeta.device)
         return Pass(new, old_zeta, self._log_ratio(new, old_zeta, buffer, rows))
 
-    def kl(self, found: Pass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
-        """DD-17 or DD-20 per transition, (M,). version: optimizer steps made, which tell when a dual anchor is due."""
-        settings, kl = self.settings.kl, torch.zeros_like(found.log_ratio)
+    def kl(self, current: Pass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
+        """Return DD-17 or DD-20 per transition, (M,). version: optimizer steps made, for the dual anchor."""
+        settings, kl = self.settings.kl, torch.zeros_like(current.log_ratio)
         if settings.mode == "none" or settings.beta == 0:
             return kl
         if settings.anchor in ("buffer", "dual"):
-            kl = kl + self._distance(found.new, found.old_zeta, buffer, rows)
+            kl = kl + self._distance(current.new, current.old_zeta, buffer, rows)
         due = settings.anchor in ("frozen", "moving", "lora_off") or version % settings.dual_every == 0
         if settings.anchor != "buffer" and due:
-            kl = kl + self._distance(found.new, self._anchor_zeta(buffer, rows), buffer, rows)
+            kl = kl + self._distance(current.new, self._anchor_zeta(buffer, rows), buffer, rows)
         return kl
 
     @torch.no_grad()
     def step_weights(self, buffer: RolloutBuffer, video: Tensor) -> Tensor:
-        """SAGE's equaliser over the stochastic steps, (S,), from the sensitivity rms_u |d mean / d v| / std of one
-        video (1,)."""
+        """Return SAGE's equaliser, (S,), from the sensitivity rms_u |d mean / d v| / std of one video (1,)."""
         S = len(buffer.rollout.steps)
         rows = Rows(video.expand(S), torch.arange(S))
         law = self._transition(self.model, buffer, rows, self._mask(buffer, rows))
@@ -140,9 +139,8 @@ class GrpoTerms:
     ) -> Tensor:
         """Ablation: the current weights choose the mask too, so all three terms of DD-12 stay in the ratio."""
         old_std, zeros = self._old_std(new, buffer, rows), torch.zeros_like(new.zeta)
-        return gaussian_logprob(new.zeta * new.std, zeros, new.std) - gaussian_logprob(
-            old_zeta * old_std, zeros, old_std
-        )
+        logprob = gaussian_logprob(new.zeta * new.std, zeros, new.std)
+        return logprob - gaussian_logprob(old_zeta * old_std, zeros, old_std)
 
     def _old_std(self, new: GaussianTransition, buffer: RolloutBuffer, rows: Rows) -> Tensor:
         """The deviation at rollout, (M, U); not that of `new` where the current weights chose the mask."""
@@ -167,23 +165,22 @@ class GrpoTerms:
     def _anchor_zeta(self, buffer: RolloutBuffer, rows: Rows) -> Tensor:
         mask = self._mask(buffer, rows)
         if self.settings.kl.anchor != "lora_off":
-            return self._transition(self._anchored, buffer, rows, mask).zeta
+            return self._transition(self._call_anchor, buffer, rows, mask).zeta
         disable: Any = self.model.disable_adapter
         with disable():
             return self._transition(self.model, buffer, rows, mask).zeta
 
-    def _anchored(self, *arguments: Any) -> Any:
-        """The model with the anchor's parameters, while the current ones keep their graph."""
+    def _call_anchor(self, *arguments: Any) -> Any:
+        """Call the model with the anchor's parameters, while the current ones keep their graph."""
         return functional_call(self.model, self.anchor, arguments)
 
 
 def _stored_zeta(buffer: RolloutBuffer, rows: Rows) -> Tensor:
-    """The normalised noise of the rollout, float32 (M, U); drawn again where only seeds are kept."""
+    """Return the normalised noise of the rollout, float32 (M, U); drawn again where only seeds are kept."""
     if buffer.rollout.zeta is not None:
         return buffer.rollout.zeta[rows.videos, rows.positions].flatten(1).float()
     shape, K = tuple(buffer.rollout.latents.shape[1:]), buffer.condition.num_conditioning
     steps = [buffer.rollout.steps[position] for position in rows.positions.tolist()]
-    noise = [
-        step_noise(shape, buffer.rollout.seeds[i : i + 1], k) for i, k in zip(rows.videos.tolist(), steps, strict=True)
-    ]
-    return torch.cat(noise)[:, :, K:].flatten(1)
+    pairs = zip(rows.videos.tolist(), steps, strict=True)
+    noise = torch.cat([step_noise(shape, buffer.rollout.seeds[i : i + 1], k) for i, k in pairs])
+    return noise[:, :, K:].flatten(1)

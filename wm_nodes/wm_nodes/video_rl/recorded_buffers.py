@@ -24,16 +24,17 @@ from wm_nodes.recording.messages import stamp_ns
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_rl.reference_reward import mixed, rewarded, score_clips
+from wm_nodes.video_rl.reference_reward import attach_rewards, mix_rewards, score_clips
 from wm_nodes.world_model.position_probe import PositionProbe
 
 
 @dataclass(frozen=True)
 class RecordedClips:
-    """One ClipBatch with its ClipScores. contexts: rows of the context bags' clips, one per clip (N,). scores, total:
-    float64 (N,), NaN where missing. valid: bool (N,). picture: uint8 (N H, F W, 3), or None where not asked for.
-    weights: of the scores in the total. audit_ids: of the agent's verdicts (N,), "" where no answer came; () where it
-    was not asked. judge_id: of who gave them; "" where nobody did.
+    """One ClipBatch with its ClipScores.
+
+    contexts: rows of the context bags' clips, one per clip (N,). scores, total: float64 (N,), NaN where missing. valid:
+    bool (N,). picture: uint8 (N H, F W, 3), or None where not read. weights: of the scores in the total. audit_ids: of
+    the agent's verdicts (N,), "" for a failed one; () where it was not called. judge_id: the judge's, "" without one.
     """
 
     iteration: int
@@ -59,9 +60,9 @@ class RecordedClips:
         count = len(self.contexts)
         tiles = Tiles(count, self.num_frames, height, width)
         if self.picture is None or self.picture.shape[:2] != tiles.mosaic_shape:
-            found = "not in the bag" if self.picture is None else f"{self.picture.shape[:2]} px"
+            size = "not in the bag" if self.picture is None else f"{self.picture.shape[:2]} px"
             raise BagError(
-                f"the picture of iteration {self.iteration} is {found}; {count} clips of {self.num_frames} frames need "
+                f"the picture of iteration {self.iteration} is {size}; {count} clips of {self.num_frames} frames need "
                 f"{tiles.mosaic_shape} px: record {topics.CLIP_IMAGES.name}, and name the context bags of that run"
             )
         cut = tiles.untile(self.picture, count * self.num_frames)
@@ -70,9 +71,11 @@ class RecordedClips:
 
 @dataclass(frozen=True)
 class Rescored:
-    """A buffer scored again. different: names of scores, `total`, `valid` or `verdicts` whose bits are not the recorded
-    ones. same_reward: the total was recorded by the same rewards; else it is not compared. verdicts: the agent's, if it
-    was asked; a clip that got no answer then is not compared.
+    """A buffer scored again.
+
+    different: names of scores, `total`, `valid` or `verdicts` whose bits are not the recorded ones. same_reward: the
+    total was recorded with the same rewards; else it is not compared. verdicts: the agent's, where it was called; clips
+    without a recorded verdict are not compared.
     """
 
     recorded: RecordedClips
@@ -84,7 +87,7 @@ class Rescored:
 
 @dataclass(frozen=True)
 class JudgedBuffer:
-    """What a judge says of N clips. scores: float64 (N,) by name. verdicts: a row per clip, with its `audit_id`."""
+    """A judge's result for N clips. scores: float64 (N,) by name. verdicts: a row per clip, with its `audit_id`."""
 
     scores: Mapping[str, Tensor]
     verdicts: tuple[Mapping[str, Any], ...]
@@ -95,7 +98,7 @@ BufferJudge = Callable[[RecordedClips, Tensor, Clips], JudgedBuffer]
 
 
 def read_run(run_dir: Path, overrides: dict[str, Any] | None = None) -> tuple[Path, VideoRlConfig]:
-    """The full path of a run folder, and its settings with some overridden.
+    """Return the full path of a run folder, and its settings with some overridden.
 
     Raises:
         ValueError: it holds no settings.
@@ -108,7 +111,7 @@ def read_run(run_dir: Path, overrides: dict[str, Any] | None = None) -> tuple[Pa
 
 
 def recorded_bags(run_dir: Path) -> list[Path]:
-    """The bags of a run, oldest first: one for each time it was started, those of killed recorders by their final name.
+    """Return the bags of a run, one per start, oldest first; those of killed recorders by their final name.
 
     Raises:
         ValueError: there is none.
@@ -121,7 +124,7 @@ def recorded_bags(run_dir: Path) -> list[Path]:
 
 
 def recorded_episodes(run_dir: Path, part: Literal["train", "heldout"]) -> list[Path]:
-    """The bags of simulator episodes that a run took its contexts from.
+    """Return the bags of simulator episodes that a run took its contexts from.
 
     Raises:
         ValueError: there is none.
@@ -142,7 +145,7 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
     rows = {topics.absolute(topics.DEFAULT_NAMESPACE, topic): topic for topic in wanted}
     with Bag(bag) as opened:
         opened.check_types()
-        verdicts = _verdicts(opened)
+        verdicts = _read_verdicts(opened)
         for name in rows:
             if not opened.count(name):
                 raise BagError(f"bag {bag} has no message on {name}; name a recorded run of train-video-model")
@@ -150,14 +153,13 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
         for name, _, data in opened.messages(list(rows)):
             topic, message = rows[name], opened.decode(data, rows[name].msgtype)
             if topic is topics.CLIP_IMAGES:
-                shown[stamp_ns(message.header.stamp)] = np.asarray(message.data).reshape(
-                    message.height, message.width, 3
-                )
+                pixels = np.asarray(message.data).reshape(message.height, message.width, 3)
+                shown[stamp_ns(message.header.stamp)] = pixels
             elif topic is topics.CLIPS:
                 clips[message.sha256] = message
             elif (batch := clips.pop(message.buffer_sha256, None)) is not None:
                 picture = shown.pop(stamp_ns(batch.header.stamp), None)
-                yield _joined(batch, message, picture, *_audit_ids(verdicts, message))
+                yield _join_scores(batch, message, picture, *_match_audit_ids(verdicts, message))
 
 
 def rescore(
@@ -167,11 +169,11 @@ def rescore(
     """Score the pictures against the recordings of their contexts and compare with the recorded scores, bit for bit.
 
     Args:
-        rewards: weights of the total; where other scores are weighed than were recorded, the total is not compared.
-        judge: asked where the agent is among the rewards.
+        rewards: weights of the total; where other scores have a weight than were recorded, the total is not compared.
+        judge: called where the agent is among the rewards.
 
     Raises:
-        BagError: no picture, or scores that nobody can give again.
+        BagError: no picture, or scores that cannot be computed from pictures.
         ValueError: a context that the bags do not hold.
     """
     if int(recorded.contexts.max()) >= len(contexts):
@@ -181,19 +183,20 @@ def rescore(
         )
     references = contexts.select(recorded.contexts)
     frames = recorded.frames(*references.frames.shape[2:4])
-    found = score_clips(frames, references, probe, num_conditioning).named()
-    foreign, verdicts = sorted(set(recorded.scores) - set(found) - {AGENT}), tuple[Mapping[str, Any], ...]()
+    scores = score_clips(frames, references, probe, num_conditioning).named()
+    unknown, verdicts = sorted(set(recorded.scores) - set(scores) - {AGENT}), tuple[Mapping[str, Any], ...]()
     if judge is not None and rewards.get(AGENT):
-        judged = judge(recorded, frames, references)
-        verdicts = judged.verdicts
-        found |= judged.scores
-    if foreign:
-        raise BagError(f"{', '.join(foreign)} cannot be scored again from pictures; only {', '.join(found)} can")
-    total = mixed(found, rewards)
+        verdict = judge(recorded, frames, references)
+        verdicts = verdict.verdicts
+        scores |= verdict.scores
+    if unknown:
+        raise BagError(f"{', '.join(unknown)} cannot be scored again from pictures; only {', '.join(scores)} can")
+    total = mix_rewards(scores, rewards)
     valid = torch.isfinite(total)
     total = torch.where(valid, total, torch.nan)
-    same_reward = _weighed(recorded.weights) == _weighed(rewards)
-    pairs = {name: (values, found[name].double()) for name, values in recorded.scores.items() if name in found}
+    weighted, weighted_now = ({n for n, weight in weights.items() if weight} for weights in (recorded.weights, rewards))
+    same_reward = weighted == weighted_now
+    pairs = {name: (values, scores[name].double()) for name, values in recorded.scores.items() if name in scores}
     if same_reward:
         pairs |= {"total": (recorded.total, total), "valid": (recorded.valid, valid)}
     ids, answered = recorded.audit_ids, torch.ones(len(total), dtype=torch.bool)
@@ -208,7 +211,7 @@ def rescore(
 def recorded_buffer(
     run_dir: Path, recorded: RecordedClips, rewards: Mapping[str, float] | None = None
 ) -> RolloutBuffer:
-    """The kept rollout buffer with its recorded scores. rewards: weights to mix them anew; None: the recorded total.
+    """Return the saved rollout buffer with its recorded scores. rewards: weights to mix them; None: the recorded total.
 
     Raises:
         RolloutBufferError: the buffer was not kept, or is another one; names the remedy.
@@ -220,64 +223,62 @@ def recorded_buffer(
             "start a run with --keep-buffers as large as its iterations"
         )
     data = path.read_bytes()
-    found = hashlib.sha256(data).hexdigest()
-    if found != recorded.sha256:
+    sha256 = hashlib.sha256(data).hexdigest()
+    if sha256 != recorded.sha256:
         raise RolloutBufferError(
-            f"{path} has sha256 {found[:12]}, the bag says {recorded.sha256[:12]}: it is damaged or of another run; "
+            f"{path} has sha256 {sha256[:12]}, the bag says {recorded.sha256[:12]}: it is damaged or of another run; "
             "restore it, or train again from another run"
         )
-    total = recorded.total if rewards is None else mixed(recorded.scores, rewards)
-    return rewarded(RolloutBuffer.from_bytes(data), recorded.scores, total)
+    total = recorded.total if rewards is None else mix_rewards(recorded.scores, rewards)
+    return attach_rewards(RolloutBuffer.from_bytes(data), recorded.scores, total)
 
 
 def trained_clips(bags: Sequence[Path], iterations: int) -> list[RecordedClips]:
-    """The clips of iterations 0, 1, ... without pictures; of one that was sampled twice (a resumed run) the later ones.
+    """Return the clips of iterations 0, 1, ... without pictures; the later ones where a resumed run sampled one twice.
 
     Raises:
         BagError: an unusable bag, or an iteration that none of them holds.
     """
-    found = {recorded.iteration: recorded for bag in bags for recorded in read_clips(bag)}
-    missing = [iteration for iteration in range(iterations) if iteration not in found]
+    clips = {recorded.iteration: recorded for bag in bags for recorded in read_clips(bag)}
+    missing = [iteration for iteration in range(iterations) if iteration not in clips]
     if missing:
         raise BagError(
             f"{len(missing)} of {iterations} iterations, from {missing[0]} on, have no scored clips in "
             f"{', '.join(map(str, bags)) or 'any bag'}; train again from a run that was recorded to its end"
         )
-    return [found[iteration] for iteration in range(iterations)]
+    return [clips[iteration] for iteration in range(iterations)]
 
 
-def _verdicts(bag: Bag) -> dict[tuple[str, int], list[tuple[int, str, str]]]:
-    """(stamp in ns, audit id, judge id) of every verdict on a clip (sha256 of its buffer, row), in the order of their
-    stamps; the audit id is "" where no answer came."""
-    found = defaultdict[tuple[str, int], list[tuple[int, str, str]]](list)
+def _read_verdicts(bag: Bag) -> dict[tuple[str, int], list[tuple[int, str, str]]]:
+    """Return (stamp in ns, audit id, judge id) of every verdict on a clip (sha256 of its buffer, row), in the order of
+    their stamps; the audit id of a failed one is ""."""
+    verdicts = defaultdict[tuple[str, int], list[tuple[int, str, str]]](list)
     name = topics.absolute(topics.DEFAULT_NAMESPACE, topics.VERDICT)
     for _, _, data in bag.messages([name]) if bag.count(name) else ():
         message = bag.decode(data, topics.VERDICT.msgtype)
         audit_id = "" if message.status == message.ERROR else str(message.audit_id)
         key = message.buffer_sha256, int(message.clip)
-        found[key].append((stamp_ns(message.header.stamp), audit_id, str(message.judge_id)))
-    return {key: sorted(values) for key, values in found.items()}
+        verdicts[key].append((stamp_ns(message.header.stamp), audit_id, str(message.judge_id)))
+    return {key: sorted(values) for key, values in verdicts.items()}
 
 
-def _audit_ids(
+def _match_audit_ids(
     verdicts: Mapping[tuple[str, int], list[tuple[int, str, str]]], scores: Any
 ) -> tuple[tuple[str, ...], str]:
-    """Of the verdicts behind a ClipScores, on each clip the newest one before it, and their judge, who is one for all.
-    Empty where a verdict is missing."""
-    until, found = stamp_ns(scores.header.stamp), list[tuple[str, str]]()
+    """Return the audit ids of the verdicts behind a ClipScores, of each clip the newest before, and their judge.
+
+    Empty where a verdict is missing.
+    """
+    until, matches = stamp_ns(scores.header.stamp), list[tuple[str, str]]()
     for clip in range(int(scores.num_clips)):
-        before = [told for stamp, *told in verdicts.get((scores.buffer_sha256, clip), ()) if stamp <= until]
-        found += [(audit_id, judge_id) for audit_id, judge_id in before[-1:]]
-    if not found or len(found) != int(scores.num_clips):
+        before = [ids for stamp, *ids in verdicts.get((scores.buffer_sha256, clip), ()) if stamp <= until]
+        matches += [(audit_id, judge_id) for audit_id, judge_id in before[-1:]]
+    if not matches or len(matches) != int(scores.num_clips):
         return (), ""
-    return tuple(audit_id for audit_id, _ in found), found[0][1]
+    return tuple(audit_id for audit_id, _ in matches), matches[0][1]
 
 
-def _weighed(weights: Mapping[str, float]) -> set[str]:
-    return {name for name, weight in weights.items() if weight}
-
-
-def _joined(
+def _join_scores(
     batch: Any, scores: Any, picture: UInt8Array | None, audit_ids: tuple[str, ...], judge_id: str
 ) -> RecordedClips:
     count = int(scores.num_clips)

@@ -1,4 +1,4 @@
-"""What sampled clips are worth, against the recorded episode they should have shown (DD-28).
+"""Rewards of sampled clips, from the recorded episode that they should show (DD-28).
 
 Shapes: N clips, F frames, H W 3 image. Positions are read off the decoded pictures by the judge's probe
 (world_model/position_probe.py), which shares nothing with the video model; the truth is the simulator's. Nothing here
@@ -59,10 +59,10 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
     if frames.shape != references.frames.shape:
         raise ValueError(f"clips are {tuple(frames.shape)}, their recordings {tuple(references.frames.shape)}")
     generated = slice(num_conditioning, None)
-    found = probe.read(frames[:, generated])
+    positions = probe.read(frames[:, generated])
     truth = probe_targets(references.ground_truth[:, generated], references.task)
-    object_m = np.linalg.norm(found[..., OBJECT] - truth[..., OBJECT], axis=-1)
-    tool_m = np.linalg.norm(found[..., TOOL] - truth[..., TOOL], axis=-1)
+    object_m = np.linalg.norm(positions[..., OBJECT] - truth[..., OBJECT], axis=-1)
+    tool_m = np.linalg.norm(positions[..., TOOL] - truth[..., TOOL], axis=-1)
     tracking = (np.exp(-object_m / TRACKING_SCALE_M) + np.exp(-tool_m / TRACKING_SCALE_M)) / 2
     error = (frames[:, generated].float() - references.frames[:, generated].float()) / 255
     changed = (references.frames.int() - references.frames[:, :1].int()).abs().amax((1, 4)) > SEEN_MOTION
@@ -74,31 +74,27 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
         psnr_db=(-10 * error.square().mean((1, 2, 3, 4)).clamp_min(1e-8).log10()).double(),
         object_cm=torch.from_numpy(100 * object_m.mean(1)).double(),
         tool_cm=torch.from_numpy(100 * tool_m.mean(1)).double(),
-        motion=torch.from_numpy(_path_share(found[..., OBJECT], truth[..., OBJECT])).double(),
+        motion=torch.from_numpy(_path_share(positions[..., OBJECT], truth[..., OBJECT])).double(),
     )
 
 
 def more_is_better(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """A score turned so that more is better: errors negated, motion as -|1 - motion|, others as they are."""
-    turned: NDArray[np.float64] = np.asarray(values, np.float64)
+    """Return a score as a number of which more is better: errors negated, motion as -|1 - motion|, others unchanged."""
+    scores: NDArray[np.float64] = np.asarray(values, np.float64)
     if name == "motion":
-        turned = -np.abs(1 - turned)
-    return -turned if name in ERRORS else turned
+        scores = -np.abs(1 - scores)
+    return -scores if name in ERRORS else scores
 
 
 def load_probe(folder: Path) -> PositionProbe:
-    """The judge's probe of a world model's folder.
-
-    Raises:
-        ValueError: it has none.
-    """
+    """Load the judge's probe of a world model's folder. Raises ValueError where it has none."""
     probe = load_model_folder(folder).probe
     if probe is None:
         raise ValueError(f"{folder} has no position probe to judge with; take the shipped world model")
     return probe
 
 
-def mixed(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
+def mix_rewards(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
     """Return sum over names of weight x value (DD-13a), float64 (N,).
 
     Raises:
@@ -110,15 +106,14 @@ def mixed(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
     return torch.stack([weight * values[name].double() for name, weight in weights.items()]).sum(0)
 
 
-def rewarded(buffer: RolloutBuffer, scores: Mapping[str, Tensor], total: Tensor) -> RolloutBuffer:
-    """The buffer with raw scores and the mixed reward `total`; a clip whose total is NaN is left out of training."""
+def attach_rewards(buffer: RolloutBuffer, scores: Mapping[str, Tensor], total: Tensor) -> RolloutBuffer:
+    """Return the buffer with raw scores and the mixed reward `total`; a clip whose total is NaN does not train."""
     raw = {name: values.double() for name, values in scores.items()}
     return replace(buffer.with_rewards({"total": total}), rewards={**raw, "total": total.double()})
 
 
-def _path_share(found: FloatArray, truth: FloatArray) -> FloatArray:
-    """Distance between first and last generated frame, found over true, limited to 2; 1 where nothing should move."""
-    went = np.linalg.norm(found[:, -1] - found[:, 0], axis=-1)
-    should = np.linalg.norm(truth[:, -1] - truth[:, 0], axis=-1)
-    share: FloatArray = np.where(should > 0.01, np.minimum(went / np.maximum(should, 1e-6), 2.0), 1.0)
+def _path_share(positions: FloatArray, truth: FloatArray) -> FloatArray:
+    """Return the distance from first to last generated frame over the true one, at most 2; 1 where nothing moves."""
+    distance, wanted = (np.linalg.norm(path[:, -1] - path[:, 0], axis=-1) for path in (positions, truth))
+    share: FloatArray = np.where(wanted > 0.01, np.minimum(distance / np.maximum(wanted, 1e-6), 2.0), 1.0)
     return share

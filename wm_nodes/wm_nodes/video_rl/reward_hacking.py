@@ -1,4 +1,4 @@
-"""Reward hacking made visible (DD-2): the training reward goes up while what it stands for does not."""
+"""Detects reward hacking (DD-2): the training reward goes up while what it stands for does not."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class HackedMetric:
     true_slope: float
 
 
-def hacked_metrics(
+def find_hacked_metrics(
     proxy: Sequence[float], held_out: Mapping[str, Sequence[float]], *, window: int
 ) -> list[HackedMetric]:
     """Return the metrics whose least-squares slope is < 0 over the last `window` evaluations while the proxy's is > 0.
@@ -43,12 +43,8 @@ def hacked_metrics(
     rise, rise_error = slope(proxy[-window:])
     if rise <= widths * rise_error:
         return []
-    found = []
-    for name, values in held_out.items():
-        trend, error = slope(values[-window:])
-        if trend < -widths * error:
-            found.append(HackedMetric(name, rise, trend))
-    return found
+    slopes = {name: slope(values[-window:]) for name, values in held_out.items()}
+    return [HackedMetric(name, rise, trend) for name, (trend, error) in slopes.items() if trend < -widths * error]
 
 
 def slope(values: Sequence[float]) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from wm_nodes.video_model import (
     Condition,
     RolloutBuffer,
     RolloutSettings,
+    VideoNetwork,
     config_hash,
     initial_noise,
     sample_videos,
@@ -20,14 +21,14 @@ from wm_nodes.video_model import (
 )
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.reference_reward import mixed, rewarded, score_clips
+from wm_nodes.video_rl.reference_reward import attach_rewards, mix_rewards, score_clips
 from wm_nodes.world_model.position_probe import PositionProbe
 
 _ROLLOUT = TypeAdapter(RolloutSettings)
 
 
 def rollout_settings(config: RolloutConfig) -> RolloutSettings:
-    """The settings that the sampler is called with."""
+    """Return the settings that the sampler is called with."""
     return _ROLLOUT.validate_python(config.model_dump())
 
 
@@ -42,6 +43,24 @@ class GroupRequest:
     shared_noise: bool = False
 
 
+def sample_buffer(
+    network: VideoNetwork, config: VideoRlConfig, condition: Condition, noise: Tensor, seeds: Tensor, groups: Tensor,
+    samples: Tensor, iteration: int, policy_version: int,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RolloutBuffer:
+    """Sample one video per row of `noise`, stochastic at the window's steps of `iteration`; the buffer has no rewards.
+
+    seeds: of each video's step noise. groups, samples: int64 (N,), see RolloutBuffer.
+    """
+    settings = rollout_settings(config.rollout)
+    steps = stochastic_steps(settings.num_steps, config.window, iteration, config.seed)
+    rollout = sample_videos(network, condition, noise, seeds, settings, steps, on_progress)
+    valid = torch.ones(len(groups), dtype=torch.bool)
+    return RolloutBuffer(
+        rollout, condition, groups, samples, {}, valid, policy_version, iteration, config_hash(settings)
+    )
+
+
 class ClipGenerator:
     """Samples clips of recorded contexts (first frames, actions, instruction) from the video model.
 
@@ -54,7 +73,7 @@ class ClipGenerator:
         self.folder, self.contexts, self.config = folder, contexts, config
 
     def request(self, iteration: int, policy_version: int) -> GroupRequest:
-        """The contexts of an iteration, drawn without replacement from stream `contexts`."""
+        """Draw the contexts of an iteration without replacement from stream `contexts`."""
         groups = self.config.groups
         count = min(groups.contexts, len(self.contexts))
         drawn = numpy_stream(self.config.seed, "contexts", iteration).choice(len(self.contexts), count, replace=False)
@@ -65,29 +84,23 @@ class ClipGenerator:
     def sample(
         self, request: GroupRequest, on_progress: Callable[[int, int], None] = lambda done, total: None
     ) -> RolloutBuffer:
-        """A buffer of len(contexts) x group_size clips without rewards; equal requests and weights give equal bytes.
+        """Sample len(contexts) x group_size clips without rewards; equal requests and weights give equal bytes.
 
         on_progress: called with (clips sampled, of how many); may raise to stop.
         """
         group = torch.arange(len(request.contexts)).repeat_interleave(request.group_size)
         sample = torch.arange(request.group_size).repeat(len(request.contexts))
         rows = torch.tensor(request.contexts)[group]
-        settings, seed = rollout_settings(self.config.rollout), self.config.seed
-        seeds = _seeds(seed, "clip_steps", request.iteration, group, sample)
+        seeds = _seeds(self.config.seed, "clip_steps", request.iteration, group, sample)
         noises = torch.zeros_like(sample) if request.shared_noise else sample
-        drawn = _seeds(seed, "clip_noise", request.iteration, group, noises)
-        steps = stochastic_steps(settings.num_steps, self.config.window, request.iteration, seed)
-        condition = self._condition(rows)
-        rollout = sample_videos(
-            self.folder.network, condition, initial_noise(self._shape(), drawn), seeds, settings, steps, on_progress
-        )
-        return RolloutBuffer(
-            rollout, condition, group, sample, {}, torch.ones(len(group), dtype=torch.bool),
-            request.policy_version, request.iteration, config_hash(settings),
+        noise = initial_noise(self._shape(), _seeds(self.config.seed, "clip_noise", request.iteration, group, noises))
+        return sample_buffer(
+            self.folder.network, self.config, self._condition(rows), noise, seeds, group, sample, request.iteration,
+            request.policy_version, on_progress,
         )
 
     def evaluate(self, contexts: Clips, num_steps: int) -> Tensor:
-        """One clip of each context by ODE, decoded: uint8 (E, F, H, W, 3)."""
+        """Sample one clip of each context by ODE and decode it: uint8 (E, F, H, W, 3)."""
         generator = ClipGenerator(self.folder, contexts, self.config)
         rows = torch.arange(len(contexts))
         seeds = _seeds(self.config.seed, "clip_evaluation", 0, rows, torch.zeros_like(rows))
@@ -97,7 +110,7 @@ class ClipGenerator:
         return self.folder.codec.decode(rollout.latents)
 
     def references(self, request: GroupRequest) -> Clips:
-        """The recordings that the request's clips are scored against, one row per clip."""
+        """Return the recordings that the request's clips are scored against, one row per clip."""
         return self.contexts.select(torch.tensor(request.contexts).repeat_interleave(request.group_size))
 
     def _condition(self, rows: Tensor) -> Condition:
@@ -123,11 +136,11 @@ class RecordedContexts(ClipGenerator):
         self.probe = probe
 
     def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
-        """The buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
+        """Return the buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
         frames = self.folder.codec.decode(clips.rollout.latents)
         given = self.folder.clip["num_conditioning"]
         scores = score_clips(frames, self.references(request), self.probe, given).named()
-        return rewarded(clips, scores, mixed(scores, self.config.rewards))
+        return attach_rewards(clips, scores, mix_rewards(scores, self.config.rewards))
 
 
 def _seeds(seed: int, name: str, iteration: int, group: Tensor, sample: Tensor) -> Tensor:

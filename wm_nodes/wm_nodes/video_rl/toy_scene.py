@@ -1,4 +1,4 @@
-"""A toy world for GRPO of video models: a disc on a texture, told where to go. Scored by DD-29.
+"""A toy world for GRPO of video models: a disc on a texture with a commanded direction. Scored by DD-29.
 
 Shapes: B scenes, C = 2 channels, F = 6 frames, H = W = 16 cells, or the same scene in more of them. A "latent" video is
 the picture itself. In the training videos the disc obeys its action with probability OBEDIENCE and else takes a random
@@ -22,13 +22,11 @@ from wm_nodes.video_model import (
     NetworkSettings,
     RolloutBuffer,
     VideoNetwork,
-    config_hash,
     initial_noise,
     sample_videos,
-    stochastic_steps,
 )
-from wm_nodes.video_rl.reference_reward import rewarded
-from wm_nodes.video_rl.sampling import rollout_settings
+from wm_nodes.video_rl.reference_reward import attach_rewards
+from wm_nodes.video_rl.sampling import rollout_settings, sample_buffer
 
 CHANNELS, FRAMES, SIDE = 2, 6, 16
 NUM_ACTIONS = 4
@@ -76,15 +74,11 @@ class Scenes:
 
     def videos(self, direction: Tensor) -> Tensor:
         """Render (B, C, F, H, W)."""
-        alpha = self.opacity_at(self.path(direction))[:, None]
+        alpha = opacity_at(self.path(direction), RADIUS * self.scale, self.side)[:, None]
         return self.background[:, :, None] * (1 - alpha) + COLOUR.view(1, 2, 1, 1, 1) * alpha
 
-    def opacity_at(self, centres: Tensor, radius: float = RADIUS) -> Tensor:
-        """A Gaussian disc of `radius` cells at each centre (B, F, 2) in pixels: (B, F, H, W), 1 in its middle."""
-        return opacity_at(centres, radius * self.scale, self.side)
-
     def rows(self, index: Tensor) -> "Scenes":
-        """The scenes of `index`, int64 (B,)."""
+        """Return the scenes of `index`, int64 (B,)."""
         return Scenes(self.background[index], self.start[index], self.speed[index], self.action[index])
 
     def condition(self) -> Condition:
@@ -149,7 +143,8 @@ def score(videos: Tensor, scenes: Scenes) -> Scores:
     lost = alpha.sum((2, 3)) < 0.5 * scenes.scale**2
     distance = (centre - wanted).norm(dim=2) / scenes.scale
     error = torch.where(lost, torch.full_like(distance, SIDE), distance)
-    near = torch.maximum(scenes.opacity_at(centre, NEAR * RADIUS), scenes.opacity_at(wanted, NEAR * RADIUS))
+    reach = NEAR * RADIUS * scenes.scale
+    near = torch.maximum(*(opacity_at(place, reach, scenes.side) for place in (centre, wanted)))
     away = (near < 0.6)[:, None]
     wrong = (videos.float() - scenes.background[:, :, None]).square() * away
     travelled = ((centre[:, -1] - centre[:, 0]) * DIRECTIONS[scenes.action]).sum(1) / scenes.scale
@@ -191,34 +186,29 @@ class ToyContexts:
         return SceneRequest(scenes, iteration, policy_version)
 
     def sample(self, request: SceneRequest) -> RolloutBuffer:
-        """A buffer of len(scenes) x group_size videos without rewards."""
-        settings, size = rollout_settings(self.config.rollout), self.config.groups.group_size
-        iteration = request.iteration
+        """Sample len(scenes) x group_size videos without rewards."""
+        size, iteration = self.config.groups.group_size, request.iteration
         index = torch.arange(len(request.scenes)).repeat_interleave(size)
         samples = torch.arange(size).repeat(len(request.scenes))
-        condition = request.scenes.rows(index).condition()
-        steps = stochastic_steps(settings.num_steps, self.config.window, iteration, self.config.seed)
         first = index * size if self.config.groups.shared_noise else index * size + samples
         noise = self._noise(request.scenes, self._seeds("initial", iteration, first))
         seeds = self._seeds("steps", iteration, index * size + samples)
         self.network.eval()
-        rollout = sample_videos(self.network, condition, noise, seeds, settings, steps)
-        return RolloutBuffer(
-            rollout, condition, index, samples, {}, torch.ones(len(index), dtype=torch.bool), request.policy_version,
-            iteration, config_hash(settings),
+        return sample_buffer(
+            self.network, self.config, request.scenes.rows(index).condition(), noise, seeds, index, samples, iteration,
+            request.policy_version,
         )
 
     def score(self, request: SceneRequest, clips: RolloutBuffer) -> RolloutBuffer:
-        """The buffer with every score of its videos, and as `total` the one that trains."""
+        """Return the buffer with every score of its videos, and as `total` the one that trains."""
         scores = score(clips.rollout.latents, request.scenes.rows(clips.group_ids)).named()
-        return rewarded(clips, scores, scores[self.reward])
+        return attach_rewards(clips, scores, scores[self.reward])
 
     def evaluate(self, scenes: Scenes) -> Scores:
         """Score one video of each scene, sampled by ODE."""
-        seeds = self._seeds("evaluation", 0, torch.arange(len(scenes)))
+        seeds, settings = self._seeds("evaluation", 0, torch.arange(len(scenes))), rollout_settings(self.config.rollout)
         self.network.eval()
         noise = self._noise(scenes, seeds)
-        settings = rollout_settings(self.config.rollout)
         rollout = sample_videos(self.network, scenes.condition(), noise, seeds, settings, stochastic=[])
         return score(rollout.latents, scenes)
 

@@ -5,7 +5,7 @@ grpo.ema_decay > 0, averaged_<optimizer steps>.safetensors beside each: the weig
 
 Staleness: by default buffer i is sampled by the version that trains on it. Where grpo.max_staleness covers the
 optimizer steps of one buffer it may be sampled while the learner trains on buffer i - 1, so by the version before.
-sampling_version follows from the run folder alone: a resumed run asks for what an undisturbed one had.
+sampling_version follows from the run folder alone, so a resumed run uses the versions of one that was not stopped.
 """
 
 import json
@@ -25,19 +25,19 @@ from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_rl.grpo import BufferReport, GrpoLearner
 from wm_nodes.video_rl.reward_hacking import HackedMetric
 from wm_nodes.video_rl.sampling import rollout_settings
-from wm_nodes.video_rl.validation import SECTION, HeldoutScores, alarm_scalars, hacked_now
+from wm_nodes.video_rl.validation import SECTION, HeldoutScores, alarm_scalars, find_hacked_now
 
 CHECKPOINT = "checkpoints/video_learner.safetensors"
 VIDEO_FILES, AVERAGED_FILES = VersionFiles("video_policies/video"), VersionFiles("video_policies/averaged")
 
 
 def evaluated_uri(version: int, config: VideoRlConfig) -> str:
-    """File name of the weights of a version that are evaluated: the averaged ones where the run keeps an average."""
+    """Return the file name of the weights of a version that are evaluated: the averaged ones where there are any."""
     return (AVERAGED_FILES if config.grpo.ema_decay > 0 else VIDEO_FILES).uri(version)
 
 
 def progress(run_dir: Path) -> tuple[int, int]:
-    """Version and buffers trained on, as the learner's checkpoint says; (0, 0) where there is none."""
+    """Return version and number of buffers trained on, from the learner's checkpoint; (0, 0) where there is none."""
     path = run_dir / CHECKPOINT
     if not path.is_file():
         return 0, 0
@@ -78,7 +78,7 @@ class VideoRun(TrainingRun):
         """Optimizer steps between sampling and training of the last buffer."""
         self._metrics = MetricsWriter(run_dir, tensorboard=tensorboard) if self.ranks.rank == 0 else None
         self.hacked: list[HackedMetric] = []
-        """What the newest held-out evaluation says of reward hacking, DD-2."""
+        """Metrics that the newest held-out evaluation finds hacked (DD-2)."""
 
     @property
     def version(self) -> int:
@@ -118,7 +118,7 @@ class VideoRun(TrainingRun):
             self.previous_version = before
             if self._metrics is not None:
                 self.save()
-                self._metrics.write("grpo", self.iterations, {**flat_metrics(report), "staleness": self.staleness})
+                self._metrics.write("grpo", self.iterations, {**flatten_metrics(report), "staleness": self.staleness})
                 self._watch(self._metrics)
             return report
 
@@ -151,17 +151,17 @@ class VideoRun(TrainingRun):
         with self.learner.averaged_weights():
             scores = self._heldout()
         lines = [*read_metrics(self.run_dir), {"section": SECTION, "step": self.iterations, **scores}]
-        self.hacked = hacked_now(lines, self.config.evaluation.window)
+        self.hacked = find_hacked_now(lines, self.config.evaluation.window)
         metrics.write(SECTION, self.iterations, {**scores, **alarm_scalars(self.hacked)})
 
 
-def flat_metrics(report: BufferReport) -> dict[str, float]:
-    """One number per name; those of the k-th optimizer step on a buffer end in _<k>, from 1."""
+def flatten_metrics(report: BufferReport) -> dict[str, float]:
+    """Return one number per name; those of the k-th optimizer step on a buffer end in _<k>, from 1."""
     values = asdict(report)
     updates, rewards, noise = (values.pop(name) for name in ("updates", "raw_rewards", "step_noise"))
-    found = {name: float(value) for name, value in values.items()}
-    found |= {f"reward_{name}": value for name, value in rewards.items()}
-    found |= {f"noise_share_step_{k}": value for k, value in noise.items()}
+    metrics = {name: float(value) for name, value in values.items()}
+    metrics |= {f"reward_{name}": value for name, value in rewards.items()}
+    metrics |= {f"noise_share_step_{k}": value for k, value in noise.items()}
     for index, update in enumerate(updates, 1):
-        found |= {f"{name}_{index}": float(value) for name, value in update.items()}
-    return found
+        metrics |= {f"{name}_{index}": float(value) for name, value in update.items()}
+    return metrics

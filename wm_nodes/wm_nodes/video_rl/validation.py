@@ -15,8 +15,8 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.reference_reward import ClipScores, load_probe, mixed, more_is_better, score_clips
-from wm_nodes.video_rl.reward_hacking import HackedMetric, hacked_metrics
+from wm_nodes.video_rl.reference_reward import ClipScores, load_probe, mix_rewards, more_is_better, score_clips
+from wm_nodes.video_rl.reward_hacking import HackedMetric, find_hacked_metrics
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -32,19 +32,24 @@ def context_scores(
     folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
 ) -> dict[str, Tensor]:
     """Score one ODE clip of each of the first `evaluation.contexts` held-out contexts, by name, float64 (E,)."""
-    some = heldout.select(torch.arange(min(config.evaluation.contexts, len(heldout))))
+    contexts = evaluated_contexts(heldout, config)
     folder.network.eval()
-    frames = ClipGenerator(folder, some, config).evaluate(some, config.evaluation.num_steps)
-    return score_clips(frames, some, probe, folder.clip["num_conditioning"]).named()
+    frames = ClipGenerator(folder, contexts, config).evaluate(contexts, config.evaluation.num_steps)
+    return score_clips(frames, contexts, probe, folder.clip["num_conditioning"]).named()
 
 
-def kept_scores(
+def evaluated_contexts(heldout: Clips, config: VideoRlConfig) -> Clips:
+    """Return the first `evaluation.contexts` held-out contexts, or all where there are fewer."""
+    return heldout.select(torch.arange(min(config.evaluation.contexts, len(heldout))))
+
+
+def load_or_measure_scores(
     path: Path, folder: VideoFolder, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
 ) -> dict[str, list[float]]:
-    """context_scores() from `path` where they are of the same weights, else measured and written there."""
+    """Return context_scores(): read from `path` where they are of the same weights, else measured and written there."""
     sha256 = pack_weights(folder.network).sha256
-    if path.is_file() and (kept := json.loads(path.read_text()))["sha256"] == sha256:
-        return dict(kept["scores"])
+    if path.is_file() and (saved := json.loads(path.read_text()))["sha256"] == sha256:
+        return dict(saved["scores"])
     scores = {name: values.tolist() for name, values in context_scores(folder, heldout, probe, config).items()}
     write_atomic(path, json.dumps({"sha256": sha256, "scores": scores}).encode())
     return scores
@@ -53,7 +58,7 @@ def kept_scores(
 def validation_scores(
     folder: VideoFolder, bags: Sequence[Path], model_dir: Path, config: VideoRlConfig
 ) -> HeldoutScores:
-    """The scores of whatever weights folder.network has when asked; `reward` too, where the rewards are such scores.
+    """Return the scores of the weights that folder.network has at a call; `reward` too, where the rewards are such.
 
     Raises:
         BagError: an unusable bag. ValueError: model_dir has no position probe.
@@ -61,18 +66,18 @@ def validation_scores(
     clips, probe = load_clips(bags, folder.clip["stride"]), load_probe(model_dir)
 
     def scores() -> dict[str, float]:
-        found = context_scores(folder, clips, probe, config)
-        if config.rewards.keys() <= found.keys():
-            found["reward"] = mixed(found, config.rewards)
-        return {name: float(values.mean()) for name, values in found.items()}
+        values = context_scores(folder, clips, probe, config)
+        if config.rewards.keys() <= values.keys():
+            values["reward"] = mix_rewards(values, config.rewards)
+        return {name: float(value.mean()) for name, value in values.items()}
 
     return scores
 
 
-def hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[HackedMetric]:
-    """DD-2 on lines of metrics.jsonl: the scores that got worse over the newest `window` evaluations while the
-    training reward rose, [] while there are fewer. The reward of an evaluation is that of the buffers since the one
-    before; slopes are per evaluation, of scores turned so that more is better. Other scores are not watched.
+def find_hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[HackedMetric]:
+    """Return the metrics that fell over the newest `window` evaluations in lines of metrics.jsonl while the training
+    reward rose (DD-2), [] while there are fewer evaluations. The reward of an evaluation is the mean of the buffers
+    since the one before; slopes are per evaluation, of more_is_better(). Only WATCHED scores are compared.
     """
     rewards = {_step(line): line["reward_mean"] for line in lines if line["section"] == "grpo"}
     evaluations = {_step(line): line for line in lines if line["section"] == SECTION}
@@ -85,19 +90,19 @@ def hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[Hacke
             rows.append(evaluations[step])
     names = [name for name in WATCHED if all(row.get(name) is not None for row in rows)]
     curves = {name: [float(more_is_better(name, float(str(row[name])))) for row in rows] for name in names}
-    return hacked_metrics(proxy, curves, window=window)
+    return find_hacked_metrics(proxy, curves, window=window)
 
 
 def alarm_scalars(alarms: Sequence[HackedMetric]) -> dict[str, float]:
-    """What metrics.jsonl says of the alarms: their number, and the slopes of the reward and of each score."""
-    found = {"hacked": float(len(alarms))}
+    """Return for metrics.jsonl the number of alarms, and the slopes of the reward and of each score."""
+    scalars = {"hacked": float(len(alarms))}
     for alarm in alarms:
-        found |= {"reward_slope": alarm.proxy_slope, f"hacked_{alarm.metric}": alarm.true_slope}
-    return found
+        scalars |= {"reward_slope": alarm.proxy_slope, f"hacked_{alarm.metric}": alarm.true_slope}
+    return scalars
 
 
 def alarms_of(line: Mapping[str, object]) -> list[HackedMetric]:
-    """The alarms in a line of metrics.jsonl."""
+    """Read the alarms in a line of metrics.jsonl."""
     return [
         HackedMetric(name, float(str(line["reward_slope"])), float(str(line[f"hacked_{name}"])))
         for name in WATCHED if line.get(f"hacked_{name}") is not None

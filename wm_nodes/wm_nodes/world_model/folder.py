@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
-from torch import Tensor, nn
+from torch import nn
 
-from wm_nodes.config.schema import SimulationConfig, TokenizerConfig, WorldModelConfig
+from wm_nodes.config.schema import RunConfig, SimulationConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.core.model_folder import ModelFolderError, read_manifest, read_model_file, write_model_folder
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.world_model.dynamics import ActionModel
@@ -59,11 +58,13 @@ class WorldModels:
 
 
 def save_model_folder(
-    folder: Path, tokenizer: Tokenizer, action: ActionModel | TokenActionModel, text: TextModel | None, *,
-    tokenizer_config: TokenizerConfig, world_model_config: WorldModelConfig, simulation: SimulationConfig,
-    tasks: tuple[str, ...], story: Mapping[str, Any], probe: PositionProbe | None = None,
+    folder: Path, tokenizer: Tokenizer, action: ActionModel | TokenActionModel, text: TextModel | None,
+    config: RunConfig, *, tasks: tuple[str, ...], story: Mapping[str, Any], probe: PositionProbe | None = None,
 ) -> Path:
-    """Write the models as float16 and the manifest; `story`: data, seeds, commands, metrics, machine, date."""
+    """Write the models, made with `config`, as float16, and the manifest.
+
+    story: further entries of the manifest: data, seeds, commands, metrics, machine, date.
+    """
     modules: dict[str, nn.Module | None] = {"tokenizer": tokenizer, "action": action, "text": text, "probe": probe}
     packed = {key: _pack(module) for key, module in modules.items() if module is not None}
     for key in FILES.keys() - packed.keys():
@@ -76,27 +77,25 @@ def save_model_folder(
         "state_dim": len(action.condition.state_mean),
         "height": tokenizer.height,
         "width": tokenizer.width,
-        "tokenizer": tokenizer_config.model_dump(),
-        "world_model": world_model_config.model_dump(),
-        "simulation": simulation.model_dump(),
+        "tokenizer": config.tokenizer.model_dump(),
+        "world_model": config.world_model.model_dump(),
+        "simulation": config.simulation.model_dump(),
         "sha256": _hashes(packed),
         **story,
     }
     return write_model_folder(folder, {FILES[key]: data for key, data in packed.items()}, manifest)
 
 
-def save_refreshed_folder(
-    folder: Path, source: Path, action: ActionModel, world_model_config: WorldModelConfig, story: Mapping[str, Any]
-) -> Path:
+def save_refreshed_folder(folder: Path, source: Path, action: ActionModel, story: Mapping[str, Any]) -> Path:
     """Write the folder `source` again with another action model; every other file is copied byte for byte.
 
-    Tasks, scene and sizes stay those of the source's manifest; `story` goes on top of it. The manifest comes last.
+    The manifest is that of the source, with the entries of `story` added or replaced.
     """
     manifest = read_world_manifest(source)
     packed = {key: (source / FILES[key]).read_bytes() for key in manifest["sha256"].keys() - {"action"}}
     packed["action"] = _pack(action)
     hashes = manifest["sha256"] | _hashes({"action": packed["action"]})
-    manifest |= {"world_model": world_model_config.model_dump(), "sha256": hashes, **story}
+    manifest |= {"sha256": hashes, **story}
     return write_model_folder(folder, {FILES[key]: data for key, data in packed.items()}, manifest)
 
 
@@ -117,11 +116,10 @@ def load_model_folder(folder: Path) -> WorldModels:
     )
     _load(folder, "tokenizer", tokenizer, manifest)
     _load(folder, "action", action, manifest)
-    text = None
+    text = probe = None
     if "text" in manifest["sha256"]:
         text = TextModel(config, vocabulary=tuple(manifest["vocabulary"]), num_tasks=num_tasks, **sizes)
         _load(folder, "text", text, manifest)
-    probe = None
     if "probe" in manifest["sha256"]:
         probe = PositionProbe(manifest["height"], manifest["width"])
         _load(folder, "probe", probe, manifest)
@@ -130,12 +128,12 @@ def load_model_folder(folder: Path) -> WorldModels:
 
 
 def action_model_class(kind: str) -> type[ActionModel] | type[TokenActionModel]:
-    """The action model that goes with a tokenizer of `kind`."""
+    """Return the class of action model that goes with a tokenizer of `kind`."""
     return TokenActionModel if kind == "lfq" else ActionModel
 
 
 def read_world_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a world-model folder. Raises ModelFolderError."""
+    """Read the manifest of a world-model folder. Raises ModelFolderError."""
     return read_manifest(folder, "world model", FORMAT)
 
 
@@ -144,8 +142,7 @@ def _load(folder: Path, key: str, module: nn.Module, manifest: Mapping[str, Any]
     expected = module.state_dict()
     try:
         tensors = load(read_model_file(path, manifest["sha256"][key]))
-        tensors = {name: tensor.to(expected[name].dtype) if name in expected else tensor
-                   for name, tensor in tensors.items()}
+        tensors = {name: t.to(expected[name].dtype) if name in expected else t for name, t in tensors.items()}
         check_same_layout(expected, tensors, what=str(path))
     except (SafetensorError, WeightsError) as error:
         raise ModelFolderError(f"{error}; train it anew with this version") from None
@@ -153,13 +150,10 @@ def _load(folder: Path, key: str, module: nn.Module, manifest: Mapping[str, Any]
     module.eval().requires_grad_(False)
 
 
-def _compact(tensor: Tensor) -> Tensor:
-    return tensor.detach().cpu().to(torch.float16 if tensor.is_floating_point() else tensor.dtype).contiguous()
-
-
 def _pack(module: nn.Module) -> bytes:
-    """A module's weights as float16."""
-    data: bytes = save({name: _compact(tensor) for name, tensor in module.state_dict().items()})
+    """Return a module's weights as float16, safetensors."""
+    tensors = {name: tensor.detach().cpu() for name, tensor in module.state_dict().items()}
+    data: bytes = save({name: (t.half() if t.is_floating_point() else t).contiguous() for name, t in tensors.items()})
     return data
 
 

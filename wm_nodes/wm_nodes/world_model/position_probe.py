@@ -1,7 +1,7 @@
-"""Reads positions off pictures, for judging a world model. Shapes: B images, H W 3 image, P positions (PROBE_NAMES).
+"""Reads positions off pictures, to measure a world model. Shapes: B images, H W 3 image, P positions (PROBE_NAMES).
 
-It shares nothing with the world model: other weights, other layers, trained on recorded images only, and no training
-loss ever passes through it. A world model cannot learn to please it.
+It shares no weights and no layers with the world model, is trained on recorded images only, and is part of no loss of
+the world model, which therefore cannot learn to exploit it.
 """
 
 import numpy as np

@@ -78,7 +78,7 @@ class ImaginedGoals:
 
     @property
     def goals(self) -> UInt8Array:
-        """(B, H, W, 3)"""
+        """Goal frames (B, H, W, 3)."""
         chosen: UInt8Array = self.frames[np.arange(len(self.frames)), self.lengths - 1]
         return chosen
 

@@ -94,20 +94,20 @@ def turned(
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
     out = np.array([[cos, -sin], [sin, cos]], np.float32)
 
-    def back(places: FloatArray) -> FloatArray:
-        """x y m turned back about the centre; what follows them is kept."""
+    def turn_back(places: FloatArray) -> FloatArray:
+        """Turn x y, m, back about the centre; further values stay."""
         return np.concatenate([centre + (places[:2] - centre) @ out, places[2:]])
 
-    def seen(truth_now: FloatArray) -> FloatArray:
-        found = truth_now.copy()
+    def turn_truth_back(truth_now: FloatArray) -> FloatArray:
+        turned_truth = truth_now.copy()
         for places in (CUBE, TOOL, GOAL):
-            found[places] = back(truth_now[places])
-        return found
+            turned_truth[places] = turn_back(truth_now[places])
+        return turned_truth
 
-    scripted = script(behaviour, seen(truth), rng, max_action_m)
+    scripted = script(behaviour, turn_truth_back(truth), rng, max_action_m)
 
     def act(truth_now: FloatArray, state: FloatArray) -> FloatArray:
-        action = scripted(seen(truth_now), back(state + ROBOT_BASE) - ROBOT_BASE)
+        action = scripted(turn_truth_back(truth_now), turn_back(state + ROBOT_BASE) - ROBOT_BASE)
         turned_action: FloatArray = np.clip(np.concatenate([out @ action[:2], action[2:]]), -1, 1).astype(np.float32)
         return turned_action
 
@@ -115,7 +115,7 @@ def turned(
 
 
 def _waypoints(behaviour: str, style: Style, truth: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
-    """World tool positions (3,) of the episode; the last one is held."""
+    """Yield world tool positions (3,) of the episode; the tool stays at the last one."""
     cube = truth[CUBE]
     for _ in range(style.detours):
         yield _near(cube, rng)

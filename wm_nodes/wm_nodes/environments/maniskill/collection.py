@@ -51,12 +51,10 @@ class CollectionPlan:
 
 
 WriteShard = Callable[[Path, CollectionPlan, list[Episode]], None]
-"""Writes the episodes of one shard to a bag at the path; introduced by the learning layer (recording is a sibling)."""
+"""Writes the episodes of one shard to a bag at the path; environments/record.py has the one that is used."""
 
 
-def collect(
-    folder: Path, plan: CollectionPlan, write_shard: WriteShard, *, num_workers: int, progress: bool = True
-) -> list[Path]:
+def collect(folder: Path, plan: CollectionPlan, write_shard: WriteShard, *, num_workers: int) -> list[Path]:
     """Collect into `folder`/shard_<first seed>; returns the bags in seed order.
 
     Raises:
@@ -70,7 +68,7 @@ def collect(
     ]
     missing = [shard for shard in shards if not shard[0].exists()]
     done = plan.num_episodes - sum(stop - start for _, start, stop in missing)
-    with tqdm(total=plan.num_episodes, initial=done, unit="episode", desc="collect", disable=not progress) as bar:
+    with tqdm(total=plan.num_episodes, initial=done, unit="episode", desc="collect") as bar:
         workers = min(num_workers, len(missing))
         if workers == 1:  # a process of its own would only cost the seconds of its start
             for shard in missing:
@@ -94,7 +92,7 @@ def behaviour_of(seed: int, shares: dict[str, float]) -> str:
 
 def _collect_shard(path: Path, start: int, stop: int, plan: CollectionPlan, write_shard: WriteShard) -> int:
     env = _worker_environment(plan.task, plan.simulation.model_dump_json(), plan.end_on_success)
-    act_episode = _policy_episodes(env, plan) if plan.make_policy else _behaviour_episodes(env, plan)
+    act_episode = _make_policy_actor(env, plan) if plan.make_policy else _make_behaviour_actor(env, plan)
     write_shard(path, plan, [act_episode(plan.first_seed + i, i) for i in range(start, stop)])
     return stop - start
 
@@ -106,7 +104,7 @@ def _worker_environment(task: str, simulation_json: str, end_on_success: bool) -
     return ManiSkillEnvironment(task, config, 1, end_on_success=end_on_success)
 
 
-def _behaviour_episodes(env: ManiSkillEnvironment, plan: CollectionPlan) -> Callable[[int, int], Episode]:
+def _make_behaviour_actor(env: ManiSkillEnvironment, plan: CollectionPlan) -> Callable[[int, int], Episode]:
     planner = DemonstrationPlanner(env)
 
     def act_episode(seed: int, episode_id: int) -> Episode:
@@ -121,7 +119,7 @@ def _behaviour_episodes(env: ManiSkillEnvironment, plan: CollectionPlan) -> Call
     return act_episode
 
 
-def _policy_episodes(env: ManiSkillEnvironment, plan: CollectionPlan) -> Callable[[int, int], Episode]:
+def _make_policy_actor(env: ManiSkillEnvironment, plan: CollectionPlan) -> Callable[[int, int], Episode]:
     assert plan.make_policy is not None
     policy = plan.make_policy()
 

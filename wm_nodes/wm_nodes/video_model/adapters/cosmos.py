@@ -9,7 +9,7 @@ Predict2 is written as a denoiser of L = x_0 + sigma eps, with t = sigma / (1 + 
 
 Since (1 - t) L = (1 - t) x_0 + t eps is our x_t, the network again sees x_t and returns (x_t - x_0) / t = v. Its
 training ends at sigma = 80, t = 0.988; Predict2.5's sampler starts at 0.995. Our samplers start at t = 1.
-Given frames are clean latents in place, marked in a mask channel and told a time near 0 (CLEAN_TIME).
+Given frames are clean latents in place, marked in a mask channel and given a time near 0 (CLEAN_TIME).
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ class CosmosVelocity(PublicVelocity):
     """CosmosTransformer3DModel.
 
     Args:
-        fps: camera frames per second told to the position embedding; None (2.5's pipeline): not told.
+        fps: camera frames per second for the position embedding; None (2.5's pipeline): none.
     """
 
     cfg_convention: ClassVar[CfgConvention] = "conditional"
@@ -69,7 +69,7 @@ class CosmosVelocity(PublicVelocity):
         times = self._frame_times(t, x, K, CLEAN_TIME[self.version])
         text = self._text(condition, drop, dtype)
         embedder = self.transformer.time_embed.t_embedder
-        with self._precision(x.device), self._steered(embedder, condition, drop, 1, x):
+        with self._precision(x.device), self._steer(embedder, condition, drop, 1, x):
             out = self.transformer(
                 hidden_states=with_conditioning(x, condition.frames).to(dtype),
                 timestep=times.to(dtype if self.version == "2" else torch.float32)[:, None, :, None, None],

@@ -44,19 +44,19 @@ class ModelFolder:
         return self._json("scheduler/scheduler_config.json")
 
     def model(self, part: str, class_name: str, dtype: torch.dtype) -> Any:
-        """A diffusers model, with every weight from the folder."""
-        path = self._checked(part)
-        found = self._json(f"{part}/config.json").get("_class_name")
-        if found != class_name:
-            raise ModelFolderError(f"{path} holds a {found}, not a {class_name}; {REMEDY}")
-        return self._loaded(getattr(package("diffusers"), class_name), path, dtype)
+        """Load a diffusers model, with every weight from the folder."""
+        path = self._check_part(part)
+        name = self._json(f"{part}/config.json").get("_class_name")
+        if name != class_name:
+            raise ModelFolderError(f"{path} holds a {name}, not a {class_name}; {REMEDY}")
+        return self._load(getattr(package("diffusers"), class_name), path, dtype)
 
     def text_encoder(self, dtype: torch.dtype) -> Any:
-        path = self._checked("text_encoder")
+        path = self._check_part("text_encoder")
         name = self.index["text_encoder"][-1] if self.has("text_encoder") else None
         if name not in TEXT_ENCODERS:
             raise ModelFolderError(f"{path} holds a {name}; supported text encoders are {', '.join(TEXT_ENCODERS)}")
-        return self._loaded(getattr(package("transformers"), name), path, dtype)
+        return self._load(getattr(package("transformers"), name), path, dtype)
 
     def tokenizer(self) -> Any:
         path = self.folder / "tokenizer"
@@ -68,7 +68,7 @@ class ModelFolder:
         except (OSError, ValueError, KeyError, ImportError) as error:
             raise ModelFolderError(f"{path} cannot be read as a tokenizer ({error}); {REMEDY}") from error
 
-    def _loaded(self, cls: Any, path: Path, dtype: torch.dtype) -> Any:
+    def _load(self, cls: Any, path: Path, dtype: torch.dtype) -> Any:
         try:
             model, report = cls.from_pretrained(
                 str(path), torch_dtype=dtype, use_safetensors=True, local_files_only=True, output_loading_info=True
@@ -84,8 +84,8 @@ class ModelFolder:
             )
         return model.eval()
 
-    def _checked(self, part: str) -> Path:
-        """The part's folder, whose configuration and weight files are all there."""
+    def _check_part(self, part: str) -> Path:
+        """Return the part's folder after checking that its configuration and weight files are all there."""
         path = self.folder / part
         self._json(f"{part}/config.json")
         indices = sorted(path.glob("*.safetensors.index.json"))

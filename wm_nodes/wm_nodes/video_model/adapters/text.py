@@ -45,15 +45,15 @@ class TextEncoder:
                 self.encoder.to("cpu")
 
     def _t5(self, prompts: list[str]) -> Tensor:
-        texts = [_cleaned(prompt) for prompt in prompts] if self.style == "wan" else prompts
+        texts = [_clean(prompt) for prompt in prompts] if self.style == "wan" else prompts
         tokens = self.tokenizer(
             texts, padding="max_length", max_length=self.max_tokens, truncation=True, return_attention_mask=True,
             return_tensors="pt",
         )
         present = tokens.attention_mask.to(self.device)
         embedded: Tensor = self.encoder(tokens.input_ids.to(self.device), attention_mask=present).last_hidden_state
-        kept: Tensor = embedded * present.unsqueeze(2).to(embedded.dtype)
-        return kept
+        masked: Tensor = embedded * present.unsqueeze(2).to(embedded.dtype)
+        return masked
 
     def _qwen(self, prompts: list[str]) -> Tensor:
         ids = torch.stack([self._chat(prompt) for prompt in prompts]).to(self.device)
@@ -74,6 +74,6 @@ class TextEncoder:
         return torch.tensor(ids if isinstance(ids, list) else ids["input_ids"], dtype=torch.long)
 
 
-def _cleaned(prompt: str) -> str:
+def _clean(prompt: str) -> str:
     fixed = package("ftfy").fix_text(prompt)
     return re.sub(r"\s+", " ", html.unescape(html.unescape(fixed))).strip()

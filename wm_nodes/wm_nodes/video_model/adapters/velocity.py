@@ -128,7 +128,7 @@ class PublicVelocity(nn.Module):
         return times_BF
 
     @contextmanager
-    def _steered(
+    def _steer(
         self, embedder: nn.Module, condition: Condition, drop: Tensor | None, cells: int, x: Tensor
     ) -> Iterator[None]:
         """Add the actions to what `embedder` returns, rows of (batch, frame, cell) in that order, for one call."""

@@ -18,9 +18,11 @@ from wm_nodes.video_model.adapters.velocity import CfgConvention, PublicVelocity
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import with_conditioning
 
+CACHED_CONTINUATIONS = 32
+
 GivenFrames = Literal["none", "fused", "channels"]
 Continuation = Callable[[Tensor, int], Tensor]
-"""(clean latents of the first K frames, F) -> what the VAE makes of them followed by grey frames, (B, C, F, H, W)."""
+"""(clean latents of the first K frames, F) -> latents of them and of grey frames after them, (B, C, F, H, W)."""
 
 
 class WanVelocity(PublicVelocity):
@@ -51,7 +53,7 @@ class WanVelocity(PublicVelocity):
         self.patch: tuple[int, int, int] = tuple(config.patch_size)
         self.channels = int(config.out_channels)
         self.mask_channels = int(config.in_channels) - 2 * self.channels
-        self._continued = _Continued(continuation)
+        self._continue = _ContinuationCache(continuation)
         self._check(config, continuation)
 
     def transformers(self) -> list[Any]:
@@ -84,12 +86,12 @@ class WanVelocity(PublicVelocity):
         cells = num_cells(x, self.patch)
         time_in_place = self.frames == "fused" or self.actions is not None
         times = self._frame_times(t, x, K if self.frames == "fused" else 0, clean=0.0)
-        told = times.repeat_interleave(cells, 1) if time_in_place else times[:, 0]
+        token_times = times.repeat_interleave(cells, 1) if time_in_place else times[:, 0]
         text = self._text(condition, drop, dtype)
         embedder = network.condition_embedder.time_embedder
-        with self._precision(x.device), self._steered(embedder, condition, drop, cells, x):
+        with self._precision(x.device), self._steer(embedder, condition, drop, cells, x):
             out = network(
-                hidden_states=self._inputs(x, t, condition).to(dtype), timestep=(told * self.time_scale).float(),
+                hidden_states=self._inputs(x, t, condition).to(dtype), timestep=(token_times * self.time_scale).float(),
                 encoder_hidden_states=text, return_dict=False,
             )[0]
         velocity: Tensor = out.float()
@@ -102,7 +104,7 @@ class WanVelocity(PublicVelocity):
         K, clean = condition.num_conditioning, condition.frames.to(x)
         time = t.to(x).view(-1, 1, 1, 1, 1)
         noise = torch.randn((1, self.channels, K, H, W), generator=torch_stream(0, "given_frames")).to(x)
-        given = self._continued(clean, F)
+        given = self._continue(clean, F)
         mask = x.new_zeros(B, self.mask_channels, F, H, W)
         mask[:, :, :K] = 1
         return torch.cat([with_conditioning(x, (1 - time) * clean + time * noise), mask, given], 1)
@@ -122,14 +124,14 @@ class WanVelocity(PublicVelocity):
             raise ValueError("frames channels needs the codec: pass continuation=VideoCodec.continuation")
 
 
-class _Continued:
-    """The last few continuations; what a copy of the model shares, VAE included."""
+class _ContinuationCache:
+    """Caches the last CACHED_CONTINUATIONS continuations; copies of the model share it, VAE included."""
 
-    def __init__(self, continuation: Continuation | None, size: int = 32) -> None:
-        self._continuation, self._size = continuation, size
-        self._kept: dict[tuple[bytes, int], Tensor] = {}
+    def __init__(self, continuation: Continuation | None) -> None:
+        self._continuation = continuation
+        self._cache: dict[tuple[bytes, int], Tensor] = {}
 
-    def __deepcopy__(self, _memo: dict[int, Any]) -> "_Continued":
+    def __deepcopy__(self, _memo: dict[int, Any]) -> "_ContinuationCache":
         return self
 
     def __call__(self, frames: Tensor, num_frames: int) -> Tensor:
@@ -137,10 +139,10 @@ class _Continued:
 
     def _row(self, frame: Tensor, num_frames: int) -> Tensor:
         key = (frame.detach().cpu().float().contiguous().numpy().tobytes(), num_frames)
-        if key not in self._kept:
-            if len(self._kept) >= self._size:
-                self._kept.pop(next(iter(self._kept)))
+        if key not in self._cache:
+            if len(self._cache) >= CACHED_CONTINUATIONS:
+                self._cache.pop(next(iter(self._cache)))
             assert self._continuation is not None
             with torch.no_grad():
-                self._kept[key] = self._continuation(frame, num_frames)
-        return self._kept[key].to(frame)
+                self._cache[key] = self._continuation(frame, num_frames)
+        return self._cache[key].to(frame)

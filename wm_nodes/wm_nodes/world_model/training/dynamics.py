@@ -6,22 +6,26 @@ compared with the recorded frames all along. A frame is real at the start and th
 phase of its own in each episode, so every recorded frame is used in every iteration whatever the rollout length.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.schema import RunConfig, WorldModelConfig
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.recording.episode_arrays import EpisodeArrays
-from wm_nodes.training.loop import LoopSettings, TrainingLoop
-from wm_nodes.world_model.conditions import ActionCondition
-from wm_nodes.world_model.dynamics import ActionModel
+from wm_nodes.training.loop import TrainingLoop
+from wm_nodes.world_model.dynamics import ActionModel, Prediction
 from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.tokenizer import foreground_weight, probe_loss, probe_targets
+
+M = TypeVar("M", ActionModel, TokenActionModel)
 
 INPUT_NOISE = 0.05
 """Standard deviation of noise on real input frames, against copying tokenizer detail."""
@@ -57,10 +61,8 @@ class LatentEpisodes:
 
 @dataclass(frozen=True)
 class RolloutTerms:
-    """What a training rollout gave, of frames 1..T.
-
-    next_latents (B, T, S, D). positions (B, T, P), in the probe's units. done_logits (B, T, K, J).
-    """
+    """Predictions of frames 1..T: next_latents (B, T, S, D), positions (B, T, P) in the probe's units, done_logits
+    (B, T, K, J)."""
 
     next_latents: Tensor
     positions: Tensor
@@ -84,7 +86,7 @@ def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEp
 
 def train_action_model(
     tokenizer: Tokenizer, episodes: EpisodeArrays | LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None,
-    *, progress: bool = True, model: ActionModel | None = None, done_loss: str = "bce",
+    *, model: ActionModel | None = None, done_loss: str = "bce",
 ) -> tuple[ActionModel, dict[str, float]]:
     """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
 
@@ -95,7 +97,7 @@ def train_action_model(
     data = episodes if isinstance(episodes, LatentEpisodes) else tokenise_episodes(tokenizer, episodes)
     settings = config.world_model
     if model is None:
-        model = new_action_model(tokenizer, data, config, seed)
+        model = new_model(ActionModel, "action_model_init", tokenizer, data, settings, seed)
     tokenizer.requires_grad_(False)
     trained = model
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed)
@@ -106,37 +108,33 @@ def train_action_model(
         index = torch.from_numpy(rows)
         with compute_context(tokenizer.device):
             terms = unroll(trained, tokenizer, data, index, steps, torch_stream(seed, "action_model_noise", iteration))
-            losses = rollout_losses(terms, tokenizer, data, index, heads[index], config, done_loss)
+            losses = rollout_losses(
+                terms, tokenizer, data, index, data.step_mask[index].float(), heads[index], settings, done_loss
+            )
             if settings.decoded_weight:
                 generator = torch_stream(seed, "action_model_decoded", iteration)
                 losses |= decoded_losses(terms, tokenizer, data, index, config, generator)
-                losses["loss"] = losses["loss"] + settings.decoded_weight * sum(
-                    losses[key] for key in ("pixel", "recoded", "recoded_state")
-                )
+                decoded = losses["pixel"] + losses["recoded"] + losses["recoded_state"]
+                losses["loss"] = losses["loss"] + settings.decoded_weight * decoded
             return losses | {"rollout_steps": torch.tensor(float(steps))}
 
-    loop_settings = LoopSettings(settings.num_iterations, settings.learning_rate)
-    loop = TrainingLoop("action_model", trained, loop_settings, run_dir)
-    metrics = loop.run(loss, progress=progress)
-    return trained, metrics
+    loop = TrainingLoop("action_model", trained, settings.num_iterations, settings.learning_rate, run_dir)
+    return trained, loop.run(loss)
 
 
-def new_action_model(tokenizer: Tokenizer, data: LatentEpisodes, config: RunConfig, seed: int) -> ActionModel:
-    """A freshly initialised model whose state normalisation fits the data."""
-    with initial_weights(seed, "action_model_init"):
-        model = ActionModel(
-            config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
+def new_model(
+    kind: type[M], stream: str, tokenizer: Tokenizer, data: LatentEpisodes, settings: WorldModelConfig, seed: int
+) -> M:
+    """Return a model with first weights from `stream`, whose condition lets the data's states span [-1, 1]."""
+    with initial_weights(seed, stream):
+        model = kind(
+            settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
             action_dim=data.actions.shape[-1], state_dim=data.states.shape[-1], num_tasks=data.success.shape[-1],
         )
-    fit_state_range(model.condition, data)
-    return model
-
-
-def fit_state_range(condition: ActionCondition, data: LatentEpisodes) -> None:
-    """Let the condition's states span [-1, 1] over the data."""
     states = data.states.flatten(0, 1)
-    condition.state_mean.copy_((states.amax(0) + states.amin(0)) / 2)
-    condition.state_scale.copy_(((states.amax(0) - states.amin(0)) / 2).clamp_min(1e-3))
+    model.condition.state_mean.copy_((states.amax(0) + states.amin(0)) / 2)
+    model.condition.state_scale.copy_(((states.amax(0) - states.amin(0)) / 2).clamp_min(1e-3))
+    return model
 
 
 def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> int:
@@ -164,40 +162,58 @@ def unroll(
         one_step = tokenizer.normalise(noisy + prediction.change_BTSD)
         return RolloutTerms(one_step, prediction.positions_BTQ, prediction.done_logits_BTKJ)
     caches = model.trunk.new_caches()
-    frames, positions, logits = list[Tensor](), list[Tensor](), list[Tensor]()
-    current = noisy[:, :1]
+
+    def predict(t: int, latents: Tensor) -> Prediction:
+        return model.predict(latents, condition[:, t : t + 1], caches)
+
+    def choose_input(t: int, frame: Tensor) -> Tensor:
+        return torch.where(anchors[:, t, None, None, None], noisy[:, t : t + 1], frame)
+
+    return roll_out(predict, tokenizer, noisy[:, :1], num_steps, choose_input)
+
+
+def roll_out(
+    predict: Callable[[int, Tensor], Prediction], tokenizer: Tokenizer, first: Tensor, num_steps: int,
+    choose_input: Callable[[int, Tensor], Tensor] = lambda t, frame: frame,
+) -> RolloutTerms:
+    """Predict `num_steps` frames one by one, from latents `first` (B, 1, S, D) of frame 0.
+
+    Args:
+        predict: (t, latents of frame t) -> prediction of frame t + 1.
+        choose_input: (t, predicted latents of frame t) -> the latents to go on from.
+    """
+    current, frames, positions, logits = first, list[Tensor](), list[Tensor](), list[Tensor]()
     for t in range(num_steps):
-        prediction = model.predict(current, condition[:, t : t + 1], caches)
-        frame = tokenizer.normalise(current + prediction.change_BTSD)
-        frames.append(frame)
+        prediction = predict(t, current)
+        frames.append(tokenizer.normalise(current + prediction.change_BTSD))
         positions.append(prediction.positions_BTQ)
         logits.append(prediction.done_logits_BTKJ)
         if t + 1 < num_steps:
-            current = torch.where(anchors[:, t + 1, None, None, None], noisy[:, t + 1 : t + 2], frame)
+            current = choose_input(t + 1, frames[-1])
     return RolloutTerms(torch.cat(frames, 1), torch.cat(positions, 1), torch.cat(logits, 1))
 
 
 def rollout_losses(
-    terms: RolloutTerms, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, head_mask_BK: Tensor,
-    config: RunConfig, done_loss: str = "bce",
+    terms: RolloutTerms, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, mask_BT: Tensor,
+    head_mask_BK: Tensor, settings: WorldModelConfig, done_loss: str = "bce",
 ) -> dict[str, Tensor]:
-    """The training losses (RS-2 for continuous latents, RS-3, RS-4) over the recorded steps."""
-    target = data.latents[index].float()
-    mask = data.step_mask[index].float()
-    weight = token_weights(target, data.mean_change_S) * mask[..., None]
+    """Return the training losses (RS-2 for continuous latents, RS-3, RS-4) of frames 1..T of the episodes `index`.
+
+    mask_BT: 1 where the frame was recorded. head_mask_BK: 1 where head k learns from the episode.
+    """
+    steps = mask_BT.shape[1]
+    target = data.latents[index][:, : steps + 1].float()
+    weight = token_weights(target, data.mean_change_S) * mask_BT[..., None]
     errors = F.huber_loss(terms.next_latents, target[:, 1:], delta=HUBER_DELTA, reduction="none").mean(-1)
     losses = {"latent": (errors * weight).sum() / weight.sum()}
-    labels = data.success[index][:, 1:].float()
-    losses["done"] = done_losses(terms.done_logits, labels, mask[:, :, None] * head_mask_BK[:, None], done_loss)
+    labels = data.success[index][:, 1 : steps + 1].float()
+    losses["done"] = done_losses(terms.done_logits, labels, mask_BT[:, :, None] * head_mask_BK[:, None], done_loss)
     probed = tokenizer.read_state_normalised(terms.next_latents.flatten(0, 1))
-    truth = torch.where(mask[..., None] > 0, data.truth[index][:, 1:], torch.nan).flatten(0, 1)
+    truth = torch.where(mask_BT[..., None] > 0, data.truth[index][:, 1 : steps + 1], torch.nan).flatten(0, 1)
     losses["state"] = probe_loss(tokenizer, probed, truth)
     losses["position"] = probe_loss(tokenizer, terms.positions.flatten(0, 1), truth)
-    settings = config.world_model
-    losses["loss"] = (
-        losses["latent"] + settings.done_weight * losses["done"]
-        + settings.state_weight * (losses["state"] + losses["position"])
-    )
+    state = settings.state_weight * (losses["state"] + losses["position"])
+    losses["loss"] = losses["latent"] + settings.done_weight * losses["done"] + state
     return losses
 
 
@@ -211,9 +227,8 @@ def decoded_losses(
     recoded_state: positions that the frozen probe reads after the round trip. Between encoder images, latents that
     predict well may still decode to a blur from which nobody can read positions.
     """
-    steps = (
-        torch.rand(len(index), DECODED_FRAMES, generator=generator) * data.step_mask[index].sum(1, keepdim=True)
-    ).long()
+    share = torch.rand(len(index), DECODED_FRAMES, generator=generator)
+    steps = (share * data.step_mask[index].sum(1, keepdim=True)).long()
     rows = torch.arange(len(index)).unsqueeze(1).expand_as(steps).flatten()
     steps, episodes = steps.flatten(), index[rows]
     wanted = tokenizer.to_pixels(data.images[episodes, steps + 1])

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.recording.episode_arrays import EpisodeArrays
-from wm_nodes.training.loop import LoopSettings, TrainingLoop
+from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.training.tokenizer import probe_targets
 
@@ -20,10 +20,11 @@ HUBER_DELTA = 0.5
 
 
 def train_position_probe(
-    episodes: EpisodeArrays, config: RunConfig, seed: int, run_dir: Path | None, *, progress: bool = True
+    episodes: EpisodeArrays, config: RunConfig, seed: int, run_dir: Path | None
 ) -> tuple[PositionProbe, dict[str, float]]:
-    """As many iterations as the tokenizer; half of each batch is blurred, as imagined frames are, so that a blur alone
-    does not read as a wrong place. Returns the probe (averaged weights) and its last metrics (m).
+    """Train for as many iterations as the tokenizer; return the probe (averaged weights) and its last metrics (m).
+
+    Half of each batch is blurred, as imagined frames are, so that a blur alone does not read as a wrong place.
 
     Raises:
         ValueError: a position is unknown (NaN) in every recorded frame.
@@ -52,5 +53,5 @@ def train_position_probe(
             "error_m": ((read.detach() - wanted) * probe.std).abs().mean(),
         }
 
-    loop = TrainingLoop("position_probe", probe, LoopSettings(config.tokenizer.num_iterations, LEARNING_RATE), run_dir)
-    return probe, loop.run(loss, progress=progress)
+    loop = TrainingLoop("position_probe", probe, config.tokenizer.num_iterations, LEARNING_RATE, run_dir)
+    return probe, loop.run(loss)

@@ -9,13 +9,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
-from wm_nodes.training.loop import LoopSettings, TrainingLoop
+from wm_nodes.core.seeding import numpy_stream, torch_stream
+from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.decoding import choose_codes, code_targets
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
-from wm_nodes.world_model.training.dynamics import LatentEpisodes, bootstrap_masks, done_losses, fit_state_range
+from wm_nodes.world_model.training.dynamics import LatentEpisodes, bootstrap_masks, done_losses, new_model
 
 MAX_CORRUPTION = 0.2
 """Share of the tokens of the last given frame that are replaced by random codes; it grows linearly with time, so that
@@ -23,30 +23,22 @@ the model meets errors of its own kind."""
 
 
 def train_token_model(
-    tokenizer: Tokenizer, data: LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None, *,
-    progress: bool = True,
+    tokenizer: Tokenizer, data: LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None
 ) -> tuple[TokenActionModel, dict[str, float]]:
     """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics."""
     settings = config.world_model
-    with initial_weights(seed, "token_model_init"):
-        model = TokenActionModel(
-            settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
-            action_dim=data.actions.shape[-1], state_dim=data.states.shape[-1], num_tasks=data.success.shape[-1],
-        )
-    fit_state_range(model.condition, data)
+    model = new_model(TokenActionModel, "token_model_init", tokenizer, data, settings, seed)
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed)
 
     def loss(iteration: int) -> dict[str, Tensor]:
-        index = torch.from_numpy(
-            numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
-        )
+        rows = numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
+        index = torch.from_numpy(rows)
         generator = torch_stream(seed, "action_model_mask", iteration)
         with compute_context(tokenizer.device):
             return token_losses(model, data, index, heads[index], generator, settings.done_weight)
 
-    loop = TrainingLoop("action_model", model, LoopSettings(settings.num_iterations, settings.learning_rate), run_dir)
-    metrics = loop.run(loss, progress=progress)
-    return model, metrics
+    loop = TrainingLoop("action_model", model, settings.num_iterations, settings.learning_rate, run_dir)
+    return model, loop.run(loss)
 
 
 def token_losses(
@@ -61,18 +53,18 @@ def token_losses(
     condition = model.condition(data.actions[index], states[:, :-1], states[:, 1:])
     prediction = model(given, wanted, decided, condition)
     steps = data.step_mask[index].float()
-    judged = (~decided).float() * steps.unsqueeze(-1)
+    counted = (~decided).float() * steps.unsqueeze(-1)
     entropies = [
         F.cross_entropy(part.flatten(0, -2), target.flatten(), reduction="none").view(target.shape)
         for part, target in zip(prediction.logits, code_targets(wanted), strict=True)
     ]
-    count = judged.sum().clamp_min(1)
+    count = counted.sum().clamp_min(1)
     right = (choose_codes(prediction.logits, model.latent_dim)[0] == wanted).all(-1)
     labels = data.success[index][:, 1:].float()
     losses = {
-        "tokens": (torch.stack(entropies).sum(0) * judged).sum() / count,
+        "tokens": (torch.stack(entropies).sum(0) * counted).sum() / count,
         "done": done_losses(prediction.done_logits_BTKJ, labels, steps[:, :, None] * head_mask_BK[:, None]),
-        "accuracy": (right * judged).sum() / count,
+        "accuracy": (right * counted).sum() / count,
     }
     return losses | {"loss": losses["tokens"] + done_weight * losses["done"]}
 

@@ -5,13 +5,14 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
-from wm_nodes.training.loop import LoopSettings, TrainingLoop
+from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.quantizer import entropy_loss
 from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
@@ -25,7 +26,7 @@ PROBE_WEIGHT = 0.1
 
 
 def train_tokenizer(
-    episodes: EpisodeArrays, config: RunConfig, seed: int, run_dir: Path | None, *, progress: bool = True
+    episodes: EpisodeArrays, config: RunConfig, seed: int, run_dir: Path | None
 ) -> tuple[Tokenizer, dict[str, float]]:
     """Train on every recorded frame; returns the tokenizer (averaged weights) and its last metrics.
 
@@ -45,9 +46,8 @@ def train_tokenizer(
     def loss(iteration: int) -> dict[str, Tensor]:
         rows = numpy_stream(seed, "tokenizer_batch", iteration).choice(frames, settings.batch_size)
         pixels = codec.to_pixels(images[rows])
-        noise = torch.randn(
-            (len(rows), codec.num_tokens, codec.latent_dim), generator=torch_stream(seed, "latent_noise", iteration)
-        )
+        generator = torch_stream(seed, "latent_noise", iteration)
+        noise = torch.randn((len(rows), codec.num_tokens, codec.latent_dim), generator=generator)
         with compute_context(codec.device):
             features = codec.features(pixels)
             latents = codec.bottleneck(features)
@@ -69,10 +69,8 @@ def train_tokenizer(
         terms["psnr_db"] = -10 * error.detach().square().mean().log10()
         return terms
 
-    schedule = LoopSettings(settings.num_iterations, settings.learning_rate)
-    loop = TrainingLoop("tokenizer", codec, schedule, run_dir)
-    metrics = loop.run(loss, progress=progress)
-    return codec, metrics
+    loop = TrainingLoop("tokenizer", codec, settings.num_iterations, settings.learning_rate, run_dir)
+    return codec, loop.run(loss)
 
 
 def foreground_weight(pixels_B3HW: Tensor, background_3HW: Tensor, extra: float) -> Tensor:
@@ -92,7 +90,7 @@ def probe_loss(tokenizer: Tokenizer, probed_BP: Tensor, targets_BP: Tensor) -> T
     """Huber loss of normalised positions; unknown (NaN) and constant values do not count."""
     wanted = (targets_BP - tokenizer.probe_mean) / tokenizer.probe_std
     known = torch.isfinite(wanted)
-    losses = torch.nn.functional.huber_loss(probed_BP, wanted.nan_to_num(), delta=0.5, reduction="none")
+    losses = F.huber_loss(probed_BP, wanted.nan_to_num(), delta=0.5, reduction="none")
     return (losses * known).sum() / known.sum().clamp_min(1)
 
 

@@ -1,7 +1,7 @@
 """Whether a world model passes acceptance: measured on held-out real episodes, before a policy is trained in it
 (RS-12).
 
-The numbers come from rollout_evaluation: recorded actions rolled out open-loop from recorded first frames. Positions
+The numbers come from open_loop.py: recorded actions rolled out open-loop from recorded first frames. Positions
 are read off the imagined pictures by the judge's own probe; "copying" reads them off the first frame instead.
 """
 
@@ -84,7 +84,7 @@ class AcceptanceReport:
 
 
 def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> dict[str, float]:
-    """Rollouts of held-out actions against what really happened; see rollout_evaluation."""
+    """Return the metrics of rollouts of held-out actions against the recordings; see open_loop.evaluate_rollouts."""
     threshold = config.reward.success_threshold
     return evaluate_rollouts(models.tokenizer, models.action, heldout, threshold=threshold, probe=models.probe)
 
@@ -93,26 +93,26 @@ def accept_world_model(
     models: WorldModels, heldout: EpisodeArrays, config: RunConfig, imagined: tuple[int, int] | None = None,
     real: tuple[int, int] | None = None,
 ) -> AcceptanceReport:
-    """Judge a world model for config.task.
+    """Measure whether a world model passes acceptance for config.task.
 
     Args:
         heldout: real episodes with ground truth that the model was not trained on.
-        imagined, real: (successes, episodes) of the SFT policy in the model and in the simulator; None: not judged.
+        imagined, real: (successes, episodes) of the SFT policy in the model and in the simulator; None: not measured.
 
     Raises:
         ValueError: episodes without ground truth, or labelled for other tasks than the model's.
     """
     _check(models, heldout, config.task)
     metrics = model_metrics(models, heldout, config)
-    criteria, notes = criteria_of(metrics, config, heldout.num_steps, imagined, real)
+    criteria, notes = apply_criteria(metrics, config, heldout.num_steps, imagined, real)
     return AcceptanceReport(config.task, len(heldout), criteria, metrics, notes)
 
 
-def criteria_of(
+def apply_criteria(
     metrics: Mapping[str, float], config: RunConfig, num_steps: int, imagined: tuple[int, int] | None,
     real: tuple[int, int] | None,
 ) -> tuple[tuple[Criterion, ...], tuple[str, ...]]:
-    """Criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model."""
+    """Return criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model."""
     limits, task = config.acceptance, config.task
     notes = [
         f"Errors are those of the full horizon over those of copying the first frame; the object's over the episodes "
@@ -163,14 +163,14 @@ def _check(models: WorldModels, heldout: EpisodeArrays, task: str) -> None:
     models.task_index(task)
     if heldout.tasks != models.tasks:
         raise ValueError(
-            f"held-out episodes are labelled for {', '.join(heldout.tasks)}, the world model judges "
+            f"held-out episodes are labelled for {', '.join(heldout.tasks)}, the world model knows "
             f"{', '.join(models.tasks)}; stack them with the tasks of the model's manifest"
         )
     unknown = int(np.isnan(heldout.ground_truth).reshape(len(heldout), -1).any(1).sum())
     if heldout.ground_truth.shape[-1] == 0 or unknown:
         raise ValueError(
             f"{unknown or len(heldout)} of {len(heldout)} held-out episodes carry no ground truth, so positions cannot "
-            "be compared; judge on simulator episodes (collect_heldout_data), not on imagined or real-robot ones"
+            "be compared; measure on simulator episodes (environments/record.py), not on imagined or real-robot ones"
         )
 
 

@@ -1,9 +1,9 @@
-"""Open-loop rollouts of held-out episodes by the action model, against what really happened.
+"""Open-loop rollouts of held-out episodes by the action model, compared with the recordings.
 
 Shapes: E episodes, T steps, S tokens, D values per token, J tasks, P probed values (PROBE_NAMES).
 
 Positions are read off pictures, by the judge's own probe (world_model/position_probe.py), which was trained on real
-frames only and through which no loss of the world model ever passed. Where a model folder has none, predicted frames
+frames only, and which no loss of the world model trains. Where a model folder has none, predicted frames
 are encoded again and read by the tokenizer's probe. The reader's own error on real held-out frames is reported as the
 floor, and copying the first frame is measured in the same way.
 """
@@ -69,18 +69,20 @@ def imagine(
     Args:
         images: uint8 (E, H, W, 3), first frames. actions: (E, T, A). states: (E, T + 1, S), commanded.
     """
-    told, commanded = torch.from_numpy(actions), torch.from_numpy(states)
+    actions_ETA, states_ETS = torch.from_numpy(actions), torch.from_numpy(states)
     current = tokenizer.encode(images)
     caches = model.trunk.new_ring_caches(len(images), current.device)
     frames, signals, spreads = list[Tensor](), list[Tensor](), list[Tensor]()
     for t in range(actions.shape[1]):
         with compute_context(current.device):
-            current, logits = model.advance(current, told[:, t], commanded[:, t], commanded[:, t + 1], caches)
+            current, logits = model.advance(
+                current, actions_ETA[:, t], states_ETS[:, t], states_ETS[:, t + 1], caches
+            )
         signal, spread = done_signal(logits)
         frames.append(tokenizer.decode(current))
         signals.append(signal)
         spreads.append(spread)
-    return ImaginedEpisodes(*(torch.stack(listed, 1).numpy() for listed in (frames, signals, spreads)))
+    return ImaginedEpisodes(*(torch.stack(steps, 1).numpy() for steps in (frames, signals, spreads)))
 
 
 def evaluate_rollouts(
@@ -96,7 +98,7 @@ def evaluate_rollouts(
     imagined = imagine_episodes(tokenizer, model, episodes)
     truth = probe_targets(episodes.ground_truth, episodes.tasks[0])
     read = probe.read if probe else partial(_read_frames, tokenizer)
-    real, told = read(episodes.images), read(imagined.frames)
+    real, predicted = read(episodes.images), read(imagined.frames)
     moved = np.linalg.norm(truth[:, -1, OBJECT] - truth[:, 0, OBJECT], axis=-1) > MOVED_M
     metrics: dict[str, float] = {"episodes": float(len(episodes)), "moved_share": float(moved.mean())}
     for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
@@ -105,7 +107,7 @@ def evaluate_rollouts(
             continue
         label = f"h{horizon:02d}"
         metrics |= _picture_metrics(tokenizer, imagined, episodes, rows, horizon, label)
-        estimates = {"rollout": told[:, horizon - 1], "floor": real[:, horizon], "copy": real[:, 0]}
+        estimates = {"rollout": predicted[:, horizon - 1], "floor": real[:, horizon], "copy": real[:, 0]}
         for name, columns, chosen in (
             ("object", OBJECT, rows), ("object_moved", OBJECT, rows & moved), ("tool", TOOL, rows),
         ):
@@ -114,8 +116,8 @@ def evaluate_rollouts(
     for j, task in enumerate(episodes.tasks):
         happened = (episodes.success[:, 1:, j] & frame_mask).any(1)
         signal = np.where(frame_mask, imagined.signals[..., j], 0).max(1)
-        found = detection_metrics(signal, happened, threshold)
-        metrics |= {f"done_{task}_{key}": value for key, value in found.items()}
+        detection = detection_metrics(signal, happened, threshold)
+        metrics |= {f"done_{task}_{key}": value for key, value in detection.items()}
         metrics[f"done_{task}_uncertainty_p99"] = float(np.quantile(imagined.uncertainty[..., j][frame_mask], 0.99))
     return metrics
 
