@@ -62,7 +62,7 @@ def _load_codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Codec:
     if kind == "tokenizer" and not (folder / CODEC).is_file() and (folder.parent / MANIFEST).is_file():
         shared = codec_of_world_model(folder.parent)
         if pack_weights(shared).sha256 != sha256:
-            raise ModelFolderError(f"{folder} has another tokenizer than that of {folder.parent}; train it anew")
+            raise ModelFolderError(f"{folder} was made with another tokenizer than {folder.parent}'s; train it anew")
         return shared
     if kind == "tokenizer":
         settings["config"] = TokenizerConfig.model_validate(settings["config"])
