@@ -12,7 +12,7 @@ from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import planned_episode, scripted_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 from wm_nodes.environments.record import collect_plan, demonstration_plan
-from wm_nodes.judge.dataset.build import ClipSource
+from wm_nodes.judge.dataset.build import LabelledClipSource
 from wm_nodes.judge.dataset.edits.truth import tc_level
 from wm_nodes.recording import read_episodes
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
@@ -110,7 +110,7 @@ def test_its_demonstrations_are_recorded_and_what_a_world_model_probes_is_found_
 
 
 def test_the_judge_draws_and_labels_its_clips_by_its_own_rule() -> None:
-    source = ClipSource("nudge", load_config("cpu").simulation)
+    source = LabelledClipSource("nudge", load_config("cpu").simulation)
     clip = source.clip(1)
     source.close()
     assert clip.clip.origin.behaviour == "short" and clip.clip.instruction.startswith("nudge the ")

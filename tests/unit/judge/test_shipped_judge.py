@@ -15,7 +15,7 @@ from wm_nodes.judge.agent.types import ClipRef, Stage, Status, TaskSpec, clip_re
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
 from wm_nodes.judge.backends.factory import check_judge, make_judge
-from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, instruction_of
+from wm_nodes.judge.dataset.build import HELD_OUT, LabelledClipSource, instruction_of
 from wm_nodes.judge.dataset.edits.clips import LabelledClip
 from wm_nodes.judge.dataset.edits.generator import apply_edit
 from wm_nodes.judge.evidence.head import load_head
@@ -69,14 +69,14 @@ def test_noise_and_another_size_are_not_judged() -> None:
 
 
 @pytest.fixture(scope="module")
-def source() -> Iterator[ClipSource]:
-    made = ClipSource("push_cube", load_config("cpu").simulation)
+def source() -> Iterator[LabelledClipSource]:
+    made = LabelledClipSource("push_cube", load_config("cpu").simulation)
     yield made
     made.close()
 
 
 @pytest.fixture(scope="module")
-def recording(source: ClipSource) -> LabelledClip:
+def recording(source: LabelledClipSource) -> LabelledClip:
     """The first successful push of a scene that is not held out."""
     for seed in range(FIRST_SEED, FIRST_SEED + 100):
         origin = source.origin(seed)
@@ -89,7 +89,7 @@ def recording(source: ClipSource) -> LabelledClip:
 
 @pytest.mark.rendering
 def test_a_clean_success_is_accepted_and_each_hacking_pattern_is_worth_less_and_refused(
-    source: ClipSource, recording: LabelledClip
+    source: LabelledClipSource, recording: LabelledClip
 ) -> None:
     task = TaskSpec(instruction_of(recording.clip.origin), "push_cube", "panda", recording.clip.frames[0])
     clean = judged(recording.ref, task)
@@ -111,7 +111,7 @@ def test_a_clean_success_is_accepted_and_each_hacking_pattern_is_worth_less_and_
 
 @pytest.mark.rendering
 def test_equal_clips_get_equal_verdicts_and_a_mild_edit_does_not_close_a_gate(
-    source: ClipSource, recording: LabelledClip
+    source: LabelledClipSource, recording: LabelledClip
 ) -> None:
     task = TaskSpec(instruction_of(recording.clip.origin), "push_cube", "panda", recording.clip.frames[0])
     first, again = judged(recording.ref, task), judged(recording.ref, task)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from benchmarks.judge.hacking import SearchStart
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.judge.dataset.build import ClipSource
+from wm_nodes.judge.dataset.build import LabelledClipSource
 from wm_nodes.judge.dataset.edits.clips import LabelledClip, NotApplicableError
 from wm_nodes.judge.dataset.edits.generator import STATE_RECIPES, apply_edit
 from wm_nodes.judge.dataset.edits.manifest import Division, ManifestError, ManifestRow
@@ -24,7 +24,7 @@ def hacking_starts(
     roots = [row for row in rows if not row.edits and row.labels.overall]
     shapes = {name.split("/")[0] for name in division.objects}
     for task in dict.fromkeys(row.origin.task for row in roots):
-        source = ClipSource(task, config, shapes)
+        source = LabelledClipSource(task, config, shapes)
         try:
             for row in (row for row in roots if row.origin.task == task):
                 parent = source.clip(row.origin.seed)
@@ -39,7 +39,7 @@ def hacking_starts(
             source.close()
 
 
-def _make_defect(parent: LabelledClip, source: ClipSource, seed: int) -> LabelledClip | None:
+def _make_defect(parent: LabelledClip, source: LabelledClipSource, seed: int) -> LabelledClip | None:
     for index in numpy_stream(seed, f"hack_start/{parent.sha256}").permutation(len(STATE_RECIPES)):
         try:
             return apply_edit(parent, STATE_RECIPES[index], "fail", seed, source.redraw)

@@ -25,7 +25,7 @@ class ClipSource(Protocol[Request]):
     def score(self, request: Request, clips: RolloutBuffer) -> RolloutBuffer: ...
 
 
-class Learner(Protocol):
+class VideoLearner(Protocol):
     """GrpoLearner, or a VideoRun, which also writes versions, checkpoints and metrics."""
 
     @property
@@ -34,7 +34,7 @@ class Learner(Protocol):
 
 
 def post_train(
-    learner: Learner, source: ClipSource[Request], iterations: int
+    learner: VideoLearner, source: ClipSource[Request], iterations: int
 ) -> Iterator[tuple[RolloutBuffer, BufferReport]]:
     """Train on `iterations` buffers; yield each with the report of its optimizer steps."""
     for iteration in range(iterations):

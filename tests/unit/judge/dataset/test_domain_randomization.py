@@ -13,7 +13,7 @@ from wm_nodes.judge.dataset.build import (
     HELD_OUT,
     OBJECT_COLOURS,
     TABLES,
-    ClipSource,
+    LabelledClipSource,
     SetPlan,
     instruction_of,
 )
@@ -55,8 +55,8 @@ def of_set(seed: int) -> RandomizedScene:
 
 
 @pytest.fixture(scope="module")
-def source() -> Iterator[ClipSource]:
-    made = ClipSource("push_cube", CONFIG, diverse=True)
+def source() -> Iterator[LabelledClipSource]:
+    made = LabelledClipSource("push_cube", CONFIG, diverse=True)
     yield made
     made.close()
 
@@ -126,7 +126,7 @@ def test_a_development_set_is_the_part_of_a_whole_one_that_training_reads() -> N
     assert part.seeds("push_cube") == kept[:30] and 30 <= len(kept) < 50
 
 
-def test_a_push_goes_where_it_was_headed_and_is_the_same_each_time(source: ClipSource) -> None:
+def test_a_push_goes_where_it_was_headed_and_is_the_same_each_time(source: LabelledClipSource) -> None:
     seed = next(
         s for s in PLAN.seeds("push_cube") if source.origin(s).behaviour.startswith("expert")
         and abs(of_set(s).look.layout.heading_rad) > 1
@@ -144,7 +144,7 @@ def test_a_push_goes_where_it_was_headed_and_is_the_same_each_time(source: ClipS
     assert source.clip(seed).sha256 == found.sha256
 
 
-def test_clutter_lies_beside_the_way_and_a_drawn_scene_leaves_no_trace(source: ClipSource) -> None:
+def test_clutter_lies_beside_the_way_and_a_drawn_scene_leaves_no_trace(source: LabelledClipSource) -> None:
     clip = source.clip(20_000).clip
     states, plain = clip.states.at(np.array([0])), SceneAppearance(seed=1)
 

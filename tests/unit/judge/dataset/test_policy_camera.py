@@ -16,7 +16,7 @@ from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_heads
-from wm_nodes.judge.dataset.build import SIDE_PX, ClipSource, SetPlan
+from wm_nodes.judge.dataset.build import SIDE_PX, LabelledClipSource, SetPlan
 from wm_nodes.judge.dataset.edits.clips import OBJECT
 from wm_nodes.judge.dataset.edits.truth import tc_level
 from wm_nodes.judge.dataset.policy_camera import (
@@ -41,8 +41,8 @@ def view() -> PolicyCamera:
 
 
 @pytest.fixture(scope="module")
-def source(view: PolicyCamera) -> Iterator[ClipSource]:
-    made = ClipSource("push_cube", CONFIG, policy=view)
+def source(view: PolicyCamera) -> Iterator[LabelledClipSource]:
+    made = LabelledClipSource("push_cube", CONFIG, policy=view)
     yield made
     made.close()
 
@@ -91,7 +91,7 @@ def test_the_window_of_the_loops_is_the_side_camera_wherever_it_stands() -> None
 
 @pytest.mark.rendering
 def test_a_drawn_clip_begins_with_the_picture_that_the_environment_shows(
-    source: ClipSource, view: PolicyCamera
+    source: LabelledClipSource, view: PolicyCamera
 ) -> None:
     seed = seeds_of(view, DRAWN)[0]
     clip = source.clip(seed).clip
@@ -103,7 +103,7 @@ def test_a_drawn_clip_begins_with_the_picture_that_the_environment_shows(
 
 @pytest.mark.rendering
 def test_of_a_decoded_clip_all_pictures_but_the_first_have_gone_through_the_tokenizer(
-    source: ClipSource, view: PolicyCamera
+    source: LabelledClipSource, view: PolicyCamera
 ) -> None:
     seed, window = seeds_of(view, DECODED)[0], policy_window(CONFIG, SIDE_PX)
     clip, shown = source.clip(seed).clip, first_picture(seed)
@@ -117,7 +117,7 @@ def test_of_a_decoded_clip_all_pictures_but_the_first_have_gone_through_the_toke
 
 @pytest.mark.rendering
 def test_an_imagined_clip_is_the_models_own_where_it_stays_with_the_simulator_and_else_is_decoded(
-    source: ClipSource, view: PolicyCamera, monkeypatch: pytest.MonkeyPatch
+    source: LabelledClipSource, view: PolicyCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seed = seeds_of(view, IMAGINED)[0]
     monkeypatch.setattr("wm_nodes.judge.dataset.policy_camera.NEAR_M", {"object": 1.0, "tool": 1.0})
@@ -131,7 +131,7 @@ def test_an_imagined_clip_is_the_models_own_where_it_stays_with_the_simulator_an
 
 
 @pytest.mark.rendering
-def test_successes_are_cut_at_their_end_or_go_on_and_failures_are_whole(source: ClipSource, view: PolicyCamera) -> None:
+def test_successes_are_cut_at_their_end_or_go_on_and_failures_are_whole(source: LabelledClipSource, view: PolicyCamera) -> None:
     rule, cut = clip_rules("push_cube").label, 0
     for seed in [s for s in range(40) if view.origin("push_cube", s).behaviour in ("expert", "short")][:6]:
         states = source.clip(seed).clip.states
@@ -152,7 +152,7 @@ def test_the_loops_have_one_look_and_the_cube_alone() -> None:
 
 @pytest.mark.rendering
 def test_the_shipped_judge_of_these_pictures_pays_a_success_more_than_what_only_ends_like_one(
-    source: ClipSource, view: PolicyCamera
+    source: LabelledClipSource, view: PolicyCamera
 ) -> None:
     clips = (source.clip(seed) for seed in seeds_of(view, DRAWN))
     states = next(clip.clip.states for clip in clips if clip.labels.overall and len(clip.clip) > 8)

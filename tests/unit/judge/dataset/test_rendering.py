@@ -12,7 +12,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import clip_rules, success, task_names
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.judge.dataset import rendering
-from wm_nodes.judge.dataset.build import HELD_OUT, ClipSource, SetPlan, build, scene_states
+from wm_nodes.judge.dataset.build import HELD_OUT, LabelledClipSource, SetPlan, build, scene_states
 from wm_nodes.judge.dataset.edits.clips import BACKGROUND, DISTRACTOR, OBJECT, ROBOT
 from wm_nodes.judge.dataset.edits.manifest import ManifestError, regenerate
 from wm_nodes.judge.dataset.edits.recipes import edit_states
@@ -25,17 +25,17 @@ CONFIG = load_config("cpu").simulation
 
 
 @pytest.fixture(scope="module")
-def source() -> Iterator[ClipSource]:
-    made = ClipSource("push_cube", CONFIG)
+def source() -> Iterator[LabelledClipSource]:
+    made = LabelledClipSource("push_cube", CONFIG)
     yield made
     made.close()
 
 
-def expert_seed(source: ClipSource) -> int:
+def expert_seed(source: LabelledClipSource) -> int:
     return next(seed for seed in range(50) if source.origin(seed).behaviour == "expert")
 
 
-def test_the_cube_is_nine_pixels_wide_and_its_track_is_on_it_in_every_camera(source: ClipSource) -> None:
+def test_the_cube_is_nine_pixels_wide_and_its_track_is_on_it_in_every_camera(source: LabelledClipSource) -> None:
     clip = source.clip(expert_seed(source)).clip
     states = clip.states.at(np.array([0, len(clip) // 2]))
     for camera in CAMERAS:
@@ -55,7 +55,7 @@ def test_the_cube_is_nine_pixels_wide_and_its_track_is_on_it_in_every_camera(sou
         assert drawing.tracks["object"][0] == pytest.approx([rows.mean(), columns.mean()], abs=3.0)
 
 
-def test_held_out_places_are_rare_and_every_trained_one_is_common(source: ClipSource) -> None:
+def test_held_out_places_are_rare_and_every_trained_one_is_common(source: LabelledClipSource) -> None:
     origins = [source.origin(seed) for seed in range(600)]
     for values, rare in (
         ([o.camera for o in origins], HELD_OUT.cameras),
@@ -67,14 +67,14 @@ def test_held_out_places_are_rare_and_every_trained_one_is_common(source: ClipSo
         assert all(share > 0.24 for value, share in shares.items() if value not in rare)
 
 
-def test_an_expert_succeeds_and_a_clip_is_the_same_each_time(source: ClipSource) -> None:
+def test_an_expert_succeeds_and_a_clip_is_the_same_each_time(source: LabelledClipSource) -> None:
     seed = expert_seed(source)
     first = source.clip(seed)
     assert first.labels.overall and first.labels.tc_level == 4
     assert source.clip(seed).sha256 == first.sha256 != source.clip(seed + 1).sha256
 
 
-def test_a_cube_that_the_simulator_knocked_ahead_passes_and_only_its_edits_fail(source: ClipSource) -> None:
+def test_a_cube_that_the_simulator_knocked_ahead_passes_and_only_its_edits_fail(source: LabelledClipSource) -> None:
     knocked = source.clip(1018)
     states = knocked.clip.states
     cube_m, tool_m = (np.linalg.norm(np.diff(way, axis=0), axis=1) for way in (states.thing, states.tool))
@@ -84,7 +84,7 @@ def test_a_cube_that_the_simulator_knocked_ahead_passes_and_only_its_edits_fail(
 
 
 def test_a_long_set_outlives_the_sixteen_bits_of_the_segmentation(
-    source: ClipSource, monkeypatch: pytest.MonkeyPatch
+    source: LabelledClipSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, other = (source.clip(seed) for seed in (expert_seed(source), expert_seed(source) + 1))
     monkeypatch.setattr(rendering, "MAX_ID", 0)  # every drawing begins with a new scene
@@ -103,7 +103,7 @@ def test_hovering_above_the_cube_is_success_of_reach_and_of_no_push() -> None:
     assert success("reach", env.ground_truth)[0]
 
 
-def test_edited_states_are_drawn(source: ClipSource) -> None:
+def test_edited_states_are_drawn(source: LabelledClipSource) -> None:
     parent = source.clip(expert_seed(source))
     ghost = source.redraw(parent, edit_states(parent, "ghost_motion", "fail", 0))
     arm = ghost.clip.masks == ROBOT
@@ -115,7 +115,7 @@ def test_edited_states_are_drawn(source: ClipSource) -> None:
     assert (double.clip.masks[0] == OBJECT).sum() > 1.5 * (parent.clip.masks[0] == OBJECT).sum()
 
 
-def test_one_command_builds_a_set_that_can_be_made_again(source: ClipSource, tmp_path: Path) -> None:
+def test_one_command_builds_a_set_that_can_be_made_again(source: LabelledClipSource, tmp_path: Path) -> None:
     plan = SetPlan(num_episodes=2, edits_per_clip=8, seed=3, stacks_per_clip=2)
     manifest, skipped = build(tmp_path, plan, CONFIG, progress=False)
     assert load_set(tmp_path) == manifest and 2 + 8 < len(manifest.rows) <= 2 + 2 * (8 + 2) - sum(skipped.values())

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
-from wm_nodes.judge.dataset.build import BENCHMARK, HELD_OUT, STEADY, ClipSource, SetPlan, draw_origin, instruction_of
+from wm_nodes.judge.dataset.build import (
+    BENCHMARK,
+    HELD_OUT,
+    STEADY,
+    LabelledClipSource,
+    SetPlan,
+    draw_origin,
+    instruction_of,
+)
 from wm_nodes.judge.dataset.edits.clips import OBJECT
 
 pytestmark = pytest.mark.rendering
@@ -16,13 +24,13 @@ CONFIG = load_config("cpu").simulation
 
 
 @pytest.fixture(scope="module")
-def source() -> Iterator[ClipSource]:
-    made = ClipSource("push_cube", CONFIG, ("slab", "post"))
+def source() -> Iterator[LabelledClipSource]:
+    made = LabelledClipSource("push_cube", CONFIG, ("slab", "post"))
     yield made
     made.close()
 
 
-def test_shapes_are_rare_held_out_and_change_nothing_else(source: ClipSource) -> None:
+def test_shapes_are_rare_held_out_and_change_nothing_else(source: LabelledClipSource) -> None:
     shapes: Counter[str] = Counter()
     for seed in range(600):
         origin, without = source.origin(seed), draw_origin("push_cube", seed)
@@ -38,7 +46,7 @@ def test_shapes_are_rare_held_out_and_change_nothing_else(source: ClipSource) ->
         assert shapes[shape] / shapes.total() == pytest.approx(0.12, abs=0.04)
 
 
-def test_a_post_stands_on_the_table_is_taller_and_is_named(source: ClipSource) -> None:
+def test_a_post_stands_on_the_table_is_taller_and_is_named(source: LabelledClipSource) -> None:
     seed = next(
         seed for seed in range(300) if (o := source.origin(seed)).object_id.startswith("post")
         and o.behaviour == "expert" and o.camera == "near_side"

@@ -115,7 +115,7 @@ BENCHMARK = SetPlan(
 were trained without that task."""
 
 
-class ClipSource:
+class LabelledClipSource:
     """Records clips of one task and renders edits of them. shapes, diverse: see SetPlan. It starts the simulator.
 
     Raises NoRendererError where Vulkan finds no device.
@@ -249,7 +249,7 @@ def build(
 
     def make_clips() -> Iterator[LabelledClip]:
         for task in plan.tasks:
-            source = ClipSource(task, config, plan.shapes, diverse=plan.diverse, policy=policy)
+            source = LabelledClipSource(task, config, plan.shapes, diverse=plan.diverse, policy=policy)
             try:
                 for seed in tqdm(plan.seeds(task), desc=task, disable=not progress):
                     parent = source.clip(seed)
