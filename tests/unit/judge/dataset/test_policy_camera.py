@@ -131,7 +131,9 @@ def test_an_imagined_clip_is_the_models_own_where_it_stays_with_the_simulator_an
 
 
 @pytest.mark.rendering
-def test_successes_are_cut_at_their_end_or_go_on_and_failures_are_whole(source: LabelledClipSource, view: PolicyCamera) -> None:
+def test_successes_are_cut_at_their_end_or_go_on_and_failures_are_whole(
+    source: LabelledClipSource, view: PolicyCamera
+) -> None:
     rule, cut = clip_rules("push_cube").label, 0
     for seed in [s for s in range(40) if view.origin("push_cube", s).behaviour in ("expert", "short")][:6]:
         states = source.clip(seed).clip.states
