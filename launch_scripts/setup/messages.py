@@ -28,6 +28,7 @@ def repair_cmake(share: Path, include: str, numpy_include: str) -> int:
         text = path.read_text(errors="surrogateescape")
         new = WHEEL_NUMPY.sub(lambda _: numpy_include, WHEEL_INCLUDE.sub(lambda _: include, text))
         if new != text:
+            path.unlink()  # a hard link into uv's cache: other environments take the file from there
             path.write_text(new, errors="surrogateescape")
             repaired += 1
     return repaired

@@ -1,4 +1,4 @@
-"""Sequence numbers, credit, peers and the joiner, without DDS."""
+"""Sequence numbers, credit, peers and the assembler, without DDS."""
 
 import numpy as np
 import pytest
@@ -162,25 +162,25 @@ def images(value: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return np.full((N, 2, 2, 3), value, np.uint8)
 
 
-def full_joiner(left_out: tuple[str, int] = ("", 0)) -> RolloutAssembler:
-    joiner = RolloutAssembler()
-    joiner.begin()
+def full_assembler(left_out: tuple[str, int] = ("", 0)) -> RolloutAssembler:
+    assembler = RolloutAssembler()
+    assembler.begin()
     for step_id in (1, 2, 3):
         if left_out != ("transition", step_id):
-            joiner.put_transition(step(step_id))
+            assembler.put_transition(step(step_id))
         if left_out != ("reward", step_id):
-            joiner.put_rewards(rewards(step_id))
+            assembler.put_rewards(rewards(step_id))
     for step_id in (1, 2, 3, 4):
         if left_out != ("image", step_id):
-            joiner.put_image(10 * step_id, images(step_id))
-    return joiner
+            assembler.put_image(10 * step_id, images(step_id))
+    return assembler
 
 
 def test_a_complete_rollout_is_joined_by_stamp_and_step_id() -> None:
-    joiner = full_joiner()
-    assert joiner.missing(1, 1, 3) == []
-    assert joiner.missing(2, 1, 3) == [1, 2, 3]
-    rollout, dropped = joiner.take(1, 3, policy_version=3)
+    assembler = full_assembler()
+    assert assembler.missing(1, 1, 3) == []
+    assert assembler.missing(2, 1, 3) == [1, 2, 3]
+    rollout, dropped = assembler.take(1, 3, policy_version=3)
     assert rollout.images_TN[:, 0, 0, 0, 0].tolist() == [1, 2, 3]
     assert rollout.next_images_TN[:, 0, 0, 0, 0].tolist() == [2, 3, 4]
     assert rollout.rewards_TN[:, 0].tolist() == [1, 2, 3]
@@ -192,24 +192,24 @@ def test_a_complete_rollout_is_joined_by_stamp_and_step_id() -> None:
     ("left_out", "missing"), [(("transition", 2), [2]), (("reward", 3), [3]), (("image", 2), [1, 2])]
 )
 def test_what_is_missing_is_invalid_and_counted_never_zero(left_out: tuple[str, int], missing: list[int]) -> None:
-    joiner = full_joiner(left_out)
-    assert joiner.missing(1, 1, 3) == missing
-    rollout, dropped = joiner.take(1, 3, policy_version=3)
+    assembler = full_assembler(left_out)
+    assert assembler.missing(1, 1, 3) == missing
+    rollout, dropped = assembler.take(1, 3, policy_version=3)
     assert [t + 1 for t in range(3) if not rollout.valid_TN[t].any()] == missing
     assert dropped.gap == N * len(missing)
 
 
 def test_invalid_rewards_and_other_versions_are_left_out_by_reason() -> None:
-    joiner = full_joiner()
-    joiner.put_rewards(rewards(2, valid=False))
-    joiner.put_transition(step(3, version=2))
-    rollout, dropped = joiner.take(1, 3, policy_version=3)
+    assembler = full_assembler()
+    assembler.put_rewards(rewards(2, valid=False))
+    assembler.put_transition(step(3, version=2))
+    rollout, dropped = assembler.take(1, 3, policy_version=3)
     assert rollout.valid_TN.tolist() == [[True, True], [False, True], [False, False]]
     assert (dropped.invalid, dropped.gap, dropped.stale) == (1, 0, 2)
 
 
 def test_a_new_session_makes_everything_before_worthless() -> None:
-    joiner = full_joiner()
-    joiner.put_transition(step(1, session=2))
-    assert joiner.missing(2, 1, 1) == [1]
-    assert joiner.missing(1, 1, 3) == [1, 2, 3]
+    assembler = full_assembler()
+    assembler.put_transition(step(1, session=2))
+    assert assembler.missing(2, 1, 1) == [1]
+    assert assembler.missing(1, 1, 3) == [1, 2, 3]

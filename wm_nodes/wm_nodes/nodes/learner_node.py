@@ -83,7 +83,7 @@ class LearnerNode(TrainingNode):
         self._expected_spec = expected_spec(
             self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
         )
-        self._joiner, self._reward_name, self._max_episode_steps = RolloutAssembler(), "", 0
+        self._assembler, self._reward_name, self._max_episode_steps = RolloutAssembler(), "", 0
         self._replayed = ReplayAssembler(self._withhold)
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("env/image", self._on_image)
@@ -183,7 +183,7 @@ class LearnerNode(TrainingNode):
                 self._refused = None
             return ReplayedRollouts(self, check, progress, self._replayed, self._replay, uris, num_steps=num_steps)
         return LiveRollouts(
-            self, work, check, progress, self._joiner, self._rollouts, num_steps=num_steps, seed=self._config.seed
+            self, work, check, progress, self._assembler, self._rollouts, num_steps=num_steps, seed=self._config.seed
         )
 
     def _exhausted(self, goal: Train.Goal, made: int, left_out: list[str]) -> str:
@@ -249,7 +249,7 @@ class LearnerNode(TrainingNode):
     @property
     def _collecting(self) -> RolloutAssembler | ReplayAssembler | None:
         """Where messages go now: the source that the running goal trains from; None between goals and with bags."""
-        return next((joiner for joiner in (self._joiner, self._replayed) if joiner.collecting), None)
+        return next((assembler for assembler in (self._assembler, self._replayed) if assembler.collecting), None)
 
     def _on_spec(self, message: EnvSpec) -> None:
         try:
@@ -257,33 +257,33 @@ class LearnerNode(TrainingNode):
             if self._expected_spec is not None:
                 refuse_other(self._spec, self._expected_spec, "the learner's policy needs")
             self._max_episode_steps = self._spec.max_episode_steps
-            self._joiner.enter_session(message.session)
+            self._assembler.enter_session(message.session)
             self._replayed.enter_session(message.session)
         except WireError as error:
             self._spec, self._refused = None, error
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
 
     def _on_image(self, message: Image) -> None:
-        joiner = self._collecting
-        if self._spec is None or joiner is None:
+        assembler = self._collecting
+        if self._spec is None or assembler is None:
             return
         images = self.read_message("image", convert.images_of, message, self._spec)
         if images is not None:
-            joiner.put_image(convert.time_ns(message.header.stamp), images)
+            assembler.put_image(convert.time_ns(message.header.stamp), images)
 
     def _on_transition(self, message: TransitionBatch) -> None:
-        joiner = self._collecting
-        if self._spec is None or joiner is None:
+        assembler = self._collecting
+        if self._spec is None or assembler is None:
             return
         transition = self.read_message("transition", convert.transition_of, message, self._spec)
         if transition is not None:
-            joiner.put_transition(transition)
+            assembler.put_transition(transition)
 
     def _on_reward(self, message: RewardBatch) -> None:
-        joiner = self._collecting
-        rewards = None if joiner is None else self.read_message("reward", convert.rewards_of, message)
-        if joiner is not None and rewards is not None:
-            joiner.put_rewards(rewards)
+        assembler = self._collecting
+        rewards = None if assembler is None else self.read_message("reward", convert.rewards_of, message)
+        if assembler is not None and rewards is not None:
+            assembler.put_rewards(rewards)
             self._reward_name = message.reward_name
 
     def _on_save(self, request: SaveCheckpoint.Request, response: SaveCheckpoint.Response) -> SaveCheckpoint.Response:

@@ -31,35 +31,35 @@ def recorded(*lengths: int) -> Graph:
     return graph
 
 
-def feed(joiner: ReplayAssembler, graph: Graph, keep: Keep = lambda topic, message: True) -> None:
+def feed(assembler: ReplayAssembler, graph: Graph, keep: Keep = lambda topic, message: True) -> None:
     for topic, message, _ in graph.published:
         if not keep(topic, message):
             continue
         if topic is topics.IMAGES:
-            joiner.put_image(convert.time_ns(message.header.stamp), convert.images_of(message, graph.spec))
+            assembler.put_image(convert.time_ns(message.header.stamp), convert.images_of(message, graph.spec))
         elif topic is topics.TRANSITION:
-            joiner.put_transition(convert.transition_of(message, graph.spec))
+            assembler.put_transition(convert.transition_of(message, graph.spec))
         elif topic is topics.REWARD:
-            joiner.put_rewards(convert.rewards_of(message))
+            assembler.put_rewards(convert.rewards_of(message))
 
 
 def collecting(withheld: list[bool] | None = None) -> ReplayAssembler:
-    joiner = ReplayAssembler((withheld if withheld is not None else []).append)
-    joiner.begin(STEPS)
-    return joiner
+    assembler = ReplayAssembler((withheld if withheld is not None else []).append)
+    assembler.begin(STEPS)
+    return assembler
 
 
-def taken(joiner: ReplayAssembler) -> Iterable[tuple[int, Rollout | None, DroppedTransitions]]:
-    while (found := joiner.take(0.0)) is not None:
+def taken(assembler: ReplayAssembler) -> Iterable[tuple[int, Rollout | None, DroppedTransitions]]:
+    while (found := assembler.take(0.0)) is not None:
         yield found
 
 
 def test_a_replayed_stream_gives_the_rollouts_that_the_file_gives(tmp_path: Path) -> None:
     graph = recorded(STEPS, STEPS, STEPS)
-    joiner = collecting()
-    feed(joiner, graph)
-    joiner.finish()
-    ours = list(taken(joiner))
+    assembler = collecting()
+    feed(assembler, graph)
+    assembler.finish()
+    ours = list(taken(assembler))
     theirs = list(read_rollouts(write(tmp_path / "bag", graph), num_steps=STEPS))
     assert [version for version, _, _ in ours] == [1, 2, 3]
     for (_, rollout, _), other in zip(ours, theirs, strict=True):
@@ -76,10 +76,10 @@ def test_a_rollout_that_lost_a_message_is_given_up_and_counted(topic: topics.Rec
         count += found is topic
         return found is not topic or count != 4
 
-    joiner = collecting()
-    feed(joiner, recorded(STEPS, STEPS), keep)
-    joiner.finish()
-    (_, lost, dropped), (_, kept, _) = taken(joiner)
+    assembler = collecting()
+    feed(assembler, recorded(STEPS, STEPS), keep)
+    assembler.finish()
+    (_, lost, dropped), (_, kept, _) = taken(assembler)
     assert lost is None
     assert dropped.gap == NUM_ENVS * (STEPS - (topic is topics.TRANSITION))
     assert kept is not None
@@ -87,10 +87,10 @@ def test_a_rollout_that_lost_a_message_is_given_up_and_counted(topic: topics.Rec
 
 def test_rollouts_of_another_length_are_left_out_as_the_file_does(tmp_path: Path) -> None:
     graph = recorded(STEPS - 1, STEPS, STEPS + 1)
-    joiner = collecting()
-    feed(joiner, graph)
-    joiner.finish()
-    assert [version for version, rollout, _ in taken(joiner) if rollout is not None] == [2]
+    assembler = collecting()
+    feed(assembler, graph)
+    assembler.finish()
+    assert [version for version, rollout, _ in taken(assembler) if rollout is not None] == [2]
     bags = BagRollouts([write(tmp_path / "bag", graph)], Progress(version=2), num_steps=STEPS, expected=None)
     found = bags.next()
     assert found is not None
@@ -100,40 +100,40 @@ def test_rollouts_of_another_length_are_left_out_as_the_file_does(tmp_path: Path
 
 
 def test_a_whole_rollout_ends_in_silence_and_an_unfinished_one_is_waited_for() -> None:
-    joiner = collecting()
-    feed(joiner, recorded(STEPS))
-    assert joiner.take(60.0) is None
-    found = joiner.take(0.0)
+    assembler = collecting()
+    feed(assembler, recorded(STEPS))
+    assert assembler.take(60.0) is None
+    found = assembler.take(0.0)
     assert found is not None
     assert found[1] is not None
-    joiner = collecting()
-    feed(joiner, recorded(STEPS - 1))
-    assert joiner.take(0.0) is None
+    assembler = collecting()
+    feed(assembler, recorded(STEPS - 1))
+    assert assembler.take(0.0) is None
 
 
 def test_credit_is_withheld_while_rollouts_wait_and_what_comes_nonetheless_is_counted() -> None:
     withheld: list[bool] = []
-    joiner = collecting(withheld)
-    feed(joiner, recorded(*[STEPS] * MAX_WAITING))
+    assembler = collecting(withheld)
+    feed(assembler, recorded(*[STEPS] * MAX_WAITING))
     assert True not in withheld
-    joiner = collecting(withheld)
-    feed(joiner, recorded(*[STEPS] * (MAX_KEPT + 3)))
+    assembler = collecting(withheld)
+    feed(assembler, recorded(*[STEPS] * (MAX_KEPT + 3)))
     assert withheld[-1] is True
-    assert joiner.waiting == MAX_KEPT
-    first = joiner.take(0.0)
+    assert assembler.waiting == MAX_KEPT
+    first = assembler.take(0.0)
     assert first is not None
     assert first[2].gap == 3 * STEPS * NUM_ENVS
-    for _ in taken(joiner):
+    for _ in taken(assembler):
         pass
     assert withheld[-1] is False
 
 
 def test_nothing_is_kept_between_goals() -> None:
-    joiner = ReplayAssembler(lambda withheld: None)
-    feed(joiner, recorded(STEPS, STEPS))
-    joiner.begin(STEPS)
-    joiner.finish()
-    assert joiner.take(0.0) is None
+    assembler = ReplayAssembler(lambda withheld: None)
+    feed(assembler, recorded(STEPS, STEPS))
+    assembler.begin(STEPS)
+    assembler.finish()
+    assert assembler.take(0.0) is None
 
 
 def test_a_bag_of_another_camera_is_refused(tmp_path: Path) -> None:

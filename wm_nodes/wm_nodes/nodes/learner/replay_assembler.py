@@ -26,18 +26,18 @@ class _Group:
     """The lock-steps of one (session, policy version) since a reset. done_s: when it ended, time.monotonic()."""
 
     version: int
-    joiner: RolloutAssembler = field(default_factory=RolloutAssembler)
+    assembler: RolloutAssembler = field(default_factory=RolloutAssembler)
     steps: set[int] = field(default_factory=set)
     envs: int = 0
     done_s: float = 0.0
 
     @property
     def span(self) -> tuple[int, int, int]:
-        return self.joiner.session, min(self.steps), max(self.steps)
+        return self.assembler.session, min(self.steps), max(self.steps)
 
     @property
     def complete(self) -> bool:
-        return not self.joiner.missing(*self.span)
+        return not self.assembler.missing(*self.span)
 
 
 class ReplayAssembler:
@@ -99,7 +99,7 @@ class ReplayAssembler:
             self.heard_s = time.monotonic()
             self._images.put(stamp_ns, images)
             for group in self._open():
-                group.joiner.put_image(stamp_ns, images)
+                group.assembler.put_image(stamp_ns, images)
             self._changed.notify_all()
 
     def put_transition(self, transition: Transition) -> None:
@@ -115,7 +115,7 @@ class ReplayAssembler:
                 return
             if self._current is None:
                 self._current = self._begin_group(version)
-            self._current.joiner.put_transition(transition)
+            self._current.assembler.put_transition(transition)
             self._current.steps.add(transition.step_id)
             self._current.envs = len(transition.valid)
             if len(self._done) >= MAX_WAITING:
@@ -129,7 +129,7 @@ class ReplayAssembler:
             self.heard_s = time.monotonic()
             self._rewards.append(rewards)
             for group in self._open():
-                group.joiner.put_rewards(rewards)
+                group.assembler.put_rewards(rewards)
             self._changed.notify_all()
 
     def finish(self) -> None:
@@ -161,7 +161,7 @@ class ReplayAssembler:
         if not whole:
             return group.version, None, DroppedTransitions(gap=lost + len(group.steps) * group.envs)
         _, first, last = group.span
-        rollout, dropped = group.joiner.take(first, last, group.version)
+        rollout, dropped = group.assembler.take(first, last, group.version)
         return group.version, rollout, DroppedTransitions(dropped.invalid, dropped.gap + lost, dropped.stale)
 
     def wait(self, seconds: float) -> None:
@@ -174,12 +174,12 @@ class ReplayAssembler:
 
     def _begin_group(self, version: int) -> _Group:
         group = _Group(version)
-        group.joiner.begin()
-        group.joiner.enter_session(self._session)
+        group.assembler.begin()
+        group.assembler.enter_session(self._session)
         for stamp_ns, images in self._images.items():
-            group.joiner.put_image(stamp_ns, images)
+            group.assembler.put_image(stamp_ns, images)
         for rewards in self._rewards:
-            group.joiner.put_rewards(rewards)
+            group.assembler.put_rewards(rewards)
         return group
 
     def _finish(self) -> None:

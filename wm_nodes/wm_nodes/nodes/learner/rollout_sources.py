@@ -55,11 +55,11 @@ class LiveRollouts:
     """Asks the policy node for rollouts and joins what the graph publishes about them. check: as ReplayedRollouts's."""
 
     def __init__(
-        self, node: ManagedNode, work: Work, check: Check, progress: Progress, joiner: RolloutAssembler,
+        self, node: ManagedNode, work: Work, check: Check, progress: Progress, assembler: RolloutAssembler,
         client: ActionClient, *, num_steps: int, seed: int,
     ) -> None:
         self._node, self._work, self._check, self._progress = node, work, check, progress
-        self._joiner, self._client = joiner, client
+        self._assembler, self._client = assembler, client
         self._num_steps, self._seed = num_steps, seed
         self.left_out: list[str] = []
 
@@ -81,7 +81,7 @@ class LiveRollouts:
             self._work.sleep(RETRY_S)
 
     def close(self) -> None:
-        self._joiner.end()
+        self._assembler.end()
 
     def _attempt(self, *, accept_gaps: bool) -> tuple[Rollout, DroppedTransitions]:
         node, version = self._node, self._progress.version
@@ -95,7 +95,7 @@ class LiveRollouts:
             same_policy()
 
         alive()
-        self._joiner.begin()
+        self._assembler.begin()
         result: RolloutAction.Result = run_goal(self._client, goal, accept_s=5.0, check=self._check, alive=alive)
         if result.termination_reason == RolloutAction.Result.FAILED:
             raise WireError(ErrorCode.INTERNAL, f"the policy node failed: {result.message}")
@@ -103,15 +103,15 @@ class LiveRollouts:
             raise PeerLost(result.message or "the rollout was cut short")
         span = (result.env_session, result.first_step_id, result.last_step_id)
         deadline = time.monotonic() + float(node.param("join_timeout_s"))
-        while missing := self._joiner.missing(*span):
+        while missing := self._assembler.missing(*span):
             self._check()
             if time.monotonic() > deadline:
                 node.diagnostics.count("incomplete_steps", len(missing), text=f"{len(missing)} lock-steps incomplete")
                 if accept_gaps:
                     break
                 raise PeerLost(f"images or rewards of {len(missing)} lock-steps did not arrive; is every node active?")
-            self._joiner.wait(0.1)
-        return self._joiner.take(result.first_step_id, result.last_step_id, version)
+            self._assembler.wait(0.1)
+        return self._assembler.take(result.first_step_id, result.last_step_id, version)
 
     def _check_peers(self) -> None:
         namespace = self._node.get_namespace().rstrip("/")
@@ -160,15 +160,15 @@ class ReplayedRollouts:
     """
 
     def __init__(
-        self, node: ManagedNode, check: Check, progress: Progress, joiner: ReplayAssembler, client: ActionClient,
+        self, node: ManagedNode, check: Check, progress: Progress, assembler: ReplayAssembler, client: ActionClient,
         uris: Sequence[str], *, num_steps: int,
     ) -> None:
-        self._node, self._check, self._progress, self._joiner = node, check, progress, joiner
+        self._node, self._check, self._progress, self._assembler = node, check, progress, assembler
         self.left_out: list[str] = []
         self._error: Exception | None = None
         self._thread: threading.Thread | None = None
         self._closed = threading.Event()
-        joiner.begin(num_steps)
+        assembler.begin(num_steps)
         if uris:
             self._thread = threading.Thread(target=self._play, args=(client, list(uris)), name="replay")
             self._thread.start()
@@ -179,13 +179,13 @@ class ReplayedRollouts:
             self._check()
             if self._error is not None:
                 raise self._error
-            taken = self._joiner.take(float(self._node.param("join_timeout_s")))
+            taken = self._assembler.take(float(self._node.param("join_timeout_s")))
             if taken is None:
                 if self._over():
                     self._progress.dropped_stale += stale
                     self._progress.dropped_gap += gap
                     return None
-                self._joiner.wait(0.1)
+                self._assembler.wait(0.1)
                 continue
             version, rollout, dropped = taken
             if rollout is None:
@@ -199,20 +199,20 @@ class ReplayedRollouts:
 
     def close(self) -> None:
         self._closed.set()
-        self._joiner.end()
+        self._assembler.end()
         if self._thread is not None:
             self._thread.join(5.0)
 
     def _over(self) -> bool:
         """Whether the stream has ended; its last, unfinished rollout is then given up."""
-        silent_s = time.monotonic() - self._joiner.heard_s
+        silent_s = time.monotonic() - self._assembler.heard_s
         if self._thread is None:
             over = silent_s > float(self._node.param("recovery_timeout_s"))
         else:
             over = not self._thread.is_alive() and self._error is None and silent_s > ARRIVAL_S
         if over:
-            self._joiner.finish()
-        return over and not self._joiner.waiting
+            self._assembler.finish()
+        return over and not self._assembler.waiting
 
     def _play(self, client: ActionClient, uris: list[str]) -> None:
         """In a thread: have the bags played, as fast as `replay_rate` and the credit allow."""
