@@ -246,10 +246,10 @@ def test_recorded_verdicts_are_given_again_bit_for_bit_without_asking_the_judge(
     silent = replace(clips, audit_ids=("", *clips.audit_ids[1:]), valid=clips.valid.clone(), total=clips.total.clone())
     silent.valid[0], silent.total[0] = False, math.nan
     other = replace(clips, audit_ids=("0" * 64, *clips.audit_ids[1:]))
-    monkeypatch.setattr("wm_nodes.apps.rescore.read_clips", lambda bag, pictures: [silent])
+    monkeypatch.setattr("wm_nodes.video_rl.recorded_buffers.read_clips", lambda bag, pictures: [silent])
     assert main(["rescore", str(run), *agent]) == 0
     assert "1 clips that got no answer then are not compared" in said(capsys)
-    monkeypatch.setattr("wm_nodes.apps.rescore.read_clips", lambda bag, pictures: [other])
+    monkeypatch.setattr("wm_nodes.video_rl.recorded_buffers.read_clips", lambda bag, pictures: [other])
     assert main(["rescore", str(run), *agent]) == 1
     assert json.loads((run / "rescored.json").read_text())["buffers"][0]["different"] == ["verdicts"]
 

@@ -110,7 +110,7 @@ def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
     if arguments.task:
         overrides["task"] = arguments.task
     if arguments.rounds is not None:
-        overrides["rounds.num_rounds"] = arguments.rounds
+        overrides["model_refresh.num_rounds"] = arguments.rounds
     judge = options.judge_settings(arguments)
     if judge and arguments.reward != AGENT:
         raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")

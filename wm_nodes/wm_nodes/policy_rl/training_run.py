@@ -179,7 +179,8 @@ def restore(policy: ImagePolicy, learner: Learner, checkpoint: Path) -> Progress
         return Progress(**content["progress"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"checkpoint {checkpoint} does not fit: {error}; go on with its configuration, or begin in another run_dir"
+            f"checkpoint {checkpoint} does not fit: {error}; go on with the configuration it was made by, or begin "
+            "anew in another run_dir"
         ) from None
 
 
