@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import sys
@@ -96,6 +97,7 @@ def _uv_install(venv: Path, arguments: list[str], log: Path, why: str, **variabl
     run([str(venv / "bin" / "uv"), "pip", "install", "--python", python, *arguments], log=log, why=why, env=env)
 
 
+@functools.cache
 def _indexes(python: str) -> dict[str, str]:
     """The package indexes and certificates that pip is configured with, as variables of uv, which reads none of it."""
     settings = {}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from wm_nodes.apps.model_refresh_loop import round_config, split_updates
-from wm_nodes.apps.policy_run import kept, open_run_dir
+from wm_nodes.apps.policy_run import cached_success, open_run_dir
 from wm_nodes.config.load import ConfigError, dump_config, load_config
 from wm_nodes.reports.summary import SuccessRate, Summary
 from wm_nodes.reports.tables import ROUND_COLUMNS, round_rows
@@ -23,7 +23,7 @@ def test_an_evaluation_is_kept_until_it_is_of_something_else(tmp_path: Path) -> 
         return np.array([True, False, name == "trained"])
 
     for policy in ("weak", "weak", "trained"):
-        found = kept(path, {"policy_sha256": policy}, lambda policy=policy: measure(policy))
+        found = cached_success(path, {"policy_sha256": policy}, lambda policy=policy: measure(policy))
         assert found.tolist() == [True, False, policy == "trained"]
     assert calls == ["weak", "trained"]
     assert json.loads(path.read_text())["success"] == [1, 0, 1]

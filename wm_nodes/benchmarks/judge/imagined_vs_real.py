@@ -155,5 +155,5 @@ def run(arguments: argparse.Namespace) -> None:
     """Measure, write --json and print it without the single clips."""
     keep_freed_memory()
     results = _measure(arguments)
-    write_results(arguments, results)
+    write_results(arguments, results, exact=True)
     print(json.dumps({name: value for name, value in results.items() if name != "silent"}, indent=1))

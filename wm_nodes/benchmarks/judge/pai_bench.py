@@ -112,7 +112,7 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"questions answered: {results['answered']}, not answered and left out: {results['unanswered']}")
     if results["missing"]:
         print(f"no Quality and no Overall: {', '.join(results['missing'])} not given")
-    write_results(arguments, results)
+    write_results(arguments, results, exact=True)
 
 
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> None:
         "judge": load_head(arguments.folder).sha256, "frames": FRAMES, "side_px": SIDE_PX,
         "processes": arguments.cores, "clips_each": arguments.clips, "processor_s_per_clip": processor_s,
         "wall_s_per_clip": wall_s, "clips_per_s": clips_per_s, "clips_per_s_by_the_clock": clips_per_s_now,
-    })
+    }, exact=True)
     facts = machine_facts()
     print(f"{FRAMES} frames of {SIDE_PX} px on {arguments.cores} processes, {facts['processor']}, {facts['date']}")
     print(f"processor {1000 * processor_s:.1f} ms a clip: {clips_per_s:.1f} clips/s on idle cores")

@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> None:
         results = measure(config, QUICK if arguments.quick else FULL, folder, model)
     results |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
     show(results)
-    write_results(arguments, results)
+    write_results(arguments, results, exact=True)
 
 
 def measure(config: RunConfig, effort: Effort, folder: Path, model_dir: Path | None = None) -> dict[str, Any]:

@@ -135,7 +135,7 @@ def _finish(
         return found
     policy = trained.policy(start.folder)
     measured = ("imagined_before", "imagined_after", "real_after")
-    before, imagined, real = (policy_run.rate(read_success(start.folder, name)) for name in measured)
+    before, imagined, real = (policy_run.success_rate(read_success(start.folder, name)) for name in measured)
     job.stage(
         f"round {number}: imagined success {imagined.successes}/{imagined.episodes}, "
         f"real success {real.successes}/{real.episodes}"

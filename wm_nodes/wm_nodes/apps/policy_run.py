@@ -29,6 +29,7 @@ from wm_nodes.launching.runner import Runner
 from wm_nodes.policy_rl.evaluation import evaluate
 from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, models_of
 from wm_nodes.policy_rl.initial_policy import num_starts
+from wm_nodes.policy_rl.training_run import POLICY_FILES
 from wm_nodes.reports.summary import SuccessRate
 
 READY_S = 120.0
@@ -107,7 +108,7 @@ class TrainingResult:
     bag: str
 
     def policy(self, folder: Path) -> Path:
-        return folder / "policies" / f"policy_{self.version:06d}.safetensors"
+        return folder / POLICY_FILES.uri(self.version)
 
 
 @dataclass(frozen=True)
@@ -192,25 +193,25 @@ def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path,
         return evaluate(weights, env, episodes, job.config.evaluation.first_seed).success
 
     identity = {"policy_sha256": file_sha256(policy), "model_sha256": models_of(model_dir).sha256}
-    success = kept(folder / "evaluations" / f"imagined_{label}.json", identity, measure)
+    success = cached_success(folder / "evaluations" / f"imagined_{label}.json", identity, measure)
     job.stage(f"imagined success of {policy.stem}: {int(success.sum())}/{len(success)}")
     return success
 
 
-def kept(path: Path, identity: Mapping[str, str], measure: Callable[[], BoolArray]) -> BoolArray:
+def cached_success(path: Path, identity: Mapping[str, str], measure: Callable[[], BoolArray]) -> BoolArray:
     """Success of episodes, (E,), from `path` when it was measured on the same things, else measured and written."""
     if path.is_file():
         values: dict[str, Any] = json.loads(path.read_text())
         if values["identity"] == dict(identity):
             return np.asarray(values["success"], bool)
     success = measure()
-    low, high = wilson_interval(int(success.sum()), len(success))
-    content = {"identity": dict(identity), "success": success.astype(int).tolist(), "low": low, "high": high}
+    rate = success_rate(success)
+    content = {"identity": dict(identity), "success": success.astype(int).tolist(), "low": rate.low, "high": rate.high}
     write_atomic(path, json.dumps(content).encode())
     return success
 
 
-def rate(success: BoolArray) -> SuccessRate:
+def success_rate(success: BoolArray) -> SuccessRate:
     low, high = wilson_interval(int(success.sum()), len(success))
     return SuccessRate(int(success.sum()), len(success), low, high)
 
@@ -231,8 +232,9 @@ def _real(operator: GraphClient, job: RunContext, start: TrainingStart, label: s
                 label=label, policy_uri=str(policy), on_progress=show,
             ).success
 
-    success = kept(start.folder / "evaluations" / f"real_{label}.json", {"policy_sha256": file_sha256(policy)}, measure)
-    found = rate(success)
+    identity = {"policy_sha256": file_sha256(policy)}
+    success = cached_success(start.folder / "evaluations" / f"real_{label}.json", identity, measure)
+    found = success_rate(success)
     job.stage(
         f"real success {label} training: {found.successes}/{found.episodes} (95 % {found.low:.2f} to {found.high:.2f})"
     )

@@ -18,7 +18,7 @@ from rich.table import Table
 from tqdm import tqdm
 
 from wm_nodes.apps.options import add_preset, add_threads, prepare_torch, settings
-from wm_nodes.apps.policy_run import rate
+from wm_nodes.apps.policy_run import success_rate
 from wm_nodes.config.load import default_task, dump_config, load_config, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
@@ -165,9 +165,10 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
     save_weights(policy, run_dir / f"{arm}.safetensors", {"tokenizer_sha256": policy.encoder.sha256})
     row = {
         "task": config.task, "arm": arm, "seed": config.seed,
-        "real_before": asdict(rate(real_before.success)), "real_after": asdict(rate(real_after.success)),
-        "imagined_before": asdict(rate(imagined_before.success)),
-        "imagined_after": asdict(rate(imagined_after.success)),
+        "real_before": asdict(success_rate(real_before.success)),
+        "real_after": asdict(success_rate(real_after.success)),
+        "imagined_before": asdict(success_rate(imagined_before.success)),
+        "imagined_after": asdict(success_rate(imagined_after.success)),
         "paired": asdict(paired_difference(real_before.success.tolist(), real_after.success.tolist())),
         "accepted": acceptance.passed, "acceptance": acceptance.to_dict(),
         "environment_steps": sum(c["steps"] for c in course),

@@ -15,7 +15,7 @@ from typing import Any
 from wm_nodes.apps import options
 from wm_nodes.apps.model_refresh_loop import round_start, run_rounds
 from wm_nodes.apps.policy_pictures import write_pictures
-from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, open_run_dir, rate, start_graph
+from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, open_run_dir, start_graph, success_rate
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
@@ -86,8 +86,8 @@ def run(arguments: argparse.Namespace) -> None:
         found = run_rounds(job, model_dir, weak, partial(_judge, job, model_dir, arguments.force), waiting)
     summary = Summary(
         task=config.task, preset=arguments.preset, seed=config.seed,
-        real_before=rate(found.real_before), real_after=rate(found.real_after),
-        imagined_before=rate(found.imagined_before), imagined_after=rate(found.imagined_after),
+        real_before=success_rate(found.real_before), real_after=success_rate(found.real_after),
+        imagined_before=success_rate(found.imagined_before), imagined_after=success_rate(found.imagined_after),
         imagined_steps_per_s=found.samples_per_s, bag=found.bag,
         paired=asdict(paired_difference(found.real_before.tolist(), found.real_after.tolist())),
         imagined_paired=asdict(paired_difference(found.imagined_before.tolist(), found.imagined_after.tolist())),

@@ -16,9 +16,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-LogprobWeight = Literal["full", "cps", "base"]
-KlMode = Literal["mean", "logk2", "logk3", "velocity", "none"]
-
 
 def gaussian_logprob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     """Return DD-14: the mean over elements of DD-12, log N(x; mean, std^2), per row of (M, U), nats per element."""
