@@ -45,16 +45,16 @@ def wait_for_count(probe: Probe, node: str, counter: str, texts: tuple[str, ...]
 
 
 BAD_MESSAGES: list[tuple[str, Callable[[EnvironmentSpec, int], Any], tuple[str, ...], str, tuple[str, ...]]] = [
-    ("env/image", lambda spec, session: mosaic(spec, encoding="bgr8"), (LEARNER, EVALUATOR), "refused_images",
+    ("env/image", lambda spec, session: mosaic(spec, encoding="bgr8"), (LEARNER, EVALUATOR), "dropped env/image",
      ("encoding is 'bgr8', not 'rgb8'", "send 4 tiles of 16 x 16 px")),
-    ("env/image", lambda spec, session: mosaic(replace(spec, height=8)), (LEARNER, EVALUATOR), "refused_images",
+    ("env/image", lambda spec, session: mosaic(replace(spec, height=8)), (LEARNER, EVALUATOR), "dropped env/image",
      ("height is 16, not 32", "send 4 tiles of 16 x 16 px")),
-    ("env/image", lambda spec, session: mosaic(spec, step=1), (LEARNER, EVALUATOR), "refused_images",
+    ("env/image", lambda spec, session: mosaic(spec, step=1), (LEARNER, EVALUATOR), "dropped env/image",
      ("step is 1, not 96", "send 4 tiles of 16 x 16 px")),
     ("env/transition", lambda spec, session: TransitionBatch(session=session, num_envs=3), (LEARNER, EVALUATOR),
-     "refused_transitions", ("transition of 3 environments", "env/spec says 4; send a row for each")),
+     "dropped env/transition", ("transition of 3 environments", "env/spec says 4; send a row for each")),
     ("reward", lambda spec, session: RewardBatch(transition_session=session, num_envs=4), (LEARNER,),
-     "refused_rewards", ("total has 0 values, expected (4,)", "compare with env/spec")),
+     "dropped reward", ("total has 0 values, expected (4,)", "compare with env/spec")),
 ]
 """Topic, message, who reads it, their counter, and what their status says."""
 

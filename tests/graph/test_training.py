@@ -254,8 +254,9 @@ def test_limits_and_a_second_goal(graph: Graph, probe: Probe) -> None:
     assert (result.termination_reason, result.updates) == (Train.Result.LIMIT, 1)
     client = probe.action(Train, "train")
     running = probe.send(client, Train.Goal(updates=100000))
-    refused = probe.run(lambda: client.send_goal_async(Train.Goal(updates=1)), 10, "second goal")
-    assert not refused.accepted
+    refused = probe.finish(probe.send(client, Train.Goal(updates=1)), 5)
+    assert refused.termination_reason == Train.Result.REFUSED
+    assert refused.message == "refused: another goal is running; cancel it or wait"
     probe.run(running.cancel_goal_async, 5, "cancel")
     assert probe.finish(running, 5).termination_reason == Train.Result.CANCELED
 

@@ -8,7 +8,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from rclpy.action import ActionClient
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image
 
@@ -33,6 +32,7 @@ from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.params import COMMON, Param
 from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
@@ -91,9 +91,9 @@ class LearnerNode(TrainingNode):
         self.listen("reward", self._on_reward)
         self.serve(SaveCheckpoint, "learner/save", self._on_save)
         self.serve(GetWeights, "learner/get_weights", self._on_get_weights)
-        self._rollouts = ActionClient(self, RolloutAction, "rollout")
+        self._rollouts = GuardedActionClient(self, RolloutAction, "rollout")
         self.own(self._rollouts.destroy)
-        self._replay = ActionClient(self, Replay, "replay")
+        self._replay = GuardedActionClient(self, Replay, "replay")
         self.own(self._replay.destroy)
         self.serve_training(self._training, Train, "train", "policy/version")
 
@@ -115,7 +115,7 @@ class LearnerNode(TrainingNode):
 
     def _train_from_replay(self, uri: str) -> None:
         """Send this node's own action a goal, as soon as its server is there."""
-        client = ActionClient(self, Train, "train")
+        client = GuardedActionClient(self, Train, "train")
         self.own(client.destroy)
         goal = Train.Goal(updates=self._config.ppo.updates, from_replay=True, bag_uris=[uri])
 
@@ -267,23 +267,18 @@ class LearnerNode(TrainingNode):
         assembler = self._collecting
         if self._spec is None or assembler is None:
             return
-        images = self.read_message("image", convert.images_of, message, self._spec)
-        if images is not None:
-            assembler.put_image(convert.time_ns(message.header.stamp), images)
+        assembler.put_image(convert.time_ns(message.header.stamp), convert.images_of(message, self._spec))
 
     def _on_transition(self, message: TransitionBatch) -> None:
         assembler = self._collecting
         if self._spec is None or assembler is None:
             return
-        transition = self.read_message("transition", convert.transition_of, message, self._spec)
-        if transition is not None:
-            assembler.put_transition(transition)
+        assembler.put_transition(convert.transition_of(message, self._spec))
 
     def _on_reward(self, message: RewardBatch) -> None:
         assembler = self._collecting
-        rewards = None if assembler is None else self.read_message("reward", convert.rewards_of, message)
-        if assembler is not None and rewards is not None:
-            assembler.put_rewards(rewards)
+        if assembler is not None:
+            assembler.put_rewards(convert.rewards_of(message))
             self._reward_name = message.reward_name
 
     def _on_save(self, request: SaveCheckpoint.Request, response: SaveCheckpoint.Response) -> SaveCheckpoint.Response:

@@ -10,6 +10,7 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 from wm_msgs.msg import ErrorCode
@@ -18,7 +19,6 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.nodes.recorder.qos import recorded_qos
 from wm_nodes.recording import BagError, RawBagWriter, RecordingError, topics
 from wm_nodes.recording import messages as m
-from wm_nodes.recording.cdr import session_and_seq
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.flow_control import ConsumerCredits
@@ -104,9 +104,10 @@ class RecorderNode(ManagedNode):
 
     def _on_message(self, name: str, credits: ConsumerCredits | None, data: bytes) -> None:
         self._last_message_s = time.monotonic()
+        message = deserialize_message(data, self._rows[name].type)  # bytes that nobody can read do not belong in a bag
         tracker = self._gaps.get(name)
         if tracker is not None:
-            missing = tracker.observe(*session_and_seq(data))
+            missing = tracker.observe(message.session, message.seq)
             if missing and self._bag is not None:
                 self.diagnostics.count(f"gaps {name}", missing, text=f"{missing} messages of {name} missed")
         if self._rows[name].qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:

@@ -123,17 +123,13 @@ class RewardEvaluatorNode(ManagedNode):
     def _on_image(self, message: Image) -> None:
         if self._spec is None:
             return
-        images = self.read_message("image", convert.images_of, message, self._spec)
-        if images is not None:
-            self._images.put(convert.time_ns(message.header.stamp), images)
-            self._judge_waiting()
+        self._images.put(convert.time_ns(message.header.stamp), convert.images_of(message, self._spec))
+        self._judge_waiting()
 
     def _on_goal(self, message: TaskGoal) -> None:
         if self._spec is None:
             return
-        goals = self.read_message("goal", convert.goals_of, message, self._spec)
-        if goals is None:
-            return
+        goals = convert.goals_of(message, self._spec)
         self._enter_session(message.session)
         for i, episode_id in enumerate(goals.episode_ids):
             self._goals[int(episode_id)] = (None if goals.images is None else goals.images[i], bool(goals.found[i]))
@@ -145,9 +141,7 @@ class RewardEvaluatorNode(ManagedNode):
         if self._spec is None:
             self.diagnostics.count("before_spec", text="a transition came before env/spec; it gets no reward")
             return
-        transition = self.read_message("transition", convert.transition_of, message, self._spec)
-        if transition is None:
-            return
+        transition = convert.transition_of(message, self._spec)
         self._enter_session(message.session)
         if not transition.is_reset and transition.valid.any():
             self._waiting.append((time.monotonic(), transition))

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from rclpy.action import ActionClient
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
 from wm_msgs.msg import ClipScores
@@ -20,6 +19,7 @@ from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.clip_evaluator_node import read_buffer
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
 from wm_nodes.ros import convert, diagnostics
+from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.params import COMMON, Param
@@ -63,8 +63,8 @@ class VideoLearnerNode(TrainingNode):
         self.own(self._video.close)
         self._watched = self._video.hacked
         self._start_barrier = StartBarrier(self, self.links.table)
-        self._generate = ActionClient(self, GenerateClips, "video/generate")
-        self._evaluate = ActionClient(self, EvaluateClips, "clips/evaluate")
+        self._generate = GuardedActionClient(self, GenerateClips, "video/generate")
+        self._evaluate = GuardedActionClient(self, EvaluateClips, "clips/evaluate")
         self.own(self._generate.destroy)
         self.own(self._evaluate.destroy)
         self.serve_training(self._video, TrainVideo, "video/train", "video/version")
@@ -146,7 +146,7 @@ class VideoLearnerNode(TrainingNode):
             )
         return with_scores(read_buffer(self.run_dir / clips.buffer_uri, clips.sha256), judged.scores)
 
-    def _ask(self, client: ActionClient, goal: Any, check: Callable[[], None], peer: str) -> Any:
+    def _ask(self, client: GuardedActionClient, goal: Any, check: Callable[[], None], peer: str) -> Any:
         """Raises PeerLost where nobody answers, ValueError where the peer says that it failed."""
         name = self.get_namespace().rstrip("/") + peer
         alive = same_process(self.peers, name)

@@ -1,5 +1,8 @@
 """Actions whose work runs in a thread: cancel is answered at once, and nothing is awaited.
 
+ROS 2 gives no reason for a rejected goal. So every goal is accepted, and one that cannot be done now ends at once,
+aborted, with termination_reason REFUSED and a message that its client prints.
+
 An execute callback that awaits keeps a core busy under EventsExecutor (measured: 2.06 s of CPU for a 2 s wait), and a
 blocking one cannot be cancelled. Here the executor only accepts, cancels and sends results.
 """
@@ -9,14 +12,42 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 
+from wm_nodes.ros.guard import LOG_PERIOD_S
 from wm_nodes.ros.wire import Cancelled
 from wm_nodes.ros.worker import Work, WorkerNode
 
+RESULTS_KEPT_S = 120
+"""How long the result of an ended goal can be asked for."""
 
-class _ThreadedServer(ActionServer):  # type: ignore[misc]
+
+class _Guarded:
+    """Drops an answer, a request or a feedback that makes no sense, so that the node lives on."""
+
+    _node: Any
+    _action_name: str
+
+    def take_data(self) -> Any:
+        try:
+            return super().take_data()  # type: ignore[misc]
+        except Exception as error:
+            self._node.guard.drop(self._action_name, error)
+            return {}
+
+    async def execute(self, taken_data: Any) -> None:
+        try:
+            await super().execute(taken_data)  # type: ignore[misc]
+        except Exception as error:
+            self._node.guard.drop(self._action_name, error)
+
+
+class GuardedActionClient(_Guarded, ActionClient):  # type: ignore[misc]
+    """A client of an action, in a ManagedNode."""
+
+
+class _ThreadedServer(_Guarded, ActionServer):  # type: ignore[misc]
     """Starts the work when rclpy would run the execute callback, and hands rclpy a finished one afterwards."""
 
     begin: Callable[[ServerGoalHandle], None]
@@ -32,12 +63,12 @@ class WorkerAction:
     """One action, one goal at a time, until the node's cleanup.
 
     Args:
-        node: goals are refused while it is not active.
+        node: a ManagedNode; goals are refused while it is not active.
         action_type: e.g. wm_msgs.action.Train.
         name: relative action name.
         run: does the work in its own thread and returns a Result; raises Cancelled when told to stop.
         fill: completes the Result of a goal that ended early; it has termination_reason (one of the Result's constants
-            CANCELED, DEACTIVATED, FAILED) and message.
+            CANCELED, DEACTIVATED, FAILED, REFUSED) and message.
     """
 
     def __init__(
@@ -47,10 +78,12 @@ class WorkerAction:
         self._node, self._type, self._name, self._run, self._fill = node, action_type, name, run, fill
         self._lock = threading.Lock()
         self._work: Work | None = None
+        self._goal_id = b""
         self._thread: threading.Thread | None = None
         self._server = _ThreadedServer(
-            node, action_type, name, execute_callback=lambda goal: None, goal_callback=self._on_goal,
-            cancel_callback=self._on_cancel,
+            node, action_type, name, execute_callback=lambda goal: None,
+            goal_callback=lambda request: GoalResponse.ACCEPT, cancel_callback=self._on_cancel,
+            result_timeout=RESULTS_KEPT_S,
         )
         self._server.begin = self._begin
         node.own(self.destroy)
@@ -71,32 +104,38 @@ class WorkerAction:
         self.stop("deactivated")
         self._server.destroy()
 
-    def _on_goal(self, request: Any) -> GoalResponse:
-        logger = self._node.get_logger()
-        if not self._node.active:
-            logger.error(f"{self._name} goal refused: the node is not active; activate it first")
-            return GoalResponse.REJECT
-        with self._lock:
-            if self._work is not None:
-                logger.warning(f"{self._name} goal refused: another goal is running; cancel it or wait")
-                return GoalResponse.REJECT
-            self._work = Work(request, lambda feedback: None, threading.Event())
-        return GoalResponse.ACCEPT
-
     def _on_cancel(self, goal_handle: ServerGoalHandle) -> CancelResponse:
         work = self._work
-        if work is None:
+        if work is None or bytes(goal_handle.goal_id.uuid) != self._goal_id:
             return CancelResponse.REJECT
         work.stop("cancelled")
         return CancelResponse.ACCEPT
 
     def _begin(self, goal_handle: ServerGoalHandle) -> None:
-        work = self._work
-        assert work is not None
-        work.request = goal_handle.request
-        work.feedback = goal_handle.publish_feedback
+        with self._lock:
+            if refusal := self._refusal():
+                self._refuse(goal_handle, refusal)
+                return
+            work = Work(goal_handle.request, goal_handle.publish_feedback, threading.Event())
+            self._work, self._goal_id = work, bytes(goal_handle.goal_id.uuid)
         self._thread = threading.Thread(target=self._thread_main, args=(goal_handle, work), name=self._name)
         self._thread.start()
+
+    def _refusal(self) -> str:
+        if not self._node.active:
+            return "the node is not active; activate it first"
+        return "another goal is running; cancel it or wait" if self._work is not None else ""
+
+    def _refuse(self, goal_handle: ServerGoalHandle, reason: str) -> None:
+        result = self._end_early(self._type.Result.REFUSED, f"refused: {reason}")
+        self._node.get_logger().warning(f"{self._name} goal refused: {reason}", throttle_duration_sec=LOG_PERIOD_S)
+        self._node.diagnostics.count("refused_goals", text=f"{self._name} goal refused: {reason}")
+
+        def conclude(handle: ServerGoalHandle) -> Any:
+            handle.abort()
+            return result
+
+        self._server.finish(goal_handle, conclude)
 
     def _end_early(self, reason: int, text: str) -> Any:
         return self._fill(self._type.Result(termination_reason=reason, message=text))

@@ -316,7 +316,7 @@ def run_goal(
         alive: raises PeerLost when the server is known to be gone.
 
     Raises:
-        PeerLost: no server, no acceptance, a refusal, or a lost server.
+        PeerLost: no server, no acceptance, a refusal for accept_s, or a lost server.
     """
     name, node = client._action_name, client._node
     wait_until(client.server_is_ready, accept_s, check, name)
@@ -341,16 +341,18 @@ def run_goal(
                 raise PeerLost(f"{name}: {error}") from None
             raise
         if handle.accepted:
-            break
+            try:
+                result = goal_result(handle, float("inf"), both)
+            except BaseException:
+                node.executor.create_task(handle.cancel_goal_async)
+                raise
+            if result.termination_reason != type(result).REFUSED:
+                return result
         if time.monotonic() >= deadline:
-            raise PeerLost(f"{name} refused the goal for {accept_s:g} s; is its node active and idle?")
+            reason = result.message if handle.accepted else "rejected"
+            raise PeerLost(f"{name} refused the goal for {accept_s:g} s: {reason}")
         check()
         time.sleep(POLL_S)
-    try:
-        return goal_result(handle, float("inf"), both)
-    except BaseException:
-        node.executor.create_task(handle.cancel_goal_async)
-        raise
 
 
 def same_process(peers: PeerWatch, name: str) -> Callable[[], None]:

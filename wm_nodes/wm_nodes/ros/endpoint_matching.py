@@ -14,9 +14,11 @@ from typing import Any
 
 from rclpy.node import Node
 
-from wm_msgs.msg import NodeLinks
+from wm_msgs.msg import ErrorCode, NodeLinks
+from wm_nodes.ros.liveliness import check_sender
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
+from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work, WorkerNode
 
 Ends = Callable[[str], set[str]]
@@ -49,9 +51,14 @@ class EndpointTable:
         self._own = _Peer(session, False, frozenset(), frozenset(), frozenset())
 
     def note(self, message: NodeLinks) -> None:
-        """Take in what another node says."""
+        """Take in what another node says. Raises WireError where its lists differ in length."""
         if message.node == self._own_name:
             return
+        if len(message.linked) != len(message.linked_sessions):
+            raise WireError(
+                ErrorCode.BAD_SHAPE, f"linked has {len(message.linked)} nodes, linked_sessions "
+                f"{len(message.linked_sessions)}; run the same version of wm_msgs on both sides",
+            )
         linked = frozenset(zip(message.linked, message.linked_sessions, strict=True))
         with self._lock:
             self._ever.add(message.node)
@@ -59,6 +66,9 @@ class EndpointTable:
             self._peers[message.node] = _Peer(
                 message.session, message.active, frozenset(message.publishes), frozenset(message.subscribes), linked
             )
+
+    def knows(self, name: str) -> bool:
+        return name in self._peers
 
     def forget(self, name: str, *, lost: bool = False) -> None:
         """A node stopped, and is not waited for until it speaks again; or it is lost, and may come back."""
@@ -155,6 +165,8 @@ class Links:
             self._publisher.publish(message)
 
     def _on_links(self, message: NodeLinks) -> None:
+        if message.node != self._node.get_fully_qualified_name() and not self.table.knows(message.node):
+            check_sender(self._node, "run/links", message.node)
         self.table.note(message)
         self.announce()
 

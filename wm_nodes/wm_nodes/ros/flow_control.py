@@ -7,7 +7,7 @@ from rclpy.node import Node
 
 from wm_msgs.msg import Credit
 from wm_nodes.ros.qos import CREDIT_WINDOW, topic
-from wm_nodes.ros.sequence_numbers import GapTracker
+from wm_nodes.ros.sequence_numbers import MAX_NUMBER, GapTracker
 
 SILENT_S = 5.0
 """A consumer that has held the producer up for so long without a word is dropped."""
@@ -92,10 +92,10 @@ class ConsumerCredits:
         self._since_grant = 0
         session = self._tracker.session
         if not (self.withheld and self._granted is not None and self._granted[0] == session):
-            self._granted = session, self._tracker.last_seq + self._window
+            self._granted = session, min(self._tracker.last_seq + self._window, MAX_NUMBER)
         message = Credit(
             consumer=self._node.get_fully_qualified_name(), topic=self._topic_name, stream_session=session,
-            received_seq=self._tracker.last_seq, granted_seq=self._granted[1], lost_total=self._tracker.lost,
+            received_seq=max(self._tracker.last_seq, 0), granted_seq=self._granted[1], lost_total=self._tracker.lost,
         )
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)

@@ -1,9 +1,5 @@
 """The base of every node: lifecycle, described parameters, diagnostics, heartbeat, sequence numbers, clean stop."""
 
-import math
-import os
-import socket
-import time
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,7 +22,8 @@ from wm_nodes.ros import diagnostics
 from wm_nodes.ros.diagnostics import Diagnostics
 from wm_nodes.ros.endpoint_matching import Links
 from wm_nodes.ros.flow_control import ConsumerCredits
-from wm_nodes.ros.liveliness import HEARTBEAT_S, PeerWatch
+from wm_nodes.ros.guard import Guard
+from wm_nodes.ros.liveliness import HEARTBEAT_S, Heartbeat, PeerWatch
 from wm_nodes.ros.params import COMMON, Param, declare, refusal
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
@@ -51,12 +48,14 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     """
 
     def __init__(self, name: str, params: Sequence[Param] = (), **node_arguments: Any) -> None:
+        self.guard = Guard(self)
         super().__init__(name, **node_arguments)
+        for service in self.services:  # of parameters and of the lifecycle
+            service.callback = self.guard.wrap_service(service.srv_name, service.callback)
         self.session = new_session()
         """A new one at every configure: what is numbered (seq, step ids, stamps) starts again with it."""
         self.failed = False
         """True: the process should end with a non-zero exit code."""
-        self._identity = f"process {os.getpid()} on {socket.gethostname()} since {time.time():.6f}"
         self._active = False
         self._entities: list[Callable[[], object]] = []
         self._trackers: dict[str, GapTracker] = {}
@@ -72,10 +71,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.get_fully_qualified_name(), run_dir.name if run_dir else "", self._publish_diagnostics,
             lambda: self.get_clock().now().to_msg(), run_dir,
         )
-        self.peers = PeerWatch(self.get_fully_qualified_name(), float(self.param("peer_timeout_s")))
-        row = topic("run/state")
-        self._state_publisher = self.create_publisher(RunState, row.name, row.qos)
-        self._state_subscription = self.create_subscription(RunState, row.name, self._on_run_state, row.reader_qos)
+        self._heartbeat = Heartbeat(self)
         self.links = Links(self, self.session, lambda: self._active)
         self._heartbeat_timer = self.create_timer(HEARTBEAT_S, self._on_heartbeat, clock=steady)
         self._diagnostics_timer = self.create_timer(1.0, self._on_diagnostics, clock=steady)
@@ -107,6 +103,19 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         return self._active
 
     @property
+    def peers(self) -> PeerWatch:
+        """The nodes whose heartbeats this one hears."""
+        return self._heartbeat.peers
+
+    def create_subscription(
+        self, msg_type: type[Any], topic: str, callback: Callable[[Any], object], qos_profile: Any, *,
+        raw: bool = False, **arguments: Any,
+    ) -> Any:
+        """As rclpy's, but guarded (see ros/guard.py); the callback takes one argument."""
+        guarded = self.guard.wrap_subscription(topic, None if raw else msg_type, callback)
+        return super().create_subscription(msg_type, topic, guarded, qos_profile, raw=True, **arguments)
+
+    @property
     def run_dir(self) -> Path:
         """Raises ValueError where the parameter is empty."""
         if not self.param("run_dir"):
@@ -133,14 +142,6 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             self.diagnostics.count("refused_parameters", text=f"parameter refused: {result.reason}")
         return result
 
-    def read_message(self, what: str, read: Callable[..., T], *arguments: Any) -> T | None:
-        """Return read(*arguments), or None for a message that does not fit (WireError), which is counted."""
-        try:
-            return read(*arguments)
-        except WireError as error:
-            self.count_refused(what, error)
-            return None
-
     def count_refused(self, what: str, error: WireError) -> None:
         """Log a refused message or request and count it in diagnostics."""
         self.get_logger().error(f"{what} refused: {error}", throttle_duration_sec=1.0)
@@ -166,10 +167,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def watch(self, prefix: str) -> None:
         """Hear the heartbeats of the nodes of a relative namespace, too, until cleanup: their silence is reported."""
-        row = topic("run/state")
-        name = f"{prefix}/{row.name}"
-        subscription = self.create_subscription(RunState, name, self._on_run_state, row.reader_qos)
-        self.own(self.destroy_subscription, subscription)
+        self.own(self.destroy_subscription, self._heartbeat.watch(f"{prefix}/"))
 
     def listen(
         self, name: str, callback: Callable[[Any], None], *, credit: bool = False, while_inactive: bool = False
@@ -187,10 +185,12 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         def observe(message: Any) -> None:
             if hasattr(message, "seq"):
                 self._note_gap(name, tracker, message)
-            if self._active or while_inactive:
-                callback(message)
-            if credits is not None:
-                credits.record_consumed(tracker)
+            try:
+                if self._active or while_inactive:
+                    callback(message)
+            finally:
+                if credits is not None:
+                    credits.record_consumed(tracker)
 
         subscription = self.create_subscription(row.type, row.name, observe, row.reader_qos)
         self.own(self.destroy_subscription, subscription)
@@ -200,7 +200,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def serve(self, service_type: type[Any], name: str, callback: Callable[[Any, Any], Any]) -> None:
         """A service until cleanup."""
-        service = self.create_service(service_type, name, callback)
+        service = self.create_service(service_type, name, self.guard.wrap_service(name, callback))
         self._introspect(service, str(self.param("service_introspection")))
         self._introspected.append(service)
         self.own(self.destroy_service, service)
@@ -233,7 +233,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         label = self._state_machine.current_state[1]
         if label in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
-        self._publish_state(RunState.FAILED if self.failed else RunState.FINISHED, "stopped")
+        self._heartbeat.publish(RunState.FAILED if self.failed else RunState.FINISHED, "stopped")
 
     # Lifecycle callbacks of rclpy.
 
@@ -305,45 +305,19 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     # Heartbeat and diagnostics.
 
     def _note_gap(self, name: str, tracker: GapTracker, message: Any) -> None:
+        restarts = tracker.restarts
         missing = tracker.observe(message.session, message.seq)
+        if tracker.restarts > restarts:
+            self.diagnostics.count(f"restarts {name}", text=f"{name} jumped to seq {message.seq}: a new sender")
         if missing:
             self.diagnostics.count(f"gaps {name}", missing, text=f"{missing} messages of {name} missed")
             self.on_gap(name, missing)
 
-    def _on_run_state(self, message: RunState) -> None:
-        if message.node == self.get_fully_qualified_name():
-            self._check_name(message)
-        elif message.state in (RunState.FINISHED, RunState.FAILED):
-            self.peers.left(message.node)
-            self.links.table.forget(message.node)
-            self.diagnostics.clear_condition(f"peer {message.node}")
-        elif self.peers.heard(message.node, identity=message.detail):
-            self.diagnostics.clear_condition(f"peer {message.node}")
-
-    def _check_name(self, message: RunState) -> None:
-        """End this node where another one of its name was there before: both would answer the same services.
-
-        Only a living process sends a heartbeat, so what a killed one left in the ROS graph does not count.
-        """
-        if message.state not in (RunState.IDLE, RunState.RUNNING) or message.detail == self._identity or self.failed:
-            return
-        if _start_time(message.detail) < _start_time(self._identity):
-            self.failed = True
-            self.get_logger().error(
-                f"another {message.node} is there already ({message.detail}): stop it, or give this one another "
-                "namespace (-r __ns:=...) or ROS_DOMAIN_ID"
-            )
-
     def _on_heartbeat(self) -> None:
-        self.peers.timeout_s = float(self.param("peer_timeout_s"))
-        self._publish_state(RunState.RUNNING if self._active else RunState.IDLE, self._identity)
-        self.links.announce()
-        for name in self.peers.check():
-            text = f"{name} is lost: silent for more than {self.peers.timeout_s:g} s; restart it"
-            self.get_logger().error(text)
-            self.diagnostics.set_condition(f"peer {name}", diagnostics.ERROR, text)
+        for name in self._heartbeat.beat():
             self.links.table.forget(name, lost=True)
             self.on_peer_lost(name)
+        self.links.announce()
 
     def _after_set(self, changes: Sequence[Parameter]) -> None:
         for change in changes:
@@ -360,17 +334,12 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.links.announce(again=True)
         self.update_diagnostics()
         self.diagnostics.gauge("state", self._state_machine.current_state[1])
+        for name, number in self.guard.handled.items():
+            self.diagnostics.gauge(f"received {name}", number)
         for name, tracker in self._trackers.items():
             if tracker.received:
-                self.diagnostics.gauge(f"received {name}", tracker.received)
                 self.diagnostics.gauge(f"lost {name}", tracker.lost)
         self.diagnostics.publish()
-
-    def _publish_state(self, state: int, detail: str) -> None:
-        message = RunState(state=state, node=self.get_fully_qualified_name(), detail=detail)
-        message.run_id = Path(str(self.param("run_dir"))).name
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._state_publisher.publish(message)
 
     def _publish_diagnostics(self, message: DiagnosticArray) -> None:
         try:
@@ -378,11 +347,3 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         except InvalidHandle:
             return
 
-
-def _start_time(identity: str) -> float:
-    """When a process of this name began, in s since 1970; never, where another program wrote the heartbeat."""
-    _, separator, text = identity.rpartition(" since ")
-    try:
-        return float(text) if separator else math.inf
-    except ValueError:
-        return math.inf

@@ -3,6 +3,14 @@
 import time
 from dataclasses import dataclass, field
 
+MAX_NUMBER = 2**64 - 1
+"""Largest value of the fields session and seq."""
+
+MAX_GAP = 2**16
+"""A jump by more is a restart of the sender, or no number at all: no history and no credit window is as long."""
+
+SESSIONS_KEPT = 64
+
 
 def new_session() -> int:
     """Start time of a publisher in ns since the epoch; tells a restarted publisher from the one before."""
@@ -23,6 +31,8 @@ class GapTracker:
     lost: int = 0
     """Over all sessions."""
     repeated: int = 0
+    restarts: int = 0
+    """Jumps by more than MAX_GAP."""
     sessions: int = 0
     gaps: list[tuple[int, int, int]] = field(default_factory=list)
     """(session, first missing seq, number of missing seqs), newest last; at most 1000 kept."""
@@ -35,11 +45,17 @@ class GapTracker:
             joined_late = not self._last_seqs or session < min(self._last_seqs)
             self._last_seqs[session] = seq - 1 if joined_late else -1
             self.sessions += 1
+            if len(self._last_seqs) > SESSIONS_KEPT:
+                del self._last_seqs[next(iter(self._last_seqs))]
+        self._last_seqs[session] = self._last_seqs.pop(session)  # the newest last, so that it stays longest
         self.session, self.last_seq = session, self._last_seqs[session]
-        if seq <= self.last_seq:
+        missing = seq - self.last_seq - 1
+        if abs(missing) > MAX_GAP:
+            self.restarts += 1
+            missing = 0
+        elif missing < 0:
             self.repeated += 1
             return 0
-        missing = seq - self.last_seq - 1
         if missing:
             self.lost += missing
             self.gaps.append((session, self.last_seq + 1, missing))

@@ -67,15 +67,19 @@ class LiveRollouts:
         """A lost node may come back within recovery_timeout_s: the same seed gives the same rollout again."""
         node = self._node
         give_up = time.monotonic() + float(node.param("recovery_timeout_s"))
-        gaps = 0
+        gaps, began = 0, time.monotonic()
         while True:
             try:
-                return self._attempt(accept_gaps=gaps > MAX_GAP_RETRIES)
+                rollout = self._attempt(accept_gaps=gaps > MAX_GAP_RETRIES)
+                if gaps:
+                    node.get_logger().info(f"the rollout is complete after {time.monotonic() - began:.1f} s")
+                return rollout
             except PeerLost as error:
                 text = str(error)
-                gaps += 1
                 node.diagnostics.count("repeated_rollouts", text=f"rollout repeated: {text}")
-                node.get_logger().warning(f"rollout repeated: {text}")
+                if not gaps:
+                    node.get_logger().warning(f"rollout repeated until it is complete: {text}")
+                gaps += 1
                 if time.monotonic() > give_up:
                     raise PeerLost(f"{text}; nothing came back for {node.param('recovery_timeout_s'):g} s") from None
             self._work.sleep(RETRY_S)

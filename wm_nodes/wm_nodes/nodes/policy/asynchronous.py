@@ -78,9 +78,7 @@ class AsynchronousPolicy:
     def _on_image(self, message: Image) -> None:
         if self.spec is None:
             return
-        images = self._node.read_message("image", convert.images_of, message, self.spec)
-        if images is None:
-            return
+        images = convert.images_of(message, self.spec)
         stamp_ns = convert.time_ns(message.header.stamp)
         with self._changed:
             self._images.put(stamp_ns, images)
@@ -90,9 +88,7 @@ class AsynchronousPolicy:
         if self.spec is None:
             return
         shape = (self.spec.num_envs, self.spec.state_dim)
-        states = self._node.read_message("transition", convert.floats, message.next_state, shape, "next_state")
-        if states is None:
-            return
+        states = convert.floats(message.next_state, shape, "next_state")
         stamp_ns = convert.time_ns(message.next_stamp)
         with self._changed:
             self._states[stamp_ns] = message.step_id + 1, states
