@@ -1,5 +1,6 @@
 """Nodes when something breaks inside them: the model, the renderer, a callback, the disk, the clock, a lifecycle."""
 
+import os
 import resource
 import subprocess
 import sys
@@ -92,20 +93,26 @@ def test_a_node_without_a_renderer_ends_with_one_line(graph: Graph) -> None:
     assert "Traceback" not in log
 
 
-@pytest.mark.kills
-def test_an_unexpected_exception_in_a_callback_ends_the_node_in_order(graph: Graph, probe: Probe) -> None:
-    states, events = probe.listen("run/state"), probe.listen("episode")
-    process = graph.start_environment("toy:make_environment_with_bad_goals")
+def test_an_environment_that_fails_in_a_reset_says_so_in_the_answer_and_can_be_reset_again(
+    graph: Graph, probe: Probe
+) -> None:
+    graph.start_environment("toy:make_environment_with_bad_goals")
     client = Client(probe)
-    wait_until("matching", lambda: probe.node.count_publishers("/wm/episode"))
     client.reset()
-    wait_until("START", lambda: events)
-    with pytest.raises(AssertionError, match="no answer"):
-        probe.call(ResetBatch, "env/reset", calls.reset_request(ResetCommand()), timeout_s=5)
-    assert process.wait(20) == 1
-    wait_until("END", lambda: any(e.kind == EpisodeEvent.KIND_END for e in events))
+    answer = probe.call(ResetBatch, "env/reset", calls.reset_request(ResetCommand()))
+    assert (answer.error_code, "ZeroDivisionError: no goal" in answer.message) == (ErrorCode.INTERNAL, True)
+    client.reset()
+
+
+def test_an_unexpected_exception_in_a_timer_ends_the_node_in_order(graph: Graph, probe: Probe) -> None:
+    states = probe.listen("run/state")
+    program = [sys.executable, "-m", "graph.failing_node", "--ros-args", "-r", "__ns:=/wm"]
+    ended = subprocess.run(
+        program, env=graph.environment() | {"PYTHONPATH": f"{Path(__file__).parents[1]}:{os.environ['PYTHONPATH']}"},
+        capture_output=True, text=True, timeout=60, check=False,
+    )
+    assert ended.returncode == 1 and "ZeroDivisionError" in ended.stderr
     wait_until("FAILED", lambda: any(s.state == s.FAILED for s in states))
-    assert "ZeroDivisionError" in graph.log("/wm/environment")
 
 
 def test_transitions_without_images_are_declared_invalid_although_the_simulated_clock_stands(

@@ -1,5 +1,6 @@
 """A tiny deterministic environment and policy: real objects for the graph, small enough for two cores."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -100,14 +101,26 @@ def make_environment_of_large_images(config: RunConfig, num_envs: int, seed: int
     return environment
 
 
+COMPUTING_S = 6.0
+"""Twice the time after which a silent node is lost."""
+
+
 class Faulty(ReachToy):
-    """What goes wrong once: `nan` state, `raise` in the first step, or `goals` that raise in the second reset."""
+    """What goes wrong once: `nan` state, `raise` in the first step, `compute` for COMPUTING_S in the 20th step, or
+    `goals` that raise in the second reset."""
 
     def __init__(self, num_envs: int, seed: int, fault: str) -> None:
         super().__init__(num_envs, seed)
-        self._fault, self._goals = fault, 0
+        self._fault, self._goals, self._calls = fault, 0, 0
 
     def step(self, actions: FloatArray) -> StepResult:
+        self._calls += 1
+        if self._fault == "compute":
+            if self._calls == 20:
+                end = time.monotonic() + COMPUTING_S
+                while time.monotonic() < end:
+                    np.ones(10**6).sum()
+            return super().step(actions)
         fault, self._fault = self._fault, ""
         if fault == "raise":
             raise RuntimeError("broken motor")
@@ -129,6 +142,10 @@ def make_nan_environment(config: RunConfig, num_envs: int, seed: int) -> Faulty:
 
 def make_failing_environment(config: RunConfig, num_envs: int, seed: int) -> Faulty:
     return Faulty(num_envs, seed, "raise")
+
+
+def make_computing_environment(config: RunConfig, num_envs: int, seed: int) -> Faulty:
+    return Faulty(num_envs, seed, "compute")
 
 
 def make_environment_with_bad_goals(config: RunConfig, num_envs: int, seed: int) -> Faulty:

@@ -8,6 +8,7 @@ pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
 from rclpy.clock import Clock
 
 from wm_msgs.msg import Credit
+from wm_nodes.core.processes import Activity
 from wm_nodes.nodes.learner.rollout_assembler import ImageCache, RolloutAssembler
 from wm_nodes.ros.flow_control import SILENT_S, ConsumerCredits, ProducerCredits
 from wm_nodes.ros.liveliness import PeerWatch
@@ -36,6 +37,16 @@ def test_publishers_that_take_turns_lose_nothing_and_a_gap_in_one_of_them_is_cou
     turns = [(1, 5), (2, 0), (1, 6), (2, 1), (1, 8), (2, 2)]
     assert [tracker.observe(*turn) for turn in turns] == [0, 0, 0, 0, 1, 0]
     assert (tracker.session, tracker.last_seq, tracker.sessions) == (2, 2, 2)
+
+
+def test_a_jump_beyond_every_buffer_is_a_restart_of_the_sender_and_no_loss() -> None:
+    tracker = GapTracker()
+    assert [tracker.observe(1, seq) for seq in (0, 1, 2**64 - 1, 2, 3, 2**40, 4, 6)] == [0, 0, 0, 0, 0, 0, 0, 1]
+    assert (tracker.lost, tracker.restarts, tracker.last_seq) == (1, 4, 6)
+    for session in range(2, 1000):
+        tracker.observe(session, 2**63)
+        tracker.observe(1, 5 + session)
+    assert tracker.lost == 1 and len(tracker._last_seqs) <= 64
 
 
 def test_the_producer_waits_for_every_consumer_and_drops_the_silent_one() -> None:
@@ -106,6 +117,15 @@ def test_a_silent_peer_is_lost_once_and_a_leaving_one_is_not() -> None:
     assert [peers.silence_s(name, now=4.5) for name in ("/wm/a", "/wm/b", "/wm/never")] == [4.5, 0.0, 0.0]
     assert peers.heard("/wm/a", now=5.0)
     assert peers.lost == [] and peers.silence_s("/wm/a", now=5.5) == 0.5
+
+
+def test_a_peer_that_computes_is_lost_only_after_five_times_as_long() -> None:
+    seen = {"busy": Activity.BUSY, "stopped": Activity.STOPPED, "gone": Activity.GONE, "elsewhere": None}
+    peers = PeerWatch("/wm/me", timeout_s=3.0, activity=lambda identity: seen[identity])
+    for name in seen:
+        peers.heard(f"/wm/{name}", now=0.0, identity=name)
+    lost = {now: fresh for now in range(40) if (fresh := peers.check(now=now / 2))}
+    assert lost == {7: ["/wm/elsewhere", "/wm/gone", "/wm/stopped"], 31: ["/wm/busy"]}
 
 
 def test_time_in_which_a_process_stood_still_makes_no_peer_lost() -> None:

@@ -233,7 +233,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         label = self._state_machine.current_state[1]
         if label in ("unconfigured", "inactive", "active"):
             self.trigger_shutdown()
-        self._heartbeat.publish(RunState.FAILED if self.failed else RunState.FINISHED, "stopped")
+        self._heartbeat.end(RunState.FAILED if self.failed else RunState.FINISHED)
 
     # Lifecycle callbacks of rclpy.
 

@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from rclpy.duration import Duration
+
 from wm_msgs.msg import ErrorCode, RunState
 from wm_nodes.core.processes import Activity, ActivityWatch
 from wm_nodes.ros import diagnostics
@@ -26,6 +28,7 @@ crowded machine, or in the middleware, where `kill -9` of a node can hold all it
 264 kills)."""
 AWAKE_S = 2 * HEARTBEAT_S
 """After it stood still a process takes what has come meanwhile; a peer of which nothing has come by then is lost."""
+LAST_WORD_ARRIVES = Duration(seconds=0.5)
 BUSY_FACTOR = 5
 """How many times the timeout a process may be silent that is seen to compute."""
 
@@ -139,6 +142,15 @@ class Heartbeat:
             node.get_logger().error(text)
             node.diagnostics.set_condition(f"peer {name}", diagnostics.ERROR, text)
         return lost
+
+    def end(self, state: int) -> None:
+        """Say that this node stops, and wait until those who listen know it: a publisher that is gone delivers nothing.
+
+        Args:
+            state: RunState.FINISHED or FAILED.
+        """
+        self.publish(state, "stopped")
+        self._publisher.wait_for_all_acked(LAST_WORD_ARRIVES)
 
     def publish(self, state: int, detail: str) -> None:
         """state: a constant of RunState."""

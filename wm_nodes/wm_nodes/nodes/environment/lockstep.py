@@ -317,7 +317,8 @@ class LockstepEnvironment:
         assert self._current is not None
         self._sink.image(self._current.image, stamp)
         if goals_changed:
-            goals = self.environment.goals()
+            with self._environment_errors():
+                goals = self.environment.goals()
             images, found = (None, np.zeros(self.spec.num_envs, bool)) if goals is None else goals
             self._sink.goals(Goals(stamp, images, found, self._current.episode_id))
 
