@@ -200,6 +200,8 @@ def main() -> None:
         if isinstance(end.code, int):
             _leave(end.code)
         raise
+    except KeyboardInterrupt:  # before the node could take the signal itself
+        _leave(128 + signal.SIGINT)
 
 
 def _show(command: Sequence[str]) -> None:

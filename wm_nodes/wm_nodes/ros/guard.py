@@ -83,8 +83,11 @@ class Guard:
             self._logged[kind] = since, more + 1
             return
         self._logged[kind] = now, 0
-        logger = self._node.get_logger()
-        (logger.warning if known else logger.error)(text + (f"; {more} more like it before" if more else ""))
+        text += f"; {more} more like it before" if more else ""
+        if known:
+            self._node.get_logger().warning(text)
+        else:  # rclpy allows one severity per line of code
+            self._node.get_logger().error(text)
 
     def _publishers_of(self, topic: str) -> str:
         """Who may have sent a message of a topic: DDS hands rclpy's callbacks no sender."""

@@ -62,17 +62,43 @@ def spin(executor: Executor, until: Callable[[], bool]) -> None:
         return
 
 
+class StopSignals:
+    """Whether SIGINT or SIGTERM has come: a flag, so that nodes can still publish while they stop."""
+
+    def __init__(self) -> None:
+        self._interrupting = False
+        self._received: list[int] = []
+
+    def __call__(self) -> bool:
+        return bool(self._received)
+
+    def note(self, number: int, _frame: FrameType | None) -> None:
+        self._received.append(number)
+        if self._interrupting:
+            self._interrupting = False
+            raise KeyboardInterrupt
+
+    def interrupt(self, work: Callable[[], bool]) -> bool:
+        """Return work(), or False as soon as a signal comes."""
+        if self():
+            return False
+        try:
+            self._interrupting = True
+            return work()
+        except KeyboardInterrupt:
+            return False
+        finally:
+            self._interrupting = False
+
+
 @contextmanager
-def stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Turn SIGINT and SIGTERM into a flag, so that nodes can still publish while they stop."""
-    received: list[int] = []
+def stop_on_signals() -> Iterator[StopSignals]:
+    """Yield what notes SIGINT and SIGTERM."""
+    signals = StopSignals()
 
-    def note(number: int, _frame: FrameType | None) -> None:
-        received.append(number)
-
-    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, signals.note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: bool(received)
+        yield signals
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
@@ -120,7 +146,7 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
             for node in nodes:
                 executor.add_node(node)
             with _mark_failed(nodes):
-                if all(node.start() for node in nodes):
+                if stopped.interrupt(lambda: all(node.start() for node in nodes)):
                     spin(executor, until=lambda: stopped() or any(node.failed for node in nodes))
                     _settle(executor, nodes)
             for node in reversed(nodes):
