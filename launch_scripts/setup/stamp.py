@@ -1,4 +1,5 @@
-"""What the virtual environment already holds: one fingerprint per step, so that only what changed is done again."""
+"""What the virtual environment already holds: one fingerprint per step, so that only what changed is done again; and
+what was begun, so that a start after an interrupted one knows what to repair."""
 
 from __future__ import annotations
 
@@ -8,6 +9,9 @@ import platform
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+
+BEGUN = "begun"
+"""In place of a fingerprint: what the step makes cannot be trusted."""
 
 
 def fingerprint(files: Iterable[Path], *extra: str) -> str:
@@ -28,6 +32,22 @@ def python_version(venv: Path) -> str:
         return platform.python_version()
     values = {key.strip(): value.strip() for key, _, value in (line.partition("=") for line in lines)}
     return values.get("version", platform.python_version())
+
+
+def stamp_file(venv: Path) -> Path:
+    return venv / "wm_setup_stamp.json"
+
+
+def begin(venv: Path, part: str) -> bool:
+    """Note that `part` begins; return True where it was begun before and has not been finished."""
+    stamp = read_stamp(stamp_file(venv))
+    write_stamp(stamp_file(venv), {**stamp, part: BEGUN})
+    return stamp.get(part) == BEGUN
+
+
+def finish(venv: Path, done: dict[str, str]) -> None:
+    """Note what has been finished: part -> fingerprint, or any other word."""
+    write_stamp(stamp_file(venv), {**read_stamp(stamp_file(venv)), **done})
 
 
 def read_stamp(path: Path) -> dict[str, str]:

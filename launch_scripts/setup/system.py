@@ -18,6 +18,8 @@ from setup.console import SetupError, output_of, run, say
 MIN_MESA = (24, 3)
 """The first Mesa whose software renderer (lavapipe) has VK_KHR_external_memory_fd, which SAPIEN needs."""
 BACKPORTS_FILE = "/etc/apt/sources.list.d/wm-backports.sources"
+DPKG_UPDATES = Path("/var/lib/dpkg/updates")
+"""Holds numbered files after dpkg was interrupted; apt-get then refuses to install."""
 RENDERER = ("mesa-vulkan-drivers", "libvulkan1")
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "chrome")
 """Programs that open a page in tests."""
@@ -180,9 +182,11 @@ def install(plan: AptPlan, log: Path) -> bool:
     try:
         for command in plan.commands():
             say(f"running: {command}")
-            run([*prefix, "sh", "-c", command], log=log, why="installing system packages", env=env)
+            run([*prefix, "sh", "-c", command], log=log, why="installing system packages", env=env, asks=True)
     except SetupError as error:
         say(str(error))
+        if any(DPKG_UPDATES.glob("[0-9]*")):
+            say("dpkg was interrupted: `sudo dpkg --configure -a`, then `python3 launch_scripts/setup --system`")
         say("continuing without them")
         return False
     left = current_plan().packages

@@ -33,6 +33,23 @@ def test_cmake_repair_replaces_the_wheel_builders_folders_and_nothing_else(tmp_p
     assert messages.repair_cmake(tmp_path, "/py/include", "/np/include") == 0
 
 
+def test_cmake_file_stays_whole_where_its_repair_fails(tmp_path: Path) -> None:
+    file = tmp_path / "export.cmake"
+    file.write_text("/opt/python/cp312-cp312/include/python3.12")
+    (tmp_path / "export.tmp").mkdir()
+    with pytest.raises(OSError, match="Is a directory"):
+        messages.repair_cmake(tmp_path, "/py/include", "/np/include")
+    assert file.read_text() == "/opt/python/cp312-cp312/include/python3.12"
+
+
+def test_what_was_begun_is_not_trusted_until_it_is_finished(tree: Path) -> None:
+    venv = tree / ".venv"
+    assert not stamp.begin(venv, "messages") and entry.pending(venv) == ["messages"]
+    assert stamp.begin(venv, "messages"), "an earlier start began it"
+    stamp.finish(venv, {"messages": entry._wanted(venv)["messages"]})
+    assert entry.pending(venv) == [] and not stamp.begin(venv, "messages")
+
+
 def test_live_environment_has_no_unrepaired_cmake_file() -> None:
     share = Path(sys.prefix) / "share"
     left = [path for path in share.rglob("*.cmake") if "/opt/python/cp3" in path.read_text(errors="replace")]

@@ -116,6 +116,21 @@ def test_without_root_the_commands_are_named_and_the_set_up_goes_on(
     assert not (tmp_path / "log").exists()
 
 
+def test_interrupted_dpkg_is_named_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    apt = tmp_path / "apt-get"
+    apt.write_text("#!/bin/sh\necho 'E: dpkg was interrupted'\nexit 100\n")
+    apt.chmod(0o755)
+    (tmp_path / "updates").mkdir()
+    (tmp_path / "updates" / "0001").touch()
+    monkeypatch.setattr(system, "DPKG_UPDATES", tmp_path / "updates")
+    monkeypatch.setattr(system, "_root_prefix", list)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    assert not system.install(plan("", NOBLE), tmp_path / "log")
+    assert "`sudo dpkg --configure -a`, then `python3 launch_scripts/setup --system`" in capsys.readouterr().err
+
+
 def test_a_browser_for_the_tests_is_asked_for_on_debian_where_there_is_none() -> None:
     assert system.browser_plan(None, BOOKWORM).packages == ["chromium-headless-shell"]
     assert system.browser_plan("/usr/bin/chromium", BOOKWORM).packages == []

@@ -1,0 +1,100 @@
+"""A set-up that was interrupted is repaired by the next start, wherever it stopped: real commands, small packages."""
+
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from unit.setup.small_checkout import SmallCheckout
+
+from setup import console, stamp
+
+COMMANDS = {
+    "-m venv": 1.5, "pip install --disable": 0.4, "torch-cpu.txt": 0.05, "lock.txt": 0.1, "colcon": 1.2, "wm_nodes": 0.3
+}
+"""Commands of the set-up in their order -> within how many seconds of its start each is interrupted."""
+HOW = ("INT", "KILL", "KILL ALL")
+TORN_STEPS = ("packages", "torch", "messages", "wm_nodes")
+
+
+def tear(file: Path) -> None:
+    """Replace a file by its first half, newer than all others."""
+    content = file.read_bytes()
+    file.unlink()
+    file.write_bytes(content[: len(content) // 2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2026])
+def test_ten_interruptions_and_a_full_disk_leave_what_the_next_start_repairs(
+    seed: int, tmp_path: Path, repository: Path
+) -> None:
+    checkout, draw = SmallCheckout(tmp_path, repository), random.Random(seed)
+    full = checkout.start(limit=100_000)
+    _, err = full.communicate(timeout=60)
+    assert full.returncode == 1 and "creating the virtual environment failed" in err
+    said = ""
+    for word in sorted(["-m venv", *draw.choices(list(COMMANDS), k=9)], key=list(COMMANDS).index):
+        point = word, draw.uniform(0, COMMANDS[word]), draw.choice(HOW)
+        code, err = checkout.interrupt(*point)
+        said += err
+        if point[2] == "INT":
+            *_, last = err.splitlines()
+            assert (code, last) == (130, "interrupted; start again to continue where the set-up stopped"), (point, err)
+            assert "Traceback" not in err and not checkout.processes() and not checkout.locked(), point
+        else:
+            assert code == -9, (point, err)
+    checkout.complete()
+    assert f"{checkout.venv} was begun and not finished: making it again" in said
+    assert checkout.complete() == ""
+
+
+@pytest.mark.slow
+def test_torn_packages_and_a_torn_build_are_made_again_in_an_environment_whose_other_files_stay(
+    tmp_path: Path, repository: Path
+) -> None:
+    """Each file is left as a killed pip, uv, compiler or colcon leaves it; the user's own environment has no pip."""
+    checkout = SmallCheckout(tmp_path, repository)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(checkout.venv)], check=True)
+    (checkout.venv / "mine.txt").write_text("mine")
+    checkout.complete()
+    site = next(checkout.venv.glob("lib/python3.*/site-packages"))
+    assert '"/opt/python' not in (checkout.venv / "share/parts/export.cmake").read_text()
+    lost = [site / "setuptools/archive_util.py", site / "torch/__init__.py", checkout.venv / "bin/uv",
+            checkout.venv / "lib/libwm_msgs.so"]
+    for path in lost:
+        path.unlink()
+    build, install = (checkout.root / "ros2_ws" / name / "wm_msgs" for name in ("build", "install"))
+    torn = [site / "parts-1.0.dist-info/RECORD", next(site.glob("wm_nodes-*.dist-info")) / "RECORD",
+            install / "lib/libwm_msgs.so", next(build.rglob("two.c.o"))]
+    sizes = [path.stat().st_size for path in torn]
+    for path in torn:
+        tear(path)
+    for step in TORN_STEPS:
+        stamp.begin(checkout.venv, step)
+    said = checkout.complete()
+    assert "packages did not finish: installing all" in said and "wm_msgs did not finish: building it" in said
+    assert all(path.exists() for path in lost) and [path.stat().st_size for path in torn] == sizes
+    assert (checkout.venv / "mine.txt").read_text() == "mine"
+    assert checkout.complete() == ""
+
+
+def test_a_folder_that_is_no_environment_is_refused_and_left_alone(tmp_path: Path, repository: Path) -> None:
+    checkout = SmallCheckout(tmp_path, repository)
+    checkout.venv.mkdir()
+    (checkout.venv / "thesis.txt").write_text("mine")
+    refused = checkout.start()
+    _, err = refused.communicate(timeout=30)
+    assert refused.returncode == 1 and err.splitlines()[-1].startswith(f"error: {checkout.venv} is not empty")
+    assert os.listdir(checkout.venv) == ["thesis.txt"]
+
+
+def test_processes_that_ignore_ctrl_c_are_ended_with_all_that_they_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, "PATIENCE_S", 0.2)
+    command = ["sh", "-c", "trap '' INT; sleep 60 & echo; wait"]
+    child = subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True)
+    assert child.stdout and child.stdout.readline() and console._group_lives(child.pid)
+    console._end_group(child)
+    assert child.returncode == -9 and not console._group_lives(child.pid)
