@@ -84,8 +84,8 @@ def _end_group(child: subprocess.Popen[bytes]) -> None:
         with suppress(ProcessLookupError):
             os.killpg(child.pid, number)
         while time.monotonic() < patience:
-            child.poll()
             if not _group_lives(child.pid):
+                child.wait()
                 return
             time.sleep(0.05)
 

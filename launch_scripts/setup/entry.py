@@ -127,7 +127,8 @@ def _one_line():
     except SetupError as error:
         raise SystemExit(f"error: {error}") from None
     except OSError as error:
-        raise SystemExit(f"error: {error}; remedy that, then start again to continue") from None
+        where = "" if error.filename else f" in {venv_folder().parent}"
+        raise SystemExit(f"error: {error}{where}; remedy that, then start again to continue") from None
     except KeyboardInterrupt:
         print("interrupted; start again to continue where the set-up stopped", file=sys.stderr)
         raise SystemExit(130) from None

