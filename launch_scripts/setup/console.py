@@ -62,7 +62,8 @@ def run(
         try:
             code = child.wait()
         except KeyboardInterrupt:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C would leave them behind
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C would leave them behind
             if asks:
                 say("waiting for the package manager to end")
                 child.wait()

@@ -10,6 +10,7 @@ script again there if need be. $WM_VENV names another virtual environment than <
 import argparse
 import fcntl
 import os
+import signal
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -136,7 +137,8 @@ def _one_line():
 
 @contextmanager
 def _alone(venv):
-    """Hold a lock file, so that two starts at the same time set up once; commands started meanwhile hold it, too."""
+    """Hold a lock file, so that two starts at the same time set up once; commands started meanwhile hold it, too.
+    SIGTERM then does what Ctrl-C does."""
     venv.parent.mkdir(parents=True, exist_ok=True)
     with open(venv.parent / (venv.name + ".lock"), "w") as lock:
         try:
@@ -145,7 +147,11 @@ def _alone(venv):
             say(f"another process is setting up {venv}; waiting for it")
             fcntl.flock(lock, fcntl.LOCK_EX)
         os.set_inheritable(lock.fileno(), True)
-        yield
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGTERM, before)
 
 
 def main():

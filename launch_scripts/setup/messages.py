@@ -41,7 +41,8 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
     python, env = venv / "bin" / "python", isolated_environment(venv)
     answer = subprocess.run([str(python), "-c", WHERE], capture_output=True, text=True, env=env, check=False)
     if answer.returncode:
-        raise SetupError(f"numpy is not importable in {venv}:\n{answer.stderr}\n  delete {venv} and start again")
+        begin(venv, "packages")
+        raise SetupError(f"numpy is not importable in {venv}:\n{answer.stderr}\n  start again to install it anew")
     include, numpy_include = answer.stdout.split("\n")[:2]
     repair = begin(venv, "messages")
     if repair:
@@ -53,8 +54,11 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
     env.pop("COLCON_PREFIX_PATH", None)
     env["MAKEFLAGS"] = f"-j{os.cpu_count() or 1}"
     if repair or not _built_here(workspace, python):
-        for folder in ("build", "install"):
-            shutil.rmtree(workspace / folder / "wm_msgs", ignore_errors=True)
+        for folder in (workspace / "build" / "wm_msgs", workspace / "install" / "wm_msgs"):
+            if folder.exists():
+                shutil.rmtree(folder)
+    built = workspace / "install" / "wm_msgs" / "share" / "wm_msgs" / "package.xml"
+    built.unlink(missing_ok=True)  # which says to every environment that there is a build
     command = [str(python), "-m", "colcon", "--log-base", "log", "build", "--paths", "src/wm_msgs"]
     cmake = ["-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={python}"]
     command += ["--event-handlers", "console_direct+", "--cmake-args", *cmake]

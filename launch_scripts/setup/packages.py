@@ -39,7 +39,10 @@ def parse_version(text: str) -> tuple[int, int]:
 
 
 def create_venv(venv: Path, log: Path) -> None:
-    """Create the virtual environment, with the base interpreter's packages visible where they bring a GPU's torch."""
+    """Create the virtual environment, with the base interpreter's packages visible where they bring a GPU's torch.
+
+    What this began and did not finish is emptied and made again; no other folder is emptied.
+    """
     if read_stamp(stamp_file(venv)).get("venv") == BEGUN:
         say(f"{venv} was begun and not finished: making it again")
         _empty(venv)

@@ -110,23 +110,19 @@ class SmallCheckout:
         """Start; `delay_s` after a command with `word` in it has begun, interrupt; return (exit code, what was said).
 
         Args:
-            how: "INT" as Ctrl-C does it or to the first process alone, "KILL" for that, "KILL ALL" for each process.
+            how: a signal's name, for the first process alone, or "KILL ALL" for each.
         """
         before = self.log.stat().st_size if self.log.exists() else 0
         child = self.start()
         while child.poll() is None and not self._runs(word, before):
             time.sleep(0.005)
         time.sleep(delay_s)
-        match how:
-            case "INT":
-                os.kill(child.pid, signal.SIGINT)
-            case "KILL":
-                os.kill(child.pid, signal.SIGKILL)
-            case "KILL ALL":
-                while processes := self.processes():
-                    for pid in processes:
-                        with suppress(ProcessLookupError):
-                            os.kill(pid, signal.SIGKILL)
+        if how != "KILL ALL":
+            child.send_signal(signal.Signals[f"SIG{how}"])
+        while how == "KILL ALL" and (processes := self.processes()):
+            for pid in processes:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
         _, err = child.communicate(timeout=60)
         return child.returncode, err
 

@@ -4,6 +4,7 @@ import os
 import random
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -15,15 +16,15 @@ COMMANDS = {
     "-m venv": 1.5, "pip install --disable": 0.4, "torch-cpu.txt": 0.05, "lock.txt": 0.1, "colcon": 1.2, "wm_nodes": 0.3
 }
 """Commands of the set-up in their order -> within how many seconds of its start each is interrupted."""
-HOW = ("INT", "KILL", "KILL ALL")
-TORN_STEPS = ("packages", "torch", "messages", "wm_nodes")
+HOW = ("INT", "TERM", "KILL", "KILL ALL")
+TORN_STEPS = ("packages", "torch", "messages")
 
 
-def tear(file: Path) -> None:
-    """Replace a file by its first half, newer than all others."""
+def tear(file: Path, last: bytes) -> None:
+    """Replace a file by its first half, up to and with the next `last`, newer than all others."""
     content = file.read_bytes()
     file.unlink()
-    file.write_bytes(content[: len(content) // 2])
+    file.write_bytes(content[: content.index(last, len(content) // 2) + len(last)])
 
 
 @pytest.mark.slow
@@ -40,7 +41,7 @@ def test_ten_interruptions_and_a_full_disk_leave_what_the_next_start_repairs(
         point = word, draw.uniform(0, COMMANDS[word]), draw.choice(HOW)
         code, err = checkout.interrupt(*point)
         said += err
-        if point[2] == "INT":
+        if point[2] in {"INT", "TERM"}:
             *_, last = err.splitlines()
             assert (code, last) == (130, "interrupted; start again to continue where the set-up stopped"), (point, err)
             assert "Traceback" not in err and not checkout.processes() and not checkout.locked(), point
@@ -67,18 +68,29 @@ def test_torn_packages_and_a_torn_build_are_made_again_in_an_environment_whose_o
     for path in lost:
         path.unlink()
     build, install = (checkout.root / "ros2_ws" / name / "wm_msgs" for name in ("build", "install"))
-    torn = [site / "parts-1.0.dist-info/RECORD", next(site.glob("wm_nodes-*.dist-info")) / "RECORD",
-            install / "lib/libwm_msgs.so", next(build.rglob("two.c.o"))]
-    sizes = [path.stat().st_size for path in torn]
-    for path in torn:
-        tear(path)
+    torn = [(site / "parts-1.0.dist-info/RECORD", b"\n"), (next(site.glob("setuptools-*")) / "RECORD", b"/"),
+            (install / "lib/libwm_msgs.so", b""), (next(build.rglob("two.c.o")), b"")]
+    sizes = [path.stat().st_size for path, _ in torn]
+    for path, last in torn:
+        tear(path, last)
     for step in TORN_STEPS:
         stamp.begin(checkout.venv, step)
     said = checkout.complete()
     assert "packages did not finish: installing all" in said and "wm_msgs did not finish: building it" in said
-    assert all(path.exists() for path in lost) and [path.stat().st_size for path in torn] == sizes
+    assert all(path.exists() for path in lost) and [path.stat().st_size for path, _ in torn] == sizes
+    tear(next(site.glob("wm_nodes-*.dist-info")) / "RECORD", b"/")
+    stamp.begin(checkout.venv, "wm_nodes")
+    checkout.complete()
     assert (checkout.venv / "mine.txt").read_text() == "mine"
-    assert checkout.complete() == ""
+
+
+def test_commands_of_a_killed_set_up_keep_its_lock_until_they_end(tmp_path: Path, repository: Path) -> None:
+    checkout = SmallCheckout(tmp_path, repository)
+    checkout.interrupt("-m venv", 0.2, "KILL")
+    assert checkout.locked()
+    while checkout.processes():
+        time.sleep(0.05)
+    assert not checkout.locked()
 
 
 def test_a_folder_that_is_no_environment_is_refused_and_left_alone(tmp_path: Path, repository: Path) -> None:
