@@ -96,6 +96,7 @@ class SmallCheckout:
         return subprocess.Popen(
             limited, env=self.environment, cwd=self.root, text=True, start_new_session=True, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored in background jobs
         )
 
     def complete(self) -> str:
