@@ -9,6 +9,14 @@ LEAST_SHARE = 0.1
 """Share of one core from which on a process computes. Middleware threads of an idle node need about 0.01."""
 
 
+def stat_fields(pid: int) -> list[str]:
+    """The fields of /proc/<pid>/stat from the third, the state, on; [] where there is no such process."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+    except OSError:
+        return []
+
+
 class Activity(Enum):
     """What a process was seen to do."""
 
@@ -27,12 +35,11 @@ class ActivityWatch:
     def look(self, pid: int, now: float | None = None) -> Activity:
         """Look at a process; whether it computes is known from the second look on. now: monotonic, in s."""
         now = time.monotonic() if now is None else now
-        try:
-            fields = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()
-        except OSError:
+        fields = stat_fields(pid)
+        if not fields:
             self._seen.pop(pid, None)
             return Activity.GONE
-        state, cpu_s = fields[0].decode(), (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        state, cpu_s = fields[0], (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
         before_s, before_cpu_s = self._seen.get(pid, (now, cpu_s))
         if now != before_s or pid not in self._seen:
             self._seen[pid] = now, cpu_s

@@ -72,6 +72,7 @@ class LearnerNode(TrainingNode):
         super().__init__(PARAMS, ranks, **node_arguments)
 
     def configure(self) -> None:
+        self.hold_run_folder()
         self._config = self.run_config()
         values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
         self._training = make_run(values, self.run_dir, self.ranks)

@@ -58,6 +58,7 @@ class VideoLearnerNode(TrainingNode):
         super().__init__(PARAMS, ranks, **node_arguments)
 
     def configure(self) -> None:
+        self.hold_run_folder()
         values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
         self._video = make_run(values, self.run_dir, self.ranks)
         self.own(self._video.close)

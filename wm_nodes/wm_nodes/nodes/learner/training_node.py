@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_msgs.msg import PolicyVersion
+from wm_nodes.core.run_lock import RunLock
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import WorkerAction
@@ -22,8 +23,9 @@ from wm_nodes.training.run_folder import TrainingRun
 class TrainingNode(ManagedNode):
     """A learner: trains by an action and announces every version of its run folder.
 
-    A subclass makes the run in configure() and calls serve_training(); it says in train() how a goal is trained and in
-    fill() what a result holds. The Result of the action has the reasons FINISHED, FAILED, PEER_LOST, PAUSED.
+    A subclass calls hold_run_folder() in configure(), makes the run and calls serve_training(); it says in train() how
+    a goal is trained and in fill() what a result holds. The Result of the action has the reasons FINISHED, FAILED,
+    PEER_LOST, PAUSED.
 
     Args:
         ranks: this process is rank 0 of them.
@@ -45,6 +47,12 @@ class TrainingNode(ManagedNode):
     @abstractmethod
     def fill(self, result: Any) -> Any:
         """Put the run's counts into a result, and return it."""
+
+    def hold_run_folder(self) -> None:
+        """Let nobody else write into the run folder until cleanup. Raises RunFolderInUseError."""
+        lock = RunLock(self.run_dir, say=self.get_logger().warning)
+        lock.acquire()
+        self.own(lock.release)
 
     def serve_training(self, run: TrainingRun, action_type: type[Any], action: str, version_topic: str) -> None:
         """Serve the action and announce versions, until cleanup."""
