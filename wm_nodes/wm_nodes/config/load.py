@@ -61,14 +61,15 @@ def _load(schema: type[Config], loop: str, preset: str, overrides: dict[str, Any
     if loop == POLICY and task in task_names():
         for dotted, value in get_task(task).settings.items():
             _set_dotted(values, dotted, deepcopy(value))
+    file = "" if preset in preset_names(loop) else preset
     if preset != "base":
-        _merge(values, chosen)
+        _merge(values, chosen, file=file)
     for dotted, value in overrides.items():
         _set_dotted(values, dotted, value)
     try:
         return schema.model_validate(values)
     except ValidationError as error:
-        raise refusal(error, f"{schema.__module__.replace('.', '/')}.py") from None
+        raise refusal(error, f"{schema.__module__.replace('.', '/')}.py", file) from None
 
 
 def default_task() -> str:
@@ -129,7 +130,11 @@ def parse_override(text: str) -> tuple[str, Any]:
     name, separator, value = text.partition("=")
     if not separator or not name:
         raise ConfigError(f"expected section.key=value, got {text!r}")
-    return name.strip(), yaml.safe_load(value)
+    try:
+        return name.strip(), yaml.safe_load(value)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = getattr(error, "problem", None) or error
+        raise ConfigError(f"value of {text!r} is no YAML: {reason}; quote it if it is text") from None
 
 
 def preset_names(loop: str = POLICY) -> list[str]:
@@ -141,23 +146,23 @@ def read_preset(name: str, loop: str = POLICY) -> dict[str, Any]:
     """The values of a preset: a name of the loop's, or a path of a YAML file.
 
     Raises:
-        ConfigError: neither of them, or no mapping.
+        ConfigError: neither of them, or as read_yaml.
     """
     if name in preset_names(loop):
         return _read(PRESETS / loop / f"{name}.yaml")
-    if Path(name).suffix not in {".yaml", ".yml"} or not Path(name).is_file():
+    if Path(name).suffix not in {".yaml", ".yml"}:
         known = ", ".join(preset_names(loop))
         raise ConfigError(f"unknown preset {name!r}; choose one of {known} or give a .yaml file")
     return _read(Path(name))
 
 
-def _merge(base: dict[str, Any], top: dict[str, Any], path: str = "") -> None:
-    """Lay `top` over `base`, in place. Raises ConfigError for a name that base does not have."""
+def _merge(base: dict[str, Any], top: dict[str, Any], path: str = "", file: str = "") -> None:
+    """Lay `top`, of a file of the user's, over `base`, in place. Raises ConfigError for a name that base has not."""
     for key, value in top.items():
         if key not in base:
-            raise _unknown(f"{path}{key}", base)
+            raise _unknown(f"{path}{key}", base, file)
         if isinstance(value, dict) and isinstance(base[key], dict) and key not in FREE:
-            _merge(base[key], value, f"{path}{key}.")
+            _merge(base[key], value, f"{path}{key}.", file)
         else:
             base[key] = value
 
@@ -178,23 +183,57 @@ def _set_dotted(values: dict[str, Any], dotted: str, value: Any) -> None:
         _merge(section, {last: value}, path)
 
 
-def refusal(error: ValidationError, where: str) -> ConfigError:
-    """One error that names every refused value. where: the file that explains the settings."""
-    lines = []
+def refusal(error: ValidationError, where: str, file: str = "") -> ConfigError:
+    """One error that names every refused value. where: what explains the settings. file: of the user's, with them."""
+    refused = []
     for row in error.errors():
-        text = f"  {'.'.join(map(str, row['loc']))}: {row['msg'].removeprefix('Value error, ')}"
+        text = f"{'.'.join(map(str, row['loc']))}: {row['msg'].removeprefix('Value error, ')}"
         names_values = row["type"] == "value_error" and not isinstance(row["input"], (str, int, float))
-        lines.append(text if names_values else f"{text} (got {row['input']!r})")
-    return ConfigError(f"settings refused; see {where}:\n" + "\n".join(lines))
+        refused.append(text if names_values else f"{text} (got {row['input']!r})")
+    return ConfigError(f"settings{f' in {file}' if file else ''} refused; see {where}: {'; '.join(refused)}")
 
 
-def _unknown(dotted: str, section: dict[str, Any]) -> ConfigError:
+def _unknown(dotted: str, section: dict[str, Any], file: str = "") -> ConfigError:
     renamed = f", now called {FORMER_NAMES[dotted]!r}" if dotted in FORMER_NAMES else ""
-    return ConfigError(f"unknown setting {dotted!r}{renamed}; known there: {', '.join(map(str, section))}")
+    where = f" in {file}" if file else ""
+    return ConfigError(f"unknown setting {dotted!r}{where}{renamed}; known there: {', '.join(map(str, section))}")
 
 
 def _read(path: Traversable) -> dict[str, Any]:
-    values = yaml.safe_load(with_current_names(path.read_text())) or {}
-    if not isinstance(values, dict):
-        raise ConfigError(f"preset {str(path)!r} must be a YAML mapping")
-    return values
+    """The settings in a file, sections that were renamed since by their names of today."""
+    return {FORMER_NAMES.get(name, name): values for name, values in read_yaml(path).items()}
+
+
+def read_yaml(path: Traversable) -> dict[str, Any]:
+    """Return the mapping in a YAML file.
+
+    Raises:
+        ConfigError: there is none; one line with file, line and remedy.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise ConfigError(f"{path} does not exist; name a .yaml file") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{path} is a folder; name a .yaml file") from None
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}; make it readable, or name another file") from None
+    line, problem = 1, ""
+    try:
+        values = yaml.safe_load(data.decode())
+        if isinstance(values, dict):
+            return values
+        if values is None and data.strip():
+            return {}  # comments only
+        kind = "nothing" if values is None else f"a {type(values).__name__}"
+        problem = f"it holds {kind}, not a mapping (name: value)"
+    except UnicodeDecodeError as error:
+        line, problem = data.count(b"\n", 0, error.start) + 1, "no text (UTF-8)"
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line, problem = mark.line + 1 if mark else 1, f"no YAML: {error.problem}"
+    except yaml.reader.ReaderError as error:
+        line, problem = data.decode().count("\n", 0, error.position) + 1, f"no YAML: {error.reason}"
+    except (ValueError, RecursionError) as error:  # of a value, e.g. a date with month 13, or nested too deep
+        line, problem = 0, f"no YAML: {error}"
+    raise ConfigError(f"{path}{f', line {line}' if line else ''}: {problem}; mend the file, or copy it again")

@@ -8,6 +8,7 @@ from typing import Any
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
+from wm_nodes.config.load import ConfigError, read_yaml
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.recording import topics
 from wm_nodes.recording.errors import BagError
@@ -38,7 +39,8 @@ class Bag:
             self._reader = Reader(self.path)
             self._reader.open()
         except Exception as error:
-            raise BagError(f"bag {self.path} is damaged: {error}; {recover.format(self.path)}") from error
+            problem = _problem(self.path / "metadata.yaml") or " ".join(str(error).split())
+            raise BagError(f"bag {self.path} is damaged: {problem}; {recover.format(self.path)}") from error
         self._recover = recover.format(self.path)
 
     def __enter__(self) -> "Bag":
@@ -154,3 +156,13 @@ class Bag:
             return []
         table = json.loads(text)
         return [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+
+
+def _problem(metadata: Path) -> str:
+    """Why metadata.yaml of a bag folder cannot be read, with its line; '' where it can, and for an .mcap file."""
+    if metadata.exists():
+        try:
+            read_yaml(metadata)
+        except ConfigError as error:
+            return str(error).partition("; ")[0]
+    return ""

@@ -130,7 +130,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         path = str(self.param("config_file"))
         if not path:
             raise ValueError(f"{self.get_name()}: parameter config_file is empty; give the resolved YAML configuration")
-        if not Path(path).is_file():
+        if not Path(path).exists():
             raise ValueError(f"{self.get_name()}: config_file {path!r} does not exist")
         return load_config(path)
 

@@ -11,6 +11,8 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -19,6 +21,7 @@ from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedEx
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from wm_nodes.config.load import read_yaml
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.ros.middleware import set_node_defaults
 
@@ -136,10 +139,10 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
     keep_freed_memory()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     set_node_defaults()
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Any] = []
     code = 0
     try:
+        init(args)
         with stop_on_signals() as stopped:
             nodes = list(make_nodes())
             executor = make_executor(executor_kind(nodes[0]))
@@ -167,6 +170,22 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
         # Lifecycle nodes are reference cycles; while they live, so does the DDS participant with its shared memory.
         gc.collect()
     return code
+
+
+def init(args: list[str] | None = None) -> None:
+    """Initialise rclpy, which leaves signals alone.
+
+    Raises:
+        ValueError: a parameter file that cannot be read, or other ROS arguments that are wrong, in one line.
+    """
+    words = sys.argv if args is None else args
+    for option, file in pairwise(words):
+        if option == "--params-file":
+            read_yaml(Path(file))
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise ValueError(f"ROS arguments refused: {str(error).splitlines()[0].partition(', at /')[0]}") from None
 
 
 def run_node(make_node: Callable[[], Any], args: list[str] | None = None) -> int:

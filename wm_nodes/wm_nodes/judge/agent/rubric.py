@@ -10,10 +10,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from wm_nodes.config.load import ConfigError, refusal
+from wm_nodes.config.load import ConfigError, read_yaml, refusal
 from wm_nodes.judge.agent.types import GATED, NUM_LEVELS, NUM_PLAN_LEVELS, Component, Profile, Stage
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -215,14 +214,11 @@ def _resolve(pack: str, seen: tuple[str, ...]) -> dict[str, Any]:
     if pack in seen:
         raise ConfigError(f"rubric packs extend each other in a circle: {' -> '.join((*seen, pack))}")
     if pack in pack_names():
-        text = (_pack_folder() / f"{pack}.yaml").read_text()
-    elif Path(pack).suffix in {".yaml", ".yml"} and Path(pack).is_file():
-        text = Path(pack).read_text()
+        values = read_yaml(_pack_folder() / f"{pack}.yaml")
+    elif Path(pack).suffix in {".yaml", ".yml"} and Path(pack).exists():
+        values = read_yaml(Path(pack))
     else:
         raise ConfigError(f"unknown rubric pack {pack!r}; choose one of {', '.join(pack_names())} or give a .yaml file")
-    values = yaml.safe_load(text)
-    if not isinstance(values, dict):
-        raise ConfigError(f"rubric pack {pack!r} must be a YAML mapping")
     base = values.pop("extends", None)
     return values if base is None else _merge(_resolve(str(base), (*seen, pack)), values)
 

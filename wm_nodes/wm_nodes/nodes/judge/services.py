@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from yaml import YAMLError
-
 from wm_msgs.action import JudgeClips
 from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
@@ -169,7 +167,7 @@ class JudgeServices:
         before = self.judge.rubric.version
         try:
             self.judge.set_rubric(pack, base)
-        except (ConfigError, ValueError, OSError, YAMLError) as error:
+        except (ConfigError, ValueError, OSError) as error:
             raise WireError(ErrorCode.OUT_OF_RANGE, f"rubric {pack!r} refused: {error}") from None
         self._node.get_logger().info(f"rubric {before} -> {self.judge.rubric.version}")
 
