@@ -5,17 +5,21 @@ import importlib.util
 import json
 import sys
 import types
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from run_holders import holder
 
+from wm_nodes.core.run_lock import RunFolderInUseError
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching import launch_description as launch_face
 from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
 from wm_nodes.launching.environment import graph_environment
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec
 from wm_nodes.launching.runner import Runner, main
+from wm_nodes.launching.saved_arguments import read_arguments
 from wm_nodes.launching.scenarios import (
     ARGUMENTS,
     SCENARIOS,
@@ -200,6 +204,13 @@ def test_show_args_lists_every_argument(capsys: pytest.CaptureFixture[str]) -> N
     assert main("evaluate", ["seed=3"]) == 2
 
 
+@dataclass
+class Context:
+    """launch.LaunchContext."""
+
+    launch_configurations: dict[str, str]
+
+
 class StubLaunch:
     """What generate_launch_description uses of ROS 2's launch and launch_ros: the one stub that the tests have."""
 
@@ -215,8 +226,8 @@ class StubLaunch:
                 self.arguments, self.named = arguments, named
 
         class LaunchConfiguration(Record):
-            def perform(self, context: dict[str, str]) -> str:
-                return context[self.arguments[0]]
+            def perform(self, context: Context) -> str:
+                return context.launch_configurations[self.arguments[0]]
 
         self.launch.LaunchDescription = type("LaunchDescription", (Record,), {})
         for name in ("DeclareLaunchArgument", "OpaqueFunction", "Shutdown"):
@@ -246,13 +257,17 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
     file = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(file)
     (entities,) = file.generate_launch_description().arguments
-    *declared, start = entities
+    note, *declared, start = entities
     defaults = {action.arguments[0]: action.named["default_value"] for action in declared}
     assert defaults == {argument.name: argument.default for argument in ARGUMENTS if argument.name in defaults}
-    nodes = start.named["function"]({**defaults, **values})
+    note.named["function"](Context(values))
+    with holder(Path(values["run_dir"])), pytest.raises(RunFolderInUseError, match=r"is in use by process \d+ on"):
+        start.named["function"](Context({**defaults, **values}))
+    nodes = start.named["function"](Context({**defaults, **values}))
+    assert set(read_arguments(Path(values["run_dir"]))[scenario]) == set(values) - {"run_dir", "domain_id", "compose"}
     (lock,) = launch_face.LOCKS
     with pytest.raises(DomainInUseError, match=r"ROS domain 7 is already in use .*domain_id:=8"):
-        start.named["function"]({**defaults, **values})
+        start.named["function"](Context({**defaults, **values}))
     launch_face.LOCKS.clear()
     lock.release()
 

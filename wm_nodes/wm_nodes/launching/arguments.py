@@ -16,12 +16,15 @@ from wm_nodes.config.load import (
     judge_overrides,
     load_config,
     load_video_config,
+    read_yaml,
     reward_overrides,
 )
 from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.files import write_atomic
 from wm_nodes.launching.graph import Graph, GraphError, compose
-from wm_nodes.launching.scenarios import build_graph, parse_arguments
+from wm_nodes.launching.saved_arguments import full_paths, keep_arguments, read_arguments, saved_config, take_up
+from wm_nodes.launching.scenarios import build_graph, parse_arguments, run_folder
 
 
 def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None) -> dict[str, str]:
@@ -33,9 +36,10 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     """
     values = parse_arguments(scenario, given)
     values |= {"reward": "agent"} if scenario == "judge_clips" else {}
-    time = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
-    run_dir = Path(values["run_dir"] or f"runs/{time}-{scenario}").expanduser().absolute()
+    run_dir = run_folder(scenario, values, now)
     values["run_dir"] = str(run_dir)
+    if values["params_file"]:
+        values["params_file"] = _check_params(values["params_file"])
     given_config = values["config_file"]
     judge = _judge_settings(values)
     if "video_preset" in values:
@@ -61,13 +65,11 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
         values["model_dir"] = _model_dir(values["model_dir"], config.task)
     if values.get("starts_file") == "":
         values["starts_file"] = str(Path(values["model_dir"]) / "starts.safetensors")
-    if values["params_file"]:
-        values["params_file"] = _check_file(values["params_file"], "params_file")
     if "bag_uri" in values:
         values["bag_uri"] = _bag_uri(values["bag_uri"], scenario, run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
     if not given_config:
-        Path(values["config_file"]).write_text(dump_config(config))
+        write_atomic(Path(values["config_file"]), dump_config(config).encode())
     return values
 
 
@@ -114,13 +116,44 @@ def _resolve_video(values: dict[str, str], run_dir: Path, judge: dict[str, Any])
     values["model_dir"] = _model_dir(values["model_dir"], config.task)
     values["bag_uri"] = _bag_uri(values["bag_uri"], "world_model_rl", run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
-    values["config_file"] = str(run_dir / "video_config.yaml")
-    Path(values["config_file"]).write_text(dump_config(config))
-    return values
+    if values["config_file"] != (saved := str(run_dir / "video_config.yaml")):
+        write_atomic(Path(saved), dump_config(config).encode())
+    return {**values, "config_file": saved}
 
 
-def prepare(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
-    """Return the graph to start and its resolved arguments; graph.json in the run folder keeps a copy for people."""
+def begin(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, str]]:
+    """prepare() for a person's command: an existing run folder goes on with its settings and arguments.
+
+    Args:
+        given: the arguments that were given, without any defaults.
+
+    Raises:
+        As resolve(); ConfigError: given arguments differ from the run's.
+    """
+    parse_arguments(scenario, given)
+    run_dir = run_folder(scenario, given)
+    saved = saved_config(scenario, run_dir)
+    if saved.exists():
+        values = take_up(scenario, given, run_dir)
+        return prepare(scenario, values, {**read_arguments(run_dir).get(scenario, values), **given})
+    try:
+        values = full_paths(given)
+        if values.get("config_file") and saved.name == "config.yaml":
+            write_atomic(saved, dump_config(load_config(values["config_file"])).encode())
+            values["config_file"] = str(saved)
+        return prepare(scenario, values, given)
+    except BaseException:
+        saved.unlink(missing_ok=True)  # nothing has begun
+        raise
+
+
+def prepare(
+    scenario: str, given: Mapping[str, str], kept: Mapping[str, str] | None = None
+) -> tuple[Graph, dict[str, str]]:
+    """Return the graph to start and its resolved arguments; graph.json in the run folder keeps a copy for people.
+
+    kept: the arguments by which the run folder will be known; None: those given.
+    """
     values = resolve(scenario, given)
     graph = build_graph(scenario, values)
     if values.get("compose") == "true":
@@ -129,6 +162,7 @@ def prepare(scenario: str, given: Mapping[str, str]) -> tuple[Graph, dict[str, s
             if node.inside:
                 Path(node.parameter_file).write_text(node.carried_parameters())
     (Path(values["run_dir"]) / "graph.json").write_text(graph.to_json())
+    keep_arguments(scenario, given if kept is None else kept, Path(values["run_dir"]))
     return graph, values
 
 
@@ -146,10 +180,11 @@ def _model_dir(given: str, task: str) -> str:
         raise GraphError(str(error)) from None
 
 
-def _check_file(given: str, name: str) -> str:
+def _check_params(given: str) -> str:
     path = Path(given).expanduser().absolute()
-    if not path.is_file():
-        raise GraphError(f"{name} {given!r} does not exist")
+    if not path.exists():
+        raise GraphError(f"params_file {given!r} does not exist")
+    read_yaml(path)
     return str(path)
 
 
@@ -164,7 +199,7 @@ def _bag_uri(given: str, scenario: str, run_dir: Path) -> str:
 
 def main() -> int:
     try:
-        graph, _ = prepare(sys.argv[1], json.load(sys.stdin))
+        graph, _ = begin(sys.argv[1], json.load(sys.stdin))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -6,15 +6,17 @@ ros2 runs under the system's Python, which has neither pydantic nor torch: the g
 PyPI's `launch` 0.1.3 is an unrelated project of the same name.
 """
 
+import atexit
 import json
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from wm_nodes.core.run_lock import RunLock
 from wm_nodes.launching.domain_lock import DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
 from wm_nodes.launching.graph import Graph, NodeSpec
-from wm_nodes.launching.scenarios import argument_table
+from wm_nodes.launching.scenarios import argument_table, parse_arguments, run_folder
 
 LOCKS: list[DomainLock] = []
 """Of the graphs that this process launched, until it ends: ros2 launch runs nothing of ours at its own end."""
@@ -43,19 +45,30 @@ def launch_description(scenario: str) -> Any:
         )
         for argument in table
     ]
-    start = OpaqueFunction(function=lambda context: _start(scenario, context))
-    return launch.LaunchDescription([*declared, start])
+    given = set[str]()
+    note = OpaqueFunction(function=lambda context: given.update(context.launch_configurations))  # before the defaults
+    start = OpaqueFunction(function=lambda context: _start(scenario, context, given))
+    return launch.LaunchDescription([note, *declared, start])
 
 
-def _start(scenario: str, context: Any) -> list[Any]:
-    """Raises DomainInUseError where another graph of this host works on the domain, whichever way it was started."""
+def _start(scenario: str, context: Any, names: Iterable[str]) -> list[Any]:
+    """names: of the arguments that were given; others, of including launch files, may be among them.
+
+    Raises:
+        RunFolderInUseError, DomainInUseError: another process writes into the run folder, or works on the domain on
+            this host, whichever way it was started.
+    """
     from launch.substitutions import LaunchConfiguration
 
-    given = {
-        argument.name: LaunchConfiguration(argument.name).perform(context) for argument in argument_table(scenario)
-    }
+    known = {argument.name for argument in argument_table(scenario)}
+    given = {name: LaunchConfiguration(name).perform(context) for name in sorted(known.intersection(names))}
+    parse_arguments(scenario, given)
+    run_dir = run_folder(scenario, given)
+    writer = RunLock(run_dir)
+    writer.acquire()
+    atexit.register(writer.release)
     python = interpreter(given)
-    graph = prepare_graph(scenario, given, python)
+    graph = prepare_graph(scenario, {**given, "run_dir": str(run_dir)}, python)
     domain = int(graph_environment(graph.environment, python=python)["ROS_DOMAIN_ID"])
     lock = DomainLock(domain, f"graph {graph.name!r}")
     lock.acquire()
@@ -64,7 +77,7 @@ def _start(scenario: str, context: Any) -> list[Any]:
 
 
 def prepare_graph(scenario: str, given: Mapping[str, str], python: str) -> Graph:
-    """Run launching.arguments.prepare in the nodes' interpreter and return its graph.
+    """Run launching.arguments.begin in the nodes' interpreter and return its graph.
 
     Raises:
         RuntimeError: its last line of error, and what to set where a module is missing.

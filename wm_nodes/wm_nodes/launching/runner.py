@@ -17,6 +17,7 @@ from types import FrameType
 from typing import TextIO
 
 from wm_nodes.core.errors import RunError
+from wm_nodes.core.run_lock import RunLock
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
@@ -24,7 +25,7 @@ from wm_nodes.launching.fork_server import ForkServer
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec
 from wm_nodes.launching.process import NodeProcess
 from wm_nodes.launching.readiness import NotReadyError, activate, wait_ready
-from wm_nodes.launching.scenarios import describe_arguments
+from wm_nodes.launching.scenarios import describe_arguments, parse_arguments, run_folder
 from wm_nodes.ros.middleware import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
@@ -277,15 +278,22 @@ def main(scenario: str, argv: Sequence[str] | None = None) -> int:
             return 2
         given[name] = value
     try:
-        graph, values = launch_arguments.prepare(scenario, given)
-        return run(graph, Path(values["run_dir"]), interpreter(values))
+        parse_arguments(scenario, given)
+        run_dir = run_folder(scenario, given)
+        with RunLock(run_dir, say=_print):
+            graph, values = launch_arguments.begin(scenario, {**given, "run_dir": str(run_dir)})
+            return run(graph, run_dir, interpreter(values))
     except (GraphError, DomainInUseError, ValueError, OSError, NotReadyError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
 
 
 def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: float = 120.0) -> int:
-    """Run a graph until Ctrl-C, SIGTERM, or the end of a required node."""
+    """Run a graph until Ctrl-C, SIGTERM, or the end of a required node.
+
+    Raises:
+        RunFolderInUseError: another process writes into run_dir. DomainInUseError, NotReadyError: as the Runner.
+    """
     received: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -296,7 +304,10 @@ def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: floa
     if reach not in {"LOCALHOST", "OFF"}:
         print(f"WARNING: discovery range {reach}: whoever reaches this network can steer the graph", flush=True)
     try:
-        with Runner(graph, log_dir=run_dir / "logs", python=python) as runner:
+        with (
+            RunLock(run_dir, say=_print),
+            Runner(graph, log_dir=run_dir / "logs", python=python) as runner,
+        ):
             print(f"[runner] {len(graph.nodes)} processes, domain {runner.domain}, run folder {run_dir}", flush=True)
             try:
                 wait_ready(graph.nodes, domain=runner.domain, timeout_s=ready_s, check=lambda: _raise(runner, received))
@@ -309,6 +320,10 @@ def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: floa
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def _print(text: str) -> None:
+    print(f"[runner] {text}", flush=True)
 
 
 def _raise(runner: Runner, received: Sequence[int]) -> None:

@@ -8,6 +8,8 @@ import dataclasses
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.tasks import task_names
@@ -39,7 +41,8 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("preset", "cpu", "Settings to start from, when config_file is empty: a name or a .yaml file"),
     LaunchArgument("task", "push_cube", "Task, when config_file is empty", task_names()),
     LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
-    LaunchArgument("run_dir", "", "Folder for weights, bags and logs; empty: runs/<time>-<scenario>"),
+    LaunchArgument("run_dir", "", "Folder for settings, weights, bags and logs; an existing one goes on as it was "
+                   "begun; empty: runs/<time>-<scenario>"),
     LaunchArgument("namespace", "wm", "ROS namespace of the graph; several graphs on one host need several domains"),
     LaunchArgument("model_dir", "", "World-model folder; empty: the one shipped for the task"),
     LaunchArgument("video_model_dir", "", "Folder of the trained video model"),
@@ -111,6 +114,12 @@ def parse_arguments(scenario: str, given: Mapping[str, str]) -> dict[str, str]:
         if choices and value not in choices:
             raise GraphError(f"{name} must be one of {', '.join(c or '(empty)' for c in choices)}; got {value!r}")
     return {name: given.get(name, _BY_NAME[name].default) for name in names}
+
+
+def run_folder(scenario: str, given: Mapping[str, str], now: datetime | None = None) -> Path:
+    """The folder that argument run_dir names; where it is empty, a new one of this moment."""
+    time = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
+    return Path(given.get("run_dir") or f"runs/{time}-{scenario}").expanduser().absolute()
 
 
 def build_graph(scenario: str, arguments: Mapping[str, str]) -> Graph:
