@@ -43,7 +43,7 @@ def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_
     assert "tool error / copying" in said and "or go on with --force" in said
     policies = sorted(path.name for path in (run_dir / "policies").iterdir())
     assert policies == ["policy_000001.safetensors", "weak.safetensors"], "trained in a model that failed"
-    done = start([*arguments, "--force"], ros_domain)
+    done = start(["--run-dir", str(run_dir), "--force"], ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     summary = read_summary(run_dir)
     assert (summary["task"], summary["preset"], summary["seed"]) == ("push_cube", "smoke", 0)
@@ -90,7 +90,7 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
     for lost in ("trained.json", "evaluations/real_before.json"):  # as if stopped after the last update of round 1
         (run_dir / "rounds" / "1" / lost).unlink()
     finished = {path: path.stat().st_mtime_ns for path in (run_dir / "rounds" / "2").rglob("*") if path.is_file()}
-    done = start(arguments, ros_domain)
+    done = start(["--run-dir", str(run_dir)], ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "training the policy in the world model: 0 updates" in done.stdout
     assert done.stdout.count("starting the graph") == 1
@@ -121,10 +121,12 @@ def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(ros
         with Bag(Path(summary["bag"])) as bag:
             assert bag.count("/wm/reward/verdict")
         assert recorded_reward_name(Path(summary["bag"])) == "agent"
-        other = start(arguments, ros_domain)
-        assert other.returncode == 2 and "repeat its options or use a new folder" in other.stderr
-        again = start([*arguments, *agent], ros_domain)
-        assert again.returncode == 0 and "training is done already" in again.stdout, again.stdout + again.stderr
+        other = start([*arguments, "--reward", "endogenous"], ros_domain)
+        assert other.returncode == 2 and other.stderr.count("\n") == 1
+        assert "--reward is 'agent' in this run, 'endogenous' is given" in other.stderr
+        for options in ([*arguments, *agent], ["--run-dir", str(run_dir)]):
+            again = start(options, ros_domain)
+            assert again.returncode == 0 and "training is done already" in again.stdout, again.stdout + again.stderr
         assert len(server.requests) == asked
 
 

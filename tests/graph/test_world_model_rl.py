@@ -4,6 +4,7 @@ then its recording scored and trained on again."""
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from graph.harness import Probe, own_domain
+from graph.harness import Probe, own_domain, wait_until
 from graph.launched import launched
 from metric_docs import documented, written
 
@@ -23,6 +24,7 @@ from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.run_lock import NAME
 from wm_nodes.nodes.video_model_node import film_strip
 from wm_nodes.recording import BagError
 from wm_nodes.recording.bag import Bag
@@ -35,7 +37,7 @@ from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescor
 from wm_nodes.video_rl.reference_reward import ClipScores, load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
 from wm_nodes.video_rl.train import post_train
-from wm_nodes.video_rl.training_run import CHECKPOINT, VIDEO_FILES, VideoRun, evaluated_uri
+from wm_nodes.video_rl.training_run import CHECKPOINT, VIDEO_FILES, VideoRun, evaluated_uri, progress
 from wm_nodes.video_rl.validation import context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -199,10 +201,13 @@ def test_other_weights_of_the_rewards_give_exit_code_1(run_dir: Path, tmp_path: 
 
 @pytest.mark.slow
 def test_training_again_from_the_recording_gives_the_same_weights_and_other_rewards_give_others(
-    run_dir: Path, tmp_path: Path
+    run_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     live = {path.name: path.read_bytes() for path in (run_dir / "video_policies").iterdir()}
     assert main(["retrain", str(run_dir), "--run-dir", str(tmp_path / "same"), "--no-tensorboard"]) == 0
+    shutil.copytree(run_dir, tmp_path / "copy")
+    assert main(["retrain", str(tmp_path / "copy"), "--run-dir", str(tmp_path / "same")]) == 2
+    assert f"run is '{run_dir}' in this run, '{tmp_path / 'copy'}' is given" in capsys.readouterr().err
     for name in ("video_000002.safetensors", "video_000004.safetensors", "averaged_000004.safetensors"):
         assert (tmp_path / "same" / "video_policies" / name).read_bytes() == live[name]
     for mine, theirs in zip(read_metrics(tmp_path / "same"), read_metrics(run_dir), strict=True):
@@ -253,8 +258,30 @@ def test_recordings_that_are_named_stand_in_for_new_episodes(run_dir: Path, tmp_
     assert done.returncode == 0 and "recordings" in done.stdout, done.stdout + done.stderr
     assert (tmp_path / "run" / VIDEO_FILES.uri(4)).read_bytes() == (run_dir / VIDEO_FILES.uri(4)).read_bytes()
     assert main(["rescore", str(tmp_path / "run")]) == 0
-    other = start([*ARGUMENTS, "--run-dir", str(tmp_path / "run")], ros_domain)
-    assert other.returncode == 2 and "begun with another configuration" in other.stderr
+    swapped = [f"--bags={kept['heldout'] / 'shard_00500000'}", f"--heldout-bags={kept['train'] / 'shard_00000000'}"]
+    other = start([*ARGUMENTS, *swapped, "--run-dir", str(tmp_path / "run")], ros_domain)
+    assert other.returncode == 2 and "begun with other options: --bags is ['" in other.stderr
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_goes_on_from_its_folder_alone_to_the_same_weights(
+    run_dir: Path, tmp_path: Path, ros_domain: int
+) -> None:
+    kept = {name: shutil.copytree(run_dir / "data" / name, tmp_path / name) for name in ("train", "heldout")}
+    named = [f"--bags={kept['train'] / 'shard_00000000'}", f"--heldout-bags={kept['heldout'] / 'shard_00500000'}"]
+    folder = tmp_path / "run"
+    command = [sys.executable, "-c", PROGRAM, *ARGUMENTS, *named, "--run-dir", str(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    wait_until("the first update", lambda: process.poll() is not None or progress(folder)[1] == 1, 200)
+    assert (folder / NAME).is_file(), "nobody holds the folder"
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60)[0]
+    assert process.returncode == 130 and "name the run folder with --run-dir to go on" in said, said
+    assert progress(folder) == (2, 1) and not (folder / NAME).exists()
+    done = start(["--run-dir", str(folder)], ros_domain)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (folder / VIDEO_FILES.uri(4)).read_bytes() == (run_dir / VIDEO_FILES.uri(4)).read_bytes()
+    assert read_summary(folder)["preset"] == "smoke"
 
 
 @pytest.mark.parametrize(
@@ -270,8 +297,10 @@ def test_recordings_that_cannot_be_used_end_with_one_clear_line(
     options: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    for name in "ab":
+        (tmp_path / name).mkdir()
     assert main(["train-video-model", "--preset", "smoke", *options, "--run-dir", str(tmp_path / "run")]) == 2
-    assert words in capsys.readouterr().err
+    assert words in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
 def test_no_kept_buffer_is_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from wm_nodes.apps.model_refresh_loop import round_config, split_updates
-from wm_nodes.apps.policy_run import cached_success, open_run_dir
-from wm_nodes.config.load import ConfigError, dump_config, load_config
+from wm_nodes.apps.policy_run import cached_success
+from wm_nodes.config.load import load_config
 from wm_nodes.reports.summary import SuccessRate, Summary
 from wm_nodes.reports.tables import ROUND_COLUMNS, round_rows
 from wm_nodes.training.metrics import MetricsWriter, join_metrics, read_metrics
@@ -66,18 +66,3 @@ def test_the_table_of_rounds_says_what_became_of_the_refreshed_model() -> None:
     assert len(rows[0]) == len(ROUND_COLUMNS)
     assert rows[0][-1] == "old one kept: worse: done recall" and rows[1][-1] == ""
     assert rows[0][4] == "25.0 % (1/4)"
-
-
-def test_a_run_goes_on_with_its_own_options_only(tmp_path: Path) -> None:
-    text, other = dump_config(load_config("smoke")), dump_config(load_config("smoke", {"seed": 1}))
-    options = ["--from-scratch", "--reward agent"]
-    run_dir = open_run_dir(tmp_path / "run", "name", text, begun_with=options)
-    assert open_run_dir(run_dir, "name", text, begun_with=options) == run_dir
-    saved, old = run_dir / "config.yaml", {"acceptance:": "gate:", "model_refresh:": "rounds:"}
-    for name, former in old.items():  # as the folder of a run from before they were renamed
-        saved.write_text(saved.read_text().replace(f"\n{name}", f"\n{former}"))
-    assert open_run_dir(run_dir, "name", text, begun_with=options) == run_dir
-    for changed, begun_with in ((other, options), (text, []), (text, options[:1]), (text, options[1:])):
-        with pytest.raises(ConfigError, match="repeat its options or use a new folder"):
-            open_run_dir(run_dir, "name", changed, begun_with=begun_with)
-    assert load_config(str(run_dir / "config.yaml")) == load_config("smoke")

@@ -10,7 +10,6 @@ from wm_nodes.config.load import (
     load_video_config,
     parse_override,
     preset_names,
-    with_current_names,
 )
 from wm_nodes.config.shipped import PRETRAINED, shipped_model
 
@@ -37,7 +36,7 @@ def test_a_saved_configuration_comes_back_equal(tmp_path: Path) -> None:
 def test_a_configuration_saved_before_sections_were_renamed_comes_back_equal(tmp_path: Path) -> None:
     config = load_config("smoke", {"acceptance.num_episodes": 5, "model_refresh.num_rounds": 2})
     text = dump_config(config).replace("\nacceptance:", "\ngate:").replace("\nmodel_refresh:", "\nrounds:")
-    assert "gate:\n" in text and "rounds:\n" in text and with_current_names(text) == dump_config(config)
+    assert "gate:\n" in text and "rounds:\n" in text
     (tmp_path / "config.yaml").write_text(text)
     assert load_config(str(tmp_path / "config.yaml")) == config
 

@@ -30,7 +30,8 @@ def add_seed(parser: argparse.ArgumentParser, default: int | None = 0) -> None:
 
 def add_run_dir(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--run-dir", type=Path, help="run folder; an existing one is resumed (default: runs/<time>-<name>)"
+        "--run-dir", type=Path,
+        help="run folder; an existing one goes on, with the options it was begun with (default: runs/<time>-<name>)",
     )
 
 

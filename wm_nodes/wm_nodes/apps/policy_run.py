@@ -8,7 +8,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 from rich.console import Console
 from tqdm import tqdm
 
-from wm_nodes.config.load import ConfigError, dump_config, with_current_names
+from wm_nodes.config.load import dump_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.statistics import wilson_interval
@@ -36,25 +36,6 @@ READY_S = 120.0
 TRAINED = "trained.json"
 
 console = Console()
-
-
-def open_run_dir(given: Path | None, name: str, config_text: str, *, begun_with: Sequence[str] = ()) -> Path:
-    """Make the run folder (default: runs/<time>-<name>) and keep its configuration there. begun_with: options that are
-    no settings but without which the run must not go on; kept as comments.
-
-    Raises:
-        ConfigError: the folder was begun with another configuration or other such options.
-    """
-    config_text += "".join(f"# begun with {option}\n" for option in begun_with)
-    run_dir = (given or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}").expanduser().absolute()
-    run_dir.mkdir(parents=True, exist_ok=True)
-    saved = run_dir / "config.yaml"
-    if saved.exists() and with_current_names(saved.read_text()) != config_text:
-        raise ConfigError(
-            f"{run_dir} was begun with another configuration ({saved}); repeat its options or use a new folder"
-        )
-    saved.write_text(config_text)
-    return run_dir
 
 
 class Stages:
@@ -123,7 +104,7 @@ def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
     """Start the processes of one training; the caller stops the runner."""
     start.folder.mkdir(parents=True, exist_ok=True)
     config_file = start.folder / "config.yaml"
-    if not config_file.exists():  # the run folder's own says more, see open_run_dir
+    if not config_file.exists():
         config_file.write_text(dump_config(start.config))
     name = "_".join(["training", *start.label.split(), time.strftime("%H%M%S")])
     bag = job.run_dir / "bags" / name

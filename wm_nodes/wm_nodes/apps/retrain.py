@@ -8,14 +8,17 @@ scores are mixed anew.
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from wm_nodes.apps.options import add_run_dir, add_set, add_tensorboard, prepare_torch, settings
-from wm_nodes.apps.policy_run import Stages, open_run_dir
+from wm_nodes.apps.policy_run import Stages
+from wm_nodes.apps.run_options import open_run
 from wm_nodes.apps.video_results import conclude
-from wm_nodes.config.load import dump_config, load_video_config
+from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers
@@ -29,19 +32,36 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_run_dir(parser)
     add_set(parser)
     add_tensorboard(parser)
+    parser.set_defaults(tensorboard=None)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Train in a new run folder and measure as train-video-model does."""
     prepare_torch()
-    stage = Stages()
     source, live = recorded_buffers.read_run(arguments.run_folder)
-    config = load_video_config(str(source / "config.yaml"), settings(arguments))
-    if config.seed != live.seed:
-        raise ValueError(f"the clips of {source} were drawn with seed {live.seed}, not {config.seed}; do not set it")
-    run_dir = open_run_dir(arguments.run_dir, "world_model_retrain", dump_config(config))
-    if run_dir == source:
-        raise ValueError(f"{run_dir} is the run to train again from; name a new folder with --run-dir")
+    if arguments.run_dir and arguments.run_dir.expanduser().absolute() == source:
+        raise ValueError(f"{source} is the run to train again from; name a new folder with --run-dir")
+
+    def load(file: str, changes: dict[str, Any]) -> VideoRlConfig:
+        return load_video_config(file or str(source / "config.yaml"), changes)
+
+    def check(config: VideoRlConfig) -> None:
+        if config.seed != live.seed:
+            raise ValueError(
+                f"the clips of {source} were drawn with seed {live.seed}, not {config.seed}; do not set it"
+            )
+
+    with open_run(
+        arguments, "retrain", name=lambda config: "world_model_retrain", load=load, check=check,
+        settings=settings(arguments), fixed=("run_folder",), free=("tensorboard",), defaults={"tensorboard": True},
+    ) as (config, run_dir):
+        _run(arguments, source, live, config, run_dir)
+
+
+def _run(
+    arguments: argparse.Namespace, source: Path, live: VideoRlConfig, config: VideoRlConfig, run_dir: Path
+) -> None:
+    stage = Stages()
     _, iterations = progress(source)
     if not iterations:
         raise ValueError(f"{source} has no checkpoint of a learner: nothing was trained there to train again")

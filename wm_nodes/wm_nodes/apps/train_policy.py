@@ -6,7 +6,7 @@ Every stage leaves its files in the run folder and is skipped when they are ther
 
 import argparse
 import json
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -15,12 +15,14 @@ from typing import Any
 from wm_nodes.apps import options
 from wm_nodes.apps.model_refresh_loop import round_start, run_rounds
 from wm_nodes.apps.policy_pictures import write_pictures
-from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, open_run_dir, start_graph, success_rate
+from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, start_graph, success_rate
+from wm_nodes.apps.run_options import open_run
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import task_names
 from wm_nodes.core.errors import ModelNotAcceptedError
+from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
 from wm_nodes.environments.record import HELDOUT_SEEDS, acceptance_plan, collect_plan
@@ -39,6 +41,9 @@ from wm_nodes.world_model.validation.acceptance import accept_world_model
 ENDOGENOUS = "endogenous"
 ACCEPTANCE, FORMER_ACCEPTANCE = "acceptance.json", "gate.json"
 """Report of accept_world_model in the run folder, and its name in older ones."""
+FIXED, FREE = ("preset", "model_dir", "from_scratch", "reward"), ("force", "compose")
+DEFAULTS = {"preset": "cpu", "from_scratch": False, "reward": ENDOGENOUS, "force": False, "compose": False}
+"""Options that a run keeps, see run_options.open_run."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -55,20 +60,33 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "(1: never refresh). The policy updates are split over the rounds",
     )
     parser.add_argument(
-        "--reward", choices=(ENDOGENOUS, AGENT), default=ENDOGENOUS,
+        "--reward", choices=(ENDOGENOUS, AGENT),
         help="what the policy is paid for in the world model. endogenous: the model's own signal; agent: a judge's "
         "verdict on each whole episode; name the judge below, or in section judge of the settings. Default: endogenous",
     )
     options.add_judge(parser)
     parser.add_argument("--compose", action="store_true", help="all nodes in one process")
     options.add_graph(parser)
+    parser.set_defaults(**dict.fromkeys(DEFAULTS))
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Collect, check the world model, clone a weak policy, train it in the world model, measure it in the simulator."""
-    stage = Stages()
     options.prepare_torch()
-    config, run_dir = _open_run(arguments)
+    with opened(arguments) as (config, run_dir):
+        _run(arguments, config, run_dir)
+
+
+def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[RunConfig, Path]]:
+    """The run folder of the options, see open_run."""
+    return open_run(
+        arguments, "train-policy", name=lambda config: config.task, load=partial(_load, arguments),
+        check=partial(_check, arguments), settings=_settings(arguments), fixed=FIXED, free=FREE, defaults=DEFAULTS,
+    )
+
+
+def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> None:
+    stage = Stages()
     stage(f"run folder {run_dir}")
     model_dir = _model(arguments, config, run_dir, stage)
     starts, weak = start_files(run_dir)
@@ -105,22 +123,25 @@ def run(arguments: argparse.Namespace) -> None:
     console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
 
 
-def _open_run(arguments: argparse.Namespace) -> tuple[RunConfig, Path]:
-    overrides = options.settings(arguments)
-    if arguments.task:
-        overrides["task"] = arguments.task
-    if arguments.rounds is not None:
-        overrides["model_refresh.num_rounds"] = arguments.rounds
+def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    chosen = options.settings(arguments) | options.judge_settings(arguments)
+    chosen |= {"task": arguments.task} if arguments.task else {}
+    return chosen | ({} if arguments.rounds is None else {"model_refresh.num_rounds": arguments.rounds})
+
+
+def _load(arguments: argparse.Namespace, file: str, changes: dict[str, Any]) -> RunConfig:
+    config = load_config(file, changes)
+    return config.model_copy(update={"judge": judge_or_embedded(config.judge)}) if arguments.reward == AGENT else config
+
+
+def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
+    if arguments.model_dir and not Path(arguments.model_dir, MANIFEST).is_file():
+        raise ConfigError(f"{arguments.model_dir} holds no {MANIFEST}; name the folder of a trained world model")
     judge = options.judge_settings(arguments)
     if judge and arguments.reward != AGENT:
         raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")
-    config = load_config(arguments.preset, {**overrides, **judge})
-    begun_with = ["--from-scratch"] if arguments.from_scratch else []
     if arguments.reward == AGENT:
-        config = config.model_copy(update={"judge": judge_or_embedded(config.judge)})
         check_agent(config)
-        begun_with.append("--reward agent")
-    return config, open_run_dir(arguments.run_dir, config.task, dump_config(config), begun_with=begun_with)
 
 
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: Stages) -> Path:

@@ -10,18 +10,19 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from wm_nodes.apps import options
-from wm_nodes.apps.policy_run import READY_S, Stages, open_run_dir
+from wm_nodes.apps.policy_run import READY_S, Stages
+from wm_nodes.apps.run_options import open_run
 from wm_nodes.apps.video_results import conclude
 from wm_nodes.config.load import (
     REWARDS,
     VIDEO,
-    dump_config,
     judge_or_embedded,
     load_config,
     load_video_config,
@@ -43,6 +44,9 @@ from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.video_rl.training_run import progress
 
 HELDOUT_EPISODES = 100
+FIXED, FREE = ("preset", "from_scratch", "bags", "heldout_bags"), ("keep_buffers", "tensorboard")
+DEFAULTS = {"preset": "recommended", "from_scratch": False, "keep_buffers": 4, "tensorboard": True}
+"""Options that a run keeps, see run_options.open_run."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -60,7 +64,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--heldout-bags", type=Path, nargs="+", default=[], metavar="BAG", help="and those held out")
     parser.add_argument(
-        "--keep-buffers", type=int, default=4, metavar="N",
+        "--keep-buffers", type=int, metavar="N",
         help="rollout buffers kept on disk; as many as iterations if `retrain` shall be possible. Default: 4",
     )
     parser.add_argument(
@@ -71,21 +75,36 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_judge(parser)
     options.add_tensorboard(parser)
     options.add_graph(parser)
+    parser.set_defaults(**dict.fromkeys(DEFAULTS))
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Take or record episodes, take or train a video model, run GRPO over the graph, measure, report."""
     options.prepare_torch()
+    with opened(arguments) as (config, run_dir):
+        _run(arguments, config, run_dir)
+
+
+def opened(arguments: argparse.Namespace) -> AbstractContextManager[tuple[VideoRlConfig, Path]]:
+    """The run folder of the options, see open_run. Raises ValueError for options that do not go together."""
+    _check_options(arguments)
+    return open_run(
+        arguments, "train-video-model", name=lambda config: "world_model_rl", load=_load, check=_check,
+        settings=options.settings(arguments) | reward_overrides(arguments.reward) | options.judge_settings(arguments),
+        fixed=FIXED, free=FREE, defaults=DEFAULTS,
+    )
+
+
+def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) -> None:
     stage = Stages()
-    config, run_dir = _open_run(arguments)
     stage(f"run folder {run_dir}")
     scene = load_config("cpu", {"task": config.task, "seed": config.seed})
     probe = load_probe(shipped_model(config.task))
     shipped = None if arguments.from_scratch else shipped_video_model(config)
     if arguments.bags:
         stage(f"{len(arguments.bags)} + {len(arguments.heldout_bags)} held-out recordings")
-        bags = linked(arguments.bags, run_dir / "data" / "train")
-        heldout_bags = linked(arguments.heldout_bags, run_dir / "data" / "heldout")
+        bags = linked([*map(Path, arguments.bags)], run_dir / "data" / "train")
+        heldout_bags = linked([*map(Path, arguments.heldout_bags)], run_dir / "data" / "heldout")
     else:
         bags, heldout_bags = _data(scene, config.context_episodes if shipped else config.data_episodes, run_dir, stage)
     heldout = load_clips(heldout_bags, config.model.stride)
@@ -108,13 +127,11 @@ def linked(bags: Sequence[Path], folder: Path) -> list[Path]:
     """Links to recordings of the simulator, named like the shards of episodes that a run collects itself.
 
     Raises:
-        ValueError: a recording is missing, or the folder links to another one.
+        ValueError: the folder links to another recording.
     """
     folder.mkdir(parents=True, exist_ok=True)
     links = [folder / f"shard_{index:08d}" for index in range(len(bags))]
     for link, bag in zip(links, bags, strict=True):
-        if not bag.is_dir():
-            raise ValueError(f"{bag} is no recording; name bags of simulator episodes, e.g. RUN/data/train/shard_*")
         if not link.is_symlink():
             link.symlink_to(bag.resolve(), target_is_directory=True)
         if link.resolve() != bag.resolve():
@@ -162,29 +179,27 @@ def _post_train(
             operator.train_video(config.iterations - done, show)
 
 
-def _open_run(arguments: argparse.Namespace) -> tuple[VideoRlConfig, Path]:
-    if arguments.keep_buffers < 1:
+def _check_options(arguments: argparse.Namespace) -> None:
+    if arguments.keep_buffers is not None and arguments.keep_buffers < 1:
         raise ValueError(f"--keep-buffers must be at least 1, got {arguments.keep_buffers}")
     if bool(arguments.bags) != bool(arguments.heldout_bags):
         raise ValueError("--bags and --heldout-bags go together: what is trained on, and what is held out")
+    if missing := [bag for bag in (*arguments.bags, *arguments.heldout_bags) if not bag.is_dir()]:
+        raise ValueError(f"{missing[0]} is no recording; name bags of simulator episodes, e.g. RUN/data/train/shard_*")
     if twice := {bag.resolve() for bag in arguments.bags} & {bag.resolve() for bag in arguments.heldout_bags}:
         raise ValueError(f"{min(twice)} cannot be trained on and held out; name other --heldout-bags")
-    chosen = {**options.settings(arguments), **reward_overrides(arguments.reward), **options.judge_settings(arguments)}
-    config = load_video_config(arguments.preset, chosen)
+
+
+def _load(file: str, changes: dict[str, Any]) -> VideoRlConfig:
+    config = load_video_config(file, changes)
+    return config.with_values(judge=judge_or_embedded(config.judge)) if config.rewards.get(AGENT) else config
+
+
+def _check(config: VideoRlConfig) -> None:
     if config.rewards.get(AGENT):
-        config = config.with_values(judge=judge_or_embedded(config.judge))
         check_judge(config.judge)
     if config.grpo.kl.anchor == "lora_off":
         raise ValueError(
             "grpo.kl.anchor lora_off is for public models with a LoRA adapter, trained in Python "
             "(docs/public_video_models.md); the graph's video model has none: take frozen"
         )
-    run_dir = open_run_dir(
-        arguments.run_dir, "world_model_rl", dump_config(config),
-        begun_with=[
-            *(["--from-scratch"] if arguments.from_scratch else []),
-            *(f"--bags {bag.resolve()}" for bag in arguments.bags),
-            *(f"--heldout-bags {bag.resolve()}" for bag in arguments.heldout_bags),
-        ],
-    )
-    return config, run_dir

@@ -3,7 +3,6 @@
 presets/policy is of loop 1, presets/video of loop 2; the judge of both is in presets/judge.yaml.
 """
 
-import re
 from copy import deepcopy
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -118,11 +117,6 @@ def judge_or_embedded(judge: JudgeConfig) -> JudgeConfig:
 def dump_config(config: SettingsSection) -> str:
     """The resolved configuration as YAML, as saved with every run; its loop's load function reads it back."""
     return str(yaml.safe_dump(config.model_dump(), sort_keys=False))
-
-
-def with_current_names(text: str) -> str:
-    """The YAML text of a configuration, with sections that were renamed since by their names of today."""
-    return re.sub(f"^({'|'.join(FORMER_NAMES)}):", lambda match: FORMER_NAMES[match[1]] + ":", text, flags=re.MULTILINE)
 
 
 def parse_override(text: str) -> tuple[str, Any]:
