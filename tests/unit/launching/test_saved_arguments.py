@@ -102,6 +102,15 @@ def test_a_folder_without_kept_arguments_goes_on_with_its_configuration(tmp_path
     assert set(json.loads((tmp_path / "run" / FILE).read_text())) == {"rollout_record", "evaluate"}
 
 
+def test_an_unnamed_judge_is_the_embedded_one_also_when_a_preset_is_given_again(tmp_path: Path, model: str) -> None:
+    given = {**run_in(tmp_path), "model_dir": model, "preset": "smoke"}
+    launch_arguments.begin("judge_clips", given)
+    (tmp_path / "run" / FILE).unlink()
+    launch_arguments.begin("judge_clips", given)
+    named = {"judge": "http://a/v1", "judge_model": "judge"}
+    assert "judge is [] in this run" in refused("judge_clips", {**given, **named})
+
+
 def test_loop_2_goes_on_with_its_own_settings(tmp_path: Path, model: str) -> None:
     begun = {"video_preset": "smoke", "video_model_dir": model, "context_bags": "/a,/b", "keep_buffers": "7",
              "reward": "agent", "judge": "embedded"}

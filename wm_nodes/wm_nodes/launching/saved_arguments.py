@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.load import (
-    Config,
+    EMBEDDED,
     judge_or_embedded,
     judge_overrides,
     load_config,
     load_video_config,
     reward_overrides,
 )
-from wm_nodes.config.saved import differs, load_saved, refuse_differences
-from wm_nodes.config.schema import AGENT
+from wm_nodes.config.saved import Load, differs, load_saved, refuse_differences
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import read_json
 from wm_nodes.launching.scenarios import parse_arguments, scenario_of
@@ -64,7 +63,7 @@ def take_up(scenario: str, given: Mapping[str, str], run_dir: Path) -> dict[str,
     if kept and not kept.get("config_file"):
         by_name |= {*PRESETS} & {*given}
     told = [differs(name, before[name], given[name]) for name in sorted(by_name) if before[name] != given[name]]
-    config, more = _compare(saved, {**before, **given}.get("reward", ""), given, by_name)
+    config, more = _compare(saved, given, by_name)
     refuse_differences(run_dir, [*told, *more])
     values = {**(kept or {}), **given}
     if kept is None and "seed" in scenario_of(scenario).arguments:
@@ -72,29 +71,24 @@ def take_up(scenario: str, given: Mapping[str, str], run_dir: Path) -> dict[str,
     return {name: value for name, value in values.items() if name not in settings} | {"config_file": str(saved)}
 
 
-def _compare(saved: Path, reward: str, given: Mapping[str, str], by_name: set[str]) -> tuple[Any, list[str]]:
+def _compare(saved: Path, given: Mapping[str, str], by_name: set[str]) -> tuple[Any, list[str]]:
     """The saved configuration, and in what the given settings, of those that were not compared by name, differ."""
+    load: Load[Any] = load_config if saved.name == "config.yaml" else load_video_config
     changes = judge_overrides(*(given.get(name, "") for name in JUDGE))
     changes |= {"task": given["task"]} if given.get("task") else {}
     file = next((given[name] for name in ("config_file", *PRESETS) if given.get(name) and name not in by_name), None)
     file = None if file == str(saved) else file
     if given.get("seed", "").isdigit() and (file or "seed" not in by_name):
         changes["seed"] = int(given["seed"])
-    if saved.name == "config.yaml":
-        return load_saved(
-            lambda *chosen: _with_judge(load_config(*chosen), reward == AGENT), saved, file, changes, ARGUMENT_OF
-        )
-    changes |= reward_overrides(given.get("reward") or None)
+    if load is load_video_config:
+        changes |= reward_overrides(given.get("reward") or None)
+    embedded = load(str(saved), {}).judge.kind == EMBEDDED
 
-    def load(preset: str, changes: dict[str, Any]) -> Any:
-        config = load_video_config(preset, changes)
-        return _with_judge(config, bool(config.rewards.get(AGENT)))
+    def load_named(file: str, changes: dict[str, Any]) -> Any:
+        config = load(file, changes)
+        return config.model_copy(update={"judge": judge_or_embedded(config.judge)}) if embedded else config
 
-    return load_saved(load, saved, file, changes, ARGUMENT_OF)
-
-
-def _with_judge(config: Config, judges: bool) -> Config:
-    return config.model_copy(update={"judge": judge_or_embedded(config.judge)}) if judges else config
+    return load_saved(load_named, saved, file, changes, ARGUMENT_OF)
 
 
 def read_arguments(run_dir: Path) -> dict[str, Any]:
