@@ -126,6 +126,15 @@ def test_ctrl_c_lets_go_of_the_folder(tmp_path: Path) -> None:
         assert not (tmp_path / NAME).exists()
 
 
+def test_the_end_of_a_process_lets_go_of_its_folder(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from wm_nodes.core.run_lock import RunLock\n"
+        "RunLock(Path(sys.argv[1])).acquire(); raise KeyboardInterrupt"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, check=False)
+    assert done.returncode == -signal.SIGINT and not (tmp_path / NAME).exists()
+
+
 def test_what_a_holder_starts_is_its_own_and_lets_nobody_else_in(tmp_path: Path) -> None:
     with RunLock(tmp_path):
         child = [sys.executable, "-c", HOLD, str(tmp_path)]

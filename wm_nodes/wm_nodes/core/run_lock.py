@@ -4,6 +4,7 @@ What a holder's own children do counts as its own, so the nodes of a graph whose
 learner started by hand beside it does not. Standard library only: `ros2 launch` locks under the system's Python.
 """
 
+import atexit
 import fcntl
 import json
 import os
@@ -60,7 +61,7 @@ class RunLock:
         self._made = False
 
     def acquire(self) -> None:
-        """Take the lock; of two at the same moment one gets it.
+        """Take the lock, until release() or the end of the process; of two at the same moment one gets it.
 
         Raises:
             RunFolderInUseError: it is held, or held on another host, which cannot be asked.
@@ -73,6 +74,7 @@ class RunLock:
                 holder = _holder(text)
                 if not text:
                     self._held = _this_process()
+                    atexit.register(self.release)
                     os.pwrite(file, (json.dumps(asdict(self._held), indent=1) + "\n").encode(), 0)
                     os.fsync(file)
                     return
@@ -85,6 +87,7 @@ class RunLock:
 
     def release(self) -> None:
         """Let go of what acquire() took, and of a folder that it made and nobody wrote into."""
+        atexit.unregister(self.release)
         held, self._held = self._held, None
         if held is None or held.process != os.getpid():
             return

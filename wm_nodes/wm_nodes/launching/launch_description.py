@@ -6,7 +6,6 @@ ros2 runs under the system's Python, which has neither pydantic nor torch: the g
 PyPI's `launch` 0.1.3 is an unrelated project of the same name.
 """
 
-import atexit
 import json
 import subprocess
 from collections.abc import Iterable, Mapping
@@ -64,9 +63,7 @@ def _start(scenario: str, context: Any, names: Iterable[str]) -> list[Any]:
     given = {name: LaunchConfiguration(name).perform(context) for name in sorted(known.intersection(names))}
     parse_arguments(scenario, given)
     run_dir = run_folder(scenario, given)
-    writer = RunLock(run_dir)
-    writer.acquire()
-    atexit.register(writer.release)
+    RunLock(run_dir).acquire()  # until this process ends
     python = interpreter(given)
     graph = prepare_graph(scenario, {**given, "run_dir": str(run_dir)}, python)
     domain = int(graph_environment(graph.environment, python=python)["ROS_DOMAIN_ID"])
