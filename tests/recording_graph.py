@@ -28,12 +28,14 @@ class Graph:
     spec: EnvironmentSpec
     session: int = 7
     reward_lag: int = 3
+    start_ns: int = 0
+    """Stamps go on from here by the control period; 0: as in older recordings, where stamps count observations."""
     published: list[tuple[topics.RecordedTopic, Any, int]] = field(default_factory=list)
     rollouts: list[Rollout] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(self.session)
-        self.now_ns, self.clock_ns, self.step_id = 0, 0, 0
+        self.now_ns, self.clock_ns, self.step_id = self.start_ns, 0, 0
         self.sequence: dict[str, int] = {}
         self.rewards: list[tuple[int, Any]] = []
         self.episode_id = np.zeros(NUM_ENVS, np.uint64)

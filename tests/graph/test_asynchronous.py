@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graph.harness import Graph, Probe, wait_until
-from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image
 
 from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, ErrorCode
@@ -91,13 +91,19 @@ def test_the_policy_acts_on_images_in_real_time_and_says_hold_when_it_stops(grap
     wait_until("a held step", lambda: held(transitions[-1]))
 
 
-def test_the_clock_shows_the_stamp_of_each_observation(graph: Graph, probe: Probe) -> None:
-    ticks: list[int] = []
-    row = topic("/clock")
-    probe.node.create_subscription(Clock, row.name, lambda m: ticks.append(convert.time_ns(m.clock)), row.qos)
+def test_stamps_are_wall_time_that_passes_as_the_environment_steps(graph: Graph, probe: Probe) -> None:
+    period_s, delays_s = 0.05, list[float]()
+    row, clock = topic("env/image"), probe.node.get_clock()
+
+    def note(image: Image) -> None:
+        delays_s.append((clock.now().nanoseconds - convert.time_ns(image.header.stamp)) / 1e9)
+
+    probe.node.create_subscription(row.type, row.name, note, row.qos)
     transitions = probe.listen("env/transition")
-    graph.start_environment(num_envs=N, mode="asynchronous", control_period_s=0.05, publish_clock=True)
-    wait_until("ticks", lambda: len(ticks) > 5 and len(transitions) > 5)
-    stamps = {convert.time_ns(t.next_stamp) for t in list(transitions)}
-    assert ticks == sorted(ticks)
-    assert len(stamps & set(ticks)) >= 3
+    graph.start_environment(num_envs=N, mode="asynchronous", control_period_s=period_s)
+    wait_until("steps", lambda: len(transitions) > 40)
+    steps = [t for t in transitions if t.header.stamp != t.next_stamp]
+    took_s = [(convert.time_ns(t.next_stamp) - convert.time_ns(t.header.stamp)) / 1e9 for t in steps]
+    assert min(took_s) > 0
+    assert np.median(took_s) == pytest.approx(period_s, rel=0.2)
+    assert 0 < min(delays_s) <= np.median(delays_s) < period_s

@@ -28,6 +28,20 @@ def test_rollouts_equal_what_the_graph_published(tmp_path: Path, graph: Graph) -
         assert_same_rollout(ours, theirs)
 
 
+def test_stamps_of_wall_time_give_the_same_rollouts_and_episodes_as_stamps_that_count(
+    tmp_path: Path, graph: Graph
+) -> None:
+    timed = Graph(graph.spec, start_ns=1_764_000_000 * m.NS_PER_S)
+    for each in (graph, timed):
+        each.rollout(1, 8)
+    paths = write(tmp_path / "counted", graph), write(tmp_path / "timed", timed)
+    for ours, theirs in zip(*map(read_rollouts, paths), strict=True):
+        assert_same_rollout(ours, theirs)
+    for episode, same in zip(*map(read_episodes, paths), strict=True):
+        np.testing.assert_array_equal(episode.images, same.images)
+        np.testing.assert_array_equal(episode.ground_truth, same.ground_truth)
+
+
 def test_rewards_a_whole_rollout_late_still_join(tmp_path: Path, graph: Graph) -> None:
     graph.reward_lag = 40
     graph.rollout(1, 50)
@@ -108,9 +122,13 @@ def test_a_lost_reward_leaves_out_the_rollout_but_keeps_the_episodes(tmp_path: P
     assert not report.incomplete
 
 
-def test_a_restarted_environment_counts_stamps_anew_without_mixing_images(tmp_path: Path, graph: Graph) -> None:
+@pytest.mark.parametrize("start_ns", [0, 1_000 * m.NS_PER_S, 2_000 * m.NS_PER_S])
+def test_the_images_before_and_after_a_restart_are_not_mixed_whichever_stamps_are_later(
+    tmp_path: Path, start_ns: int
+) -> None:
+    graph = Graph(make_spec(num_envs=NUM_ENVS), start_ns=1_500 * m.NS_PER_S if start_ns else 0)
     graph.rollout(1, 3)
-    again = Graph(graph.spec, session=8)
+    again = Graph(graph.spec, session=8, start_ns=start_ns)
     again.rollout(1, 9)
     found = list(read_rollouts(write(tmp_path / "bag", graph, again)))
     for ours, theirs in zip(found, graph.rollouts + again.rollouts, strict=True):

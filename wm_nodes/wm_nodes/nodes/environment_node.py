@@ -13,7 +13,6 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.timer import Timer
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 from std_msgs.msg import Bool
 
@@ -24,7 +23,7 @@ from wm_nodes.core.types import UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
 from wm_nodes.nodes.environment.image_views import PARAMS as VIEW_PARAMS
 from wm_nodes.nodes.environment.image_views import ImageViews
-from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
+from wm_nodes.nodes.environment.lockstep import LockstepEnvironment, StampClock
 from wm_nodes.nodes.factories import BACKENDS, make_environment
 from wm_nodes.ros import calls, convert, diagnostics
 from wm_nodes.ros.flow_control import ProducerCredits
@@ -52,7 +51,6 @@ PARAMS = (
           read_only=True, minimum=0.0, maximum=60.0),
     Param("max_action_age_s", 0.3, "Mode asynchronous: an action is used until the observation it answers is older "
           "than this; then the environment holds", "s", minimum=0.001, maximum=60.0),
-    Param("publish_clock", False, "Publish /clock: the stamp of each observation", read_only=True),
     *VIEW_PARAMS,
 )
 
@@ -66,6 +64,7 @@ class EnvironmentNode(ManagedNode):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("environment", PARAMS, **node_arguments)
         self.served: LockstepEnvironment | None = None
+        self._stamps = StampClock(lambda: self.get_clock().now().nanoseconds)
         self._timer: Timer | None = None
         self._unsent = deque[Callable[[], object]]()
         self._sending = threading.Lock()
@@ -84,13 +83,14 @@ class EnvironmentNode(ManagedNode):
                 f"px make one env/image of {size} bytes, more than the {MAX_MOSAIC_BYTES} that DDS carries in time; "
                 "lower num_envs or simulation.image_size"
             )
-        self.served = LockstepEnvironment(environment, self.session, self, seed=int(self.param("seed")))
+        self.served = LockstepEnvironment(
+            environment, self.session, self, seed=int(self.param("seed")), clock=self._stamps
+        )
         self.served.before_step = self._require_credit
         self._spec = environment.spec
         self._shown: Image | None = None
         self._images = self.publish_unnumbered("env/image")
         self._views = ImageViews(self)
-        self._clock_publisher = self._make_clock()
         self._transitions = self.publish_on("env/transition")
         self._episodes = self.publish_on("episode")
         self._goals = self.publish_on("env/goal")
@@ -144,8 +144,6 @@ class EnvironmentNode(ManagedNode):
     def image(self, images: UInt8Array, stamp_ns: int) -> None:
         message = convert.mosaic_msg(images, stamp_ns, self._spec)
         self._shown = message
-        if self._clock_publisher is not None:
-            self._send(lambda: self._clock_publisher.publish(Clock(clock=message.header.stamp)))
         self._send(lambda: self._images.publish(message))
         self._send(lambda: self._views.show(images, message))
 
@@ -267,14 +265,6 @@ class EnvironmentNode(ManagedNode):
         if blocking:
             self.diagnostics.count("waits_for_credit", level=diagnostics.OK)
             raise WireError(ErrorCode.BUSY, f"waiting for {', '.join(blocking)} to take in seq {next_seq - 1}; retry")
-
-    def _make_clock(self) -> Any:
-        """The publisher of /clock, or None where nobody wants it."""
-        if not self.param("publish_clock"):
-            return None
-        if self.param("use_sim_time"):
-            raise ValueError("use_sim_time with publish_clock: the node would wait for its own clock; unset one")
-        return self.publish_unnumbered("/clock")
 
     def _refusal(self, response: Any, error: WireError, what: str) -> Any:
         self._count_refusal(error, what)

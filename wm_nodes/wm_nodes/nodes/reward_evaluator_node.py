@@ -110,7 +110,8 @@ class RewardEvaluatorNode(ManagedNode):
         self._enter_session(message.session)
 
     def _enter_session(self, session: int) -> None:
-        """Stamps start again with every environment process: what came from the one before must not be joined."""
+        """Episode ids start again with every environment process, in older recordings stamps do, too: what came from
+        the one before must not be joined."""
         if session != self._session:
             self._session = session
             self._images.clear()
@@ -193,7 +194,9 @@ class RewardEvaluatorNode(ManagedNode):
         while self._agent is not None and self._undecided and self._undecided[0][2].done:
             since, transition, pending = self._undecided.popleft()
             for env, verdict in pending.verdicts().items():
-                self._agent.publish(verdict, clip=env, iteration=transition.step_id)
+                self._agent.publish(
+                    verdict, clip=env, iteration=transition.step_id, stamp_ns=transition.stamp_ns
+                )
             self._publish(transition, pending.result(), time.perf_counter() - since)
 
     def _drop_undecided(self) -> None:
@@ -251,7 +254,7 @@ class RewardEvaluatorNode(ManagedNode):
         values = self._window.take()
         if values is not None:
             message = RewardSummary(**values)
-            message.header = convert.header(self._window.last_stamp_ns)
+            message.header = convert.header(self.get_clock().now().nanoseconds)
             self._summaries.publish(message)
 
     # Service.

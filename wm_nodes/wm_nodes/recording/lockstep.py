@@ -220,7 +220,8 @@ class LockSteps:
             del self._images[stamp], self._received[stamp]
 
     def _forget_images(self, restart_ns: int) -> None:
-        """A restarted environment counts its stamps anew: drop what its predecessor showed, going by when it came."""
+        """Drop what the environment before a restart showed, going by when it came: in older recordings stamps count
+        observations, anew after every restart."""
         before = self._last_transition_ns
         self._drop_images([stamp for stamp, came in self._received.items() if came - before < restart_ns - came])
 

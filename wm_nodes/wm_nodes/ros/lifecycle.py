@@ -53,7 +53,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         for service in self.services:  # of parameters and of the lifecycle
             service.callback = self.guard.wrap_service(service.srv_name, service.callback)
         self.session = new_session()
-        """A new one at every configure: what is numbered (seq, step ids, stamps) starts again with it."""
+        """A new one at every configure: what is numbered (seq, step ids) starts again with it."""
         self.failed = False
         """True: the process should end with a non-zero exit code."""
         self._active = False

@@ -1,4 +1,4 @@
-"""Lock-step rules where things go wrong: NaN of the model, an environment that raises, the emergency stop."""
+"""Lock-step rules: the stamp of an observation; NaN of the model, an environment that raises, the emergency stop."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ from graph.toy import ReachToy
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
-from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
+from wm_nodes.nodes.environment.lockstep import LockstepEnvironment, StampClock
 from wm_nodes.ros.clients import LocalEnvironmentClient
 from wm_nodes.ros.wire import EpisodeNote, Goals, PeerLost, ResetCommand, StepCommand, Transition, WireError
 
@@ -36,18 +36,23 @@ class Fragile(ReachToy):
 
 
 class Bench:
-    """A lock-step environment over Fragile; it is also the sink."""
+    """A lock-step environment over Fragile; it is also the sink. now_ns: stands still until a test changes it."""
 
-    def __init__(self) -> None:
+    def __init__(self, now_ns: int = 1_764_000_000_000_000_000) -> None:
+        self.now_ns = now_ns
         self.transitions: list[Transition] = []
         self.notes: list[EpisodeNote] = []
+        self.image_stamps: list[int] = []
+        self.goal_stamps: list[int] = []
         self.environment = Fragile(N, seed=0, max_episode_steps=50)
-        self.served = LockstepEnvironment(self.environment, 1, self)
+        self.served = LockstepEnvironment(self.environment, 1, self, clock=StampClock(lambda: self.now_ns))
         self.served.reset(ResetCommand(seeds=np.full(N, 3, np.uint64)))
 
-    def image(self, images: UInt8Array, stamp_ns: int) -> None: ...
+    def image(self, images: UInt8Array, stamp_ns: int) -> None:
+        self.image_stamps.append(stamp_ns)
 
-    def goals(self, goals: Goals) -> None: ...
+    def goals(self, goals: Goals) -> None:
+        self.goal_stamps.append(goals.stamp_ns)
 
     def transition(self, transition: Transition) -> None:
         self.transitions.append(transition)
@@ -62,6 +67,28 @@ class Bench:
     def ends(self) -> list[tuple[int, int]]:
         """(environment, reason) of the END events."""
         return [(note.env_index, note.reason) for note in self.notes if note.kind == EpisodeEvent.KIND_END]
+
+
+def test_everything_about_an_observation_has_the_time_at_which_it_was_made_for_its_stamp() -> None:
+    bench = Bench(now_ns=1_764_000_000_000_000_000)
+    bench.now_ns += 5_000_000
+    reply = bench.served.step(replace(bench.command(), reset_mask=np.array([True, False])))
+    assert bench.image_stamps == bench.goal_stamps == [1_764_000_000_000_000_000, 1_764_000_000_005_000_000]
+    first, second = bench.image_stamps
+    assert [(t.stamp_ns, t.next_stamp_ns) for t in bench.transitions] == [(first, first), (first, second)]
+    assert reply.stamp_ns == second
+    assert [(note.kind, note.stamp_ns) for note in bench.notes[-2:]] == [
+        (EpisodeEvent.KIND_END, first), (EpisodeEvent.KIND_START, second),
+    ]
+
+
+def test_stamps_become_later_although_the_clock_stands_still_or_jumps_back() -> None:
+    bench = Bench(now_ns=1000)
+    for now_ns in (1000, 400, 1001, 1003, 2000):
+        bench.now_ns = now_ns
+        bench.served.step(bench.command())
+    assert bench.image_stamps == [1000, 1001, 1002, 1003, 1004, 2000]
+    assert Bench(now_ns=0).image_stamps == [1]  # without /clock; 0 is the stamp of an action that answers nothing
 
 
 def test_an_episode_reset_without_a_seed_names_the_seed_that_makes_it_again() -> None:

@@ -2,7 +2,7 @@
 
 Shapes: N environments, A action, S state, P ground truth.
 
-Stamps count observations: observation k has stamp k * control period, so that equal seeds give equal recordings.
+A stamp is the wall time at which an observation was made. Nothing that is computed depends on it.
 """
 
 import threading
@@ -21,6 +21,20 @@ from wm_nodes.core.types import BoolArray, Environment, FloatArray, Observation,
 from wm_nodes.ros.wire import EpisodeNote, Goals, Reply, ResetCommand, StepCommand, Transition, WireError
 
 UNIT_TOLERANCE = 1e-6
+
+
+class StampClock:
+    """Gives the stamps of one node's observations: wall time, and always later than the stamp before.
+
+    now_ns: ns since the epoch; it may stand still or jump back.
+    """
+
+    def __init__(self, now_ns: Callable[[], int] = time.time_ns) -> None:
+        self._now_ns, self._last_ns = now_ns, 0
+
+    def __call__(self) -> int:
+        self._last_ns = max(self._now_ns(), self._last_ns + 1)
+        return self._last_ns
 
 
 class Sink(Protocol):
@@ -58,10 +72,12 @@ class LockstepEnvironment:
         sink: gets every published item.
         behaviour: label of the episode events until a reset names another.
         seed: root of the resets that name no seeds (stream `reset`, number of the draw).
+        clock: gives the stamp of an observation, ns; every call a later one.
     """
 
     def __init__(
-        self, environment: Environment, session: int, sink: Sink, behaviour: str = "policy", seed: int = 0
+        self, environment: Environment, session: int, sink: Sink, behaviour: str = "policy", seed: int = 0,
+        clock: Callable[[], int] | None = None,
     ) -> None:
         self.environment, self.session = environment, session
         self.spec: EnvironmentSpec = environment.spec
@@ -72,8 +88,8 @@ class LockstepEnvironment:
         self._behaviour = behaviour
         self._seed, self._draws = seed, 0
         self._lock = threading.Lock()
-        self._period_ns = round(self.spec.control_period_s * 1e9)
-        self._num_observations = 0
+        self._clock = clock or StampClock()
+        self._stamp_ns = 0
         self._last_step_id = 0
         self._last_reply: Reply | WireError | None = None
         self._current: Observation | None = None
@@ -100,12 +116,11 @@ class LockstepEnvironment:
             if self._current is None and not mask.all():
                 raise WireError(ErrorCode.OUT_OF_ORDER, "the first reset must be of all environments; empty mask")
             seeds = self._seeds(command.seeds)
-            stamp_before = self._stamp_ns()
-            self._end_episodes(mask, EpisodeEvent.REASON_RESET, stamp_before)
+            self._end_episodes(mask, EpisodeEvent.REASON_RESET, self._stamp_ns)
             self._behaviour = command.behaviour or self._behaviour
             with self._environment_errors():
                 self._current = self.environment.reset(mask, seeds)
-            stamp = self._advance()
+            stamp = self._stamp_ns = self._clock()
             reply = self._reply(stamp, command.with_image)
             self._last_reply = None
             self._publish_observation(stamp, goals_changed=True)
@@ -154,14 +169,14 @@ class LockstepEnvironment:
     def end_episodes(self, reason: int) -> None:
         """End all running episodes, e.g. when the node stops or the estop is set."""
         with self._lock:
-            self._abort(np.ones(self.spec.num_envs, bool), reason, self._stamp_ns())
+            self._abort(np.ones(self.spec.num_envs, bool), reason, self._stamp_ns)
 
     def close(self) -> None:
         self.environment.close()
 
     def _step(self, command: StepCommand, actions: FloatArray, seeds: UInt64Array | None) -> Reply:
         started = time.perf_counter()
-        before, before_stamp = self._current, self._stamp_ns()
+        before, before_stamp = self._current, self._stamp_ns
         assert before is not None
         with self._environment_errors():
             result = self.environment.step(actions)
@@ -178,7 +193,7 @@ class LockstepEnvironment:
                 observation = self.environment.reset(mask, seeds)
             valid &= ~mask
         self._current = observation
-        stamp = self._advance()
+        stamp = self._stamp_ns = self._clock()
         self._last_step_id = command.step_id
         aborted = self._aborted() if mask is None else self._aborted() & ~mask
         success = np.where(valid, result.success_probability, 0).astype(np.float32)
@@ -242,7 +257,7 @@ class LockstepEnvironment:
         try:
             yield
         except Exception as error:
-            self._abort(np.ones(self.spec.num_envs, bool), EpisodeEvent.REASON_ERROR, self._stamp_ns())
+            self._abort(np.ones(self.spec.num_envs, bool), EpisodeEvent.REASON_ERROR, self._stamp_ns)
             for slot in self._slots:
                 slot.aborted = True
             code = ErrorCode.NAN_MODEL if isinstance(error, FloatingPointError) else ErrorCode.INTERNAL
@@ -274,13 +289,6 @@ class LockstepEnvironment:
         if seeds.shape != (self.spec.num_envs,):
             raise WireError(ErrorCode.BAD_SHAPE, f"{len(seeds)} seeds for {self.spec.num_envs} environments")
         return seeds
-
-    def _stamp_ns(self) -> int:
-        return self._num_observations * self._period_ns
-
-    def _advance(self) -> int:
-        self._num_observations += 1
-        return self._stamp_ns()
 
     def _reply(self, stamp: int, with_image: bool) -> Reply:
         assert self._current is not None

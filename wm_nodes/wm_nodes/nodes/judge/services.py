@@ -101,10 +101,15 @@ class JudgeServices:
             )
         return verdicts, [messages[clip] for clip in range(len(jobs))]
 
-    def publish(self, verdict: Verdict, *, clip: int, iteration: int, buffer_sha256: str = "") -> ClipVerdict:
-        """Publish a verdict and note it in the diagnostics; return its message. See ClipVerdict for the arguments."""
+    def publish(
+        self, verdict: Verdict, *, clip: int, iteration: int, buffer_sha256: str = "", stamp_ns: int | None = None
+    ) -> ClipVerdict:
+        """Publish a verdict and note it in the diagnostics; return its message. See ClipVerdict for the arguments.
+
+        stamp_ns: None: now.
+        """
         message = verdict_msg(verdict)
-        message.header = convert.header(self._node.get_clock().now().nanoseconds, "")
+        message.header = convert.header(self._node.get_clock().now().nanoseconds if stamp_ns is None else stamp_ns, "")
         message.clip, message.iteration, message.buffer_sha256 = clip, iteration, buffer_sha256
         self._verdicts.publish(message)
         self._node.diagnostics.latency("verdict", verdict.cost.wall_s)

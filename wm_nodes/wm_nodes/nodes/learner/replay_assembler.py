@@ -83,7 +83,7 @@ class ReplayAssembler:
             self._withhold(False)
 
     def enter_session(self, session: int) -> None:
-        """The recorded environment was restarted: its stamps and step ids start again."""
+        """The recorded environment was restarted: its step ids start again."""
         with self._changed:
             if session != self._session:
                 self._finish()

@@ -73,7 +73,7 @@ class RolloutAssembler:
             self._collecting = False
 
     def enter_session(self, session: int) -> None:
-        """The environment was (re)started: its stamps and step ids start again."""
+        """The environment was (re)started: its step ids start again."""
         with self._changed:
             if session != self.session:
                 self.session = session

@@ -13,13 +13,11 @@ class SummaryWindow:
 
     def __init__(self) -> None:
         self.invalid = 0
-        self.last_stamp_ns = 0
         self._returns: dict[int, float] = defaultdict(float)
         self._clear()
 
     def add(self, transition: Transition, result: RewardResult) -> None:
         """Count one judged lock-step."""
-        self.last_stamp_ns = transition.stamp_ns
         valid = result.valid
         self.invalid += int((transition.valid & ~valid).sum())
         self._totals.append(result.total[valid])
