@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import PolicyConfig, RunConfig
+from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
 from wm_nodes.core.specs import SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
@@ -103,6 +104,43 @@ def make_environment_of_large_images(config: RunConfig, num_envs: int, seed: int
 
 COMPUTING_S = 6.0
 """Twice the time after which a silent node is lost."""
+
+
+class TwoCameras(ReachToy):
+    """ReachToy with a camera over the table and one on the tool, whose picture is the other's negative."""
+
+    def __init__(self, num_envs: int, seed: int) -> None:
+        super().__init__(num_envs, seed, max_episode_steps=100_000)
+        self.spec = replace(self.spec, width=2 * SIDE_PX, cameras=("top", "hand"))
+        matrix = intrinsics(SIDE_PX, SIDE_PX, fov_rad=1.0)
+        top = look_at((0.6, -0.1, 0.9), (0.6, 0.0, 0.0))
+        self.cameras = (
+            CameraModel("top", SIDE_PX, SIDE_PX, matrix, top),
+            CameraModel("hand", SIDE_PX, SIDE_PX, matrix, self._hand),
+        )
+
+    def _hand(self, env: int) -> Matrix:
+        x, y, z = self._states[env].tolist()
+        return look_at((x, y - 0.1, z + 0.1), (x, y, z))
+
+    def _draw(self) -> UInt8Array:
+        images = super()._draw()
+        return np.concatenate([images, 255 - images], axis=2)
+
+
+def make_environment_with_cameras(config: RunConfig, num_envs: int, seed: int) -> TwoCameras:
+    return TwoCameras(num_envs, seed)
+
+
+class LostHand(TwoCameras):
+    """Cannot say where its moving camera is."""
+
+    def _hand(self, env: int) -> Matrix:
+        raise TimeoutError("no joint states")
+
+
+def make_environment_with_a_lost_camera(config: RunConfig, num_envs: int, seed: int) -> LostHand:
+    return LostHand(num_envs, seed)
 
 
 class Faulty(ReachToy):

@@ -59,6 +59,9 @@ class Environment(Protocol):
     """N environments stepped together; served by the world model, by ManiSkill, or by a robot.
 
     An environment that has ended (terminated or truncated) stays put, with valid=False, until it is reset.
+
+    Two attributes are optional: `ground_truth`, float32 (N, P) of the current observation, and `cameras`, a sequence of
+    core.cameras.CameraModel, some or all of spec.cameras, which people then see with calibration and frames.
     """
 
     spec: EnvironmentSpec

@@ -21,6 +21,7 @@ from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
+from wm_nodes.nodes.environment.camera_topics import CameraTopics
 from wm_nodes.nodes.environment.image_views import PARAMS as VIEW_PARAMS
 from wm_nodes.nodes.environment.image_views import ImageViews
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment, StampClock
@@ -91,6 +92,7 @@ class EnvironmentNode(ManagedNode):
         self._shown: Image | None = None
         self._images = self.publish_unnumbered("env/image")
         self._views = ImageViews(self)
+        self._cameras = CameraTopics(self, environment)
         self._transitions = self.publish_on("env/transition")
         self._episodes = self.publish_on("episode")
         self._goals = self.publish_on("env/goal")
@@ -146,6 +148,7 @@ class EnvironmentNode(ManagedNode):
         self._shown = message
         self._send(lambda: self._images.publish(message))
         self._send(lambda: self._views.show(images, message))
+        self._send(lambda: self._cameras.show(images, stamp_ns, self._spec.encoding))
 
     def goals(self, goals: Goals) -> None:
         self._send(lambda: self._goals.publish(convert.goal_msg(goals, self._spec)))

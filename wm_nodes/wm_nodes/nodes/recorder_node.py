@@ -24,7 +24,7 @@ from wm_nodes.ros import diagnostics
 from wm_nodes.ros.flow_control import ConsumerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
-from wm_nodes.ros.qos import TOPICS, GraphTopic
+from wm_nodes.ros.qos import TOPICS, GraphTopic, row_name
 from wm_nodes.ros.sequence_numbers import GapTracker
 from wm_nodes.ros.spin import run_node
 
@@ -278,6 +278,7 @@ class RecorderNode(ManagedNode):
 
 def _base(name: str) -> str:
     """The row of the QoS table that a topic name ends with: sim/env/image is an env/image."""
+    name = row_name(name)
     fitting = [row for row in TOPICS if name == row or name.endswith(f"/{row.lstrip('/')}")]
     return max(fitting, key=len, default=name)
 

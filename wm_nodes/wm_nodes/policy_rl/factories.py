@@ -12,6 +12,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import FloatArray, Observation, UInt8Array
+from wm_nodes.environments.maniskill.cameras import hand_over, table_top_cameras
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.reward import EncoderDistance, EndogenousReward
 from wm_nodes.training.weights import load_weights
@@ -98,10 +99,12 @@ def make_imagined_environment(
                 "the configuration or train another model"
             )
     spec = simulation_spec(config.task, config.simulation, num_envs)
-    return ImaginedEnvironment(
+    environment = ImaginedEnvironment(
         models, spec, load_starts(Path(starts_file)), config.reward, num_envs=num_envs, seed=seed,
         with_goals=config.reward.dense_weight > 0,
     )
+    environment.cameras = table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
+    return environment
 
 
 def policy_actor(

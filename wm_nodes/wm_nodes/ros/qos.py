@@ -1,16 +1,18 @@
 """The graph's topics: one row each, with message class and QoS. Profiles of recorded topics are those of
 recording/topics.py; here are only what nobody records, and the profiles of viewers."""
 
+import re
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Qos
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Bool
 
 from wm_msgs.msg import (
@@ -31,6 +33,11 @@ from wm_msgs.msg import (
     TransitionBatch,
 )
 from wm_nodes.recording import topics as recorded
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # ROS 2 from apt has it, the wheels of requirements/ros.txt have not
+    TFMessage = None
 
 CREDIT_WINDOW = recorded.CREDIT_WINDOW
 
@@ -79,7 +86,18 @@ METRICS = profile_of(recorded.METRICS)
 VIEW = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
 """For viewers: never holds anything back."""
 
-COMPRESSED = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=2)
+PICTURE = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=2)
+"""For viewers that ask for reliable images, as RViz does unless told otherwise; it holds nothing back either."""
+
+CALIBRATION = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=PICTURE.depth,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""Latched, and as deep as the pictures that it comes with."""
+
+FRAMES = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=100)
+"""As tf2_ros publishes /tf; /tf_static is LATCHED, as there."""
+
 CLOCK = QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=1)
 CREDIT = METRICS
 """Deeper than one: several consumers publish on the same topic."""
@@ -110,7 +128,10 @@ TOPICS: dict[str, GraphTopic] = {
         _graph_topic(recorded.CLIP_SCORES, ClipScores),
         _graph_topic(recorded.VIDEO_VERSION, PolicyVersion),
         _graph_topic(recorded.VERDICT, ClipVerdict),
-        GraphTopic("env/image/compressed", CompressedImage, COMPRESSED),
+        GraphTopic("env/image/compressed", CompressedImage, PICTURE),
+        GraphTopic("env/camera/<name>/image_raw", Image, PICTURE),
+        GraphTopic("env/camera/<name>/camera_info", CameraInfo, CALIBRATION),
+        GraphTopic("env/camera/<name>/transform", TransformStamped, LATCHED),
         GraphTopic("flow/credit", Credit, CREDIT),
         GraphTopic("run/links", NodeLinks, LATCHED),
         GraphTopic("safety/estop", Bool, LATCHED),
@@ -118,6 +139,14 @@ TOPICS: dict[str, GraphTopic] = {
         GraphTopic("/clock", Clock, CLOCK),
     )
 }
+if TFMessage is not None:
+    TOPICS |= {name: GraphTopic(name, TFMessage, qos) for name, qos in (("/tf", FRAMES), ("/tf_static", LATCHED))}
+"""A topic of each camera has <name> in place of the camera's name."""
+
+
+def row_name(name: str) -> str:
+    """A topic's name as TOPICS has it."""
+    return re.sub(r"\benv/camera/\w+/", "env/camera/<name>/", name)
 
 
 def topic(name: str) -> GraphTopic:
@@ -126,6 +155,6 @@ def topic(name: str) -> GraphTopic:
     Raises:
         KeyError: names the topics that exist.
     """
-    if name not in TOPICS:
+    if row_name(name) not in TOPICS:
         raise KeyError(f"unknown topic {name!r}; the table in wm_nodes/ros/qos.py has {', '.join(sorted(TOPICS))}")
-    return TOPICS[name]
+    return replace(TOPICS[row_name(name)], name=name)

@@ -3,6 +3,7 @@
 Shapes: N environments, M starts, S tokens, D values per token, A action, P state.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
+from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
@@ -53,6 +55,9 @@ class ImaginedEnvironment:
         with_goals: imagine goals by the text model (needed for the dense reward).
         exact: compute in float32 even where bfloat16 is faster.
     """
+
+    cameras: Sequence[CameraModel] = ()
+    """Those whose pictures it imagines, where somebody has said so."""
 
     def __init__(
         self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,

@@ -13,10 +13,12 @@ from transforms3d.euler import euler2quat
 
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.tasks import get_task
+from wm_nodes.core.cameras import CameraModel, Matrix
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.environments.maniskill.cameras import table_top_cameras
 from wm_nodes.environments.maniskill.scenes import make_scene, render
 
 CONTROLLER_RANGE_M = 0.1
@@ -52,6 +54,16 @@ class ManiSkillEnvironment:
     def ground_truth(self) -> FloatArray:
         """(N, P) simulator truth of the current observation."""
         return self._truth.copy()
+
+    @property
+    def cameras(self) -> tuple[CameraModel, ...]:
+        return table_top_cameras(self._config, self._hand)
+
+    def _hand(self, i: int) -> Matrix:
+        """Pose (4, 4) of the link panda_hand in the robot's base frame."""
+        robot = self._scenes[i].agent.robot
+        pose = robot.pose.inv() * robot.links_map["panda_hand"].pose
+        return np.asarray(pose.to_transformation_matrix()[0].numpy(), np.float64)
 
     @property
     def scene(self) -> BaseEnv:

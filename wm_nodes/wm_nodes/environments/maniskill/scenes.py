@@ -20,6 +20,7 @@ from mani_skill.utils.registration import register_env
 
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.environments.maniskill.backend import render_backend
+from wm_nodes.environments.maniskill.cameras import PLACEMENTS
 
 SIMULATION_HZ = 100
 TABLE_COLOUR = (0.78, 0.74, 0.66, 1.0)
@@ -34,12 +35,13 @@ class TableTopScene(BaseEnv):  # type: ignore[misc]
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
         common = {"width": self.image_size, "height": self.image_size, "near": 0.01, "far": 10.0}
-        side = sapien_utils.look_at(eye=[0.09, 0.5, 0.45], target=[0.09, -0.01, 0.02])
-        wrist = sapien_utils.look_at(eye=[0.06, 0.0, 0.0], target=[0.03, 0.0, 0.12])
         hand = self.agent.robot.links_map["panda_hand"]
         return [
-            CameraConfig("side", pose=side, fov=0.8, **common),
-            CameraConfig("wrist", pose=wrist, fov=1.4, mount=hand, **common),
+            CameraConfig(
+                name, pose=sapien_utils.look_at(eye=list(camera.eye), target=list(camera.target)), fov=camera.fov_rad,
+                mount=hand if camera.on_hand else None, **common,
+            )
+            for name, camera in PLACEMENTS.items()
         ]
 
     def _load_scene(self, options: dict[str, Any]) -> None:

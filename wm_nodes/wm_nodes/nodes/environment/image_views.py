@@ -15,9 +15,10 @@ from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import VIEW
 
 PARAMS = (
-    Param("view_env", -1, "Also publish this environment's image alone on env/image/view while someone looks; -1: none",
-          minimum=-1, maximum=4095),
-    Param("view_period_s", 0.066, "Least time between two env/image/view", "s", minimum=0.0, maximum=10.0),
+    Param("view_env", -1, "Also publish this environment's image alone on env/image/view while someone looks; -1: "
+          "none. env/camera/<name>/image_raw and /tf show it too, at -1 environment 0", minimum=-1, maximum=4095),
+    Param("view_period_s", 0.066, "Least time between two env/image/view, or two env/camera/<name>/image_raw", "s",
+          minimum=0.0, maximum=10.0),
     Param("compressed", "subscribed", "When to publish env/image/compressed (JPEG, for remote viewers)",
           choices=("subscribed", "always", "never")),
     Param("compressed_period_s", 0.066, "Least time between two env/image/compressed", "s", minimum=0.0, maximum=10.0),

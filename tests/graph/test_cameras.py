@@ -1,0 +1,235 @@
+"""What ROS tools need of an environment's cameras: pictures with calibration, and frames, over DDS."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from graph.harness import Graph, Probe, wait_until
+from graph.test_environment import Client
+from graph.toy import SIDE_PX, TwoCameras
+from sensor_msgs.msg import CameraInfo, Image
+
+from wm_nodes.nodes.environment.camera_topics import cameras_of
+from wm_nodes.recording import Bag
+from wm_nodes.ros import convert
+from wm_nodes.ros.qos import TOPICS
+from wm_nodes.ros.wire import Reply
+
+pytestmark = pytest.mark.graph
+N, SHOWN = 4, 2
+TOP, HAND = TwoCameras(1, 0).cameras
+
+
+@pytest.fixture
+def client(graph: Graph, probe: Probe) -> Client:
+    graph.start_environment("toy:make_environment_with_cameras", num_envs=N, view_env=SHOWN, view_period_s=0.05)
+    return Client(probe)
+
+
+def move(client: Client, before: Reply) -> Reply:
+    actions = np.random.default_rng(before.step_id).uniform(-1, 1, (N, 3))
+    return client.step(client.command(before.step_id + 1, actions))
+
+
+def pose_of(message: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """(4, 4) of a TransformStamped."""
+    t, q = message.transform.translation, message.transform.rotation
+    x, y, z, w = q.x, q.y, q.z, q.w
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.vstack([np.column_stack([rotation, [t.x, t.y, t.z]]), [0, 0, 0, 1]])
+
+
+def test_a_picture_and_its_calibration_have_one_stamp_and_one_frame(client: Client) -> None:
+    infos: list[CameraInfo] = client.probe.listen("env/camera/hand/camera_info")
+    first = wait_until("the latched calibration, before any observation", lambda: infos)[0]
+    assert (first.width, first.height, first.distortion_model) == (SIDE_PX, SIDE_PX, "plumb_bob")
+    np.testing.assert_array_equal(first.k, HAND.K.reshape(-1))
+    np.testing.assert_array_equal(first.p.reshape(3, 4), np.column_stack([HAND.K, np.zeros(3)]))
+    np.testing.assert_array_equal(first.r.reshape(3, 3), np.eye(3))
+    assert not any(first.d) and len(first.d) == 5
+    images = client.probe.listen("env/image")
+    pictures: list[Image] = client.probe.listen("env/camera/hand/image_raw")
+    reply = client.reset()
+
+    def seen() -> list[Image]:
+        """Pictures whose mosaic has come too."""
+        nonlocal reply
+        reply = move(client, reply)
+        whole.update({convert.time_ns(image.header.stamp): image for image in images})
+        return [picture for picture in pictures if convert.time_ns(picture.header.stamp) in whole]
+
+    whole = dict[int, Image]()
+    wait_until("pictures", lambda: len(seen()) > 3)
+    found = seen()
+    time.sleep(0.2)  # for the calibration of the last one
+    calibrated = {convert.time_ns(info.header.stamp) for info in infos}
+    for picture in found:
+        assert convert.time_ns(picture.header.stamp) in calibrated
+        assert picture.header.frame_id == first.header.frame_id == "wm_camera_hand_optical"
+        assert (picture.width, picture.height, picture.step) == (SIDE_PX, SIDE_PX, 3 * SIDE_PX)
+        mosaic = convert.images_of(whole[convert.time_ns(picture.header.stamp)], client.spec)
+        pixels = np.frombuffer(picture.data, np.uint8).reshape(SIDE_PX, SIDE_PX, 3)
+        np.testing.assert_array_equal(pixels, mosaic[SHOWN, :, SIDE_PX:])
+    assert client.probe.node.count_subscribers("/wm/env/camera/top/image_raw") == 0
+
+
+def test_a_still_camera_has_a_latched_frame_and_a_moving_one_that_of_each_observation(client: Client) -> None:
+    reply = move(client, client.reset())
+    still = client.probe.listen("env/camera/top/transform")
+    moving = client.probe.listen("env/camera/hand/transform")
+    message = wait_until("the latched transform", lambda: still)[0]
+    assert (message.header.frame_id, message.child_frame_id) == ("wm_base", "wm_camera_top_optical")
+    np.testing.assert_allclose(pose_of(message), TOP.pose_in(), atol=1e-9)
+    wait_until("matching", lambda: client.probe.node.count_publishers("/wm/env/camera/hand/transform"))
+    replies = {reply.stamp_ns: reply}
+
+    def moved() -> bool:
+        nonlocal reply
+        reply = move(client, reply)
+        replies[reply.stamp_ns] = reply
+        return len(moving) > 3
+
+    wait_until("frames of several observations", moved)
+    assert len(still) == 1
+    for message in moving:
+        tool = replies[convert.time_ns(message.header.stamp)].states[SHOWN]
+        np.testing.assert_allclose(pose_of(message)[:3, 3], np.add(tool, (0, -0.1, 0.1)), atol=1e-6)
+        np.testing.assert_allclose(pose_of(message)[:3, 2], np.array([0, 1, -1]) / 2**0.5, atol=1e-6)
+
+
+def test_a_recorder_takes_the_topics_of_a_camera_when_it_is_told_to(client: Client, graph: Graph) -> None:
+    names = ["env/camera/top/camera_info", "env/camera/top/transform", "env/camera/top/image_raw"]
+    recorder = graph.start("recorder", topics=json.dumps(["env/spec", *names]))
+    reply = client.reset()
+
+    def recorded() -> bool:
+        nonlocal reply
+        reply = move(client, reply)
+        return int(client.probe.value("/wm/recorder", "messages") or 0) > 8
+
+    wait_until("messages", recorded)
+    recorder.terminate()
+    assert recorder.wait(20) == 0
+    with Bag(graph.folder / "bags" / "bag_000") as bag:
+        counts = [bag.count(f"/wm/{name}") for name in names]
+    assert counts[0] > 3 and counts[1] == 1 and counts[2] > 2
+
+
+def test_an_environment_that_says_nothing_of_its_cameras_has_no_such_topics_and_the_log_says_what_to_give(
+    graph: Graph, probe: Probe
+) -> None:
+    graph.start_environment(num_envs=N)
+    Client(probe).reset()
+    assert not [name for name, _ in probe.node.get_topic_names_and_types() if "/env/camera/" in name]
+    assert graph.log("/wm/environment").count("the attribute `cameras` (wm_nodes/core/cameras.py)") == 1
+
+
+def test_a_camera_whose_pose_cannot_be_told_is_counted_and_stops_no_step(graph: Graph, probe: Probe) -> None:
+    graph.start_environment("toy:make_environment_with_a_lost_camera", num_envs=N)
+    client = Client(probe)
+    heard = probe.listen("env/camera/hand/transform")
+    reply = client.reset()
+
+    def counted() -> bool:
+        nonlocal reply
+        reply = move(client, reply)
+        return bool(probe.value("/wm/environment", "camera_pose_errors"))
+
+    wait_until("the count", counted)
+    assert not heard
+    wait_until("the reason", lambda: "TimeoutError: no joint states" in probe.diagnostics["/wm/environment"].message)
+
+
+def test_cameras_that_do_not_fit_the_spec_are_refused() -> None:
+    environment = TwoCameras(1, 0)
+    environment.spec = replace(environment.spec, cameras=("top", "wrist"))
+    with pytest.raises(ValueError, match=r"camera 'hand' is none of \['top', 'wrist'\]"):
+        cameras_of(environment)
+    environment = TwoCameras(1, 0)
+    environment.spec = replace(environment.spec, width=4 * SIDE_PX)
+    with pytest.raises(ValueError, match=r"camera top says \(16, 16\) px \(W, H\), its picture has \(32, 16\)"):
+        cameras_of(environment)
+
+
+PACKAGE = {
+    "msg/TFMessage.msg": "geometry_msgs/TransformStamped[] transforms\n",
+    "CMakeLists.txt": """
+cmake_minimum_required(VERSION 3.22)
+project(tf2_msgs)
+find_package(ament_cmake REQUIRED)
+find_package(rosidl_default_generators REQUIRED)
+find_package(geometry_msgs REQUIRED)
+rosidl_generate_interfaces(tf2_msgs msg/TFMessage.msg DEPENDENCIES geometry_msgs)
+ament_package()
+""",
+    "package.xml": """
+<package format="3"><name>tf2_msgs</name><version>0.36.0</version><description>Only TFMessage</description>
+<maintainer email="maintainers@wm-nodes.invalid">wm_nodes</maintainer><license>BSD</license>
+<buildtool_depend>ament_cmake</buildtool_depend><buildtool_depend>rosidl_default_generators</buildtool_depend>
+<depend>geometry_msgs</depend><member_of_group>rosidl_interface_packages</member_of_group>
+<export><build_type>ament_cmake</build_type></export></package>
+""",
+}
+LISTENER = """
+import json, sys, rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from tf2_msgs.msg import TFMessage
+rclpy.init()
+node, heard = rclpy.create_node("listener"), {}
+def note(name, message):
+    frames = [[t.header.frame_id, t.child_frame_id, t.transform.translation.x] for t in message.transforms]
+    heard.setdefault(name, frames)
+latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # as tf2_ros.TransformListener
+node.create_subscription(TFMessage, "/tf", lambda m: note("/tf", m), 100)
+node.create_subscription(TFMessage, "/tf_static", lambda m: note("/tf_static", m), latched)
+while len(heard) < 2:
+    rclpy.spin_once(node, timeout_sec=0.1)
+print(json.dumps(heard))
+"""
+
+
+@pytest.fixture
+def with_tf2_msgs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes started from now on find tf2_msgs: ROS 2's where it is installed, else one built here."""
+    if "/tf" not in TOPICS:
+        for name, text in PACKAGE.items():
+            path = tmp_path / "tf2_msgs" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text.lstrip())
+        prefix = dict.fromkeys(("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"), sys.prefix)
+        build = [sys.executable, "-m", "colcon", "--log-base", "log", "build", "--paths", "tf2_msgs", "--cmake-args"]
+        subprocess.run(
+            [*build, "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={sys.executable}"], cwd=tmp_path, check=True,
+            env={**os.environ, **prefix}, capture_output=True,
+        )
+        install = tmp_path / "install" / "tf2_msgs"
+        site = next((install / "lib").glob("python3.*/site-packages"))
+        folders = {"PYTHONPATH": site, "AMENT_PREFIX_PATH": install, "LD_LIBRARY_PATH": install / "lib"}
+        for variable, folder in folders.items():
+            monkeypatch.setenv(variable, os.pathsep.join([str(folder), *filter(None, [os.environ.get(variable)])]))
+
+
+@pytest.mark.slow
+def test_tf_has_the_frames_where_tf2_msgs_is_installed(with_tf2_msgs: None, domain: int, tmp_path: Path) -> None:
+    graph = Graph(domain, tmp_path / "run", forks=False)
+    graph.start_environment("toy:make_environment_with_cameras", num_envs=N, mode="asynchronous")
+    done = subprocess.run(
+        [sys.executable, "-c", LISTENER], env=graph.environment(), capture_output=True, text=True, timeout=100,
+        check=False,
+    )
+    assert graph.stop() == {"/wm/environment": 0}
+    assert done.returncode == 0, done.stderr
+    heard = json.loads(done.stdout)
+    assert heard["/tf_static"] == [["wm_base", "wm_camera_top_optical", pytest.approx(0.6)]]
+    assert [frames[:2] for frames in heard["/tf"]] == [["wm_base", "wm_camera_hand_optical"]]
