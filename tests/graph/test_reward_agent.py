@@ -300,6 +300,7 @@ def test_a_policys_episodes_are_judged_at_their_end_and_a_judge_that_is_down_pau
             for key, verdict in told.items():
                 assert verdict.status == ClipVerdict.OK
                 assert verdict.clip_id.startswith(f"episode {ended[key]} of session")
+                assert verdict.header.stamp == steps[key[0]].header.stamp
             server.down = True
             forget_reads(graph)
             paused = probe.finish(probe.send(client, Train.Goal(updates=1)))

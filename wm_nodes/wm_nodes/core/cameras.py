@@ -46,15 +46,16 @@ class CameraModel:
 
     def pose_in(self, env: int = 0) -> Matrix:
         """The pose (4, 4) in environment `env`. Raises ValueError where it is none."""
-        return check_pose(self.pose(env), self.name) if callable(self.pose) else self.pose
+        return check_pose(self.pose(env) if callable(self.pose) else self.pose, self.name)
 
 
 def check_pose(pose: Matrix, name: str) -> Matrix:
     """Return a camera's pose. Raises ValueError unless it is a rotation and a translation."""
-    rotation = np.asarray(pose, np.float64)[:3, :3] if np.shape(pose) == (4, 4) else np.full((3, 3), np.nan)
+    matrix = np.asarray(pose, np.float64)
+    rotation = matrix[:3, :3] if matrix.shape == (4, 4) and np.isfinite(matrix).all() else np.zeros((3, 3))
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
         raise ValueError(f"camera {name}: pose must be 4 x 4, optical axes to base frame, got {pose!r}")
-    return pose
+    return matrix
 
 
 def intrinsics(width: int, height: int, fov_rad: float) -> Matrix:

@@ -2,6 +2,7 @@
 
 import time
 
+import numpy as np
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from sensor_msgs.msg import CameraInfo
 
@@ -16,7 +17,7 @@ def camera_info_msg(camera: CameraModel, stamp_ns: int, frame_id: str) -> Camera
     """Calibration of a picture without distortion."""
     message = CameraInfo(height=camera.height, width=camera.width, distortion_model="plumb_bob", d=[0.0] * 5)
     message.header = convert.header(stamp_ns, frame_id)
-    message.k[:] = camera.K.reshape(-1)
+    message.k[:] = np.ravel(camera.K)
     message.r[::4] = [1.0] * 3
     message.p.reshape(3, 4)[:, :3] = camera.K
     return message
