@@ -147,8 +147,11 @@ class EnvironmentNode(ManagedNode):
         message = convert.mosaic_msg(images, stamp_ns, self._spec)
         self._shown = message
         self._send(lambda: self._images.publish(message))
-        self._send(lambda: self._views.show(images, message))
-        self._send(lambda: self._cameras.show(images, stamp_ns, self._spec.encoding))
+        self._send(lambda: self._show(images, message))
+
+    def _show(self, images: UInt8Array, message: Image) -> None:
+        self._views.show(images, message)
+        self._cameras.show(images, message)
 
     def goals(self, goals: Goals) -> None:
         self._send(lambda: self._goals.publish(convert.goal_msg(goals, self._spec)))

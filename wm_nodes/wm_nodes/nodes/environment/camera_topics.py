@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, Image
 
 from wm_nodes.core.cameras import CameraModel, quaternion
 from wm_nodes.core.types import Environment, UInt8Array
@@ -95,8 +95,8 @@ class CameraTopics:
             if static:
                 node.publish_unnumbered("/tf_static").publish(message(transforms=static))
 
-    def show(self, images: UInt8Array, stamp_ns: int, encoding: str) -> None:
-        """Publish what is due. images: uint8 (N, H, W, 3) of the observation of stamp `stamp_ns`."""
+    def show(self, images: UInt8Array, mosaic: Image) -> None:
+        """Publish what is due. images: uint8 (N, H, W, 3); mosaic: the env/image message of the same observation."""
         tf_watched = self._tf is not None and self._tf.get_subscription_count() > 0
         watched = [place for place, outlets in self._outlets.items() if outlets.image.get_subscription_count()]
         moving = [
@@ -108,7 +108,7 @@ class CameraTopics:
         env = max(0, int(self._node.param("view_env")))
         if env >= len(images):
             return
-        transforms = []
+        transforms, stamp_ns = [], convert.time_ns(mosaic.header.stamp)
         for place in moving:
             outlets = self._outlets[place]
             try:
@@ -126,7 +126,7 @@ class CameraTopics:
         for place in watched:
             camera, outlets = self._cameras[place], self._outlets[place]
             left = place * camera.width
-            message = convert.image_msg(images[env][:, left : left + camera.width], stamp_ns, encoding)
+            message = convert.image_msg(images[env][:, left : left + camera.width], stamp_ns, mosaic.encoding)
             message.header.frame_id = outlets.frame_id
             outlets.info.publish(camera_info_msg(camera, stamp_ns, outlets.frame_id))
             outlets.image.publish(message)

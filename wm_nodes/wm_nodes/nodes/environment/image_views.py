@@ -49,9 +49,10 @@ class ImageViews:
     def show(self, images: UInt8Array, mosaic: Image) -> None:
         """Publish what is due. images: uint8 (N, H, W, 3); mosaic: the env/image message of the same observation."""
         stamp_ns = convert.time_ns(mosaic.header.stamp)
-        shown = int(self._param("view_env"))
-        if 0 <= shown < len(images) and self._view.get_subscription_count() and self._due("view"):
-            self._view.publish(convert.image_msg(images[shown], stamp_ns, mosaic.encoding))
+        if self._view.get_subscription_count():
+            shown = int(self._param("view_env"))
+            if 0 <= shown < len(images) and self._due("view"):
+                self._view.publish(convert.image_msg(images[shown], stamp_ns, mosaic.encoding))
         when = self._param("compressed")
         wanted = when == "always" or (when == "subscribed" and self._compressed.get_subscription_count())
         if wanted and self._due("compressed"):
