@@ -31,6 +31,8 @@ PARAMS = (
           minimum=0.1, maximum=600.0),
 )
 
+MAX_EPISODES = 1_000_000
+
 
 class EvaluationNode(ManagedNode):
     """Action evaluate; follows policy/version."""
@@ -60,6 +62,10 @@ class EvaluationNode(ManagedNode):
         goal: Evaluate.Goal = work.request
         result = Evaluate.Result(termination_reason=Evaluate.Result.FINISHED)
         try:
+            if not (1 <= goal.episodes <= MAX_EPISODES and goal.seed + goal.episodes <= 2**63):
+                raise ValueError(
+                    f"episodes {goal.episodes} from seed {goal.seed}: ask for 1 to {MAX_EPISODES}, of seeds below 2^63"
+                )
             result.policy_version = self._load(goal)
             environment = RemoteEnvironment(
                 self._environment, work.check, timeout_s=float(self.param("handshake_timeout_s")),

@@ -34,6 +34,7 @@ from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.params import COMMON, Param
+from wm_nodes.ros.sequence_numbers import check_session
 from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks
@@ -79,6 +80,7 @@ class LearnerNode(TrainingNode):
         self._report = LearnerReport(self, tensorboard=bool(self.param("tensorboard")))
         self.own(self._report.close)
         self._spec: EnvironmentSpec | None = None
+        self._spec_session = 0
         self._refused: WireError | None = None
         """Why the newest spec on env/spec cannot be trained from: it ends a goal that waits for its rollouts."""
         self._expected_spec = expected_spec(
@@ -254,10 +256,12 @@ class LearnerNode(TrainingNode):
 
     def _on_spec(self, message: EnvSpec) -> None:
         try:
+            check_session(message.session)
             self._spec, self._refused = convert.spec_from_msg(message), None
             if self._expected_spec is not None:
                 refuse_other(self._spec, self._expected_spec, "the learner's policy needs")
             self._max_episode_steps = self._spec.max_episode_steps
+            self._spec_session = message.session
             self._assembler.enter_session(message.session)
             self._replayed.enter_session(message.session)
         except WireError as error:
@@ -274,6 +278,7 @@ class LearnerNode(TrainingNode):
         assembler = self._collecting
         if self._spec is None or assembler is None:
             return
+        check_session(message.session, self._spec_session)
         assembler.put_transition(convert.transition_of(message, self._spec))
 
     def _on_reward(self, message: RewardBatch) -> None:

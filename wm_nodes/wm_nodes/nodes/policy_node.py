@@ -3,6 +3,7 @@ and follows the learner's versions."""
 
 import sys
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -32,6 +33,7 @@ from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireEr
 from wm_nodes.ros.worker import Work
 
 FEEDBACK_S = 0.5
+VERSIONS_KEPT = 8
 HOLD_ARRIVES = Duration(seconds=1)
 
 PARAMS = (
@@ -77,7 +79,7 @@ class PolicyNode(ManagedNode):
             except WireError as error:
                 raise ValueError(f"initial_policy {path}: {error}") from None
         self._spec: EnvironmentSpec | None = None
-        self._announced: PolicyVersion | None = None
+        self._announced: OrderedDict[int, PolicyVersion] = OrderedDict()
         self._last_reply: Reply | None = None
         self._start_barrier = StartBarrier(self, self.links.table)
         timeout_s = float(self.param("step_timeout_s"))
@@ -204,9 +206,9 @@ class PolicyNode(ManagedNode):
 
     def _await_version(self, version: int, work: Work) -> None:
         deadline = time.monotonic() + float(self.param("version_timeout_s"))
-        announced = self._announced
-        if announced is not None and announced.version == version != self._holder.version:
-            self._holder.follow(announced, self.run_dir)  # policy/load has replaced it since
+        announced = self._announced.get(version)
+        if announced is not None and version != self._holder.version:
+            self._holder.follow(announced, self.run_dir)  # policy/load, or another version, has replaced it since
         while version and self._holder.version != version:
             if time.monotonic() > deadline:
                 raise WireError(
@@ -247,7 +249,9 @@ class PolicyNode(ManagedNode):
         try:
             if self._holder.follow(message, self.run_dir):
                 self.diagnostics.clear_condition("policy version")
-            self._announced = message
+            self._announced[message.version] = message
+            if len(self._announced) > VERSIONS_KEPT:
+                self._announced.popitem(last=False)
         except (WireError, ValueError) as error:
             self.get_logger().error(f"{error}; still acting with version {self._holder.version}")
             self.diagnostics.count("refused_versions", level=diagnostics.OK)
@@ -262,7 +266,15 @@ class PolicyNode(ManagedNode):
             count = len(request.state) // self._holder.state_dim
             spec = replace(self._spec, num_envs=max(count, 1))
             states = convert.floats(request.state, (spec.num_envs, spec.state_dim), "state")
+            if not np.isfinite(states).all():
+                raise WireError(ErrorCode.NAN_INPUT, "state is NaN or infinite; send finite values")
             tile = request.tile
+            if (tile.tile_height, tile.tile_width) != (spec.height, spec.width) or tile.rows * tile.cols < count:
+                raise WireError(
+                    ErrorCode.BAD_SHAPE,
+                    f"{tile.rows} x {tile.cols} tiles of {tile.tile_height} x {tile.tile_width} px do not hold {count} "
+                    f"of {spec.height} x {spec.width} px; lay them out as EnvSpec.tile does",
+                )
             images = convert.images_of(
                 request.observation, spec, Tiles(tile.rows, tile.cols, tile.tile_height, tile.tile_width)
             )

@@ -10,7 +10,7 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
-from rclpy.serialization import deserialize_message
+from rosbags.serde import SerdeError
 from std_srvs.srv import Trigger
 
 from wm_msgs.msg import ErrorCode
@@ -20,13 +20,14 @@ from wm_nodes.nodes.recorder.qos import recorded_qos
 from wm_nodes.recording import BagError, RawBagWriter, RecordingError, topics
 from wm_nodes.recording import messages as m
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
-from wm_nodes.ros import diagnostics
+from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.flow_control import ConsumerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import TOPICS, GraphTopic, row_name
 from wm_nodes.ros.sequence_numbers import GapTracker
 from wm_nodes.ros.spin import run_node
+from wm_nodes.ros.wire import WireError
 
 FLUSH_S = 0.25
 QUIET_S = 0.3
@@ -104,7 +105,7 @@ class RecorderNode(ManagedNode):
 
     def _on_message(self, name: str, credits: ConsumerCredits | None, data: bytes) -> None:
         self._last_message_s = time.monotonic()
-        message = deserialize_message(data, self._rows[name].type)  # bytes that nobody can read do not belong in a bag
+        message = self._read(name, data)
         tracker = self._gaps.get(name)
         if tracker is not None:
             missing = tracker.observe(message.session, message.seq)
@@ -116,6 +117,16 @@ class RecorderNode(ManagedNode):
             self._write(name, data)
         if credits is not None and tracker is not None:
             credits.record_consumed(tracker)
+
+    def _read(self, name: str, data: bytes) -> Any:
+        """Raises WireError for what no reader of the bag could read, strict as it is: it does not belong in a bag."""
+        try:
+            message = m.deserialize(data, _msgtype(self._rows[name]))
+        except SerdeError as error:
+            raise WireError(ErrorCode.BAD_SHAPE, f"no reader of a bag can read it: {error}") from None
+        if _base(name) == topics.SPEC.name:
+            convert.spec_from_msg(message)
+        return message
 
     def _write(self, name: str, data: bytes) -> None:
         if self._bag is None:
@@ -143,8 +154,7 @@ class RecorderNode(ManagedNode):
         self._paused, self._time_ns, self._versions = False, 0, set()
         self._gaps = {name: GapTracker() for name in self._gaps}
         for name, row in self._rows.items():
-            msgtype = f"{row.type.__module__.split('.')[0]}/msg/{row.type.__name__}"
-            self._bag.add_topic(self._names[name], msgtype, [recorded_qos(row.qos)])
+            self._bag.add_topic(self._names[name], _msgtype(row), [recorded_qos(row.qos)])
         for name, data in self._latched.items():
             self._write(name, data)
         self.diagnostics.clear_condition("recording")
@@ -288,6 +298,10 @@ def _row(name: str) -> GraphTopic:
     if base not in TOPICS:
         raise ValueError(f"cannot record {name!r}; the graph's topics are {', '.join(sorted(TOPICS))}")
     return TOPICS[base]
+
+
+def _msgtype(row: GraphTopic) -> str:
+    return f"{row.type.__module__.split('.')[0]}/msg/{row.type.__name__}"
 
 
 def _lossless(offered: QoSProfile) -> QoSProfile:

@@ -27,6 +27,7 @@ from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.qos import CREDIT_WINDOW
+from wm_nodes.ros.sequence_numbers import check_session
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import Transition, WireError
 
@@ -103,6 +104,7 @@ class RewardEvaluatorNode(ManagedNode):
 
     def _on_spec(self, message: EnvSpec) -> None:
         try:
+            check_session(message.session)
             self._spec = convert.spec_from_msg(message)
         except WireError as error:
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
@@ -130,6 +132,7 @@ class RewardEvaluatorNode(ManagedNode):
     def _on_goal(self, message: TaskGoal) -> None:
         if self._spec is None:
             return
+        check_session(message.session, self._session)
         goals = convert.goals_of(message, self._spec)
         self._enter_session(message.session)
         for i, episode_id in enumerate(goals.episode_ids):
@@ -142,6 +145,7 @@ class RewardEvaluatorNode(ManagedNode):
         if self._spec is None:
             self.diagnostics.count("before_spec", text="a transition came before env/spec; it gets no reward")
             return
+        check_session(message.session, self._session)
         transition = convert.transition_of(message, self._spec)
         self._enter_session(message.session)
         if not transition.is_reset and transition.valid.any():

@@ -90,8 +90,8 @@ class Playback:
             self._seek_ns = self.start_ns + round(position_s * NS_PER_S)
             self._condition.notify_all()
 
-    def play_next(self, count: int, timeout_s: float = 5.0) -> int:
-        """While paused, publish the next `count` messages; return how many were."""
+    def play_next(self, count: int, timeout_s: float = 2.0) -> int:
+        """While paused, publish the next `count` messages; return how many were within timeout_s."""
         with self._condition:
             if not self._paused:
                 raise BagError("playing; pause before playing single messages")

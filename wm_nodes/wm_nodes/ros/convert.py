@@ -94,7 +94,13 @@ def time_msg(stamp_ns: int) -> Time:
     return Time(sec=stamp_ns // NS_PER_S, nanosec=stamp_ns % NS_PER_S)
 
 
-time_ns = stamp_ns
+def time_ns(stamp: Time) -> int:
+    """Return a message's stamp in ns. Raises WireError(OUT_OF_RANGE) for one that no clock gives."""
+    if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
+        raise WireError(
+            ErrorCode.OUT_OF_RANGE, f"stamp {stamp.sec} s + {stamp.nanosec} ns is no time; send nanosec below 10^9",
+        )
+    return stamp_ns(stamp)
 
 
 def header(stamp_ns: int, frame_id: str = BASE_FRAME) -> Header:
@@ -195,14 +201,15 @@ def transition_msg(transition: Transition) -> TransitionBatch:
 
 
 def transition_of(message: TransitionBatch, spec: EnvironmentSpec) -> Transition:
-    """Raises WireError(BAD_SHAPE) where an array does not fit the spec."""
+    """Raises WireError: BAD_SHAPE where an array does not fit the spec, NAN_INPUT where a valid row has no numbers."""
     count = spec.num_envs
     if message.num_envs != count:
         raise WireError(
             ErrorCode.BAD_SHAPE,
             f"transition of {message.num_envs} environments, env/spec says {count}; send a row for each",
         )
-    return Transition(
+    truth_dim = spec.ground_truth_dim if len(message.ground_truth) else 0
+    transition = Transition(
         stamp_ns=time_ns(message.header.stamp), next_stamp_ns=time_ns(message.next_stamp), step_id=message.step_id,
         actions=floats(message.action, (count, spec.action_dim), "action"),
         states=floats(message.state, (count, spec.state_dim), "state"),
@@ -215,9 +222,12 @@ def transition_of(message: TransitionBatch, spec: EnvironmentSpec) -> Transition
         policy_versions=reshape_field(from_field(message.policy_version, np.uint64), (count,), "policy_version"),
         success_probability=floats(message.success_probability, (count,), "success_probability"),
         uncertainty=floats(message.model_uncertainty, (count,), "model_uncertainty"),
-        ground_truth=from_field(message.ground_truth, np.float32).reshape(count, -1), source=message.source,
+        ground_truth=floats(message.ground_truth, (count, truth_dim), "ground_truth"), source=message.source,
         session=message.session,
     )
+    for name in ("actions", "states", "next_states", "success_probability"):
+        _check_finite(getattr(transition, name)[transition.valid], name, "transition")
+    return transition
 
 
 def action_of(message: ActionBatch, spec: EnvironmentSpec) -> TimedAction:
@@ -278,11 +288,18 @@ def reward_msg(
 
 
 def rewards_of(message: RewardBatch) -> Rewards:
-    """Raises WireError(BAD_SHAPE) where arrays differ in length from num_envs."""
+    """Raises WireError: BAD_SHAPE where arrays differ in length from num_envs, NAN_INPUT for a valid no-number."""
     count = message.num_envs
-    return Rewards(
+    rewards = Rewards(
         transition_session=message.transition_session, step_id=message.step_id,
         total=floats(message.total, (count,), "total"), valid=flags(message.valid, count, "valid"),
         success=reshape_field(from_field(message.success, np.uint8), (count,), "success"),
         invalid_reason=message.invalid_reason,
     )
+    _check_finite(rewards.total[rewards.valid], "total", "reward")
+    return rewards
+
+
+def _check_finite(values: FloatArray, name: str, what: str) -> None:
+    if not np.isfinite(values).all():
+        raise WireError(ErrorCode.NAN_INPUT, f"{name} of a valid {what} is NaN or infinite; set valid to 0")

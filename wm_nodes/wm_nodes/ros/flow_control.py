@@ -14,6 +14,8 @@ SILENT_S = 5.0
 
 REPEAT_S = 1.0
 
+MAX_CONSUMERS = 64
+
 
 class ProducerCredits:
     """The producer's side for one stream: who may be waited for, and whether the next message may go out.
@@ -30,7 +32,10 @@ class ProducerCredits:
         """Take in a Credit message; those of other streams or sessions are ignored."""
         if message.topic != self._topic_name or message.stream_session != self._session:
             return
+        self._consumers.pop(message.consumer, None)  # the newest last
         self._consumers[message.consumer] = message, time.monotonic() if now is None else now
+        if len(self._consumers) > MAX_CONSUMERS:
+            del self._consumers[next(iter(self._consumers))]
 
     def remove(self, consumer: str) -> None:
         self._consumers.pop(consumer, None)

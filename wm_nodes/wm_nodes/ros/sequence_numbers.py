@@ -3,6 +3,9 @@
 import time
 from dataclasses import dataclass, field
 
+from wm_msgs.msg import ErrorCode
+from wm_nodes.ros.wire import WireError
+
 MAX_NUMBER = 2**64 - 1
 """Largest value of the fields session and seq."""
 
@@ -11,10 +14,27 @@ MAX_GAP = 2**16
 
 SESSIONS_KEPT = 64
 
+CLOCKS_APART_NS = 3600 * 10**9
+"""How far the clocks of two hosts may be apart."""
+
 
 def new_session() -> int:
     """Start time of a publisher in ns since the epoch; tells a restarted publisher from the one before."""
     return time.time_ns()
+
+
+def check_session(session: int, known: int = 0) -> None:
+    """Refuse what cannot come from the publisher whose `known` session was announced, nor from its restart.
+
+    Raises:
+        WireError: OUT_OF_ORDER for a session that lies in the future, or before `known`.
+    """
+    if session != known and not known < session <= time.time_ns() + CLOCKS_APART_NS:
+        raise WireError(
+            ErrorCode.OUT_OF_ORDER,
+            f"session {session} is neither the announced {known} nor a later start; is a second publisher there, or a "
+            "clock wrong?",
+        )
 
 
 @dataclass

@@ -45,6 +45,8 @@ class PolicyHolder:
         """
         if message.sha256 == self.sha256 and message.version == self.version:
             return False
+        if not message.sha256:
+            raise WireError(ErrorCode.HASH_MISMATCH, f"policy version {message.version} has no sha256; announce one")
         if message.arch_hash and message.arch_hash != self._arch_hash:
             raise WireError(
                 ErrorCode.HASH_MISMATCH,

@@ -7,6 +7,9 @@ import numpy as np
 from wm_nodes.reward import RewardResult
 from wm_nodes.ros.wire import Transition
 
+EPISODES_KEPT = 2**15
+"""Episodes that have begun and not ended; more than environments exist are of no use."""
+
 
 class SummaryWindow:
     """Collects rewards until take()."""
@@ -25,6 +28,8 @@ class SummaryWindow:
         self._sparse.append(result.sparse[valid])
         for i in np.flatnonzero(valid):
             self._returns[int(transition.episode_ids[i])] += float(result.total[i])
+        while len(self._returns) > EPISODES_KEPT:
+            del self._returns[next(iter(self._returns))]
         for i in np.flatnonzero(transition.valid & (transition.terminated | transition.truncated)):
             self._ended_returns.append(self._returns.pop(int(transition.episode_ids[i]), 0.0))
             self._lengths.append(int(transition.episode_steps[i]) + 1)
