@@ -72,15 +72,12 @@ def _class_of(kind: NamespacedType) -> type[Any]:
     return interface("/".join((*kind.namespaces, kind.name)))
 
 
-def has_lists_of_objects(kind: type[Any]) -> bool:
-    """Whether a request of this class has a list of strings or messages, however deep. rmw_fastrtps does not check the
-    length of such a list in a request: 48 bytes make any ROS 2 node allocate gigabytes before its own code runs. So no
-    bytes with a wrong length may be sent there."""
+def has_lists(kind: type[Any]) -> bool:
+    """Whether a message of this class has a list whose length the sender chooses, however deep."""
     for slot in kind.SLOT_TYPES:
-        inner = getattr(slot, "value_type", slot)
-        if inner is not slot and not isinstance(inner, BasicType):
+        if isinstance(slot, NamespacedType) and has_lists(_class_of(slot)):
             return True
-        if isinstance(inner, NamespacedType) and has_lists_of_objects(_class_of(inner)):
+        if not isinstance(slot, BasicType | NamespacedType | AbstractGenericString | Array):
             return True
     return False
 
@@ -162,6 +159,13 @@ class MessageGenerator:
         data = self.rng.choice(self._ways)(kind)
         self._sent[kind].append(data)
         return data
+
+    def next_of_service(self, kind: type[Any]) -> bytes:
+        """The bytes of one more request or response. Lists in it have the length that they say: rmw_fastrtps 8.4 checks
+        that in messages of topics only, and 48 bytes of a request make any ROS 2 node allocate gigabytes."""
+        if not has_lists(kind):
+            return self.next(kind)
+        return self.rng.choice([self.default, self.sample, self.longer, lambda kind: HEADER])(kind)
 
     def request(self, kind: type[Any]) -> Any:
         """A message of rclpy that anybody can send, plausible or not."""

@@ -39,14 +39,23 @@ def test_publishers_that_take_turns_lose_nothing_and_a_gap_in_one_of_them_is_cou
     assert (tracker.session, tracker.last_seq, tracker.sessions) == (2, 2, 2)
 
 
-def test_a_jump_beyond_every_buffer_is_a_restart_of_the_sender_and_no_loss() -> None:
+def test_a_jump_beyond_every_buffer_is_no_loss_and_is_believed_only_where_the_next_message_goes_on() -> None:
     tracker = GapTracker()
     assert [tracker.observe(1, seq) for seq in (0, 1, 2**64 - 1, 2, 3, 2**40, 4, 6)] == [0, 0, 0, 0, 0, 0, 0, 1]
-    assert (tracker.lost, tracker.restarts, tracker.last_seq) == (1, 4, 6)
+    assert (tracker.lost, tracker.jumps, tracker.last_seq) == (1, 2, 6)
     for session in range(2, 1000):
         tracker.observe(session, 2**63)
         tracker.observe(1, 5 + session)
     assert tracker.lost == 1 and len(tracker._last_seqs) <= 64
+    assert [tracker.observe(1, 2**40 + more) for more in range(3)] == [0, 0, 0]
+    assert (tracker.lost, tracker.last_seq) == (1, 2**40 + 2)
+
+
+def test_an_old_message_after_a_jump_does_not_take_back_what_was_granted() -> None:
+    tracker = GapTracker()
+    for seq in (*range(100), 2**63, 3):
+        tracker.observe(1, seq)
+    assert tracker.last_seq == 99
 
 
 def test_the_producer_waits_for_every_consumer_and_drops_the_silent_one() -> None:

@@ -152,3 +152,11 @@ def test_a_version_without_a_sha256_is_refused(tmp_path: Any) -> None:
     with pytest.raises(WireError, match="has no sha256"):
         holder.follow(PolicyVersion(version=3, inline_data=[1, 2, 3]), tmp_path)
     assert holder.version == 0
+
+
+def test_equal_seeds_draw_equal_messages_and_other_seeds_others() -> None:
+    def draw(seed: int) -> list[bytes]:
+        generator = MessageGenerator(seed)
+        return [generator.next(kind) for kind in READERS for _ in range(50)]
+
+    assert draw(3) == draw(3) != draw(4)

@@ -3,7 +3,6 @@ and follows the learner's versions."""
 
 import sys
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -33,7 +32,6 @@ from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireEr
 from wm_nodes.ros.worker import Work
 
 FEEDBACK_S = 0.5
-VERSIONS_KEPT = 8
 HOLD_ARRIVES = Duration(seconds=1)
 
 PARAMS = (
@@ -79,7 +77,7 @@ class PolicyNode(ManagedNode):
             except WireError as error:
                 raise ValueError(f"initial_policy {path}: {error}") from None
         self._spec: EnvironmentSpec | None = None
-        self._announced: OrderedDict[int, PolicyVersion] = OrderedDict()
+        self._announced: PolicyVersion | None = None
         self._last_reply: Reply | None = None
         self._start_barrier = StartBarrier(self, self.links.table)
         timeout_s = float(self.param("step_timeout_s"))
@@ -206,9 +204,9 @@ class PolicyNode(ManagedNode):
 
     def _await_version(self, version: int, work: Work) -> None:
         deadline = time.monotonic() + float(self.param("version_timeout_s"))
-        announced = self._announced.get(version)
-        if announced is not None and version != self._holder.version:
-            self._holder.follow(announced, self.run_dir)  # policy/load, or another version, has replaced it since
+        announced = self._announced
+        if announced is not None and announced.version == version != self._holder.version:
+            self._holder.follow(announced, self.run_dir)  # policy/load has replaced it since
         while version and self._holder.version != version:
             if time.monotonic() > deadline:
                 raise WireError(
@@ -249,11 +247,10 @@ class PolicyNode(ManagedNode):
         try:
             if self._holder.follow(message, self.run_dir):
                 self.diagnostics.clear_condition("policy version")
-            self._announced[message.version] = message
-            if len(self._announced) > VERSIONS_KEPT:
-                self._announced.popitem(last=False)
+            self._announced = message
         except (WireError, ValueError) as error:
-            self.get_logger().error(f"{error}; still acting with version {self._holder.version}")
+            text = f"{error}; still acting with version {self._holder.version}"
+            self.get_logger().error(text, throttle_duration_sec=1.0)
             self.diagnostics.count("refused_versions", level=diagnostics.OK)
             self.diagnostics.set_condition("policy version", diagnostics.ERROR, str(error))
 

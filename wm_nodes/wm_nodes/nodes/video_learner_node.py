@@ -71,6 +71,9 @@ class VideoLearnerNode(TrainingNode):
         self.serve_training(self._video, TrainVideo, "video/train", "video/version")
 
     def activate(self) -> None:
+        self.announce_versions()
+
+    def announce_versions(self) -> None:
         for version in sorted({self._video.sampling_version, self._video.version}):
             self.announce(version)
 

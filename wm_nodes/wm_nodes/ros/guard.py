@@ -17,6 +17,8 @@ from wm_nodes.ros import diagnostics
 from wm_nodes.ros.wire import WireError
 
 LOG_PERIOD_S = 60.0
+MAX_TEXT = 1000
+"""Characters of an error that are logged: what it quotes was sent by others."""
 MAX_KINDS = 256
 """Kinds that are told apart in the log, and publishers in the counters; the rest is counted together."""
 
@@ -105,7 +107,7 @@ class Guard:
 
 def _describe(error: Exception, *, where: bool) -> str:
     """One line. where: also the place in the code, of an error that nobody foresaw."""
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = " ".join(str(error).split())[:MAX_TEXT] or type(error).__name__
     if type(error).__name__ == "RMWError":
         return "its bytes are no message of this type; run the same version of wm_msgs on both sides"
     if not where:

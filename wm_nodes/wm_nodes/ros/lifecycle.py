@@ -305,10 +305,10 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     # Heartbeat and diagnostics.
 
     def _note_gap(self, name: str, tracker: GapTracker, message: Any) -> None:
-        restarts = tracker.restarts
+        jumps = tracker.jumps
         missing = tracker.observe(message.session, message.seq)
-        if tracker.restarts > restarts:
-            self.diagnostics.count(f"restarts {name}", text=f"{name} jumped to seq {message.seq}: a new sender")
+        if tracker.jumps > jumps:
+            self.diagnostics.count(f"jumps {name}", text=f"{name} jumped to seq {message.seq}; a second sender?")
         if missing:
             self.diagnostics.count(f"gaps {name}", missing, text=f"{missing} messages of {name} missed")
             self.on_gap(name, missing)

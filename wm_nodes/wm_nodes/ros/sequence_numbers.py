@@ -10,7 +10,8 @@ MAX_NUMBER = 2**64 - 1
 """Largest value of the fields session and seq."""
 
 MAX_GAP = 2**16
-"""A jump by more is a restart of the sender, or no number at all: no history and no credit window is as long."""
+"""One message that jumps by more is no number at all: no history and no credit window is as long, and a restart of the
+sender begins another session."""
 
 SESSIONS_KEPT = 64
 
@@ -51,12 +52,13 @@ class GapTracker:
     lost: int = 0
     """Over all sessions."""
     repeated: int = 0
-    restarts: int = 0
-    """Jumps by more than MAX_GAP."""
+    jumps: int = 0
+    """Forward by more than MAX_GAP; one is believed when the next message goes on from there."""
     sessions: int = 0
     gaps: list[tuple[int, int, int]] = field(default_factory=list)
     """(session, first missing seq, number of missing seqs), newest last; at most 1000 kept."""
     _last_seqs: dict[int, int] = field(default_factory=dict, repr=False)
+    _jumped_to: tuple[int, int] | None = field(default=None, repr=False)
 
     def observe(self, session: int, seq: int) -> int:
         """Note one message; return how many of its session were missed directly before it."""
@@ -70,8 +72,11 @@ class GapTracker:
         self._last_seqs[session] = self._last_seqs.pop(session)  # the newest last, so that it stays longest
         self.session, self.last_seq = session, self._last_seqs[session]
         missing = seq - self.last_seq - 1
-        if abs(missing) > MAX_GAP:
-            self.restarts += 1
+        if missing > MAX_GAP:
+            self.jumps += 1
+            goes_on, self._jumped_to = self._jumped_to == (session, seq - 1), (session, seq)
+            if not goes_on:
+                return 0
             missing = 0
         elif missing < 0:
             self.repeated += 1

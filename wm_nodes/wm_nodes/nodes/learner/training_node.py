@@ -38,7 +38,6 @@ class TrainingNode(ManagedNode):
         super().__init__("learner", params, **node_arguments)
         self.ranks = ranks or Ranks()
         self._run: TrainingRun | None = None
-        self._announced = -1
 
     @abstractmethod
     def train(self, work: Work, result: Any) -> None:
@@ -56,7 +55,7 @@ class TrainingNode(ManagedNode):
 
     def serve_training(self, run: TrainingRun, action_type: type[Any], action: str, version_topic: str) -> None:
         """Serve the action and announce versions, until cleanup."""
-        self._run, self._announced = run, -1
+        self._run = run
         self._result_type = action_type.Result
         self._versions = self.publish_on(version_topic)
         self._action = WorkerAction(self, action_type, action, self._train_goal, self.fill)
@@ -85,15 +84,17 @@ class TrainingNode(ManagedNode):
         if len(packed.data) <= self.inline_limit_bytes:
             message.inline_data = convert.bytes_field(packed.data)
         self._versions.publish(message)
-        self._announced = version
+
+    def announce_versions(self) -> None:
+        """Publish every version that is acted with now. Raises OSError."""
+        self.announce()
 
     def _train_goal(self, work: Work) -> Any:
         reasons, run = self._result_type, self._run
         assert run is not None  # serve_training sets it
         result = reasons(termination_reason=reasons.FINISHED)
         try:
-            if self._announced != run.version:  # its files could not be written when it was made
-                self.announce()
+            self.announce_versions()  # again: others may have heard of another one since, or its files were not written
             self.train(work, result)
         except PeerLost as error:
             result.termination_reason, result.message = reasons.PEER_LOST, str(error)

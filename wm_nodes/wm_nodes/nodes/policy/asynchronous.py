@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from sensor_msgs.msg import Image
 
-from wm_msgs.msg import TransitionBatch
+from wm_msgs.msg import ErrorCode, TransitionBatch
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.nodes.learner.rollout_assembler import ImageCache
@@ -19,6 +19,8 @@ from wm_nodes.nodes.policy.weights import PolicyHolder
 from wm_nodes.policy_rl.image_policy import PolicyOutput
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.lifecycle import ManagedNode
+from wm_nodes.ros.sequence_numbers import MAX_NUMBER
+from wm_nodes.ros.wire import WireError
 
 CAPACITY = 8
 
@@ -89,6 +91,8 @@ class AsynchronousPolicy:
             return
         shape = (self.spec.num_envs, self.spec.state_dim)
         states = convert.floats(message.next_state, shape, "next_state")
+        if message.step_id == MAX_NUMBER:
+            raise WireError(ErrorCode.OUT_OF_RANGE, f"no step comes after step_id {message.step_id}; count from 0")
         stamp_ns = convert.time_ns(message.next_stamp)
         with self._changed:
             self._states[stamp_ns] = message.step_id + 1, states
