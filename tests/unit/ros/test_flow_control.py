@@ -51,11 +51,14 @@ def test_a_jump_beyond_every_buffer_is_no_loss_and_is_believed_only_where_the_ne
     assert (tracker.lost, tracker.last_seq) == (1, 2**40 + 2)
 
 
-def test_an_old_message_after_a_jump_does_not_take_back_what_was_granted() -> None:
+def test_an_old_message_after_a_jump_or_a_new_count_does_not_take_back_what_was_granted() -> None:
     tracker = GapTracker()
-    for seq in (*range(100), 2**63, 3):
+    for seq in (*range(98), 99, 2**63, 3):
         tracker.observe(1, seq)
-    assert tracker.last_seq == 99
+    assert (tracker.last_seq, tracker.lost, tracker.gaps) == (99, 1, [(1, 98, 1)])
+    tracker.clear_losses()
+    tracker.observe(1, 3)
+    assert (tracker.last_seq, tracker.lost, tracker.gaps) == (99, 0, [])
 
 
 def test_the_producer_waits_for_every_consumer_and_drops_the_silent_one() -> None:

@@ -152,7 +152,8 @@ class RecorderNode(ManagedNode):
             split_s=float(self.param("split_s")),
         )
         self._paused, self._time_ns, self._versions = False, 0, set()
-        self._gaps = {name: GapTracker() for name in self._gaps}
+        for tracker in self._gaps.values():  # they stay: what was granted must not be taken back
+            tracker.clear_losses()
         for name, row in self._rows.items():
             self._bag.add_topic(self._names[name], _msgtype(row), [recorded_qos(row.qos)])
         for name, data in self._latched.items():

@@ -87,3 +87,7 @@ class GapTracker:
             del self.gaps[:-1000]
         self.last_seq = self._last_seqs[session] = seq
         return missing
+
+    def clear_losses(self) -> None:
+        """Count what is lost anew."""
+        self.lost, self.gaps = 0, []
