@@ -28,6 +28,7 @@ from wm_nodes.launching.runner import clean_shared_memory
 from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.endpoint_matching import EndpointTable
 from wm_nodes.ros.qos import topic
+from wm_nodes.ros.wire import WireError
 
 DOMAINS = range(20, 90)
 TOY_FOLDER = Path(__file__).parent
@@ -108,7 +109,12 @@ class Probe:
         """A book of what the nodes say of their links from now on; a node restarted before it was reported as lost is
         in use again only when the others have matched its new session."""
         book, row = EndpointTable(self.node.get_fully_qualified_name(), 0), topic("run/links")
-        self.node.create_subscription(row.type, row.name, book.note, row.reader_qos)
+
+        def hear(message: Any) -> None:
+            with contextlib.suppress(WireError):
+                book.note(message)
+
+        self.node.create_subscription(row.type, row.name, hear, row.reader_qos)
         return book
 
     def publisher(self, name: str) -> Any:
