@@ -257,7 +257,14 @@ class LearnerNode(TrainingNode):
     def _on_spec(self, message: EnvSpec) -> None:
         try:
             check_session(message.session)
-            self._spec, self._refused = convert.spec_from_msg(message), None
+            spec = convert.spec_from_msg(message)
+        except WireError as error:
+            self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
+            if self._spec is None:  # else the one before stays
+                self._refused = error
+            return
+        try:
+            self._spec, self._refused = spec, None
             if self._expected_spec is not None:
                 refuse_other(self._spec, self._expected_spec, "the learner's policy needs")
             self._max_episode_steps = self._spec.max_episode_steps
