@@ -58,7 +58,7 @@ def test_the_embedded_judge_abstains_and_says_why(tmp_path: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"file": "gone.mp4"}, "gone.mp4 is no readable video: 0 frames"),
+        ({"file": "gone.mp4"}, "gone.mp4 is no readable video: No such file"),
         ({"file": "clips.jsonl"}, "clips.jsonl is no readable video"),
         ({"sha256": "0" * 64}, "b.npy has content "),
         ({"reference": "gone.png"}, "gone.png is no readable picture"),

@@ -151,7 +151,7 @@ def test_a_folder_is_refused_for_a_link_that_leads_out_of_it_and_for_a_fifo_in_i
 
 def test_what_belongs_to_the_run_is_no_place_for_anything_new(run: Path) -> None:
     files = NamedFiles(run)
-    taken = ("policies/policy_000027.safetensors", "config.yaml", "bags", "bags.json", "checkpoints/x", "a/../buffers/x")
+    taken = ("policies/policy_000027.safetensors", "config.yaml", "bags", "bags.json", "checkpoints/x", "a/../data/x")
     for name in taken:
         with pytest.raises(FileRefused, match="belongs to the run itself; take bags/NAME, or a new folder"):
             files.new(name, "bags")
@@ -182,7 +182,7 @@ def test_a_file_or_folder_that_is_swapped_for_a_link_meanwhile_never_leads_outsi
     thread.start()
     seen = {b"inside": 0, b"refused": 0}
     try:
-        files, until = NamedFiles(run), time.monotonic() + 3
+        files, until = NamedFiles(run), time.monotonic() + 1
         while time.monotonic() < until or not all(seen.values()):
             try:
                 seen[files.read("folder/file", SMALL)] += 1

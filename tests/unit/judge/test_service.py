@@ -21,6 +21,7 @@ from scripted_judge import make_clip, make_task
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import default_judge, dump_config, judge_overrides, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.core.named_files import NamedFiles, OutsideFolders
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.reading import read_record
@@ -112,9 +113,12 @@ def test_a_rubric_that_is_refused_leaves_the_one_before(server: PickyServer, tmp
     with closing(JudgeService(settings(server, max_reads=30), seed=0)) as judge:
         before = judge.rubric.version
         with pytest.raises(ValueError, match="unknown rubric pack"):
-            judge.set_rubric("nowhere.yaml", tmp_path)
+            judge.set_rubric("nowhere.yaml", NamedFiles(tmp_path))
         assert judge.rubric.version == before
-        judge.set_rubric("many.yaml", tmp_path)
+        (tmp_path / "outside.yaml").write_text(f"extends: {tmp_path.parent}/outside.yaml\nname: outside\n")
+        with pytest.raises(OutsideFolders):
+            judge.set_rubric("outside.yaml", NamedFiles(tmp_path))
+        judge.set_rubric("many.yaml", NamedFiles(tmp_path))
         assert judge.rubric.version.startswith("many-1-")
         assert judge.judge(jobs(1))[0].provenance.rubric_version == judge.rubric.version
 

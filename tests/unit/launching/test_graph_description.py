@@ -91,7 +91,7 @@ def test_every_node_module_and_its_ros2_run_name_exist(
 def test_nodes_get_only_parameters_that_they_declare(scenario: str, given: dict[str, str]) -> None:
     """Nodes refuse unknown parameters; the declared names are read from the node's source."""
     graph, _ = launch_arguments.prepare(scenario, of(scenario, given))
-    common = {"config_file", "run_dir", "autostart", "executor", "use_sim_time"}
+    common = {"config_file", "run_dir", "allowed_dirs", "autostart", "executor", "use_sim_time"}
     for node in graph.nodes:
         spec = importlib.util.find_spec(node.module)
         assert spec is not None and spec.origin is not None
@@ -100,6 +100,18 @@ def test_nodes_get_only_parameters_that_they_declare(scenario: str, given: dict[
             ast.literal_eval(call.args[0]) for call in calls if getattr(call.func, "id", "") == "Param" and call.args
         }
         assert set(node.parameters) - common <= declared, node.label
+
+
+def test_folders_that_the_user_allows_and_the_bag_that_is_replayed_go_to_every_node(given: dict[str, str]) -> None:
+    bag, values = given["bag_uri"], of("replay_offline", given)
+    for more, allowed in (({}, [bag]), ({"allowed_dirs": "/data:~/x"}, ["/data", str(Path("~/x").expanduser()), bag])):
+        graph, _ = launch_arguments.prepare("replay_offline", values | more)
+        assert [node.parameters["allowed_dirs"] for node in graph.nodes] == [allowed, allowed]
+    graph, _ = launch_arguments.prepare("online_training", of("online_training", given) | {"allowed_dirs": "/data"})
+    assert {tuple(node.parameters["allowed_dirs"]) for node in graph.nodes} == {("/data",)}
+    assert "-p" in (words := graph.nodes[0].parameter_arguments()) and 'allowed_dirs:=["/data"]' in words
+    graph, _ = launch_arguments.prepare("online_training", of("online_training", given))
+    assert all("allowed_dirs" not in node.parameters for node in graph.nodes)
 
 
 def test_held_out_bags_and_their_judge_go_to_the_learner_of_loop_2_and_none_where_none_are_named(

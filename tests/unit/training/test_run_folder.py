@@ -61,6 +61,19 @@ def test_the_newest_versions_are_kept_and_read_back_as_they_were_written(tmp_pat
         run.weights_of(1)
 
 
+def test_files_of_the_users_in_the_same_folder_stay_and_do_not_count(tmp_path: Path) -> None:
+    run = CountingRun(tmp_path, keep_versions=1)
+    run.update()
+    own = [f"policies/policy_{name}.safetensors" for name in ("000900", "1", "0000001", "best", "000001_mine")]
+    for name in own:
+        (tmp_path / name).write_bytes(b"mine")
+    run.update()
+    run.update()
+    assert run.weights_of(3) and not (tmp_path / run.files.uri(2)).exists()
+    assert all((tmp_path / name).read_bytes() == b"mine" for name in own)
+    assert run.files.versions(tmp_path) == [3, 900]
+
+
 def test_a_version_that_could_not_be_written_is_written_later_and_not_given_out_before(tmp_path: Path) -> None:
     run = CountingRun(tmp_path, keep_versions=2)
     run.update()

@@ -212,6 +212,11 @@ def read_yaml(path: Traversable) -> dict[str, Any]:
         raise ConfigError(f"{path} is a folder; name a .yaml file") from None
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}; make it readable, or name another file") from None
+    return parse_yaml(data, path)
+
+
+def parse_yaml(data: bytes, path: object) -> dict[str, Any]:
+    """Return the mapping in the bytes of a YAML file. Raises ConfigError: one line with file, line and remedy."""
     line, problem = 1, ""
     try:
         values = yaml.safe_load(data.decode())

@@ -1,5 +1,9 @@
 """A folder of clips to judge: video files, and clips.jsonl with the task of each."""
 
+import hashlib
+import os
+from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Annotated
 
@@ -7,12 +11,14 @@ import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from wm_nodes.core.files import file_sha256
+from wm_nodes.core.named_files import CLIP, CLIP_LIST, PICTURE, FileKind, read_regular
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.types import ClipRef, TaskSpec, clip_ref
 from wm_nodes.judge.service import ClipJob
 
 LIST = "clips.jsonl"
+Read = Callable[[Path, FileKind], bytes]
+"""How the files are read: by default from anywhere; raises ValueError for one that is refused, OSError."""
 AT_ONCE = 64
 """Clips whose pixels are held at a time, as long as the judge does not take more at once."""
 
@@ -38,16 +44,20 @@ class ClipLine(BaseModel):
     """Of the clip's content; checked where given."""
 
 
-def read_list(folder: Path) -> list[ClipLine]:
+def read_list(folder: Path, read: Read = read_regular) -> list[ClipLine]:
     """The lines of clips.jsonl. Raises ValueError: no such file, or a bad line; names line, field and problem."""
     path = folder / LIST
-    if not path.is_file():
+    try:
+        content = read(path, CLIP_LIST).decode()
+    except (FileNotFoundError, NotADirectoryError):
         raise ValueError(
             f'{path} is missing: one line per clip, e.g. {{"file": "a.mp4", "instruction": "push the cube", "task_id": '
             '"push_cube"}'
-        )
+        ) from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is no text in UTF-8: {error}; write the list again") from None
     lines = []
-    for number, text in enumerate(path.read_text().splitlines(), 1):
+    for number, text in enumerate(content.splitlines(), 1):
         if not text.strip():
             continue
         try:
@@ -59,51 +69,65 @@ def read_list(folder: Path) -> list[ClipLine]:
     return lines
 
 
-def list_sha256(folder: Path, announced: str = "") -> str:
+def list_sha256(folder: Path, announced: str = "", read: Read = read_regular) -> str:
     """SHA-256 of clips.jsonl. Raises ValueError: it is not the announced one. OSError: it cannot be read."""
     path = folder / LIST
-    digest = file_sha256(path)
+    digest = hashlib.sha256(read(path, CLIP_LIST)).hexdigest()
     if announced and digest != announced:
         raise ValueError(f"{path} is not the announced list ({digest[:12]}, not {announced[:12]}); copy it again")
     return digest
 
 
-def read_job(folder: Path, line: ClipLine) -> ClipJob:
+def read_job(folder: Path, line: ClipLine, read: Read = read_regular) -> ClipJob:
     """A clip with its pixels. Raises ValueError: an unreadable file, or another content than its sha256; names it."""
     path = folder / line.file
-    clip = _read_frames(path, line.fps) if path.suffix == ".npy" else read_video(path)
+    clip = _read_frames(path, line.fps, read) if path.suffix == ".npy" else read_video(path, read)
     if line.sha256 and clip.sha256 != line.sha256:
         raise ValueError(f"{path} has content {clip.sha256}, not {line.sha256}; copy it again")
     clip = ClipRef(line.clip_id or path.stem, clip.sha256, clip.frames, clip.fps)
-    reference = read_picture(folder / line.reference) if line.reference else clip.frames[0]
-    goal = read_picture(folder / line.goal) if line.goal else None
+    reference = read_picture(folder / line.reference, read) if line.reference else clip.frames[0]
+    goal = read_picture(folder / line.goal, read) if line.goal else None
     return ClipJob(clip, TaskSpec(line.instruction, line.task_id, line.robot, reference, goal))
 
 
-def read_video(path: Path) -> ClipRef:
+def read_video(path: Path, read: Read = read_regular) -> ClipRef:
     """Every frame of a video, RGB. Raises ValueError: no readable video of two frames or more."""
-    capture = cv2.VideoCapture(str(path))
-    fps, frames = capture.get(cv2.CAP_PROP_FPS), []
-    while (read := capture.read())[0]:
-        frames.append(read[1][..., ::-1])
-    capture.release()
+    descriptor = os.memfd_create("clip")  # OpenCV reads videos by name only
+    try:
+        with open(descriptor, "wb", closefd=False) as file:
+            file.write(_bytes_of(path, CLIP, "video", read))
+        capture = cv2.VideoCapture(f"/proc/self/fd/{descriptor}", cv2.CAP_FFMPEG)
+        fps, frames = capture.get(cv2.CAP_PROP_FPS), []
+        while (following := capture.read())[0]:
+            frames.append(following[1][..., ::-1])
+        capture.release()
+    finally:
+        os.close(descriptor)
     if len(frames) < 2 or not fps > 0:
         raise ValueError(f"{path} is no readable video: {len(frames)} frames at {fps:g} per second")
     return clip_ref(path.stem, np.stack(frames), fps)
 
 
-def read_picture(path: Path) -> UInt8Array:
+def read_picture(path: Path, read: Read = read_regular) -> UInt8Array:
     """uint8 (H, W, 3), RGB. Raises ValueError where it cannot be read."""
-    image = cv2.imread(str(path))
+    data = np.frombuffer(_bytes_of(path, PICTURE, "picture", read), np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if image is None:
         raise ValueError(f"{path} is no readable picture")
     return np.ascontiguousarray(image[..., ::-1], np.uint8)
 
 
-def _read_frames(path: Path, fps: float) -> ClipRef:
+def _read_frames(path: Path, fps: float, read: Read) -> ClipRef:
     """Load an array of frames; the agent checks their shape and type."""
     try:
-        frames = np.load(path, allow_pickle=False)
+        frames = np.load(BytesIO(_bytes_of(path, CLIP, "array", read)), allow_pickle=False)
     except (OSError, ValueError) as error:
         raise ValueError(f"{path} is no readable array: {error}") from None
     return clip_ref(path.stem, frames, fps)
+
+
+def _bytes_of(path: Path, kind: FileKind, what: str, read: Read) -> bytes:
+    try:
+        return read(path, kind)
+    except OSError as error:
+        raise ValueError(f"{path} is no readable {what}: {error.strerror}") from None

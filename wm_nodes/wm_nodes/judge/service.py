@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import AGENT, JudgeConfig
+from wm_nodes.core.named_files import RUBRIC, NamedFiles
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.judge.agent.judge import Cost, Health
 from wm_nodes.judge.agent.machine import RewardAgent
@@ -166,19 +167,19 @@ class JudgeService:
         """The measured abilities of each judge, as text; judges without a measurement are left out."""
         return [card for slot in self._slots if (card := slot.agent.judge.capabilities.card)]
 
-    def set_rubric(self, pack: str, base: Path) -> None:
+    def set_rubric(self, pack: str, files: NamedFiles) -> None:
         """Judge by another rubric from now on; call it while nothing is being judged.
 
         Args:
-            pack: a pack's name, or a YAML file, absolute or relative to `base`.
+            pack: a pack's name, or a YAML file among `files`, as are those that it extends.
 
         Raises:
             ConfigError: no such pack, or one that is refused; the rubric is then the one before.
+            FileRefused, OSError: as files.read.
             ValueError: the judge cannot read all of its components, max_reads does not cover them, or nobody measures
                 the evidence of its bands.
         """
-        path = base / pack
-        rubric = load_rubric(str(path) if path.is_file() else pack)
+        rubric = load_rubric(pack, read=lambda name: files.read(name, RUBRIC))
         old, self._slots = self._slots, self._make_slots(rubric)
         self.pack, self.fallen_back, self._used = pack, "", self._slots[0]
         for slot in old:

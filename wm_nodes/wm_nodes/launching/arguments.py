@@ -40,6 +40,9 @@ def resolve(scenario: str, given: Mapping[str, str], now: datetime | None = None
     values["run_dir"] = str(run_dir)
     if values["params_file"]:
         values["params_file"] = _check_params(values["params_file"])
+    allowed = [str(Path(folder).expanduser().absolute()) for folder in values["allowed_dirs"].split(":") if folder]
+    allowed += [str(Path(values["bag_uri"]).expanduser().absolute())] if scenario == "replay_offline" else []
+    values["allowed_dirs"] = ":".join(allowed)  # the bag that the user names is one for goals, too
     given_config = values["config_file"]
     judge = _judge_settings(values)
     if "video_preset" in values:

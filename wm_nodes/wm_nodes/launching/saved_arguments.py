@@ -28,7 +28,7 @@ JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
 SETTINGS = (*PRESETS, "config_file", "task", *JUDGE)
 """Arguments that the saved configuration stands for."""
 NOT_KEPT = (
-    "run_dir", "domain_id", "discovery_range", "python", "log_level", "executor", "autostart", "use_sim_time",
+    "run_dir", "allowed_dirs", "domain_id", "discovery_range", "python", "log_level", "executor", "autostart", "use_sim_time",
     "compose",
 )
 """Of one start, not of the run."""

@@ -43,6 +43,7 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
     LaunchArgument("run_dir", "", "Folder for settings, weights, bags and logs; an existing one goes on as it was "
                    "begun; empty: runs/<time>-<scenario>"),
+    LaunchArgument("allowed_dirs", "", "Folders, separated by colons, where others may name files, beside run_dir"),
     LaunchArgument("namespace", "wm", "ROS namespace of the graph; several graphs on one host need several domains"),
     LaunchArgument("model_dir", "", "World-model folder; empty: the one shipped for the task"),
     LaunchArgument("video_model_dir", "", "Folder of the trained video model"),
@@ -93,8 +94,8 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
 
 _BY_NAME = {argument.name: argument for argument in ARGUMENTS}
 _COMMON = (
-    "preset", "task", "config_file", "run_dir", "namespace", "executor", "autostart", "use_sim_time", "log_level",
-    "compose", "domain_id", "discovery_range", "python", "params_file",
+    "preset", "task", "config_file", "run_dir", "allowed_dirs", "namespace", "executor", "autostart", "use_sim_time",
+    "log_level", "compose", "domain_id", "discovery_range", "python", "params_file",
 )
 
 
@@ -159,6 +160,8 @@ def _node(
         "executor": arguments["executor"],
         "use_sim_time": arguments["use_sim_time"] == "true",
     }
+    if allowed := [folder for folder in arguments["allowed_dirs"].split(":") if folder]:
+        common["allowed_dirs"] = allowed
     values = {**common, **parameters}
     return NodeSpec(
         f"wm_nodes.nodes.{module or f'{name}_node'}", name, namespace, values, ranks=ranks,

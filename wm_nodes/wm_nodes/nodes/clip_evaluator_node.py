@@ -15,6 +15,7 @@ from wm_msgs.action import EvaluateClips
 from wm_msgs.msg import ClipScores, ClipVerdict
 from wm_nodes.config.load import judge_or_embedded, load_video_config
 from wm_nodes.config.schema import AGENT
+from wm_nodes.core.named_files import BUFFER, NamedFiles, shown
 from wm_nodes.judge.agent.contract import check_one_judge
 from wm_nodes.judge.agent.types import GATED
 from wm_nodes.judge.agent.verdict import Verdict
@@ -25,7 +26,7 @@ from wm_nodes.nodes.judge.services import JudgeServices, deadline_of
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import Param
+from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.worker import Work
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
@@ -64,6 +65,7 @@ class ClipEvaluatorNode(ManagedNode):
             raise ValueError(f"{self.param('model_dir')} has no position probe; take the shipped world model")
         self._probe = probe
         self._fps = clip_fps(bags[0], folder.clip["stride"])
+        self._files = named_files(self)
         self._agent = None
         if self._config.rewards.get(AGENT):
             shape = tuple(contexts.frames.shape[1:])
@@ -87,7 +89,7 @@ class ClipEvaluatorNode(ManagedNode):
         result = EvaluateClips.Result(termination_reason=EvaluateClips.Result.FINISHED)
         try:
             began = time.perf_counter()
-            buffer = read_buffer(self.run_dir / goal.buffer_uri, goal.sha256)
+            buffer = read_buffer(self._files, goal.buffer_uri, goal.sha256)
             frames = self._generator.folder.codec.decode(buffer.rollout.latents)
             verdicts: list[Verdict] = []
             if self._agent is not None:
@@ -99,7 +101,7 @@ class ClipEvaluatorNode(ManagedNode):
             self.diagnostics.latency("evaluate", result.scores.eval_s)
         except (RolloutBufferError, ValueError, OSError) as error:
             result.termination_reason, result.message = EvaluateClips.Result.FAILED, str(error)
-            self.say_failed_goal(f"{goal.buffer_uri} not judged: {error}")
+            self.say_failed_goal(f"{shown(goal.buffer_uri)} not judged: {error}")
         return result
 
     def _judge_clips(
@@ -151,22 +153,22 @@ def _why_invalid(verdicts: Sequence[Verdict]) -> str:
     return f"{len(invalid)} clips without a verdict; {invalid[0].clip_id}: {invalid[0].status} {invalid[0].reason}"
 
 
-def read_buffer(path: Path, sha256: str) -> RolloutBuffer:
-    """Read a rollout buffer.
+def read_buffer(files: NamedFiles, uri: str, sha256: str) -> RolloutBuffer:
+    """Read a rollout buffer that a goal names.
 
     Args:
         sha256: of the file; empty: any.
 
     Raises:
-        RolloutBufferError: no such file, another one than announced, or no buffer in it.
+        RolloutBufferError: no such file, another one than announced, or no buffer in it. FileRefused: as NamedFiles.
     """
     try:
-        data = path.read_bytes()
+        data = files.read(uri, BUFFER)
     except OSError as error:
-        raise RolloutBufferError(f"cannot read {path}: {error.strerror}; sample again, or raise keep_buffers") from None
+        raise RolloutBufferError(f"cannot read {uri}: {error.strerror}; sample again, or raise keep_buffers") from None
     digest = hashlib.sha256(data).hexdigest()
     if sha256 and digest != sha256:
-        raise RolloutBufferError(f"{path} is not the announced buffer (sha256 {digest[:12]}, not {sha256[:12]})")
+        raise RolloutBufferError(f"{uri} is not the announced buffer (sha256 {digest[:12]}, not {sha256[:12]})")
     return RolloutBuffer.from_bytes(data)
 
 

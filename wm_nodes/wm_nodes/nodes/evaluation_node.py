@@ -14,7 +14,7 @@ from wm_nodes.ros import convert
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import Param
+from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, WireError
 from wm_nodes.ros.worker import Work
@@ -45,6 +45,7 @@ class EvaluationNode(ManagedNode):
         self._holder = PolicyHolder(
             make_policy(self._config, str(self.param("model_dir")), str(self.param("policy_factory")))
         )
+        self._files = named_files(self, str(self.param("initial_policy")))
         self._newest: PolicyVersion | None = None
         self._environment = RosEnvironmentClient(
             self, str(self.param("env_namespace")), float(self.param("step_timeout_s"))
@@ -91,17 +92,17 @@ class EvaluationNode(ManagedNode):
     def _load(self, goal: Evaluate.Goal) -> int:
         """Load the weights the goal names; return their version (0 for a file)."""
         if goal.policy_uri:
-            self._holder.load(read_weights(goal.policy_uri, self.run_dir), 0)
+            self._holder.load(read_weights(goal.policy_uri, self._files), 0)
             return 0
         newest = self._newest
         if goal.policy_version == 0 and newest is None:
             path = existing(str(self.param("initial_policy")), "initial_policy (or give policy_uri in the goal)")
             self._holder.load(path.read_bytes(), 0)
         elif newest is not None and goal.policy_version in (0, newest.version):
-            self._holder.follow(newest, self.run_dir)
+            self._holder.follow(newest, self._files)
         else:
             version = int(goal.policy_version)
-            self._holder.load(read_weights(POLICY_FILES.uri(version), self.run_dir), version)
+            self._holder.load(read_weights(POLICY_FILES.uri(version), self._files), version)
         return self._holder.version
 
     @staticmethod

@@ -17,6 +17,7 @@ from wm_msgs.msg import EnvSpec, ErrorCode, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import AGENT
+from wm_nodes.core.named_files import NamedFiles
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Rollout
 from wm_nodes.judge.episode_reward import check_horizon, unjudged_reason
@@ -33,7 +34,7 @@ from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
-from wm_nodes.ros.params import COMMON, Param
+from wm_nodes.ros.params import COMMON, Param, named_files
 from wm_nodes.ros.sequence_numbers import check_session
 from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
@@ -76,6 +77,7 @@ class LearnerNode(TrainingNode):
         self.hold_run_folder()
         self._config = self.run_config()
         values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
+        self._files: NamedFiles = named_files(self, str(self.param("replay_at_start")))
         self._training = make_run(values, self.run_dir, self.ranks)
         self._report = LearnerReport(self, tensorboard=bool(self.param("tensorboard")))
         self.own(self._report.close)
@@ -176,12 +178,12 @@ class LearnerNode(TrainingNode):
                 raise self._refused
 
         if goal.from_bags:
-            paths = bag_paths(goal.bag_uris, self.run_dir)
+            paths = bag_paths(goal.bag_uris, self._files)
             self._reward_name = recorded_reward_name(paths[0])
             self._max_episode_steps = read_spec(paths[0]).max_episode_steps
             return BagRollouts(paths, progress, num_steps=num_steps, expected=self._expected_spec)
         if goal.from_replay:
-            uris = [str(path) for path in bag_paths(goal.bag_uris, self.run_dir)] if goal.bag_uris else []
+            uris = [str(path) for path in bag_paths(goal.bag_uris, self._files)] if goal.bag_uris else []
             if uris:
                 self._refused = None
             return ReplayedRollouts(self, check, progress, self._replayed, self._replay, uris, num_steps=num_steps)
@@ -298,11 +300,14 @@ class LearnerNode(TrainingNode):
         try:
             if self.training:
                 raise WireError(ErrorCode.BUSY, "training is running and saves after every update; cancel it or wait")
-            path = self.run_dir / (request.uri or self._training.checkpoint)
+            own = self._training.checkpoint
+            path = self._files.new(request.uri, "checkpoints") if request.uri else self.run_dir / own
             self._training.save_checkpoint(path)
             response.uri = str(path)
-        except WireError as error:
-            return convert.fill_error(response, error)
+        except (WireError, ValueError) as error:
+            refused = error if isinstance(error, WireError) else convert.file_error(error)
+            self.diagnostics.count("refused_saves", text=f"learner/save refused: {refused}")
+            return convert.fill_error(response, refused)
         except OSError as error:
             self.diagnostics.count("failed_saves", level=diagnostics.ERROR, text=f"checkpoint not written: {error}")
             return convert.fill_error(response, WireError(ErrorCode.IO_ERROR, f"checkpoint not written: {error}"))
@@ -322,15 +327,19 @@ class LearnerNode(TrainingNode):
                     ErrorCode.OUT_OF_RANGE,
                     f"offset {request.offset} lies behind the end of {len(data)} bytes; begin again at 0",
                 )
-        except (WireError, OSError) as error:
+        except OSError:
             text = f"policy version {request.version} is not in {self.run_dir / 'policies'}; ask for 0, the newest"
-            refused = error if isinstance(error, WireError) else WireError(ErrorCode.NOT_FOUND, text)
-            self.diagnostics.count("refused_weights", text=f"learner/get_weights refused: {refused}")
-            return convert.fill_error(response, refused)
+            return self._refuse_weights(response, WireError(ErrorCode.NOT_FOUND, text))
+        except (WireError, ValueError) as error:
+            return self._refuse_weights(response, error if isinstance(error, WireError) else convert.file_error(error))
         chunk = data[request.offset : request.offset + request.max_bytes]
         response.version, response.total, response.crc32 = version, len(data), zlib.crc32(chunk)
         response.data = convert.bytes_field(chunk)
         return response
+
+    def _refuse_weights(self, response: GetWeights.Response, refused: WireError) -> GetWeights.Response:
+        self.diagnostics.count("refused_weights", text=f"learner/get_weights refused: {refused}")
+        return convert.fill_error(response, refused)
 
 
 def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> PolicyTraining:

@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from rclpy.publisher import Publisher
@@ -25,7 +24,7 @@ from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.convert import time_msg
 from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import Param
+from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import Cancelled
 from wm_nodes.ros.worker import Work
@@ -59,6 +58,7 @@ class PlayerNode(ManagedNode):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("player", PARAMS, **node_arguments)
+        self._files = named_files(self, str(self.param("bag_uri")))  # as the user gave it: others may set it later
         self._playback: Playback | None = None
         self._thread: threading.Thread | None = None
         self._outlets: dict[str, Publisher] = {}
@@ -111,11 +111,11 @@ class PlayerNode(ManagedNode):
     # Playing.
 
     def _open(self, request: Replay.Goal) -> Playback:
-        """Raises BagError when the bag cannot be played or another is being played."""
+        """Raises BagError when the bag cannot be played or another is being played; as NamedFiles.readable."""
         uri = request.bag_uri or str(self.param("bag_uri"))
         if not uri:
             raise BagError("no bag named; set bag_uri in the goal or as a parameter")
-        path = self.run_dir / uri if self.param("run_dir") else Path(uri)
+        path = self._files.readable(uri)
         namespace = self.get_namespace().rstrip("/")
         names = [name if name.startswith("/") else f"{namespace}/{name}" for name in request.topics]
         with self._lock:
@@ -189,7 +189,7 @@ class PlayerNode(ManagedNode):
         try:
             playback = self._open(work.request)
             self._play(playback, work.request, work)
-        except (BagError, ValueError) as error:
+        except (ValueError, OSError) as error:
             self.say_failed_goal(f"replay failed: {error}")
             return Replay.Result(termination_reason=Replay.Result.FAILED, message=str(error))
         if not self.active:

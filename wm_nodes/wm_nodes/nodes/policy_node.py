@@ -25,7 +25,7 @@ from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
 from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import Param
+from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
@@ -70,6 +70,7 @@ class PolicyNode(ManagedNode):
     def configure(self) -> None:
         given = self.run_config(), str(self.param("model_dir")), str(self.param("policy_factory"))
         self._holder, self._expected_spec = PolicyHolder(make_policy(*given)), expected_spec(*given)
+        self._files = named_files(self, str(self.param("initial_policy")))
         if self.param("initial_policy"):
             path = existing(str(self.param("initial_policy")), "initial_policy")
             try:
@@ -206,7 +207,7 @@ class PolicyNode(ManagedNode):
         deadline = time.monotonic() + float(self.param("version_timeout_s"))
         announced = self._announced
         if announced is not None and announced.version == version != self._holder.version:
-            self._holder.follow(announced, self.run_dir)  # policy/load has replaced it since
+            self._holder.follow(announced, self._files)  # policy/load has replaced it since
         while version and self._holder.version != version:
             if time.monotonic() > deadline:
                 raise WireError(
@@ -245,7 +246,7 @@ class PolicyNode(ManagedNode):
 
     def _on_version(self, message: PolicyVersion) -> None:
         try:
-            if self._holder.follow(message, self.run_dir):
+            if self._holder.follow(message, self._files):
                 self.diagnostics.clear_condition("policy version")
             self._announced = message
         except (WireError, ValueError) as error:
@@ -292,7 +293,7 @@ class PolicyNode(ManagedNode):
         try:
             if self._rollouts.busy:
                 raise WireError(ErrorCode.BUSY, "a rollout is running; cancel it or wait")
-            self._holder.load(read_weights(request.uri, self.run_dir), 0, request.sha256)
+            self._holder.load(read_weights(request.uri, self._files), 0, request.sha256)
         except (WireError, ValueError) as error:
             wire = error if isinstance(error, WireError) else WireError(ErrorCode.IO_ERROR, str(error))
             self.diagnostics.count("refused_loads", text=f"policy/load refused: {error}")

@@ -16,6 +16,7 @@ from std_srvs.srv import Trigger
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import StartRecording, StopRecording
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.named_files import OutsideFolders
 from wm_nodes.nodes.recorder.qos import recorded_qos
 from wm_nodes.recording import BagError, RawBagWriter, RecordingError, topics
 from wm_nodes.recording import messages as m
@@ -23,7 +24,7 @@ from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.flow_control import ConsumerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import Param
+from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.qos import TOPICS, GraphTopic, row_name
 from wm_nodes.ros.sequence_numbers import GapTracker
 from wm_nodes.ros.spin import run_node
@@ -59,6 +60,7 @@ class RecorderNode(ManagedNode):
         self._last_message_s = 0.0
 
     def configure(self) -> None:
+        self._files = named_files(self)
         self._rows = {name: _row(name) for name in self.param("topics")}
         self._gaps = {name: GapTracker() for name in self._rows if _base(name) in SEQUENCED}
         self._names: dict[str, str] = {}
@@ -249,10 +251,13 @@ class RecorderNode(ManagedNode):
             response.error_code, response.message = ErrorCode.NOT_ACTIVE, "the recorder is not active; activate it"
             return response
         try:
-            response.bag_uri = str(self._start(request.bag_uri))
+            uri = str(self._files.new(request.bag_uri, "bags")) if request.bag_uri else ""
+            response.bag_uri = str(self._start(uri))
+        except OutsideFolders as error:
+            response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
         except BagError as error:
             response.error_code, response.message = ErrorCode.BUSY, str(error)
-        except (RecordingError, ValueError) as error:
+        except (OSError, ValueError) as error:
             response.error_code, response.message = ErrorCode.IO_ERROR, str(error)
         if response.message:
             self.diagnostics.count("refused_starts", text=f"not recording: {response.message}")

@@ -22,7 +22,7 @@ from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.clients import run_goal, same_process
 from wm_nodes.ros.endpoint_matching import StartBarrier
-from wm_nodes.ros.params import COMMON, Param
+from wm_nodes.ros.params import COMMON, Param, named_files
 from wm_nodes.ros.wire import Cancelled, PeerLost
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks
@@ -62,7 +62,7 @@ class VideoLearnerNode(TrainingNode):
         values = {param.name: self.param(param.name) for param in (*COMMON, *PARAMS)}
         self._video = make_run(values, self.run_dir, self.ranks)
         self.own(self._video.close)
-        self._watched = self._video.hacked
+        self._watched, self._files = self._video.hacked, named_files(self)
         self._start_barrier = StartBarrier(self, self.links.table)
         self._generate = GuardedActionClient(self, GenerateClips, "video/generate")
         self._evaluate = GuardedActionClient(self, EvaluateClips, "clips/evaluate")
@@ -109,7 +109,7 @@ class VideoLearnerNode(TrainingNode):
 
     def _read_buffers(self, uris: Sequence[str]) -> Generator[RolloutBuffer]:
         for uri in uris:
-            yield read_buffer(self.run_dir / uri, "")
+            yield read_buffer(self._files, uri, "")
 
     def _sample_buffers(self, work: Work, count: int) -> Generator[RolloutBuffer]:
         """`count` buffers of fresh clips with their rewards, each to be trained on before the next one is taken.
@@ -148,7 +148,7 @@ class VideoLearnerNode(TrainingNode):
                 f"training pauses before iteration {iteration}: {judged.scores.pause_reason}. Nothing was trained on "
                 f"these clips ({clips.buffer_uri}); mend the judge and train again: the same clips are then judged"
             )
-        return with_scores(read_buffer(self.run_dir / clips.buffer_uri, clips.sha256), judged.scores)
+        return with_scores(read_buffer(self._files, clips.buffer_uri, clips.sha256), judged.scores)
 
     def _ask(self, client: GuardedActionClient, goal: Any, check: Callable[[], None], peer: str) -> Any:
         """Raises PeerLost where nobody answers, ValueError where the peer says that it failed."""

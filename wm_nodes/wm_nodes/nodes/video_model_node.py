@@ -18,10 +18,11 @@ from wm_nodes.recording.layout import Tiles
 from wm_nodes.ros import convert
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import Param
+from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.spin import run_node
 from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
+from wm_nodes.training.run_folder import VersionFiles
 from wm_nodes.training.weights import WeightsError, load_weights
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
@@ -36,6 +37,7 @@ PARAMS = (
 )
 
 
+BUFFER_FILES = VersionFiles("buffers/buffer")
 VERSIONS_KNOWN = 20
 """Announcements kept, newest last."""
 
@@ -51,6 +53,7 @@ class VideoModelNode(ManagedNode):
         folder = load_video_folder(Path(str(self.param("video_model_dir"))))
         bags = [Path(text) for text in self.param("context_bags") if text]
         self._generator = ClipGenerator(folder, load_clips(bags, folder.clip["stride"]), config)
+        self._files = named_files(self)
         self._loaded = (0, "")  # version and, unless it is the folder's own, sha256
         self._announced = dict[int, PolicyVersion]()
         self._clips = self.publish_on("clips")
@@ -87,7 +90,7 @@ class VideoModelNode(ManagedNode):
 
             buffer = self._generator.sample(request, on_progress=report)
             data = buffer.to_bytes()
-            result.buffer_uri = f"buffers/buffer_{goal.iteration:06d}.safetensors"
+            result.buffer_uri = BUFFER_FILES.uri(goal.iteration)
             result.sha256, result.num_clips = hashlib.sha256(data).hexdigest(), len(buffer)
             write_atomic(self.run_dir / result.buffer_uri, data)
             self._forget_old()
@@ -118,7 +121,7 @@ class VideoModelNode(ManagedNode):
             work.sleep(0.02)
         message = self._announced.get(version)
         if message is not None and self._loaded != (version, message.sha256):
-            load_weights(self._generator.folder.network, read_weights(message.uri, self.run_dir), sha256=message.sha256)
+            load_weights(self._generator.folder.network, read_weights(message.uri, self._files), sha256=message.sha256)
             self._loaded = (version, message.sha256)
 
     def _publish(self, message: ClipBatch, strip: UInt8Array) -> None:
@@ -128,8 +131,8 @@ class VideoModelNode(ManagedNode):
         self._clips.publish(message)
 
     def _forget_old(self) -> None:
-        written = (self.run_dir / "buffers").glob("buffer_*.safetensors")
-        newest_last = sorted(written, key=lambda path: path.stat().st_mtime_ns)
+        written = [self.run_dir / BUFFER_FILES.uri(number) for number in BUFFER_FILES.versions(self.run_dir)]
+        newest_last = sorted(written, key=lambda path: path.lstat().st_mtime_ns)
         for path in newest_last[: -int(self.param("keep_buffers"))]:
             path.unlink(missing_ok=True)
 

@@ -5,8 +5,10 @@ Versions: run_dir/policies/policy_<version>.safetensors, from 1.
 
 import json
 import math
+import os
+import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
@@ -16,6 +18,7 @@ import numpy as np
 import torch.distributed
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.named_files import CHECKPOINT, read_regular
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.rollouts import Canceled, rollout_statistics, terminate_at_episode_end
@@ -150,20 +153,50 @@ class PolicyTraining(TrainingRun):
         return packed
 
     def save_checkpoint(self, path: Path) -> PackedWeights:
-        """Write weights, learner state and counts; `path` becomes the file that names them. Return the weights."""
+        """Write weights, learner state and counts; `path` becomes the file that names them. Return the weights.
+
+        What the checkpoint before it at `path` names is removed, and nothing else is touched.
+
+        Raises:
+            ValueError: a file lies there that is no checkpoint, or that none names. OSError.
+        """
+        weights, state = (
+            path.with_name(f"{path.stem}_{self.updates:06d}.{kind}") for kind in ("safetensors", "learner")
+        )
+        before = named_by_checkpoint(path) if os.path.lexists(path) else set()
+        if path != self.run_dir / self.checkpoint:  # beside the run's own, a kill may have left files that none names
+            check_free(path, {weights, state} - before)
         packed = pack_weights(self.policy, {**self._metadata, "policy_version": str(self.version)})
-        generation = self.updates
-        weights, state = (path.with_name(f"{path.stem}_{generation:06d}.{kind}") for kind in ("safetensors", "learner"))
         write_atomic(weights, packed.data)
         self.learner.save(state)
         content = {"progress": asdict(self.progress), "weights": weights.name, "learner": state.name,
                    "sha256": packed.sha256}
         write_atomic(path, json.dumps(content, indent=1).encode())
-        for kind in ("safetensors", "learner"):
-            for old in path.parent.glob(f"{path.stem}_*.{kind}"):
-                if old not in (weights, state):
-                    old.unlink(missing_ok=True)
+        for old in before - {weights, state}:
+            old.unlink(missing_ok=True)
         return packed
+
+
+def named_by_checkpoint(path: Path) -> set[Path]:
+    """The files beside a checkpoint that it names as its own. Raises ValueError where no checkpoint lies there."""
+    try:
+        content = json.loads(read_regular(path, CHECKPOINT))
+        Progress(**content["progress"])
+        names = [content["weights"], content["learner"]]
+        if not all(re.fullmatch(rf"{re.escape(path.stem)}_\d+\.(safetensors|learner)", name) for name in names):
+            raise ValueError("it names files of another checkpoint")
+        return {path.with_name(name) for name in names}
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        text = f"{path} is there and is no checkpoint of a learner ({error}); take another name"
+        raise ValueError(text.replace("\n", " ")) from None
+
+
+def check_free(path: Path, generated: Iterable[Path]) -> None:
+    """Raise ValueError unless a checkpoint of a name that somebody chose meets no file of others."""
+    if path.suffix != ".json":
+        raise ValueError(f"{path} must end in .json: weights and learner state lie beside it under other endings")
+    if taken := [str(file) for file in generated if os.path.lexists(file)]:
+        raise ValueError(f"{' and '.join(sorted(taken))} would be overwritten; take another name than {path.name}")
 
 
 def restore(policy: ImagePolicy, learner: Learner, checkpoint: Path) -> Progress:

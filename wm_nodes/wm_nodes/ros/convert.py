@@ -26,6 +26,7 @@ from wm_msgs.msg import (
     TileLayout,
     TransitionBatch,
 )
+from wm_nodes.core.named_files import OutsideFolders
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.recording.layout import Tiles
@@ -88,6 +89,11 @@ def fill_error(response: Any, error: WireError) -> Any:
     """Refuse a request in its answer."""
     response.error_code, response.message = error.code, str(error)
     return response
+
+
+def file_error(error: ValueError) -> WireError:
+    """What a request that names a file which is refused is answered."""
+    return WireError(ErrorCode.OUT_OF_RANGE if isinstance(error, OutsideFolders) else ErrorCode.IO_ERROR, str(error))
 
 
 def time_msg(stamp_ns: int) -> Time:

@@ -4,6 +4,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -16,6 +17,8 @@ from rclpy.exceptions import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
+
+from wm_nodes.core.named_files import NamedFiles
 
 
 class ParameterError(ValueError):
@@ -71,6 +74,7 @@ class Param:
 COMMON = (
     Param("config_file", "", "Resolved configuration (YAML), as saved in the run folder", read_only=True),
     Param("run_dir", "", "Run folder: weights, checkpoints and bags go here; its name is the run id", read_only=True),
+    Param("allowed_dirs", [""], "Folders, beside run_dir, where others may name files to this node", read_only=True),
     Param("autostart", True, "Configure and activate at start, without a lifecycle manager", read_only=True),
     Param("executor", "events", "Which rclpy executor spins the node", read_only=True,
           choices=("events", "single", "multi")),
@@ -102,6 +106,12 @@ def declare(node: Node, params: Sequence[Param]) -> None:
         if problem := param.problem(node.get_parameter(param.name).value):
             raise ParameterError(f"{node.get_name()}: {problem}")
     _refuse_unknown(node)
+
+
+def named_files(node: Node, *own: str) -> NamedFiles:
+    """The files that others may name to a node. own: what the user has named to it, e.g. the bag that it plays."""
+    run_dir, allowed = node.get_parameter("run_dir").value, node.get_parameter("allowed_dirs").value
+    return NamedFiles(Path(run_dir) if run_dir else None, [name for name in (*allowed, *own) if name])
 
 
 def refusal(node: Node, params: Mapping[str, Param], changes: Sequence[Parameter]) -> str:

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 
+from wm_nodes.core.named_files import WEIGHTS, read_regular
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import PackedWeights, unpack_weights
 
@@ -27,11 +28,11 @@ class VersionFiles:
         """The versions in the run folder, ascending."""
         path = run_dir / self.stem
         names = (file.stem.removeprefix(f"{path.name}_") for file in path.parent.glob(f"{path.name}_*.safetensors"))
-        return sorted(int(name) for name in names if name.isdigit())
+        return sorted(int(name) for name in names if name.isdecimal() and f"{int(name):06d}" == name)
 
-    def prune(self, run_dir: Path, keep: int) -> None:
-        """Delete all but the newest `keep` versions."""
-        for version in self.versions(run_dir)[:-keep]:
+    def prune(self, run_dir: Path, keep: int, newest: int) -> None:
+        """Delete all but the newest `keep` versions up to `newest`; files of later numbers are not this run's."""
+        for version in [version for version in self.versions(run_dir) if version <= newest][:-keep]:
             (run_dir / self.uri(version)).unlink(missing_ok=True)
 
 
@@ -78,7 +79,7 @@ class TrainingRun(ABC):
     def save(self) -> None:
         """Write the files of the version, and delete those of old ones. Raises OSError."""
         self._newest = self.version, self.write_files()
-        self.files.prune(self.run_dir, self._keep_versions)
+        self.files.prune(self.run_dir, self._keep_versions, self.version)
 
     def ensure_saved(self) -> None:
         """Write the files of the version where, say, a full disk kept them from it. Raises OSError."""
@@ -86,10 +87,10 @@ class TrainingRun(ABC):
             self.save()
 
     def weights_of(self, version: int) -> PackedWeights:
-        """The weights of a version that was written. Raises OSError where its file is gone."""
+        """The weights of a version that was written. Raises OSError where its file is gone, ValueError for another."""
         newest = self._newest
         if newest is not None and newest[0] == version:
             return newest[1]
-        data = (self.run_dir / self.files.uri(version)).read_bytes()
+        data = read_regular(self.run_dir / self.files.uri(version), WEIGHTS)
         _, metadata = unpack_weights(data)
         return PackedWeights(data, hashlib.sha256(data).hexdigest(), metadata["arch_hash"], metadata)

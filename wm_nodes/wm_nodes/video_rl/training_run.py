@@ -134,7 +134,7 @@ class VideoRun(TrainingRun):
                 path = self.run_dir / AVERAGED_FILES.uri(self.version)
                 save_weights(self.network, path, {"version": f"{self.version}, averaged"})
         self.learner.save(self.run_dir / CHECKPOINT, iteration=self.iterations)
-        AVERAGED_FILES.prune(self.run_dir, self._keep_versions)
+        AVERAGED_FILES.prune(self.run_dir, self._keep_versions, self.version)
         return packed
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ from wm_nodes.apps.cli import main
 from wm_nodes.config.load import default_judge
 from wm_nodes.config.schema import JudgeConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.named_files import NamedFiles
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.reflection import conflicting_evidence
 from wm_nodes.judge.agent.rubric import load_rubric
@@ -94,7 +95,7 @@ def test_bands_of_evidence_that_nobody_measures_are_refused_by_name(server: Pick
     with closing(JudgeService(settings(server, Path("robot")), seed=0)) as judge:
         before = judge.rubric.version
         with pytest.raises(ValueError, match="still_energy"):
-            judge.set_rubric("bands.yaml", tmp_path)
+            judge.set_rubric("bands.yaml", NamedFiles(tmp_path))
         assert judge.rubric.version == before
 
 

@@ -5,14 +5,15 @@ so a new domain adds components, patterns or evidence without code. Its version 
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from wm_nodes.config.load import ConfigError, read_yaml, refusal
+from wm_nodes.config.load import ConfigError, parse_yaml, read_yaml, refusal
+from wm_nodes.core.named_files import RUBRIC, read_regular, shown
 from wm_nodes.judge.agent.types import GATED, NUM_LEVELS, NUM_PLAN_LEVELS, Component, Profile, Stage
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -187,17 +188,21 @@ class Rubric(RubricSection):
         return next(stage for stage in GATED if component in self.stages[stage].components)
 
 
-def load_rubric(pack: str = "robot", overrides: Mapping[str, Any] | None = None) -> Rubric:
+def load_rubric(
+    pack: str = "robot", overrides: Mapping[str, Any] | None = None, read: Callable[[str], bytes] | None = None
+) -> Rubric:
     """Read a pack of rubrics/, or a YAML file, with what it extends.
 
     Args:
         overrides: nested mapping laid on top, e.g. {"reward": {"gate": "soft"}}.
+        read: reads the YAML files; None: from anywhere.
 
     Raises:
-        ConfigError: no such pack, or values refused; names each of them.
+        ConfigError: no such pack, or values refused; names each of them. What `read` raises, but FileNotFoundError.
     """
+    read = read or (lambda name: read_regular(Path(name), RUBRIC))
     try:
-        return Rubric.model_validate(_merge(_resolve(pack, ()), overrides or {}))
+        return Rubric.model_validate(_merge(_resolve(pack, (), read), overrides or {}))
     except ValidationError as error:
         raise refusal(error, f"wm_nodes/judge/agent/rubric.py, pack {pack}") from None
 
@@ -210,17 +215,22 @@ def _pack_folder() -> Any:
     return resources.files("wm_nodes.judge.agent") / "rubrics"
 
 
-def _resolve(pack: str, seen: tuple[str, ...]) -> dict[str, Any]:
+def _resolve(pack: str, seen: tuple[str, ...], read: Callable[[str], bytes]) -> dict[str, Any]:
     if pack in seen:
         raise ConfigError(f"rubric packs extend each other in a circle: {' -> '.join((*seen, pack))}")
     if pack in pack_names():
         values = read_yaml(_pack_folder() / f"{pack}.yaml")
-    elif Path(pack).suffix in {".yaml", ".yml"} and Path(pack).exists():
-        values = read_yaml(Path(pack))
     else:
-        raise ConfigError(f"unknown rubric pack {pack!r}; choose one of {', '.join(pack_names())} or give a .yaml file")
+        try:
+            if Path(pack).suffix not in {".yaml", ".yml"}:
+                raise FileNotFoundError
+            values = parse_yaml(read(pack), pack)
+        except FileNotFoundError:
+            raise ConfigError(
+                f"unknown rubric pack {shown(pack)}; choose one of {', '.join(pack_names())} or give a .yaml file"
+            ) from None
     base = values.pop("extends", None)
-    return values if base is None else _merge(_resolve(str(base), (*seen, pack)), values)
+    return values if base is None else _merge(_resolve(str(base), (*seen, pack), read), values)
 
 
 def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import ConfigError
 from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.core.named_files import FileKind, shown
 from wm_nodes.judge.agent.contract import pause_reason
 from wm_nodes.judge.agent.types import GATED, Status
 from wm_nodes.judge.agent.verdict import Verdict
@@ -25,7 +26,7 @@ from wm_nodes.nodes.judge.verdict_message import verdict_msg
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
-from wm_nodes.ros.params import Param
+from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
 
@@ -54,6 +55,7 @@ class JudgeServices:
             evidence=ClipEvidence(Path(models) if models else None),
         )
         node.own(self.judge.close)
+        self._files = named_files(node, *([settings.rubric] if settings.rubric.endswith((".yaml", ".yml")) else []))
         for card in self.judge.cards:
             node.get_logger().info(card)
         self._verdicts = node.publish_on("reward/verdict")
@@ -161,19 +163,21 @@ class JudgeServices:
             if request.pack and (self._busy() or self._action.busy):
                 raise WireError(ErrorCode.BUSY, "clips are being judged by the present rubric; set another one later")
             if request.pack:
-                self._set_rubric(request.pack, self._node.run_dir)
+                self._set_rubric(request.pack)
         except WireError as error:
+            self._node.diagnostics.count("refused_rubrics", text=f"reward/set_rubric refused: {error}")
             return convert.fill_error(response, error)
         response.pack, response.version = self.judge.pack, self.judge.rubric.version
         return response
 
-    def _set_rubric(self, pack: str, base: Path) -> None:
+    def _set_rubric(self, pack: str) -> None:
         """Raises WireError(OUT_OF_RANGE) where the pack is refused; the rubric is then the one before."""
         before = self.judge.rubric.version
         try:
-            self.judge.set_rubric(pack, base)
+            self.judge.set_rubric(pack, self._files)
         except (ConfigError, ValueError, OSError) as error:
-            raise WireError(ErrorCode.OUT_OF_RANGE, f"rubric {pack!r} refused: {error}") from None
+            text = f"rubric {shown(pack)} refused: {' '.join(str(error).split())}"
+            raise WireError(ErrorCode.OUT_OF_RANGE, text) from None
         self._node.get_logger().info(f"rubric {before} -> {self.judge.rubric.version}")
 
     # Clips in a folder.
@@ -187,17 +191,21 @@ class JudgeServices:
         finally:
             self._turn.release()
 
+    def _read(self, path: Path, kind: FileKind) -> bytes:
+        return self._files.read(str(path), kind)
+
     def _judge_folder(self, work: Work) -> JudgeClips.Result:
         goal: JudgeClips.Goal = work.request
         result = JudgeClips.Result(termination_reason=JudgeClips.Result.FINISHED)
-        folder, progress = self._node.run_dir / goal.folder, JudgeClips.Feedback(stages_passed=[0] * len(GATED))
+        progress = JudgeClips.Feedback(stages_passed=[0] * len(GATED))
         verdicts, messages = list[Verdict](), list[ClipVerdict]()
         at_once = max(AT_ONCE, self.judge.settings.concurrency)
         try:
             deadline = deadline_of(goal.deadline_s)
-            lines, sha256 = read_list(folder), list_sha256(folder, goal.sha256)
+            folder = self._files.path(goal.folder)
+            lines, sha256 = read_list(folder, self._read), list_sha256(folder, goal.sha256, self._read)
             for first in range(0, len(lines), at_once):
-                jobs = [read_job(folder, line) for line in lines[first : first + at_once]]
+                jobs = [read_job(folder, line, self._read) for line in lines[first : first + at_once]]
                 judged, round_messages = self.judge_round(
                     work, jobs, progress, of=len(lines), sha256=sha256, deadline=deadline, first=first
                 )
@@ -205,7 +213,7 @@ class JudgeServices:
                 messages += round_messages
         except (ValueError, OSError) as error:
             result.termination_reason, result.message = JudgeClips.Result.FAILED, str(error)
-            self._node.say_failed_goal(f"{goal.folder} not judged: {error}")
+            self._node.say_failed_goal(f"{shown(goal.folder)} not judged: {error}")
         result.verdicts, result.pause_reason = messages, pause_reason(verdicts)
         return result
 

@@ -11,6 +11,7 @@ from rclpy.action import ActionClient
 from wm_msgs.action import Replay
 from wm_msgs.action import Rollout as RolloutAction
 from wm_msgs.msg import ErrorCode
+from wm_nodes.core.named_files import NamedFiles
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Rollout
 from wm_nodes.nodes.factories import existing
@@ -238,8 +239,8 @@ class ReplayedRollouts:
             self._error = error
 
 
-def bag_paths(uris: Sequence[str], run_dir: Path) -> list[Path]:
-    """Absolute paths of bag_uris. Raises ValueError without any, FileNotFoundError for a missing one."""
+def bag_paths(uris: Sequence[str], files: NamedFiles) -> list[Path]:
+    """Absolute paths of bag_uris. Raises ValueError without any, FileNotFoundError for a missing one; FileRefused."""
     if not uris:
         raise ValueError("bag_uris is empty; name at least one recorded bag")
-    return [existing(uri if Path(uri).is_absolute() else str(run_dir / uri), "bag_uris") for uri in uris]
+    return [existing(str(files.readable(uri)), "bag_uris") for uri in uris]

@@ -1,11 +1,12 @@
 """The policy of a node and the version of its weights; weights are swapped between steps, never within one."""
 
 import threading
-from pathlib import Path
 
 from wm_msgs.msg import ErrorCode, PolicyVersion
+from wm_nodes.core.named_files import WEIGHTS, FileRefused, NamedFiles, shown
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy, PolicyOutput
+from wm_nodes.ros import convert
 from wm_nodes.ros.wire import WireError
 from wm_nodes.training.weights import WeightsError, arch_hash, load_weights
 
@@ -37,11 +38,11 @@ class PolicyHolder:
         with self._lock:
             return self._policy.act(images, states, noise=noise), self.version
 
-    def follow(self, message: PolicyVersion, run_dir: Path) -> bool:
+    def follow(self, message: PolicyVersion, files: NamedFiles) -> bool:
         """Load an announced version; return False for the one already loaded. The old weights stay on an error.
 
         Raises:
-            WireError: HASH_MISMATCH for damaged or foreign weights, IO_ERROR for an unreadable file.
+            WireError: HASH_MISMATCH for damaged or foreign weights; as read_weights.
         """
         if message.sha256 == self.sha256 and message.version == self.version:
             return False
@@ -53,7 +54,7 @@ class PolicyHolder:
                 f"policy version {message.version} has architecture {message.arch_hash[:12]}, this node's policy "
                 f"{self._arch_hash[:12]}; start both with the same config_file and model_dir",
             )
-        self.load(self._bytes(message, run_dir), message.version, message.sha256)
+        self.load(self._bytes(message, files), message.version, message.sha256)
         return True
 
     def load(self, data: bytes, version: int, sha256: str = "") -> None:
@@ -66,16 +67,18 @@ class PolicyHolder:
             raise WireError(ErrorCode.HASH_MISMATCH, f"policy version {version} refused: {error}") from None
 
     @staticmethod
-    def _bytes(message: PolicyVersion, run_dir: Path) -> bytes:
+    def _bytes(message: PolicyVersion, files: NamedFiles) -> bytes:
         if len(message.inline_data):
             return bytes(message.inline_data)
-        return read_weights(message.uri, run_dir)
+        return read_weights(message.uri, files)
 
 
-def read_weights(uri: str, run_dir: Path) -> bytes:
-    """Read a weights file by absolute path, or by one relative to the run folder. Raises WireError(IO_ERROR)."""
-    path = Path(uri) if Path(uri).is_absolute() else run_dir / uri
+def read_weights(uri: str, files: NamedFiles) -> bytes:
+    """Read a weights file that a message names. Raises WireError: OUT_OF_RANGE outside of the folders, IO_ERROR."""
     try:
-        return path.read_bytes()
+        return files.read(uri, WEIGHTS)
+    except FileRefused as error:
+        raise convert.file_error(error) from None
     except OSError as error:
-        raise WireError(ErrorCode.IO_ERROR, f"cannot read weights {path}: {error.strerror}") from None
+        text = f"cannot read weights {shown(uri)}: {error.strerror}; name a file that is in the run folder"
+        raise WireError(ErrorCode.IO_ERROR, text) from None
