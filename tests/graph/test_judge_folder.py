@@ -1,6 +1,7 @@
 """Clips in a folder, judged by an action over sockets: by a server, and by the embedded judge and nothing else."""
 
 import json
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,11 +33,11 @@ ANSWER_S = 1.0
 class Evaluator:
     """A reward evaluator alone in its graph, its run folder, and the verdicts that it publishes."""
 
-    def __init__(self, domain: int, folder: Path, **judge: Any) -> None:
+    def __init__(self, domain: int, folder: Path, allowed: Path, **judge: Any) -> None:
         self.folder, self.probe = folder, Probe(domain)
         self._graph = Graph(domain, folder, load_config("smoke", judge))
         self.verdicts: list[ClipVerdict] = self.probe.listen("reward/verdict")
-        self._graph.start("reward_evaluator", reward="agent", audit_dir="audit")
+        self._graph.start("reward_evaluator", reward="agent", audit_dir="audit", allowed_dirs=[str(allowed)])
         wait_until("the evaluator", lambda: self.probe.value(NODE, "state") == "active", 60)
         self._client = self.probe.action(JudgeClips, "reward/judge_clips")
 
@@ -56,7 +57,8 @@ class Evaluator:
 def running(server: PickyServer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Evaluator]:
     judge = {"judge.endpoints": [server.url], "judge.model": "judge", "judge.tries": 1, "judge.keep_reads": False}
     with own_domain() as domain:
-        evaluator = Evaluator(domain, tmp_path_factory.mktemp("folder") / "run", **judge)
+        allowed = tmp_path_factory.getbasetemp()
+        evaluator = Evaluator(domain, tmp_path_factory.mktemp("folder") / "run", allowed, **judge)
         try:
             yield evaluator
         finally:
@@ -113,16 +115,57 @@ def test_a_folder_may_be_named_from_the_run_folder_and_a_longer_list_than_is_hel
         ({"file": "gone.mp4", "sha256": ""}, {}, "gone.mp4 is no readable video"),
         ({"sha256": "0" * 64}, {}, "has content"),
         ({"speed": 3}, {}, "clips.jsonl:2: speed: Extra inputs"),
+        ({}, {"folder": "/dev"}, "'/dev' lies outside of the run folder and of allowed_dirs"),
+        ({}, {"folder": "~"}, "'~' is no name of a file"),
+        ({"file": "/etc/passwd", "sha256": ""}, {}, "'/etc/passwd' lies outside of the run folder and of allowed_dirs"),
+        ({"goal": "/etc/no_such.png"}, {}, "'/etc/no_such.png' lies outside of the run folder and of allowed_dirs"),
+        ({"reference": "zero"}, {}, "zero' is no regular file; name a file that holds a picture"),
+        ({"file": "link.npy", "sha256": ""}, {}, "link.npy' lies outside of the run folder and of allowed_dirs"),
     ],
-    ids=["no_folder", "another_list", "no_time", "past", "no_file", "another_clip", "unknown_field"],
+    ids=["no_folder", "another_list", "no_time", "past", "no_file", "another_clip", "unknown_field", "outside", "home",
+         "outside_file", "outside_picture", "no_file_but_a_pipe", "link_outside"],
 )
 def test_a_folder_that_cannot_be_read_ends_the_goal_with_what_is_wrong(
     evaluator: Evaluator, tmp_path: Path, changed: dict[str, Any], goal: dict[str, Any], said: str
 ) -> None:
     write_clips(tmp_path, **changed)
+    os.mkfifo(tmp_path / "zero")
+    (tmp_path / "link.npy").symlink_to("/dev/zero")
     result = evaluator.judge(**{"folder": str(tmp_path), **goal})
     assert result.termination_reason == JudgeClips.Result.FAILED and said in result.message
     assert not result.verdicts and not evaluator.verdicts
+
+
+@pytest.mark.parametrize(
+    ("pack", "words"),
+    [
+        ("/etc/strict.yaml", "'/etc/strict.yaml' lies outside of the run folder and of allowed_dirs"),
+        ("link.yaml", "'link.yaml' lies outside"),
+        ("extends.yaml", "'/etc/strict.yaml' lies outside"),
+        ("pipe.yaml", "'pipe.yaml' is no regular file; name a file that holds a rubric pack"),
+        ("large.yaml", "'large.yaml' is larger than the 1 MiB a rubric pack may have"),
+        ("latin.yaml", "refused"),
+        ("deep.yaml", "refused"),
+        ("x" * 300 + ".yaml", "is no name of a file"),
+    ],
+    ids=["outside", "link_outside", "extends_outside", "pipe", "large", "no_utf8", "deep", "long"],
+)
+def test_a_rubric_that_nobody_may_name_leaves_the_one_before_and_is_counted(
+    evaluator: Evaluator, pack: str, words: str
+) -> None:
+    folder, before = evaluator.folder, int(evaluator.probe.value(NODE, "refused_rubrics") or 0)
+    if not (folder / "pipe.yaml").exists():
+        os.mkfifo(folder / "pipe.yaml")
+        (folder / "link.yaml").symlink_to("/etc/passwd")
+        (folder / "extends.yaml").write_text("extends: /etc/strict.yaml\n")
+        (folder / "large.yaml").write_bytes(b"#" * (1 << 20) + b"\n")
+        (folder / "latin.yaml").write_bytes(b"name: \xff\xfe\xe9\n")
+        (folder / "deep.yaml").write_text("[" * 5000)
+    answer = evaluator.probe.call(SetRubric, "reward/set_rubric", SetRubric.Request(pack=pack))
+    assert answer.error_code == ErrorCode.OUT_OF_RANGE and words in answer.message, answer.message
+    assert len(answer.message.splitlines()) == 1
+    assert evaluator.probe.call(SetRubric, "reward/set_rubric", SetRubric.Request()).pack == "robot"
+    wait_until("the count", lambda: evaluator.probe.value(NODE, "refused_rubrics") == str(before + 1))
 
 
 def test_a_clip_that_is_none_has_a_verdict_without_reward_and_the_others_have_theirs(
@@ -182,7 +225,7 @@ def test_the_embedded_judge_needs_no_server_no_model_and_no_other_node(tmp_path:
         + json.dumps({"file": "b.npy", "instruction": words, "task_id": "push_cube"}) + "\n"
     )
     with own_domain() as domain:
-        evaluator = Evaluator(domain, tmp_path / "run")
+        evaluator = Evaluator(domain, tmp_path / "run", clips)
         try:
             still, wide = evaluator.judge(folder=str(clips)).verdicts
             assert still.status == ClipVerdict.OK and still.reward < 0.5 and still.judge_id.startswith("embedded:")

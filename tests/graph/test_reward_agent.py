@@ -325,7 +325,7 @@ def _assert_same_weights_from(live: Graph, bag: Path) -> None:
     with own_domain() as domain:
         graph, probe = Graph(domain, live.folder.parent / "offline", live.config), Probe(domain)
         try:
-            graph.start_learner()
+            graph.start_learner(allowed_dirs=[str(bag)])
             goal = Train.Goal(updates=2, from_bags=True, bag_uris=[str(bag)])
             result = probe.finish(probe.send(probe.action(Train, "train"), goal))
             assert (result.termination_reason, result.message) == (Train.Result.FINISHED, "")

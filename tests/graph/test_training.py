@@ -117,9 +117,9 @@ def test_training_from_the_bag_and_from_its_replay_gives_the_weights_of_the_live
         with own_domain() as domain:
             offline, other = Graph(domain, graph.folder.parent / source), Probe(domain)
             try:
-                offline.start_learner(replay_rate=1e6)
+                offline.start_learner(replay_rate=1e6, allowed_dirs=[str(bag)])
                 if source == "from_replay":
-                    offline.start("player", play_at_start=False)
+                    offline.start("player", play_at_start=False, allowed_dirs=[str(bag)])
                 result = train(other, updates=4, bag_uris=[str(bag)], **{source: True})
                 assert result.termination_reason == Train.Result.FINISHED, result.message
                 assert weights_in(offline.folder) == live
@@ -140,8 +140,8 @@ def test_a_recording_or_an_environment_of_another_camera_ends_the_goal_with_both
     with own_domain() as domain:
         offline, other = Graph(domain, tmp_path / "offline", config), Probe(domain)
         try:
-            offline.start("learner", model_dir=str(model), replay_rate=1e6)
-            offline.start("player", play_at_start=False)
+            offline.start("learner", model_dir=str(model), replay_rate=1e6, allowed_dirs=[str(bag)])
+            offline.start("player", play_at_start=False, allowed_dirs=[str(bag)])
             for goal in ({"from_bags": True}, {"from_replay": True}):
                 result = train(other, updates=1, bag_uris=[str(bag)], **goal)
                 assert result.termination_reason == Train.Result.FAILED
@@ -168,7 +168,7 @@ def test_a_replay_that_starts_with_the_learner_trains_and_a_short_one_says_so(gr
         offline, other = Graph(domain, graph.folder.parent / "offline", config), Probe(domain)
         try:
             metrics = other.listen("learner/metrics")
-            offline.start("player", play_at_start=False)
+            offline.start("player", play_at_start=False, allowed_dirs=[str(bag)])
             offline.start_learner(replay_rate=1e6, replay_at_start=bag)
             wait_until("two updates", lambda: len(metrics) == 2, 60)
             assert weights_in(offline.folder) == live
@@ -177,8 +177,8 @@ def test_a_replay_that_starts_with_the_learner_trains_and_a_short_one_says_so(gr
             offline.stop()
         short, other = Graph(domain, graph.folder.parent / "short"), Probe(domain)
         try:
-            short.start("player", play_at_start=False)
-            short.start_learner(replay_rate=1e6)
+            short.start("player", play_at_start=False, allowed_dirs=[str(bag)])
+            short.start_learner(replay_rate=1e6, allowed_dirs=[str(bag)])
             waiting = other.send(other.action(Train, "train"), Train.Goal(updates=1, from_replay=True))
             played = Replay.Goal(bag_uri=str(bag), rate=1e6)
             assert other.finish(other.send(other.action(Replay, "replay"), played)).termination_reason == 0

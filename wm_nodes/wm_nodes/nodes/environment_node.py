@@ -66,6 +66,7 @@ class EnvironmentNode(ManagedNode):
         super().__init__("environment", PARAMS, **node_arguments)
         self.served: LockstepEnvironment | None = None
         self._stamps = StampClock(lambda: self.get_clock().now().nanoseconds)
+        self._estop = False
         self._timer: Timer | None = None
         self._unsent = deque[Callable[[], object]]()
         self._sending = threading.Lock()
@@ -87,7 +88,7 @@ class EnvironmentNode(ManagedNode):
         self.served = LockstepEnvironment(
             environment, self.session, self, seed=int(self.param("seed")), clock=self._stamps
         )
-        self.served.before_step = self._require_credit
+        self.served.before_step, self.served.estop = self._require_credit, self._estop
         self._spec = environment.spec
         self._shown: Image | None = None
         self._images = self.publish_unnumbered("env/image")
@@ -98,7 +99,7 @@ class EnvironmentNode(ManagedNode):
         self._goals = self.publish_on("env/goal")
         self._credits = ProducerCredits("env/transition", self.session)
         self.listen("flow/credit", self._credits.note)
-        self.listen("safety/estop", self._on_estop)
+        self.listen("safety/estop", self._on_estop, while_inactive=True)
         self.serve(StepBatch, "env/step", self._on_step)
         self.serve(ResetBatch, "env/reset", self._on_reset)
         self.serve(GetEnvSpec, "env/get_spec", self._on_get_spec)
@@ -240,15 +241,19 @@ class EnvironmentNode(ManagedNode):
             self.diagnostics.count("overruns", text=f"a step took {spent:.3f} s, the control period is less")
 
     def _on_estop(self, message: Bool) -> None:
-        if self.served is None or message.data == self.served.estop:
+        if self.served is None or message.data == self._estop:
             return
-        self.served.estop = bool(message.data)
-        if message.data:
-            self.served.end_episodes(EpisodeEvent.REASON_ESTOP)
-            self.diagnostics.set_condition("estop", diagnostics.ERROR, "the emergency stop is set")
-        else:
-            self.diagnostics.clear_condition("estop")
+        self._estop = self.served.estop = bool(message.data)
+        self.diagnostics.show_estop(self._estop)
         self.get_logger().warning(f"emergency stop {'set' if message.data else 'released'}")
+        if not message.data:
+            return
+        try:
+            if self._asynchronous is not None and self.active:
+                self._asynchronous.stop()
+        except WireError as error:
+            self._count_refusal(error, "step")
+        self.served.end_episodes(EpisodeEvent.REASON_ESTOP)
 
     def _ready(self) -> LockstepEnvironment:
         if not self.active or self.served is None:

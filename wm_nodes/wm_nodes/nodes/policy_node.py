@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from rclpy.duration import Duration
+from std_msgs.msg import Bool
 
 from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
@@ -66,6 +67,7 @@ class PolicyNode(ManagedNode):
     def __init__(self, local_environment: Callable[[], Any] | None = None, **node_arguments: Any) -> None:
         super().__init__("policy", PARAMS, **node_arguments)
         self._local_environment = local_environment
+        self._estop = False
 
     def configure(self) -> None:
         given = self.run_config(), str(self.param("model_dir")), str(self.param("policy_factory"))
@@ -88,8 +90,11 @@ class PolicyNode(ManagedNode):
         )
         self._asynchronous: AsynchronousPolicy | None = None
         if self.param("mode") == "asynchronous":
-            self._asynchronous = AsynchronousPolicy(self, self._holder, self._publish_actions)
+            self._asynchronous = AsynchronousPolicy(
+                self, self._holder, self._publish_actions, self._publish_hold, stopped=self._estop
+            )
         self._actions = self.publish_on("action", LIVE_ACTION if self._asynchronous else None)
+        self.listen("safety/estop", self._on_estop, while_inactive=True)
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("policy/version", self._on_version, while_inactive=True)
         self.serve(InferAction, "policy/infer", self._on_infer)
@@ -104,7 +109,7 @@ class PolicyNode(ManagedNode):
         self._rollouts.stop(reason)
         if self._asynchronous is not None:
             self._asynchronous.stop()
-            self._actions.publish(ActionBatch(mode=ActionBatch.MODE_HOLD))
+            self._publish_hold()
             self._actions.publisher.wait_for_all_acked(HOLD_ARRIVES)  # a publisher that is gone delivers nothing
 
     def update_diagnostics(self) -> None:
@@ -222,6 +227,9 @@ class PolicyNode(ManagedNode):
         message.step_id = step_id
         self._actions.publish(message)
 
+    def _publish_hold(self) -> None:
+        self._actions.publish(ActionBatch(mode=ActionBatch.MODE_HOLD))
+
     @staticmethod
     def _action_message(output: PolicyOutput, version: int, infer_s: float) -> ActionBatch:
         count, action_dim = output.actions.shape
@@ -235,6 +243,16 @@ class PolicyNode(ManagedNode):
         return message
 
     # Callbacks.
+
+    def _on_estop(self, message: Bool) -> None:
+        """In mode lockstep the environment's refusal ends the rollout."""
+        if message.data == self._estop:
+            return
+        self._estop = bool(message.data)
+        if self._asynchronous is not None:
+            self._asynchronous.obey_stop(self._estop)
+        self.diagnostics.show_estop(self._estop)
+        self.get_logger().warning(f"emergency stop {'set' if message.data else 'released'}")
 
     def _on_spec(self, message: EnvSpec) -> None:
         try:

@@ -72,6 +72,14 @@ class Diagnostics:
         if present:
             self.refresh()
 
+    def show_estop(self, stopped: bool) -> None:
+        """The emergency stop as a standing condition, until it is released."""
+        if stopped:
+            text = "the emergency stop is set: nothing acts; when it is safe, publish false on safety/estop to go on"
+            self.set_condition("estop", ERROR, text)
+        else:
+            self.clear_condition("estop")
+
     def refresh(self) -> None:
         """Publish now if the level has changed since the last message."""
         if self._summary()[0] != self._level:

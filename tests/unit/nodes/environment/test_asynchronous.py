@@ -8,7 +8,7 @@ pytest.importorskip("wm_msgs.msg", reason="wm_msgs is not built")
 from graph.toy import ReachToy
 
 from wm_msgs.msg import ErrorCode
-from wm_nodes.core.types import UInt8Array
+from wm_nodes.core.types import FloatArray, StepResult, UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment
 from wm_nodes.ros.wire import EpisodeNote, Goals, ResetCommand, TimedAction, Transition, WireError
@@ -119,6 +119,27 @@ def test_a_reset_by_request_takes_the_place_of_the_one_that_was_due(bench: Bench
     bench.offer(0.5)
     assert bench.tick()
     assert bench.last.valid.all()
+
+
+def test_an_emergency_stop_holds_at_once_and_neither_keeps_nor_takes_an_action(bench: Bench) -> None:
+    bench.offer(0.5)
+    bench.tick()
+    count, moved = len(bench.published.transitions), list[np.ndarray]()
+    step = bench.served.environment.step
+
+    def note(actions: FloatArray) -> StepResult:
+        moved.append(actions)
+        return step(actions)
+
+    bench.served.environment.step = note  # type: ignore[method-assign]
+    bench.served.estop = True
+    bench.environment.stop()
+    assert len(moved) == 1 and not moved[0].any() and len(bench.published.transitions) == count
+    with pytest.raises(WireError, match="emergency stop") as refused:
+        bench.offer(0.5)
+    assert refused.value.code == ErrorCode.ESTOP
+    bench.served.estop = False
+    assert not bench.tick() and not bench.last.actions.any()
 
 
 def test_the_emergency_stop_and_missing_credit_leave_the_environment_as_it_is(bench: Bench) -> None:

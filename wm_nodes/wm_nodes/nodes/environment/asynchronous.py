@@ -53,9 +53,10 @@ class AsynchronousEnvironment:
         """Take a new action.
 
         Raises:
-            WireError: BAD_SHAPE, NAN_INPUT, OUT_OF_RANGE; TIMEOUT for one whose observation is too old to act upon. The
-                action before it stays.
+            WireError: ESTOP, BAD_SHAPE, NAN_INPUT, OUT_OF_RANGE; TIMEOUT for one whose observation is too old to act
+                upon. The action before it stays.
         """
+        self._served.check_estop()
         now = self._clock()
         self._served.check_actions(action.actions)
         seen = now if not action.stamp_ns else self._published.get(action.stamp_ns)
@@ -71,6 +72,11 @@ class AsynchronousEnvironment:
     def hold(self) -> None:
         """Forget the newest action: hold until another comes."""
         self._newest = None
+
+    def stop(self) -> None:
+        """Hold at once, after the emergency stop was set: the next step may never come. Raises WireError."""
+        self.hold()
+        self._served.hold_now()
 
     def tick(self) -> bool:
         """Step once; return False when it had to hold for want of an action.

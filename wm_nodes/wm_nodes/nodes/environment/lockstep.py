@@ -166,6 +166,21 @@ class LockstepEnvironment:
             self._gate()
             return self._step(command, actions, seeds)
 
+    def hold_now(self) -> None:
+        """Have a robot hold, which without further steps might go on with its last action: zeros, outside of any step.
+
+        Raises:
+            WireError: INTERNAL, NAN_MODEL: the environment failed.
+        """
+        with self._lock, self._environment_errors():
+            if self._current is not None:
+                self.environment.step(np.zeros((self.spec.num_envs, self.spec.action_dim), np.float32))
+
+    def check_estop(self) -> None:
+        """Raise WireError(ESTOP) while the emergency stop is set."""
+        if self.estop:
+            raise WireError(ErrorCode.ESTOP, "the emergency stop is set; publish false on safety/estop to go on")
+
     def end_episodes(self, reason: int) -> None:
         """End all running episodes, e.g. when the node stops or the estop is set."""
         with self._lock:
@@ -277,8 +292,7 @@ class LockstepEnvironment:
             self._slots[i].aborted = True
 
     def _gate(self) -> None:
-        if self.estop:
-            raise WireError(ErrorCode.ESTOP, "the emergency stop is set; publish false on safety/estop to go on")
+        self.check_estop()
         self.before_step()
 
     def _seeds(self, seeds: UInt64Array | None) -> UInt64Array:

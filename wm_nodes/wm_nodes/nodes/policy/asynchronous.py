@@ -43,12 +43,17 @@ class AsynchronousPolicy:
     Args:
         node: listens for it; its parameter `deterministic` switches the action noise off.
         publish: called with (stamp_ns, step_id, output, policy version, seconds of inference).
+        hold: publishes that the environment is to hold.
+        stopped: the emergency stop is set already.
     """
 
     def __init__(
-        self, node: ManagedNode, holder: PolicyHolder, publish: Callable[[int, int, PolicyOutput, int, float], None]
+        self, node: ManagedNode, holder: PolicyHolder, publish: Callable[[int, int, PolicyOutput, int, float], None],
+        hold: Callable[[], None], *, stopped: bool = False,
     ) -> None:
-        self._node, self._holder, self._publish = node, holder, publish
+        self._node, self._holder, self._publish, self._hold = node, holder, publish, hold
+        self._outgoing = threading.Lock()
+        self._stopped, self._stops = stopped, 0
         self.spec: EnvironmentSpec | None = None
         self._changed = threading.Condition()
         self._images = ImageCache(CAPACITY)
@@ -76,6 +81,14 @@ class AsynchronousPolicy:
             self._thread = None
         self._images.clear()
         self._states.clear()
+
+    def obey_stop(self, stopped: bool) -> None:
+        """Publish a hold at once and no action from now on, also not the one that is being computed; False: go on."""
+        with self._outgoing:
+            if stopped and not self._stopped:
+                self._stops += 1
+                self._hold()
+            self._stopped = stopped
 
     def _on_image(self, message: Image) -> None:
         if self.spec is None:
@@ -125,6 +138,10 @@ class AsynchronousPolicy:
                 self._node.diagnostics.count("failed_flights", level=diagnostics.ERROR, text=text)
 
     def _act(self, observation: SyncedObservation) -> None:
+        with self._outgoing:
+            stopped, stops = self._stopped, self._stops
+        if stopped:
+            return
         noise = None
         if not self._node.param("deterministic"):
             shape = (len(observation.states), self._holder.action_dim)
@@ -133,4 +150,6 @@ class AsynchronousPolicy:
         output, version = self._holder.act(observation.images, observation.states, noise)
         infer_s = time.perf_counter() - began
         self._node.diagnostics.latency("infer", infer_s)
-        self._publish(observation.stamp_ns, observation.step_id, output, version, infer_s)
+        with self._outgoing:
+            if stops == self._stops:
+                self._publish(observation.stamp_ns, observation.step_id, output, version, infer_s)
