@@ -1,12 +1,16 @@
 """The environment on its own clock, and the policy that acts on what it sees, over DDS."""
 
+import time
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from graph import toy
 from graph.harness import Graph, Probe, wait_until
 from sensor_msgs.msg import Image
+from std_msgs.msg import Bool
 
 from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, ErrorCode
@@ -107,3 +111,74 @@ def test_stamps_are_wall_time_that_passes_as_the_environment_steps(graph: Graph,
     assert min(took_s) > 0
     assert np.median(took_s) == pytest.approx(period_s, rel=0.2)
     assert 0 < min(delays_s) <= np.median(delays_s) < period_s
+
+
+PERIOD_S = 0.5
+
+
+def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_released(
+    graph: Graph, probe: Probe
+) -> None:
+    """The policy computes most of the time, so the stop comes while an inference is running."""
+    transitions, actions, arrived_s = probe.listen("env/transition"), probe.listen("action"), list[float]()
+    row = topic("action")
+    probe.node.create_subscription(row.type, row.name, lambda _: arrived_s.append(time.monotonic()), row.qos)
+    estop = probe.publisher("safety/estop")
+    graph.start_environment(
+        "toy:make_long_environment", num_envs=N, mode="asynchronous", control_period_s=PERIOD_S, max_action_age_s=5.0
+    )
+    policy = graph.start("policy", policy_factory="toy:make_slow_policy", mode="asynchronous")
+    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2, 60)
+    for _ in range(3):
+        seen = len(actions)
+        wait_until("actions", lambda: len(actions) > seen + 2 and not held(transitions[-1]), 60)  # noqa: B023
+        count = len(transitions)
+        wait_until("the next observation", lambda: len(transitions) > count)  # noqa: B023
+        time.sleep(toy.SLOW_S / 2)  # into the inference
+        estop.publish(Bool(data=True))
+        stopped_s = time.monotonic()
+        wait_until("the hold", lambda: actions[-1].mode == ActionBatch.MODE_HOLD, PERIOD_S)
+        time.sleep(PERIOD_S)
+        count, made = len(actions), len(transitions)
+        for node in ("/wm/environment", "/wm/policy"):
+            wait_until("the condition", lambda: "emergency stop is set" in probe.diagnostics[node].message)  # noqa: B023
+            assert probe.diagnostics[node].level == DiagnosticStatus.ERROR
+            assert "publish false on safety/estop to go on" in probe.diagnostics[node].message
+        time.sleep(2 * PERIOD_S)
+        assert (len(actions), len(transitions)) == (count, made)
+        assert max(arrived_s) < stopped_s + PERIOD_S and actions[-1].mode == ActionBatch.MODE_HOLD
+        assert sum(message.mode == ActionBatch.MODE_HOLD for message in actions[seen:]) == 1
+        estop.publish(Bool(data=False))
+        wait_until("steps again", lambda: len(transitions) > made + 1)  # noqa: B023
+        assert held(transitions[made]), "no action from before the stop is carried out after it"
+    wait_until("no condition", lambda: probe.diagnostics["/wm/policy"].level == DiagnosticStatus.OK)
+    estop.publish(Bool(data=True))
+    policy.terminate()
+    assert policy.wait(20) == 0
+    graph.start("policy", policy_factory="toy:make_slow_policy", mode="asynchronous")
+    wait_until("the stop in the new policy", lambda: "emergency stop" in probe.diagnostics["/wm/policy"].message, 60)
+    count = len(actions)
+    send = probe.publisher("action")
+    wait_until("matching", send.get_subscription_count)
+    message = ActionBatch(num_envs=N, action_dim=3, chunk_length=1)
+    message.action = convert.to_field(np.full(3 * N, 0.5, np.float32))
+    made = len(transitions)
+    send.publish(message)  # of somebody who does not obey
+    wait_until("the refusal", lambda: value(probe, "refused_action"))
+    assert [m.mode for m in actions[count:] if m.session] == [] and len(transitions) == made
+    estop.publish(Bool(data=False))
+    wait_until("actions of the new policy", lambda: len(actions) > count + 3, 60)
+
+
+def test_a_rollout_ends_with_the_emergency_stop_as_its_reason(graph: Graph, probe: Probe) -> None:
+    transitions, estop = probe.listen("env/transition"), probe.publisher("safety/estop")
+    graph.start_environment("toy:make_long_environment", num_envs=N)
+    graph.start_policy()
+    wait_until("both nodes", lambda: estop.get_subscription_count() >= 2, 60)
+    handle = probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=100_000, reset=True))
+    wait_until("steps", lambda: len(transitions) > 5)
+    estop.publish(Bool(data=True))
+    result = probe.finish(handle, 10)
+    assert result.termination_reason == Rollout.Result.FAILED
+    assert "the emergency stop is set; publish false on safety/estop to go on" in result.message
+    wait_until("the condition", lambda: "emergency stop is set" in probe.diagnostics["/wm/policy"].message)

@@ -2,6 +2,7 @@
 there. Whatever happened, the weights are those of the loop that nothing disturbed."""
 
 import hashlib
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 
 from wm_msgs.action import EvaluateClips, GenerateClips, TrainVideo
+from wm_msgs.msg import PolicyVersion
 from wm_nodes.launching.scenarios import VIDEO_TOPICS
 from wm_nodes.recording import recover
 from wm_nodes.video_model import RolloutBuffer
@@ -77,6 +79,30 @@ def _judge(cut: int | None, sha256: str = "") -> Callable[[VideoLoop], EvaluateC
     return goal
 
 
+def _pipe(make: Callable[[str], Any]) -> Callable[[VideoLoop], Any]:
+    """A goal that names a FIFO of the run folder, which nobody writes."""
+
+    def goal(loop: VideoLoop) -> Any:
+        path = loop.graph.folder / "pipe"
+        if not path.exists():
+            os.mkfifo(path)
+        return make(path.name)
+
+    return goal
+
+
+def _announced(uri: str) -> Callable[[VideoLoop], GenerateClips.Goal]:
+    """A goal for a version that somebody announced with this file."""
+
+    def goal(loop: VideoLoop) -> GenerateClips.Goal:
+        publisher = loop.probe.publisher("video/version")
+        wait_until("matching", publisher.get_subscription_count)
+        publisher.publish(PolicyVersion(version=77, uri=uri, sha256="0" * 64))
+        return GenerateClips.Goal(policy_version=77)
+
+    return goal
+
+
 def _train_on(make: Callable[[VideoLoop], Any]) -> Callable[[VideoLoop], TrainVideo.Goal]:
     def goal(loop: VideoLoop) -> TrainVideo.Goal:
         uri, _ = _buffer(loop, "garbage.safetensors", make(loop).to_bytes())
@@ -109,9 +135,15 @@ def _of_other_settings(loop: VideoLoop) -> Any:
         (_train_on(_of_other_settings), "the buffer was sampled with sampler settings"),
         (_train_on(lambda loop: loop.local.buffer(0, 0)), "is outside 0 to 0; sample again"),
         (_train_on(_without_rewards), "nothing to learn from: 6 of 6 rewards are invalid"),
+        (lambda _: EvaluateClips.Goal(buffer_uri="/dev/zero"), "'/dev/zero' lies outside of the run folder and of"),
+        (_pipe(lambda uri: EvaluateClips.Goal(buffer_uri=uri)), "is no regular file; name a file that holds"),
+        (_announced("/dev/zero"), "'/dev/zero' lies outside of the run folder and of allowed_dirs"),
+        (_pipe(lambda uri: TrainVideo.Goal(from_buffers=[uri])), "is no regular file; name a file that holds"),
+        (lambda _: TrainVideo.Goal(from_buffers=["../absent"]), "'../absent' lies outside of the run folder and of"),
     ],
     ids=["judge_missing", "judge_other", "judge_cut", "sample_unknown", "train_nothing", "train_missing",
-         "train_other_settings", "train_stale", "train_without_rewards"],
+         "train_other_settings", "train_stale", "train_without_rewards", "judge_outside", "judge_pipe",
+         "sample_outside", "train_pipe", "train_outside"],
 )
 def test_a_goal_of_garbage_fails_by_name_and_changes_nothing(loop: VideoLoop, goal: Any, words: str) -> None:
     probe, message = loop.probe, goal(loop)

@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from wm_nodes.reward import RuleReward
 from wm_nodes.training.weights import pack_weights, unpack_weights
 
 SIDE_PX = 16
+SLOW_S = 0.3
+"""One inference of make_slow_policy."""
 GOAL_M = np.array([0.6, 0.0, 0.1], np.float32)
 
 
@@ -212,3 +215,16 @@ def assert_trained_in_one_process(file: Path, updates: int, tolerance: float = 0
     expected, _ = unpack_weights(pack_weights(policy).data)
     for name, tensor in expected.items():
         np.testing.assert_allclose(found[name].numpy(), tensor.numpy(), rtol=0, atol=tolerance, err_msg=name)
+
+
+def make_slow_policy(config: RunConfig) -> ImagePolicy:
+    """Takes SLOW_S for every inference."""
+    policy = make_policy(config)
+    act = policy.act
+
+    def act_slowly(*arguments: Any, **more: Any) -> Any:
+        time.sleep(SLOW_S)
+        return act(*arguments, **more)
+
+    policy.act = act_slowly  # type: ignore[method-assign]
+    return policy
