@@ -160,11 +160,14 @@ def test_a_goal_of_garbage_fails_by_name_and_changes_nothing(loop: VideoLoop, go
 
 
 def test_an_iteration_that_is_sampled_again_keeps_its_buffer_whatever_else_is_kept(loop: VideoLoop) -> None:
+    mine = loop.graph.folder / "buffers" / "buffer_best.safetensors"
+    mine.write_bytes(b"mine")
     done = loop.train(4)
     goal = GenerateClips.Goal(iteration=0, policy_version=done.policy_version)
     result = loop.probe.finish(loop.probe.send(loop.probe.action(GenerateClips, "video/generate"), goal))
     assert result.termination_reason == GenerateClips.Result.FINISHED
     assert hashlib.sha256((loop.graph.folder / result.buffer_uri).read_bytes()).hexdigest() == result.sha256
+    assert mine.read_bytes() == b"mine" and len(list(mine.parent.iterdir())) == 1 + 4
 
 
 def test_cancel_is_answered_at_once_while_the_video_model_hangs_and_leaves_no_goal_with_it(loop: VideoLoop) -> None:

@@ -76,6 +76,8 @@ class AsynchronousPolicy:
         with self._changed:
             self._running, self._next = False, None
             self._changed.notify_all()
+        with self._outgoing:
+            self._stops += 1  # an inference that outlasts the join publishes nothing
         if self._thread is not None:
             self._thread.join(5.0)
             self._thread = None
