@@ -24,8 +24,9 @@ _MAX_NAME_BYTES, _MAX_PART_BYTES, _SHOWN = 4095, 255, 200
 
 RUN_ENTRIES = frozenset((
     "audit", "bags", "bags.json", "buffers", "checkpoints", "composed.params.yaml", "config.yaml", "data",
-    "evaluations", "graph.json", "judge_reads", "logs", "metrics.jsonl", "model", "pictures", "policies", "report.html",
-    "rounds", "summary.json", "tensorboard", "trained.json", "video_config.yaml", "video_model", "video_policies",
+    "evaluations", "graph.json", "judge_reads", "launch.json", "logs", "metrics.jsonl", "model", "pictures", "policies",
+    "report.html", "rounds", "run.lock", "summary.json", "tensorboard", "trained.json", "video_config.yaml",
+    "video_model", "video_policies",
 ))
 """What a run keeps in its folder under names of its own."""
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from wm_nodes.config.load import ConfigError, parse_yaml, read_yaml, refusal
-from wm_nodes.core.named_files import RUBRIC, read_regular, shown
+from wm_nodes.core.named_files import shown
 from wm_nodes.judge.agent.types import GATED, NUM_LEVELS, NUM_PLAN_LEVELS, Component, Profile, Stage
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -200,7 +200,6 @@ def load_rubric(
     Raises:
         ConfigError: no such pack, or values refused; names each of them. What `read` raises, but FileNotFoundError.
     """
-    read = read or (lambda name: read_regular(Path(name), RUBRIC))
     try:
         return Rubric.model_validate(_merge(_resolve(pack, (), read), overrides or {}))
     except ValidationError as error:
@@ -215,20 +214,20 @@ def _pack_folder() -> Any:
     return resources.files("wm_nodes.judge.agent") / "rubrics"
 
 
-def _resolve(pack: str, seen: tuple[str, ...], read: Callable[[str], bytes]) -> dict[str, Any]:
+def _resolve(pack: str, seen: tuple[str, ...], read: Callable[[str], bytes] | None) -> dict[str, Any]:
     if pack in seen:
         raise ConfigError(f"rubric packs extend each other in a circle: {' -> '.join((*seen, pack))}")
-    if pack in pack_names():
-        values = read_yaml(_pack_folder() / f"{pack}.yaml")
-    else:
-        try:
-            if Path(pack).suffix not in {".yaml", ".yml"}:
-                raise FileNotFoundError
-            values = parse_yaml(read(pack), pack)
-        except FileNotFoundError:
-            raise ConfigError(
-                f"unknown rubric pack {shown(pack)}; choose one of {', '.join(pack_names())} or give a .yaml file"
-            ) from None
+    try:
+        if pack in pack_names():
+            values = read_yaml(_pack_folder() / f"{pack}.yaml")
+        elif Path(pack).suffix not in {".yaml", ".yml"} or (read is None and not Path(pack).exists()):
+            raise FileNotFoundError
+        else:
+            values = read_yaml(Path(pack)) if read is None else parse_yaml(read(pack), pack)
+    except FileNotFoundError:
+        raise ConfigError(
+            f"unknown rubric pack {shown(pack)}; choose one of {', '.join(pack_names())} or give a .yaml file"
+        ) from None
     base = values.pop("extends", None)
     return values if base is None else _merge(_resolve(str(base), (*seen, pack), read), values)
 
