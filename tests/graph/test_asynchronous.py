@@ -155,9 +155,11 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
     estop.publish(Bool(data=True))
     policy.terminate()
     assert policy.wait(20) == 0
-    graph.start("policy", policy_factory="toy:make_slow_policy", mode="asynchronous")
-    wait_until("the stop in the new policy", lambda: "emergency stop" in probe.diagnostics["/wm/policy"].message, 60)
+    del probe.diagnostics["/wm/policy"]
     count = len(actions)
+    graph.start("policy", policy_factory="toy:make_slow_policy", mode="asynchronous")
+    wait_until("the new policy", lambda: "/wm/policy" in probe.diagnostics, 60)
+    wait_until("the stop in it", lambda: "emergency stop" in probe.diagnostics["/wm/policy"].message)
     send = probe.publisher("action")
     wait_until("matching", send.get_subscription_count)
     message = ActionBatch(num_envs=N, action_dim=3, chunk_length=1)
@@ -165,7 +167,7 @@ def test_no_action_is_published_or_executed_after_an_emergency_stop_until_it_is_
     made = len(transitions)
     send.publish(message)  # of somebody who does not obey
     wait_until("the refusal", lambda: value(probe, "refused_action"))
-    assert [m.mode for m in actions[count:] if m.session] == [] and len(transitions) == made
+    assert all(m.mode == ActionBatch.MODE_HOLD for m in actions[count:] if m.session) and len(transitions) == made
     estop.publish(Bool(data=False))
     wait_until("actions of the new policy", lambda: len(actions) > count + 3, 60)
 
