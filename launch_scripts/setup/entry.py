@@ -60,10 +60,13 @@ def ensure():
 
 def pending(venv):
     """Return the steps that are to be done, in order: packages, messages, wm_nodes, renderer."""
+    from setup.messages import lacks_tf
+
     stamp, wanted = read_stamp(stamp_file(venv)), _wanted(venv)
+    built = WORKSPACE / "install" / "wm_msgs" / "share" / "wm_msgs" / "package.xml"
     present = {
         "packages": (venv / "bin" / "python").exists(),
-        "messages": (WORKSPACE / "install" / "wm_msgs" / "share" / "wm_msgs" / "package.xml").exists(),
+        "messages": built.exists() and not lacks_tf(venv),
     }
     done = {step: stamp.get(step, "").split(":")[0] for step in wanted}
     return [step for step in wanted if not present.get(step, True) or done[step] != wanted[step]]

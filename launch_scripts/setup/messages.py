@@ -1,4 +1,4 @@
-"""Repair of the wheels' cmake files, build of wm_msgs by colcon, and its links into the virtual environment."""
+"""Repair of the wheels' cmake files, build of the message packages by colcon, and their links into the environment."""
 
 from __future__ import annotations
 
@@ -8,18 +8,29 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from setup.console import SetupError, isolated_environment, run, say
+from setup.console import SetupError, isolated_environment, output_of, run, say
 from setup.stamp import begin
 
 WHEEL_INCLUDE = re.compile(r"/opt/python/cp3\d+-cp3\d+/include/python3\.\d+")
 WHEEL_NUMPY = re.compile(r"/opt/python/cp3\d+-cp3\d+/lib/python3\.\d+/site-packages/numpy/_?core/include")
 WHERE = "import numpy, sysconfig; print(sysconfig.get_paths()['include']); print(numpy.get_include())"
+TF = "tf2_msgs"
+"""The frames of ROS 2's tools, which the wheels lack. Its folder in the environment keeps its build out of the
+workspace, where it would hide ROS 2's own from those who source that."""
+FIND_TF = f"from {TF}.msg import TFMessage; print(TFMessage)"
 
 
 def message_sources(msgs: Path) -> list[Path]:
     """Every file that decides what the build produces."""
-    interfaces = [path for kind in ("msg", "srv", "action") for path in (msgs / kind).glob(f"*.{kind}")]
-    return [msgs / "CMakeLists.txt", msgs / "package.xml", *interfaces]
+    kinds, packages = ("msg", "srv", "action"), (msgs, msgs / TF)
+    interfaces = [path for package in packages for kind in kinds for path in (package / kind).glob(f"*.{kind}")]
+    return [package / name for package in packages for name in ("CMakeLists.txt", "package.xml")] + interfaces
+
+
+def lacks_tf(venv: Path) -> bool:
+    """True where tf2_msgs was built for the environment and is not there any more."""
+    link = venv / "share" / TF
+    return link.is_symlink() and not link.exists()
 
 
 def repair_cmake(share: Path, include: str, numpy_include: str) -> int:
@@ -37,7 +48,10 @@ def repair_cmake(share: Path, include: str, numpy_include: str) -> int:
 
 
 def build_messages(venv: Path, workspace: Path, log: Path) -> None:
-    """Build ros2_ws/src/wm_msgs for the environment's Python. Raises SetupError with the compiler's last lines."""
+    """Build ros2_ws/src/wm_msgs for the environment's Python, and tf2_msgs where that finds none.
+
+    Raises SetupError with the compiler's last lines.
+    """
     python, env = venv / "bin" / "python", isolated_environment(venv)
     answer = subprocess.run([str(python), "-c", WHERE], capture_output=True, text=True, env=env, check=False)
     if answer.returncode:
@@ -48,46 +62,59 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
     if repair:
         say("the last build of wm_msgs did not finish: building it from the beginning")
     repair_cmake(venv / "share", include, numpy_include)
-    say("building wm_msgs, the message types of this project (1 to 3 minutes)")
+    bases = {"wm_msgs": workspace}
+    if lacks_tf(venv):
+        (venv / "share" / TF).unlink()
+    if (venv / TF).exists() or not output_of([str(python), "-c", FIND_TF], env):
+        bases[TF] = venv / TF
+    tf = f", and {TF} for the frames of cameras" if TF in bases else ""
+    say(f"building wm_msgs, the message types of this project{tf} (1 to 3 minutes)")
     for name in ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"):
         env[name] = str(venv)
     env.pop("COLCON_PREFIX_PATH", None)
     env["MAKEFLAGS"] = f"-j{os.cpu_count() or 1}"
-    if repair or not _built_here(workspace, python):
-        for folder in (workspace / "build" / "wm_msgs", workspace / "install" / "wm_msgs"):
-            if folder.exists():
-                shutil.rmtree(folder)
-    built = workspace / "install" / "wm_msgs" / "share" / "wm_msgs" / "package.xml"
-    built.unlink(missing_ok=True)  # which says to every environment that there is a build
-    command = [str(python), "-m", "colcon", "--log-base", "log", "build", "--paths", "src/wm_msgs"]
     cmake = ["-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={python}"]
-    command += ["--event-handlers", "console_direct+", "--cmake-args", *cmake]
-    run(command, log=log, why="building wm_msgs", env=env, cwd=workspace)
-    link_messages(venv, workspace / "install" / "wm_msgs")
+    for name, base in bases.items():
+        source = workspace / "src" / "wm_msgs" / ("" if name == "wm_msgs" else name)
+        build, install = base / "build" / name, base / "install" / name
+        if repair or not _built_here(source, build, python):
+            for folder in (build, install):
+                if folder.exists():
+                    shutil.rmtree(folder)
+        built = install / "share" / name / "package.xml"
+        built.unlink(missing_ok=True)  # which says to every environment that there is a build
+        command = [str(python), "-m", "colcon", "--log-base", str(base / "log"), "build", "--paths", str(source)]
+        command += ["--build-base", str(build.parent), "--install-base", str(install.parent)]
+        command += ["--event-handlers", "console_direct+", "--cmake-args", *cmake]
+        run(command, log=log, why=f"building {name}", env=env, cwd=workspace)
+    link_messages(venv, [base / "install" / name for name, base in bases.items()])
 
 
-def link_messages(venv: Path, install: Path) -> None:
-    """Make wm_msgs part of the virtual environment, to be imported without sourcing: the wheels' loader looks for
+def link_messages(venv: Path, installs: list[Path]) -> None:
+    """Make packages part of the virtual environment, to be imported without sourcing: the wheels' loader looks for
     libraries in <venv>/lib and for packages in <venv>/share; a .pth file names the Python modules."""
-    for library in sorted((install / "lib").glob("lib*.so")):
-        _link(venv / "lib" / library.name, library)
-    _link(venv / "share" / "wm_msgs", install / "share" / "wm_msgs")
-    for marker in sorted((install / "share" / "ament_index" / "resource_index").glob("*/wm_msgs")):
-        _link(venv / "share" / "ament_index" / "resource_index" / marker.parent.name / "wm_msgs", marker)
-    modules = next((install / "lib").glob("python3.*/site-packages"), None)
-    if modules is None:
-        raise SetupError(f"{install} holds no Python modules; delete it and start again")
+    found = []
+    for install in installs:
+        for library in sorted((install / "lib").glob("lib*.so")):
+            _link(venv / "lib" / library.name, library)
+        _link(venv / "share" / install.name, install / "share" / install.name)
+        for marker in sorted((install / "share" / "ament_index" / "resource_index").glob(f"*/{install.name}")):
+            _link(venv / "share" / "ament_index" / "resource_index" / marker.parent.name / install.name, marker)
+        modules = next((install / "lib").glob("python3.*/site-packages"), None)
+        if modules is None:
+            raise SetupError(f"{install} holds no Python modules; delete it and start again")
+        found.append(f"{modules}\n")
     site = next((venv / "lib").glob("python3.*/site-packages"))
-    (site / "wm_workspace.pth").write_text(f"{modules}\n")
+    (site / "wm_workspace.pth").write_text("".join(found))
 
 
-def _built_here(workspace: Path, python: Path) -> bool:
-    """True where an earlier build of this checkout, with this Python, can be continued."""
+def _built_here(source: Path, build: Path, python: Path) -> bool:
+    """True where an earlier build of these sources in this folder, with this Python, can be continued."""
     try:
-        cache = (workspace / "build" / "wm_msgs" / "CMakeCache.txt").read_text(errors="replace")
+        cache = (build / "CMakeCache.txt").read_text(errors="replace")
     except OSError:
         return False
-    return f"{workspace}/build/wm_msgs" in cache and str(python) in cache
+    return all(part in cache for part in (f"={source}\n", f"={build}\n", str(python)))
 
 
 def _link(link: Path, target: Path) -> None:

@@ -19,7 +19,6 @@ from sensor_msgs.msg import CameraInfo, Image
 from wm_nodes.nodes.environment.camera_topics import cameras_of
 from wm_nodes.recording import Bag
 from wm_nodes.ros import convert
-from wm_nodes.ros.qos import TOPICS
 from wm_nodes.ros.wire import Reply
 
 pytestmark = pytest.mark.graph
@@ -162,25 +161,8 @@ def test_cameras_that_do_not_fit_the_spec_are_refused() -> None:
         cameras_of(environment)
 
 
-PACKAGE = {
-    "msg/TFMessage.msg": "geometry_msgs/TransformStamped[] transforms\n",
-    "CMakeLists.txt": """
-cmake_minimum_required(VERSION 3.22)
-project(tf2_msgs)
-find_package(ament_cmake REQUIRED)
-find_package(rosidl_default_generators REQUIRED)
-find_package(geometry_msgs REQUIRED)
-rosidl_generate_interfaces(tf2_msgs msg/TFMessage.msg DEPENDENCIES geometry_msgs)
-ament_package()
-""",
-    "package.xml": """
-<package format="3"><name>tf2_msgs</name><version>0.36.0</version><description>Only TFMessage</description>
-<maintainer email="maintainers@wm-nodes.invalid">wm_nodes</maintainer><license>BSD</license>
-<buildtool_depend>ament_cmake</buildtool_depend><buildtool_depend>rosidl_default_generators</buildtool_depend>
-<depend>geometry_msgs</depend><member_of_group>rosidl_interface_packages</member_of_group>
-<export><build_type>ament_cmake</build_type></export></package>
-""",
-}
+HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+"""As `ros2 topic info --verbose /tf` says it with ROS 2 Jazzy from apt."""
 LISTENER = """
 import json, sys, rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -195,41 +177,36 @@ node.create_subscription(TFMessage, "/tf", lambda m: note("/tf", m), 100)
 node.create_subscription(TFMessage, "/tf_static", lambda m: note("/tf_static", m), latched)
 while len(heard) < 2:
     rclpy.spin_once(node, timeout_sec=0.1)
-print(json.dumps(heard))
+offered = node.get_publishers_info_by_topic("/tf_static")[0]
+print(json.dumps({**heard, "type": [offered.topic_type, str(offered.topic_type_hash)]}))
 """
 
 
-@pytest.fixture
-def with_tf2_msgs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes started from now on find tf2_msgs: ROS 2's where it is installed, else one built here."""
-    if "/tf" not in TOPICS:
-        for name, text in PACKAGE.items():
-            path = tmp_path / "tf2_msgs" / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text.lstrip())
-        prefix = dict.fromkeys(("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"), sys.prefix)
-        build = [sys.executable, "-m", "colcon", "--log-base", "log", "build", "--paths", "tf2_msgs", "--cmake-args"]
-        subprocess.run(
-            [*build, "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={sys.executable}"], cwd=tmp_path, check=True,
-            env={**os.environ, **prefix}, capture_output=True,
-        )
-        install = tmp_path / "install" / "tf2_msgs"
-        site = next((install / "lib").glob("python3.*/site-packages"))
-        folders = {"PYTHONPATH": site, "AMENT_PREFIX_PATH": install, "LD_LIBRARY_PATH": install / "lib"}
-        for variable, folder in folders.items():
-            monkeypatch.setenv(variable, os.pathsep.join([str(folder), *filter(None, [os.environ.get(variable)])]))
-
-
-@pytest.mark.slow
-def test_tf_has_the_frames_where_tf2_msgs_is_installed(with_tf2_msgs: None, domain: int, tmp_path: Path) -> None:
-    graph = Graph(domain, tmp_path / "run", forks=False)
+def test_tf_has_the_frames_in_the_type_that_ros_2_itself_has(graph: Graph) -> None:
     graph.start_environment("toy:make_environment_with_cameras", num_envs=N, mode="asynchronous")
     done = subprocess.run(
         [sys.executable, "-c", LISTENER], env=graph.environment(), capture_output=True, text=True, timeout=100,
         check=False,
     )
-    assert graph.stop() == {"/wm/environment": 0}
     assert done.returncode == 0, done.stderr
     heard = json.loads(done.stdout)
     assert heard["/tf_static"] == [["wm_base", "wm_camera_top_optical", pytest.approx(0.6)]]
     assert [frames[:2] for frames in heard["/tf"]] == [["wm_base", "wm_camera_hand_optical"]]
+    assert heard["type"] == ["tf2_msgs/msg/TFMessage", HASH]
+
+
+def test_without_tf2_msgs_a_camera_has_its_own_topics_alone(
+    domain: int, probe: Probe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "tf2_msgs.py").write_text("raise ImportError('not installed')\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    graph = Graph(domain, tmp_path / "run", forks=False)
+    graph.start_environment("toy:make_environment_with_cameras", num_envs=N)
+    try:
+        heard = probe.listen("env/camera/top/transform")
+        wait_until("the frame", lambda: heard, timeout_s=60)
+        Client(probe).reset()
+        names = [name for name, _ in probe.node.get_topic_names_and_types()]
+        assert "/wm/env/camera/hand/transform" in names and not {"/tf", "/tf_static"}.intersection(names)
+    finally:
+        assert graph.stop() == {"/wm/environment": 0}

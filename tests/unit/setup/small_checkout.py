@@ -1,4 +1,4 @@
-"""A checkout whose set-up takes seconds: the real launch_scripts/setup over small wheels, a small wm_msgs and wm_nodes.
+"""A checkout whose set-up takes seconds: the real launch_scripts/setup over small wheels, messages and wm_nodes.
 
 venv, pip, uv, colcon, cmake and the compiler are real; colcon and uv run from the environment of the tests. Only system
 packages are left out.
@@ -30,14 +30,14 @@ raise SystemExit(main())
 """
 CMAKE = """
 cmake_minimum_required(VERSION 3.16)
-project(wm_msgs C)
-add_library(wm_msgs SHARED one.c two.c three.c)
-install(TARGETS wm_msgs DESTINATION lib)
-install(FILES package.xml DESTINATION share/wm_msgs)
-install(FILES package.xml DESTINATION share/ament_index/resource_index/packages RENAME wm_msgs)
-install(FILES msg/__init__.py DESTINATION lib/python{python}/site-packages/wm_msgs/msg)
+project({name} C)
+add_library({name} SHARED one.c two.c three.c)
+install(TARGETS {name} DESTINATION lib)
+install(FILES package.xml DESTINATION share/{name})
+install(FILES package.xml DESTINATION share/ament_index/resource_index/packages RENAME {name})
+install(FILES msg/__init__.py DESTINATION lib/python{python}/site-packages/{name}/msg)
 """
-PACKAGE_XML = """<package format="3"><name>wm_msgs</name><version>1.0.0</version><description>-</description>
+PACKAGE_XML = """<package format="3"><name>{name}</name><version>1.0.0</version><description>-</description>
 <maintainer email="a@b.c">-</maintainer><license>-</license><export><build_type>cmake</build_type></export></package>
 """
 NODES = "from setuptools import setup\nsetup(name='wm_nodes', version='1.0', packages=['wm_nodes'])\n"
@@ -51,13 +51,11 @@ class SmallCheckout:
         self.venv, self.log = folder / "own", folder / "own_setup.log"
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(repository / "launch_scripts" / "setup", self.root / "launch_scripts" / "setup", ignore=ignored)
-        python = f"{sys.version_info[0]}.{sys.version_info[1]}"
         for name, text in {
             "launch_scripts/setup/system.py": NO_SYSTEM_PACKAGES,
             "requirements/lock.txt": f"setuptools=={SETUPTOOLS.version}\nparts\n",
             "requirements/torch-cpu.txt": "torch\n", "requirements/torch-gpu.txt": "torch\n",
-            "msgs_schema/CMakeLists.txt": CMAKE.format(python=python), "msgs_schema/package.xml": PACKAGE_XML,
-            "msgs_schema/msg/__init__.py": "", **{f"msgs_schema/{c}.c": f"int {c};\n" for c in ("one", "two", "three")},
+            **_message_package("msgs_schema", "wm_msgs"), **_message_package("msgs_schema/tf2_msgs", "tf2_msgs"),
             "wm_nodes/setup.py": NODES, "wm_nodes/setup.cfg": "",
             "wm_nodes/wm_nodes/__init__.py": "__version__ = '1'\n",
             "wm_nodes/pyproject.toml": "[build-system]\nrequires = ['setuptools']\n",
@@ -100,12 +98,19 @@ class SmallCheckout:
         )
 
     def complete(self) -> str:
-        """Set up without interruption; return what the set-up says. It ends by importing all four packages."""
+        """Set up without interruption; return what the set-up says. It ends by importing four packages."""
         child = self.start()
         out, err = child.communicate(timeout=120)
         assert child.returncode == 0 and "wm_nodes 1 on Python" in out, (out, err, self.log.read_text()[-3000:])
         assert f"{self.venv}/lib" in out and f"{self.root}/ros2_ws/install" in out
+        assert self.tf2_msgs().is_file()
         return err
+
+    def tf2_msgs(self) -> Path:
+        """The module from which the environment imports TFMessage."""
+        command = [self.venv / "bin" / "python", "-c", "import tf2_msgs.msg as m; print(m.TFMessage and m.__file__)"]
+        done = subprocess.run(command, cwd=self.venv, env=self.environment, capture_output=True, text=True, check=True)
+        return Path(done.stdout.strip())
 
     def interrupt(self, word: str, delay_s: float, how: str) -> tuple[int, str]:
         """Start; `delay_s` after a command with `word` in it has begun, interrupt; return (exit code, what was said).
@@ -148,6 +153,13 @@ class SmallCheckout:
             except BlockingIOError:
                 return True
         return False
+
+
+def _message_package(folder: str, name: str) -> dict[str, str]:
+    python = f"{sys.version_info[0]}.{sys.version_info[1]}"
+    files = {"CMakeLists.txt": CMAKE.format(name=name, python=python), "package.xml": PACKAGE_XML.format(name=name)}
+    files |= {"msg/__init__.py": "TFMessage = ...\n", **{f"{c}.c": f"int {c};\n" for c in ("one", "two", "three")}}
+    return {f"{folder}/{file}": text for file, text in files.items()}
 
 
 def _write_wheel(folder: Path, name: str, version: str, files: dict[str, str | bytes]) -> None:

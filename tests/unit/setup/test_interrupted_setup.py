@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import subprocess
 import sys
 import time
@@ -13,7 +14,8 @@ from unit.setup.small_checkout import SmallCheckout
 from setup import console, stamp
 
 COMMANDS = {
-    "-m venv": 1.5, "pip install --disable": 0.4, "torch-cpu.txt": 0.05, "lock.txt": 0.1, "colcon": 1.2, "wm_nodes": 0.3
+    "-m venv": 1.5, "pip install --disable": 0.4, "torch-cpu.txt": 0.05, "lock.txt": 0.1, "colcon": 1.2,
+    "wm_msgs/tf2_msgs": 0.8, "wm_nodes": 0.3,
 }
 """Commands of the set-up in their order -> within how many seconds of its start each is interrupted."""
 HOW = ("INT", "TERM", "KILL", "KILL ALL")
@@ -64,12 +66,14 @@ def test_torn_packages_and_a_torn_build_are_made_again_in_an_environment_whose_o
     site = next(checkout.venv.glob("lib/python3.*/site-packages"))
     assert '"/opt/python' not in (checkout.venv / "share/parts/export.cmake").read_text()
     lost = [site / "setuptools/archive_util.py", site / "torch/__init__.py", checkout.venv / "bin/uv",
-            checkout.venv / "lib/libwm_msgs.so"]
+            checkout.venv / "lib/libwm_msgs.so", checkout.venv / "lib/libtf2_msgs.so"]
     for path in lost:
         path.unlink()
     build, install = (checkout.root / "ros2_ws" / name / "wm_msgs" for name in ("build", "install"))
     torn = [(site / "parts-1.0.dist-info/RECORD", b"\n"), (next(site.glob("setuptools-*")) / "RECORD", b"/"),
-            (install / "lib/libwm_msgs.so", b""), (next(build.rglob("two.c.o")), b"")]
+            (install / "lib/libwm_msgs.so", b""), (next(build.rglob("two.c.o")), b""),
+            (checkout.venv / "tf2_msgs/install/tf2_msgs/lib/libtf2_msgs.so", b""),
+            (next((checkout.venv / "tf2_msgs/build").rglob("two.c.o")), b"")]
     sizes = [path.stat().st_size for path, _ in torn]
     for path, last in torn:
         tear(path, last)
@@ -82,6 +86,26 @@ def test_torn_packages_and_a_torn_build_are_made_again_in_an_environment_whose_o
     stamp.begin(checkout.venv, "wm_nodes")
     checkout.complete()
     assert (checkout.venv / "mine.txt").read_text() == "mine"
+
+
+def test_a_lost_tf2_msgs_is_built_again_and_one_that_the_environment_has_is_left_alone(
+    tmp_path: Path, repository: Path
+) -> None:
+    checkout = SmallCheckout(tmp_path, repository)
+    assert "and tf2_msgs for the frames of cameras" in checkout.complete()
+    folder, site = checkout.venv / "tf2_msgs", next(checkout.venv.glob("lib/python3.*/site-packages"))
+    assert folder in checkout.tf2_msgs().parents
+    assert os.listdir(checkout.root / "ros2_ws/install").count("tf2_msgs") == 0, "it would hide ROS 2's own"
+    shutil.rmtree(folder)
+    said = checkout.complete()
+    assert "setting up messages;" in said and folder in checkout.tf2_msgs().parents
+    shutil.rmtree(folder)
+    (site / "tf2_msgs/msg").mkdir(parents=True)
+    (site / "tf2_msgs/msg/__init__.py").write_text("TFMessage = ...\n")
+    said = checkout.complete()
+    assert "setting up messages;" in said and "tf2_msgs" not in said and not folder.exists()
+    assert checkout.tf2_msgs() == site / "tf2_msgs/msg/__init__.py"
+    assert checkout.complete() == ""
 
 
 def test_commands_of_a_killed_set_up_keep_its_lock_until_they_end(tmp_path: Path, repository: Path) -> None:

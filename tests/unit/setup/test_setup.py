@@ -90,7 +90,9 @@ def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     root = tmp_path / "repo"
     for name, text in {
         "requirements/core.txt": "numpy\n", "msgs_schema/CMakeLists.txt": "", "msgs_schema/package.xml": "",
-        "msgs_schema/msg/A.msg": "uint8 a\n", "wm_nodes/setup.py": "", "wm_nodes/setup.cfg": "",
+        "msgs_schema/msg/A.msg": "uint8 a\n",
+        **{f"msgs_schema/tf2_msgs/{name}": "" for name in ("CMakeLists.txt", "package.xml", "msg/TFMessage.msg")},
+        "wm_nodes/setup.py": "", "wm_nodes/setup.cfg": "",
         "wm_nodes/pyproject.toml": "", "launch_scripts/setup/system.py": "", ".venv/bin/python": "",
         "ros2_ws/install/wm_msgs/share/wm_msgs/package.xml": "",
     }.items():
@@ -112,6 +114,12 @@ def test_new_message_rebuilds_messages_only(tree: Path) -> None:
     assert entry.pending(tree / ".venv") == ["messages"]
 
 
+@pytest.mark.parametrize("name", ["CMakeLists.txt", "package.xml", "msg/TFMessage.msg"])
+def test_changed_tf2_msgs_rebuilds_messages_only(name: str, tree: Path) -> None:
+    (tree / "msgs_schema/tf2_msgs" / name).write_text("# other\n")
+    assert entry.pending(tree / ".venv") == ["messages"]
+
+
 def test_new_requirement_redoes_all_that_stands_on_it(tree: Path) -> None:
     (tree / "requirements/core.txt").write_text("numpy\nscipy\n")
     assert entry.pending(tree / ".venv") == ["packages", "messages", "wm_nodes"]
@@ -120,6 +128,15 @@ def test_new_requirement_redoes_all_that_stands_on_it(tree: Path) -> None:
 def test_lost_build_is_noticed_despite_the_stamp(tree: Path) -> None:
     (tree / "ros2_ws/install/wm_msgs/share/wm_msgs/package.xml").unlink()
     assert entry.pending(tree / ".venv") == ["messages"]
+
+
+def test_lost_tf2_msgs_is_noticed_where_it_was_built_here(tree: Path) -> None:
+    link = tree / ".venv/share/tf2_msgs"
+    link.parent.mkdir()
+    link.symlink_to(tree / "built")
+    assert entry.pending(tree / ".venv") == ["messages"]
+    (tree / "built").mkdir()
+    assert entry.pending(tree / ".venv") == []
 
 
 def test_absent_renderer_is_not_tried_again_at_every_start(tree: Path) -> None:
