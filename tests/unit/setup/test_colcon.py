@@ -45,3 +45,9 @@ def test_the_packages_build_and_what_is_installed_is_whole(repository: Path, tmp
     assert files == sorted(str(path.relative_to(PRETRAINED)) for path in PRETRAINED.rglob("*") if path.is_file())
     nodes = sorted((install / "wm_nodes" / "lib" / "wm_nodes").iterdir())
     assert len(nodes) >= 10 and all(os.access(node, os.X_OK) for node in nodes)
+
+
+def test_a_workspace_has_three_packages_and_leaves_tf2_msgs_to_ros_2(repository: Path) -> None:
+    command = [sys.executable, "-m", "colcon", "--log-base", os.devnull, "list", "--names-only"]
+    done = subprocess.run(command, cwd=repository / "ros2_ws", capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["wm_bringup", "wm_msgs", "wm_nodes"]

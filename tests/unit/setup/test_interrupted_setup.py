@@ -103,7 +103,7 @@ def test_a_lost_tf2_msgs_is_built_again_and_one_that_the_environment_has_is_left
     (site / "tf2_msgs/msg").mkdir(parents=True)
     (site / "tf2_msgs/msg/__init__.py").write_text("TFMessage = ...\n")
     said = checkout.complete()
-    assert "setting up messages;" in said and "tf2_msgs" not in said and not folder.exists()
+    assert "setting up messages;" in said and "and tf2_msgs" not in said and not folder.exists()
     assert checkout.tf2_msgs() == site / "tf2_msgs/msg/__init__.py"
     assert checkout.complete() == ""
 

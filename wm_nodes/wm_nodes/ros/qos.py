@@ -36,7 +36,7 @@ from wm_nodes.recording import topics as recorded
 
 try:
     from tf2_msgs.msg import TFMessage
-except ImportError:  # ROS 2 from apt has it, the wheels of requirements/ros.txt have not
+except ImportError:  # ROS 2 from apt has it, and the set-up builds it; other environments may lack it
     TFMessage = None
 
 CREDIT_WINDOW = recorded.CREDIT_WINDOW
