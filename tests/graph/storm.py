@@ -30,6 +30,8 @@ LEFT_OUT = ("/change_state", "/set_parameters_atomically")
 EVERYBODY = ("run/state", "run/links", "flow/credit")
 """Topics on which the nodes themselves speak all the time."""
 FEW = 2
+GOALS_END_S = 1.0
+"""Longest time until a cancelled goal of these small loops has ended."""
 LARGE_BYTES, LARGE_S = 2**14, 0.1
 """A message in fragments is complete only after the small ones that were sent behind it."""
 
@@ -157,8 +159,19 @@ class Storm:
         for publisher in self._replies.values():
             publisher.destroy()
         self._replies.clear()
+        self._end_goals()
         if ESTOP in self.topics:
             self.release_emergency_stop()
+
+    def _end_goals(self) -> None:
+        """Cancel what the last messages have started, until nothing is."""
+        cancel = {name: service for name, service in self.services.items() if service.kind is CancelGoal}
+        for name in cancel:
+            wait_until(
+                f"the end of the goals of {name}",
+                lambda n=name: not self._probe.call(CancelGoal, n, CancelGoal.Request()).goals_canceling,  # type: ignore[misc]
+            )
+        time.sleep(GOALS_END_S)
 
     def close(self) -> None:
         """Destroy what rclpy does not know of; before the probe is closed."""
