@@ -1,6 +1,5 @@
 """Nodes when something breaks inside them: the model, the renderer, a callback, the disk, the clock, a lifecycle."""
 
-import os
 import resource
 import subprocess
 import sys
@@ -106,10 +105,9 @@ def test_an_environment_that_fails_in_a_reset_says_so_in_the_answer_and_can_be_r
 
 def test_an_unexpected_exception_in_a_timer_ends_the_node_in_order(graph: Graph, probe: Probe) -> None:
     states = probe.listen("run/state")
-    program = [sys.executable, "-m", "graph.failing_node", "--ros-args", "-r", "__ns:=/wm"]
+    program = [sys.executable, "-m", "failing_node", "--ros-args", "-r", "__ns:=/wm"]
     ended = subprocess.run(
-        program, env=graph.environment() | {"PYTHONPATH": f"{Path(__file__).parents[1]}:{os.environ['PYTHONPATH']}"},
-        capture_output=True, text=True, timeout=60, check=False,
+        program, env=graph.environment(), capture_output=True, text=True, timeout=60, check=False
     )
     assert ended.returncode == 1 and "ZeroDivisionError" in ended.stderr
     wait_until("FAILED", lambda: any(s.state == s.FAILED for s in states))
