@@ -14,6 +14,7 @@ from model_folders import make_model_folder
 from safetensors.numpy import save_file
 
 from wm_nodes.apps.cli import main
+from wm_nodes.core.named_files import RUN_ENTRIES
 from wm_nodes.recording import Bag, read_episodes
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.summary import read_summary
@@ -77,6 +78,7 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
                  "--set", "evaluation.episodes=2", "--set", "data.num_workers=1", "--compose"]
     done = start(arguments, ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
+    assert {path.name for path in run_dir.iterdir()} <= RUN_ENTRIES, "a peer may write what is not listed there"
     first, last = read_summary(run_dir)["rounds"]
     assert (first["number"], last["number"], first["updates"], last["updates"]) == (1, 2, 1, 1)
     assert first["verdict"]["rows"] and not last["verdict"]

@@ -21,8 +21,9 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
+
+from wm_nodes.core.processes import stat_fields
 
 ANSWER_S = 60.0
 """Longest time for the imports."""
@@ -206,7 +207,7 @@ def main() -> None:
 
 def _show(command: Sequence[str]) -> None:
     """Have ps and pkill -f see the node's own command line in the place of the server's, as far as there is room."""
-    first, end = (int(field) for field in Path("/proc/self/stat").read_text().rpartition(")")[2].split()[45:47])
+    first, end = (int(field) for field in stat_fields(os.getpid())[45:47])
     text = "\0".join(command).encode()[: max(0, end - first - 1)]
     ctypes.memmove(first, text.ljust(end - first, b"\0"), end - first)
 

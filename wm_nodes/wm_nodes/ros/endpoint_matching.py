@@ -8,14 +8,13 @@ its links at every change and once a second.
 
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
-from typing import Any
 
 from rclpy.node import Node
 
 from wm_msgs.msg import ErrorCode, NodeLinks
-from wm_nodes.ros.liveliness import check_sender
+from wm_nodes.ros.guard import check_sender, nodes_of
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.wire import WireError
@@ -156,8 +155,8 @@ class Links:
         changed = self.table.refresh(
             {publisher.topic_name for publisher in node.publishers},
             {subscription.topic_name for subscription in node.subscriptions}, self._is_active(),
-            lambda name: _nodes_of(node.get_subscriptions_info_by_topic(name)),
-            lambda name: _nodes_of(node.get_publishers_info_by_topic(name)),
+            lambda name: nodes_of(node.get_subscriptions_info_by_topic(name)),
+            lambda name: nodes_of(node.get_publishers_info_by_topic(name)),
         )
         if changed or again:
             message = self.table.announcement()
@@ -198,7 +197,3 @@ class StartBarrier:
                 self._given_up |= lacking
                 return
             work.sleep(0.02)
-
-
-def _nodes_of(ends: Sequence[Any]) -> set[str]:
-    return {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}

@@ -7,7 +7,7 @@ Subscriptions take bytes and are read here: the middleware drops what it cannot 
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rclpy.serialization import deserialize_message
@@ -17,6 +17,8 @@ from wm_nodes.ros import diagnostics
 from wm_nodes.ros.wire import WireError
 
 LOG_PERIOD_S = 60.0
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
+"""What rmw calls the node of an end whose name has not arrived yet."""
 MAX_TEXT = 1000
 """Characters of an error that are logged: what it quotes was sent by others."""
 MAX_KINDS = 256
@@ -95,14 +97,28 @@ class Guard:
         """Who may have sent a message of a topic: DDS hands rclpy's callbacks no sender."""
         ends = self._node.get_publishers_info_by_topic(topic)
         own = self._node.get_fully_qualified_name()
-        names = sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends} - {own})
-        return " or ".join(names) or (own if ends else "a publisher that is gone")
+        return " or ".join(sorted(nodes_of(ends) - {own})) or (own if ends else "a publisher that is gone")
 
     def _bounded(self, publisher: str) -> str:
         if publisher not in self._publishers and len(self._publishers) >= MAX_KINDS:
             return "others"
         self._publishers.add(publisher)
         return publisher
+
+
+def check_sender(node: Any, topic_name: str, name: str) -> None:
+    """Raise WireError where a node speaks of itself on a topic that it does not publish: someone else speaks for it.
+
+    DDS knows an end of a topic before it knows its node's name; while one is unknown, everybody is believed.
+    """
+    names = nodes_of(node.get_publishers_info_by_topic(topic_name))
+    if name not in names and not any(UNKNOWN_NODE in known for known in names):
+        raise WireError(ErrorCode.OUT_OF_ORDER, f"it speaks for {name[:80]!r}, which does not publish {topic_name}")
+
+
+def nodes_of(ends: Iterable[Any]) -> set[str]:
+    """The fully qualified names of the nodes that ends of a topic belong to."""
+    return {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}
 
 
 def _describe(error: Exception, *, where: bool) -> str:

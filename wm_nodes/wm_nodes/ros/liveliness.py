@@ -18,12 +18,11 @@ from rclpy.duration import Duration
 from wm_msgs.msg import ErrorCode, RunState
 from wm_nodes.core.processes import Activity, ActivityWatch
 from wm_nodes.ros import diagnostics
+from wm_nodes.ros.guard import check_sender
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.wire import WireError
 
 HEARTBEAT_S = 0.5
-UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
-"""What rmw calls the node of an end whose name has not arrived yet."""
 ASLEEP_S = 3 * HEARTBEAT_S
 """Checks come once per heartbeat. Where one comes later than this, its own process stood still and heard nobody: on a
 crowded machine, or in the middleware, where `kill -9` of a node can hold all its peers up for 2 to 3 s (after 4 of
@@ -208,17 +207,6 @@ class Heartbeat:
         identity = self.peers.identity(name)
         activity = self._activity(identity)
         return f"; {identity.partition(' on ')[0]} {activity.value}" if activity is not None else ""
-
-
-def check_sender(node: Any, topic_name: str, name: str) -> None:
-    """Raise WireError where a node speaks of itself on a topic that it does not publish: someone else speaks for it.
-
-    DDS knows an end of a topic before it knows its node's name; while one is unknown, everybody is believed.
-    """
-    ends = node.get_publishers_info_by_topic(topic_name)
-    names = {f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}
-    if name not in names and not any(UNKNOWN_NODE in known for known in names):
-        raise WireError(ErrorCode.OUT_OF_ORDER, f"it speaks for {name[:80]!r}, which does not publish {topic_name}")
 
 
 def start_time(identity: str) -> float:
