@@ -16,6 +16,11 @@ def add_preset(parser: argparse.ArgumentParser, default: str, names: Sequence[st
     """--preset and --set. names: the presets that there are."""
     parser.add_argument("--preset", default=default, help=f"one of {', '.join(names)}, or a .yaml (default: {default})")
     add_set(parser)
+    add_device(parser)
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", help="where models compute: cpu, cuda, cuda:N or auto (default: the preset's)")
 
 
 def add_set(parser: argparse.ArgumentParser) -> None:
@@ -79,10 +84,9 @@ def judge_settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The dotted settings that --set and a given --seed stand for."""
-    overrides = dict(parse_override(text) for text in arguments.set)
-    seed = getattr(arguments, "seed", None)
-    return overrides if seed is None else overrides | {"seed": seed}
+    """The dotted settings that --set and a given --seed or --device stand for."""
+    named = {name: value for name in ("seed", "device") if (value := getattr(arguments, name, None)) is not None}
+    return dict(parse_override(text) for text in arguments.set) | named
 
 
 def prepare_torch(count: int | None = None) -> None:

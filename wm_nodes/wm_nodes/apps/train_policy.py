@@ -110,7 +110,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         paired=asdict(paired_difference(found.real_before.tolist(), found.real_after.tolist())),
         imagined_paired=asdict(paired_difference(found.imagined_before.tolist(), found.imagined_after.tolist())),
         acceptance=_read_acceptance(run_dir), samples=found.samples, minutes=stage.minutes,
-        command=arguments.command, machine=machine_facts(), rounds=found.table, reward=arguments.reward,
+        command=arguments.command, machine=machine_facts(config.device), rounds=found.table, reward=arguments.reward,
         judge=judge_name(episode_judge(config)) if arguments.reward == AGENT else "",
     )
     write_summary(run_dir, summary)

@@ -20,6 +20,8 @@ AGENT = "agent"
 
 TaskName = Annotated[str, AfterValidator(check_task)]
 """Name of a task's file, see config/tasks.py."""
+DeviceName = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
+"""Where models compute: cpu, cuda, cuda:N, or auto (a GPU where there is one), see core/device.py."""
 
 
 class SettingsSection(BaseModel):
@@ -282,6 +284,8 @@ class EvaluationConfig(SettingsSection):
 class RunConfig(SettingsSection):
     seed: NonNegativeInt
     task: TaskName
+    device: DeviceName
+    """Of every model, reward and learner. Processes that collect in the simulator compute on the CPU."""
     simulation: SimulationConfig
     data: DataConfig
     tokenizer: TokenizerConfig

@@ -5,6 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from wm_nodes.config.schema import (
+    DeviceName,
     Fraction,
     JudgeConfig,
     NonNegativeFloat,
@@ -239,6 +240,8 @@ class VideoRlConfig(SettingsSection):
 
     seed: NonNegativeInt
     task: TaskName
+    device: DeviceName
+    """Of the video model, its codec, the rewards and the learner."""
     iterations: NonNegativeInt
     """Buffers to train on."""
     data_episodes: PositiveInt

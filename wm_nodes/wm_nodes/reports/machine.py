@@ -6,11 +6,16 @@ from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 
+from wm_nodes.core.device import CPU, compute_device, device_label
+
 PACKAGES = ("wm_nodes", "torch", "numpy", "mani_skill", "sapien", "rclpy", "rosbags")
 
 
-def machine_facts() -> dict[str, str]:
-    """Date, processor, usable cores, memory, system, Python and package versions, by name. No host or user name."""
+def machine_facts(device: str = CPU) -> dict[str, str]:
+    """Date, processor, usable cores, memory, system, Python and package versions, by name. No host or user name.
+
+    device: the setting that the numbers were made with; a GPU is among the facts.
+    """
     kilobytes = _field("/proc/meminfo", "MemTotal").split()[:1]
     facts = {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -19,6 +24,7 @@ def machine_facts() -> dict[str, str]:
         "memory": f"{int(kilobytes[0]) / 2**20:.1f} GiB" if kilobytes else "unknown",
         "system": f"{_field('/etc/os-release', 'PRETTY_NAME', '=').strip(chr(34))} {platform.machine()}".strip(),
         "python": platform.python_version(),
+        "device": device_label(compute_device(device)),
     }
     for name in PACKAGES:
         try:
