@@ -39,7 +39,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=_size, default=(480, 832), metavar="HxW", help="pixels; default 480x832")
     parser.add_argument("--frames", type=int, default=9, help="frames of a clip; 4 n + 1 for Wan's VAE")
     parser.add_argument("--dtype", choices=("float32", "bfloat16", "float16"), default="float32")
-    parser.add_argument("--device", default="cpu")
     parser.add_argument("--offload", action="store_true", help="VAE and text encoder rest on the CPU")
     parser.add_argument("--lora-rank", type=int, default=0, help="check with a LoRA adapter of this rank")
     add_preset(parser, "recommended", preset_names(VIDEO))
@@ -81,7 +80,7 @@ def _model_to_check(arguments: argparse.Namespace, config: VideoRlConfig) -> Mod
 def _public(arguments: argparse.Namespace, config: VideoRlConfig) -> ModelToCheck:
     from wm_nodes.video_model.adapters import LoadSettings, add_lora, load_public_model
 
-    loading = LoadSettings(dtype=arguments.dtype, device=arguments.device, offload=arguments.offload)
+    loading = LoadSettings(dtype=arguments.dtype, device=config.device, offload=arguments.offload)
     public = load_public_model(arguments.public, loading)
     if public.text is None:
         raise ValueError(f"{arguments.public} has no text encoder; one is needed to embed the prompt")
@@ -95,7 +94,7 @@ def _public(arguments: argparse.Namespace, config: VideoRlConfig) -> ModelToChec
     model: Any = public.velocity
     if arguments.lora_rank:
         add_lora(model, arguments.lora_rank, 2 * arguments.lora_rank)
-    return model, condition.to(arguments.device), (C, F, H, W), config.with_values(
+    return model, condition.to(config.device), (C, F, H, W), config.with_values(
         rollout=config.rollout.with_values(shift=public.shift)
     )
 

@@ -19,6 +19,7 @@ from rich.table import Table
 from wm_nodes.apps import policy_run
 from wm_nodes.apps.policy_run import RunContext, TrainingResult, TrainingStart, WaitingGraph, console, read_success
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import BoolArray
@@ -165,8 +166,9 @@ def _refresh(job: RunContext, start: TrainingStart, policy: Path, number: int) -
     job.stage(f"refreshing the world model: {settings.refresh_iterations} iterations")
     episodes, folder = [*replay, *earlier, *bags], start.folder / "model"
     model_refresh.refresh_model(config, start.model_dir, episodes, folder, number=number)
+    old, new = (load_model_folder(path, compute_device(config.device)) for path in (start.model_dir, folder))
     verdict = model_refresh.compare_models(
-        load_model_folder(start.model_dir), load_model_folder(folder),
+        old, new,
         {"policy": load_arrays(heldout, config), "scripted": load_arrays(scripted, config)}, config,
     )
     console.print(_verdict_table(verdict, number))

@@ -57,7 +57,7 @@ def write_pictures(
     finally:
         environment.close()
     folder, pictures = run_dir / "pictures", list[Picture]()
-    for index, pair in enumerate(side_by_side(models_of(Path(model_dir)), episodes, config)):
+    for index, pair in enumerate(side_by_side(models_of(Path(model_dir), config.device), episodes, config)):
         path = folder / f"film_strip_{index}.png"
         rows = {"real": pair.real, "imagined": pair.imagined} | ({} if pair.goal is None else {"goal": pair.goal[None]})
         done = {"real": pair.real_done, "imagined": pair.imagined_done}

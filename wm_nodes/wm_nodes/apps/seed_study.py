@@ -155,7 +155,7 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
 
     real_before, imagined_before = measure()
     acceptance = accept_world_model(
-        models_of(model_dir),
+        models_of(model_dir, config.device),
         load_arrays(collect_plan(acceptance_plan(config), config, folder / "heldout"), config), config,
         (imagined_before.successes, imagined_before.episodes), (real_before.successes, real_before.episodes),
     )
@@ -174,8 +174,8 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         "environment_steps": sum(c["steps"] for c in course),
         "success_before": real_before.success.astype(int).tolist(),
         "success_after": real_after.success.astype(int).tolist(), "course": course,
-        "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(), "config": dump_config(config),
-        "world_model_sha256": models_of(model_dir).sha256,
+        "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(config.device),
+        "config": dump_config(config), "world_model_sha256": models_of(model_dir).sha256,
     }
     with open(folder / "results.jsonl", "a") as file:
         file.write(json.dumps(row) + "\n")

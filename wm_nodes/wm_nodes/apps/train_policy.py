@@ -21,6 +21,7 @@ from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, lo
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import task_names
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.errors import ModelNotAcceptedError
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.statistics import paired_difference
@@ -158,7 +159,7 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
     config = job.config
     bags = collect_plan(acceptance_plan(config), config, job.run_dir / "bags" / "heldout")
     report = accept_world_model(
-        load_model_folder(model_dir), load_arrays(bags, config), config,
+        load_model_folder(model_dir, compute_device(config.device)), load_arrays(bags, config), config,
         (int(imagined.sum()), len(imagined)), (int(real.sum()), len(real)),
     )
     path = job.run_dir / ACCEPTANCE

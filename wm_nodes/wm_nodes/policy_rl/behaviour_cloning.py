@@ -7,6 +7,7 @@ from itertools import islice
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from wm_nodes.config.schema import SftConfig
 from wm_nodes.core.seeding import torch_stream
@@ -71,13 +72,13 @@ def train_sft(
     policy.fit_normaliser(features_BF)
     optimizer = torch.optim.Adam(policy.actor.parameters(), lr=config.learning_rate)
     generator = torch_stream(seed, "sft")
-    losses = np.zeros(config.num_iterations, np.float32)
-    for iteration in range(config.num_iterations):
+    losses = list[Tensor]()
+    for _ in range(config.num_iterations):
         index = torch.randint(len(features_BF), (config.batch_size,), generator=generator).to(policy.device)
         mean_BA = policy.distribution(features_BF[index], states_BS[index]).mean_BA
         loss = (mean_BA - actions_BA[index]).square().mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        losses[iteration] = float(loss.detach())
-    return SftResult(losses, len(features_BF))
+        losses.append(loss.detach())
+    return SftResult(torch.stack(losses).cpu().numpy(), len(features_BF))

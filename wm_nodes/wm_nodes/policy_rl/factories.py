@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import FloatArray, Observation, UInt8Array
@@ -21,13 +22,15 @@ from wm_nodes.world_model import ImaginedEnvironment, WorldModels, load_model_fo
 STATE_DIM, ACTION_DIM = 3, 3
 
 
-models_of: Callable[[Path], WorldModels] = functools.lru_cache(maxsize=4)(load_model_folder)
-"""Return the models of a folder, loaded once per process."""
+@functools.lru_cache(maxsize=4)
+def models_of(model_dir: Path, device: str = CPU) -> WorldModels:
+    """Return the models of a folder on the device of that name (core/device.py), loaded once per process."""
+    return load_model_folder(model_dir, compute_device(device))
 
 
-def make_encoder(model_dir: Path) -> ImageEncoder:
+def make_encoder(model_dir: Path, device: str = CPU) -> ImageEncoder:
     """Return the tokenizer as the policy's frozen image encoder: latents flattened to (B, S D)."""
-    models = models_of(Path(model_dir))
+    models = models_of(Path(model_dir), device)
     tokenizer = models.tokenizer
 
     def encode(images: Tensor) -> Tensor:
@@ -38,7 +41,9 @@ def make_encoder(model_dir: Path) -> ImageEncoder:
 
 def make_policy(config: RunConfig, model_dir: Path) -> ImagePolicy:
     """Return a policy with fresh weights."""
-    return ImagePolicy(make_encoder(model_dir), STATE_DIM, ACTION_DIM, config.policy, seed=config.seed)
+    encoder = make_encoder(model_dir, config.device)
+    policy = ImagePolicy(encoder, STATE_DIM, ACTION_DIM, config.policy, seed=config.seed)
+    return policy.to(compute_device(config.device))
 
 
 def load_policy(config: RunConfig, model_dir: Path, weights: Path) -> ImagePolicy:
@@ -55,13 +60,13 @@ def load_policy(config: RunConfig, model_dir: Path, weights: Path) -> ImagePolic
     return policy
 
 
-def make_reconstruct(model_dir: Path) -> Callable[[UInt8Array], UInt8Array]:
+def make_reconstruct(model_dir: Path, device: str = CPU) -> Callable[[UInt8Array], UInt8Array]:
     """Return the function that gives images as the world model shows them: decode(encode(x))."""
-    tokenizer = models_of(Path(model_dir)).tokenizer
+    tokenizer = models_of(Path(model_dir), device).tokenizer
 
     def reconstruct(images: UInt8Array) -> UInt8Array:
         return np.concatenate(
-            [tokenizer.decode(tokenizer.encode(images[i : i + 256])).numpy() for i in range(0, len(images), 256)]
+            [tokenizer.decode(tokenizer.encode(images[i : i + 256])).cpu().numpy() for i in range(0, len(images), 256)]
         )
 
     return reconstruct
@@ -78,7 +83,7 @@ def make_endogenous_reward(config: RunConfig, model_dir: Path) -> EndogenousRewa
             "reward.mode progress needs golden trajectories, and environments publish the goal frame only; choose "
             "delta or abs, or set reward.dense_weight to 0 (EndogenousReward itself takes RewardInput.golden)"
         )
-    encoder = make_encoder(model_dir)
+    encoder = make_encoder(model_dir, config.device)
     return EndogenousReward(config.reward, EncoderDistance(encoder.function, identity=encoder.sha256[:16]))
 
 
@@ -90,7 +95,7 @@ def make_imagined_environment(
     Raises:
         ValueError: the folder was trained for another scene than the configuration describes.
     """
-    models = models_of(Path(model_dir))
+    models = models_of(Path(model_dir), config.device)
     for name in ("cameras", "image_size", "control_hz", "max_action_m", "workspace_low_m", "workspace_high_m"):
         wanted, trained = getattr(config.simulation, name), getattr(models.simulation, name)
         if wanted != trained:
@@ -116,7 +121,7 @@ def policy_actor(
         is (seed, step).
     """
     torch.set_num_threads(1)
-    policy = load_policy(config, model_dir, weights)
+    policy = load_policy(config.with_values(device=CPU), model_dir, weights)  # many workers: no GPU context for each
 
     def act(observation: Observation, seed: int) -> FloatArray:
         stream = numpy_stream(seed, "exploration", int(observation.episode_step[0]))

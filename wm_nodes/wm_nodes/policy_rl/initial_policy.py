@@ -54,7 +54,7 @@ def train_weak_policy(config: RunConfig, model_dir: Path, demo_bags: Iterable[Pa
     """
     policy = make_policy(config, model_dir)
     demos = demonstrations((e for bag in demo_bags for e in read_episodes(bag)), config.sft.num_demonstrations)
-    train_sft(policy, demos, config.sft, config.seed, reconstruct=make_reconstruct(model_dir))
+    train_sft(policy, demos, config.sft, config.seed, reconstruct=make_reconstruct(model_dir, config.device))
     save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
     return policy
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.config.tasks import get_task, model_tasks
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.environments.maniskill.collection import CollectionPlan
 from wm_nodes.environments.record import TRAINING_SEEDS, acceptance_plan, collect_plan, scripted_plan
@@ -122,7 +123,7 @@ def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], fold
     check_refreshable(model_dir)
     if (folder / MANIFEST).exists():
         return folder
-    models = load_model_folder(model_dir)
+    models = load_model_folder(model_dir, compute_device(config.device))
     manifest = models.manifest
     settings = WorldModelConfig.model_validate(manifest["world_model"]).model_copy(
         update={

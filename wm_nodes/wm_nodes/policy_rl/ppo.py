@@ -9,9 +9,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
@@ -133,7 +135,7 @@ class PpoLearner:
         stop = False
         for epoch in range(config.epochs):
             order = torch.randperm(count, generator=torch_stream(self.seed, "ppo_order", self.updates, epoch))
-            for index in order.chunk(num_minibatches):
+            for index in order.to(self.policy.device).chunk(num_minibatches):
                 if self.ranks.agree(should_stop is not None and should_stop()):
                     raise Canceled(f"update {self.updates} stopped after {trained} samples")
                 terms = self._minibatch(samples, index, policy_frozen)
@@ -149,7 +151,9 @@ class PpoLearner:
             raise self._not_finite("weight")
         return PpoMetrics(
             **{name: value / trained for name, value in totals.items()}, learning_rate=config.learning_rate,
-            explained_variance=explained_variance(samples.values, samples.returns, torch.ones(count, dtype=torch.bool)),
+            explained_variance=explained_variance(
+                samples.values, samples.returns, torch.ones_like(samples.values, dtype=torch.bool)
+            ),
             mean_advantage_std=float(samples.advantages.std(correction=0)), epochs=trained / count, samples=count,
         )
 
@@ -196,7 +200,7 @@ class PpoLearner:
     @torch.no_grad()
     def _samples(self, rollout: Rollout) -> _Samples:
         steps, num_envs = rollout.valid_TN.shape
-        valid_TN = torch.from_numpy(rollout.valid_TN)
+        valid_TN = self._tensor(rollout.valid_TN)
         if not bool(valid_TN.any()):
             raise ValueError("the rollout has no valid transition: no valid reward or step; see the reward's reason")
         unknown = rollout.valid_TN & ~(np.isfinite(rollout.logprobs_TN) & np.isfinite(rollout.values_TN))
@@ -207,20 +211,20 @@ class PpoLearner:
             )
         flat = (steps * num_envs, -1)
         features = self.policy.features(rollout.images_TN.reshape(-1, *rollout.images_TN.shape[2:]))
-        states = torch.from_numpy(rollout.states_TN).reshape(flat)
+        states = self._tensor(rollout.states_TN).reshape(flat)
         next_values = self._next_values(rollout)
-        rewards = torch.from_numpy(np.where(rollout.valid_TN, rollout.rewards_TN, 0.0).astype(np.float32))
-        values = torch.from_numpy(rollout.values_TN)
+        rewards = self._tensor(np.where(rollout.valid_TN, rollout.rewards_TN, 0.0).astype(np.float32))
+        values = self._tensor(rollout.values_TN)
         advantages, returns = gae(
-            rewards, values, next_values, torch.from_numpy(rollout.terminated_TN),
-            torch.from_numpy(rollout.truncated_TN), valid_TN, gamma=self.config.gamma, lambda_=self.config.gae_lambda,
+            rewards, values, next_values, self._tensor(rollout.terminated_TN),
+            self._tensor(rollout.truncated_TN), valid_TN, gamma=self.config.gamma, lambda_=self.config.gae_lambda,
         )
         advantages = masked_normalise(advantages, valid_TN)
         chosen = valid_TN.reshape(-1)
         return _Samples(
             features=features[chosen], states=states[chosen],
-            actions=torch.from_numpy(rollout.actions_TN).reshape(flat)[chosen],
-            logprobs=torch.from_numpy(rollout.logprobs_TN).reshape(-1)[chosen], values=values.reshape(-1)[chosen],
+            actions=self._tensor(rollout.actions_TN).reshape(flat)[chosen],
+            logprobs=self._tensor(rollout.logprobs_TN).reshape(-1)[chosen], values=values.reshape(-1)[chosen],
             advantages=advantages.reshape(-1)[chosen], returns=returns.reshape(-1)[chosen],
         )
 
@@ -233,9 +237,13 @@ class PpoLearner:
             rollout.valid_TN & ~rollout.terminated_TN
             & (rollout.truncated_TN | (np.arange(steps)[:, None] == steps - 1))
         )
-        values = torch.from_numpy(np.where(rollout.valid_TN, following, 0.0).astype(np.float32))
+        values = self._tensor(np.where(rollout.valid_TN, following, 0.0).astype(np.float32))
         if needed.any():
             features = self.policy.features(rollout.next_images_TN[needed])
-            states = torch.from_numpy(rollout.next_states_TN[needed])
-            values[torch.from_numpy(needed)] = self.policy.value(features, states)
+            states = self._tensor(rollout.next_states_TN[needed])
+            values[self._tensor(needed)] = self.policy.value(features, states)
         return values
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        """The array on the policy's device."""
+        return torch.from_numpy(array).to(self.policy.device)

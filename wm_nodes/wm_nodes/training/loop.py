@@ -118,7 +118,8 @@ class TrainingLoop:
                 f"{path} belongs to another architecture or configuration; give a fresh run folder, or delete the file "
                 f"to start over ({error})"
             ) from None
-        self.averaged = {key: value.clone() for key, value in checkpoint.section(tensors, "averaged.").items()}
+        averaged = checkpoint.section(tensors, "averaged.")
+        self.averaged = {key: value.to(self.averaged[key].device, copy=True) for key, value in averaged.items()}
         checkpoint.restore_optimizer(self.optimizer, checkpoint.section(tensors, "optimizer."))
         self.iteration = int(metadata["iteration"])
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import nn
@@ -99,8 +100,8 @@ def save_refreshed_folder(folder: Path, source: Path, action: ActionModel, story
     return write_model_folder(folder, {FILES[key]: data for key, data in packed.items()}, manifest)
 
 
-def load_model_folder(folder: Path) -> WorldModels:
-    """Load and verify a model folder; weights come back as float32, in evaluation mode, without gradients.
+def load_model_folder(folder: Path, device: torch.device | str = "cpu") -> WorldModels:
+    """Load and verify a model folder; weights come back as float32 on `device`, in evaluation mode, without gradients.
 
     Raises:
         ModelFolderError: names the file, what is wrong, and the remedy.
@@ -124,6 +125,9 @@ def load_model_folder(folder: Path) -> WorldModels:
         probe = PositionProbe(manifest["height"], manifest["width"])
         _load(folder, "probe", probe, manifest)
     simulation = SimulationConfig.model_validate(manifest["simulation"])
+    for module in (tokenizer, action, text, probe):
+        if module is not None:
+            module.to(device)
     return WorldModels(tokenizer, action, text, tuple(manifest["tasks"]), simulation, manifest, probe)
 
 

@@ -6,9 +6,11 @@ Shapes: N environments, M starts, S tokens, D values per token, A action, P stat
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -96,10 +98,11 @@ class ImaginedEnvironment:
         chosen = self._starts[mask]
         self._shown[mask] = self._images[chosen]
         self._states[mask] = self._start_states[chosen]
-        self._latents[torch.from_numpy(mask)] = self._start_latents[torch.from_numpy(chosen)]
+        begins, first = self._tensor(mask), self._start_latents[self._tensor(self._starts)]
+        self._latents = torch.where(begins[:, None, None], first, self._latents)
         for rows, caches in self._parts:
             for cache in caches:
-                cache.restart(torch.from_numpy(mask[rows]))
+                cache.restart(begins[rows])
         self._steps[mask] = 0
         self._ended[mask] = False
         return self.current()
@@ -145,8 +148,8 @@ class ImaginedEnvironment:
     ) -> tuple[UInt8Array, FloatArray, FloatArray]:
         """Take the step where `valid`; return frames (N, H, W, 3), done signal (N,) and disagreement (N,)."""
         tokenizer, model = self._models.tokenizer, self._models.action
-        acted, before, after = (torch.from_numpy(array) for array in (actions, self._states, moved))
-        keep = torch.from_numpy(valid)[:, None, None]
+        acted, before, after = (self._tensor(array) for array in (actions, self._states, moved))
+        keep = self._tensor(valid)[:, None, None]
 
         def part(item: CachedPart) -> tuple[Tensor, Tensor, Tensor]:
             rows, caches = item
@@ -161,7 +164,12 @@ class ImaginedEnvironment:
             raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
         self._latents = latents
         signal, spread = done_signal(logits)
-        return frames.numpy(), signal[:, self._task].numpy(), spread[:, self._task].numpy()
+        told = torch.stack((signal[:, self._task], spread[:, self._task])).cpu()
+        return frames.cpu().numpy(), told[0].numpy(), told[1].numpy()
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        """The array on the models' device."""
+        return torch.from_numpy(array).to(self._models.tokenizer.device)
 
     def _imagine_goals(self) -> tuple[UInt8Array, BoolArray]:
         """Goal frame and found flag of every start: one per (first frame, instruction), so computed once."""

@@ -97,9 +97,9 @@ def imagine_goals(
         with compute_context(current.device):
             prediction = model(current, instruction, caches)
         current = tokenizer.normalise(current + prediction.change_BTSD)
-        frames.append(tokenizer.decode(current[:, 0]).numpy())
+        frames.append(tokenizer.decode(current[:, 0]).cpu().numpy())
         signals.append(done_signal(prediction.done_logits_BTKJ[:, 0])[0][:, task])
-    signal_BT = torch.stack(signals, 1).numpy()
+    signal_BT = torch.stack(signals, 1).cpu().numpy()
     crossed = signal_BT > threshold
     found = crossed.any(1)
     first = np.where(found, crossed.argmax(1), signal_BT.argmax(1))

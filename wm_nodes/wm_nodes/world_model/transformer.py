@@ -20,7 +20,7 @@ class TemporalCache:
         """Add T frames; return the keys, values (B, K, S, H, E) and the mask (B or 1, T, K), True where visible."""
         raise NotImplementedError
 
-    def rotation(self, num_frames: int) -> Tensor:
+    def rotation(self, num_frames: int, device: torch.device) -> Tensor:
         """Time index (B or 1, T) of the next `num_frames` frames, for the rotary embedding."""
         raise NotImplementedError
 
@@ -31,8 +31,8 @@ class GrowingCache(TemporalCache):
     def __init__(self, window: int) -> None:
         self._window, self._keys, self._values, self._time = window, list[Tensor](), list[Tensor](), 0
 
-    def rotation(self, num_frames: int) -> Tensor:
-        return torch.arange(self._time, self._time + num_frames).unsqueeze(0)
+    def rotation(self, num_frames: int, device: torch.device) -> Tensor:
+        return torch.arange(self._time, self._time + num_frames, device=device).unsqueeze(0)
 
     def extend(self, keys_BTSHE: Tensor, values_BTSHE: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         num_new = keys_BTSHE.shape[1]
@@ -41,10 +41,10 @@ class GrowingCache(TemporalCache):
         self._time += num_new
         keys, values = torch.cat(self._keys, 1), torch.cat(self._values, 1)
         first = max(0, self._time - num_new - self._window + 1)
-        queries = torch.arange(self._time - num_new, self._time).unsqueeze(1)
-        past = torch.arange(first, self._time).unsqueeze(0)
+        queries = torch.arange(self._time - num_new, self._time, device=keys.device).unsqueeze(1)
+        past = torch.arange(first, self._time, device=keys.device).unsqueeze(0)
         mask = (past <= queries) & (past > queries - self._window)
-        return keys[:, first:], values[:, first:], mask.unsqueeze(0).to(keys.device)
+        return keys[:, first:], values[:, first:], mask.unsqueeze(0)
 
 
 class RingCache(TemporalCache):
@@ -52,8 +52,9 @@ class RingCache(TemporalCache):
 
     A frame is kept in slot (its time mod window). Attention runs over the slots that any environment has filled; those
     that one has not filled yet weigh exactly 0 and come after its own, so that its numbers do not depend on when the
-    others were reset. While `peeking`, a frame is seen but its slot is written again by the next one: for trying drafts
-    of a frame before the final one.
+    others were reset. On a GPU it runs over all slots and times change in place, without a question to the device, so
+    that a step can be captured as one graph. While `peeking`, a frame is seen but its slot is written again by the next
+    one: for trying drafts of a frame before the final one.
     """
 
     def __init__(self, window: int) -> None:
@@ -62,20 +63,25 @@ class RingCache(TemporalCache):
         self._keys: Tensor | None = None
         self._values: Tensor | None = None
         self._num_filled = 0
+        self._fixed = False
         self.times_B: Tensor | None = None
 
     def start(self, batch: int, device: torch.device) -> None:
         self.times_B = torch.zeros(batch, dtype=torch.long, device=device)
         self._num_filled = 0
+        self._fixed = device.type != "cpu"
 
     def restart(self, mask_B: Tensor) -> None:
         """Forget the history of the environments in `mask_B`."""
         if self.times_B is None:
             raise RuntimeError("start the cache before restarting parts of it")
+        if self._fixed:
+            self.times_B.masked_fill_(mask_B, 0)
+            return
         self.times_B = torch.where(mask_B, 0, self.times_B)
         self._num_filled = min(self._window, int(self.times_B.max()))
 
-    def rotation(self, num_frames: int) -> Tensor:
+    def rotation(self, num_frames: int, device: torch.device) -> Tensor:
         if num_frames != 1 or self.times_B is None:
             raise ValueError(f"a RingCache takes one frame at a time after start(), got {num_frames} frames")
         return self.times_B.unsqueeze(1)
@@ -90,9 +96,11 @@ class RingCache(TemporalCache):
         slots, rows = self.times_B % self._window, torch.arange(batch, device=keys_BTSHE.device)
         self._keys[rows, slots] = keys_BTSHE[:, 0]
         self._values[rows, slots] = values_BTSHE[:, 0]
-        visible = min(self._window, self._num_filled + 1)
+        visible = self._window if self._fixed else min(self._window, self._num_filled + 1)
         filled = torch.arange(visible, device=keys_BTSHE.device) <= self.times_B.unsqueeze(1)
-        if not self.peeking:
+        if not self.peeking and self._fixed:
+            self.times_B.add_(1)
+        elif not self.peeking:
             self.times_B = self.times_B + 1
             self._num_filled = visible
         return self._keys[:, :visible], self._values[:, :visible], filled.unsqueeze(1)
@@ -129,7 +137,7 @@ class TemporalAttention(Attention):
     def forward(self, x_BTSD: Tensor, cache: TemporalCache) -> Tensor:
         qkv = self.project(self.norm(x_BTSD)).unflatten(-1, (3, self.num_heads, -1))
         q_BTSHE, k_BTSHE, v_BTSHE = qkv.unbind(3)
-        cos, sin = _rotary_angles(cache.rotation(x_BTSD.shape[1]).to(x_BTSD.device), q_BTSHE.shape[-1])
+        cos, sin = _rotary_angles(cache.rotation(x_BTSD.shape[1], x_BTSD.device), q_BTSHE.shape[-1])
         q_BTSHE, k_BTSHE = _rotate(q_BTSHE, cos, sin), _rotate(k_BTSHE, cos, sin)
         keys, values, mask = cache.extend(k_BTSHE, v_BTSHE)
         if x_BTSD.shape[1] == 1:
@@ -217,7 +225,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tenso
 def _attend_one_frame(q_B1SHE: Tensor, keys_BKSHE: Tensor, values_BKSHE: Tensor, mask_B1K: Tensor) -> Tensor:
     """Attention of one frame over its past; products and sums, as matrices of one row are slow to multiply."""
     scores_BKSH = ((q_B1SHE * q_B1SHE.shape[-1] ** -0.5) * keys_BKSHE).sum(-1)
-    if not bool(mask_B1K.all()):
+    if mask_B1K.device.type != "cpu" or not bool(mask_B1K.all()):  # a GPU is not asked: the answer would be waited for
         scores_BKSH = scores_BKSH.masked_fill(~mask_B1K[:, 0, :, None, None], torch.finfo(scores_BKSH.dtype).min)
     mixed: Tensor = (scores_BKSH.softmax(1).unsqueeze(-1) * values_BKSHE).sum(1, keepdim=True)
     return mixed

@@ -92,7 +92,7 @@ class PolicyCamera:
         drawing, pictures = self.render(stage, states)
         if origin.scene != DRAWN:
             tokenizer = self.models.tokenizer
-            pictures[1:] = tokenizer.decode(tokenizer.encode(pictures[1:])).numpy()
+            pictures[1:] = tokenizer.decode(tokenizer.encode(pictures[1:])).cpu().numpy()
         return self._crop(drawing, pictures)
 
     def imagine(self, stage: ClipStage, states: SceneStates, episode: EpisodeStates) -> Drawing | None:

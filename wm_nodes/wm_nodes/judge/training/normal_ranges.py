@@ -69,7 +69,7 @@ def clip_rows(models: WorldModels, episodes: Iterator[Episode], stride: int) -> 
         frames = episode.images[: count * stride + 1 : stride]
         actions = episode.actions[: count * stride].reshape(count, -1)
         task = TaskSpec(episode.instruction, episode.task, "", frames[0], actions=actions)
-        for shown in (frames, models.tokenizer.decode(models.tokenizer.encode(frames)).numpy()):
+        for shown in (frames, models.tokenizer.decode(models.tokenizer.encode(frames)).cpu().numpy()):
             evidence = {**pixel_evidence(pictures_of(shown, frames[0])), **model_evidence(models, shown, task)}
             yield {name: evidence[name] for name in SIGNALS}, bool(episode.success[count * stride])
 

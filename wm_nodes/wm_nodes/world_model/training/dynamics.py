@@ -70,17 +70,18 @@ class RolloutTerms:
 
 
 def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEpisodes:
-    """Encode every frame once."""
+    """Encode every frame once; all but the images, a thousand times the rest, then lie on the tokenizer's device."""
+    device = tokenizer.device
     flat = episodes.images.reshape(-1, *episodes.images.shape[2:])
     pieces = [tokenizer.encode(flat[i : i + ENCODING_BATCH]).half() for i in range(0, len(flat), ENCODING_BATCH)]
     latents = torch.cat(pieces).clone().reshape(*episodes.images.shape[:2], *pieces[0].shape[1:])
     change = (latents[:, 1:].float() - latents[:, :1].float()).abs().mean(-1).mean((0, 1))
     return LatentEpisodes(
         images=torch.from_numpy(episodes.images), latents=latents, mean_change_S=change,
-        states=torch.from_numpy(episodes.states), actions=torch.from_numpy(episodes.actions),
-        success=torch.from_numpy(episodes.success),
-        truth=torch.from_numpy(probe_targets(episodes.ground_truth, episodes.tasks[0])),
-        step_mask=torch.from_numpy(episodes.step_mask),
+        states=torch.from_numpy(episodes.states).to(device), actions=torch.from_numpy(episodes.actions).to(device),
+        success=torch.from_numpy(episodes.success).to(device),
+        truth=torch.from_numpy(probe_targets(episodes.ground_truth, episodes.tasks[0])).to(device),
+        step_mask=torch.from_numpy(episodes.step_mask).to(device),
     )
 
 
@@ -100,12 +101,12 @@ def train_action_model(
         model = new_model(ActionModel, "action_model_init", tokenizer, data, settings, seed)
     tokenizer.requires_grad_(False)
     trained = model
-    heads = bootstrap_masks(len(data), settings.num_done_heads, seed)
+    heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
 
     def loss(iteration: int) -> dict[str, Tensor]:
         rows = numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
         steps = rollout_steps_at(iteration, settings.num_iterations, settings.rollout_steps)
-        index = torch.from_numpy(rows)
+        index = torch.from_numpy(rows).to(tokenizer.device)
         with compute_context(tokenizer.device):
             terms = unroll(trained, tokenizer, data, index, steps, torch_stream(seed, "action_model_noise", iteration))
             losses = rollout_losses(
@@ -134,7 +135,7 @@ def new_model(
     states = data.states.flatten(0, 1)
     model.condition.state_mean.copy_((states.amax(0) + states.amin(0)) / 2)
     model.condition.state_scale.copy_(((states.amax(0) - states.amin(0)) / 2).clamp_min(1e-3))
-    return model
+    return model.to(tokenizer.device)
 
 
 def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> int:
@@ -150,14 +151,16 @@ def unroll(
     real = data.latents[index].float()
     states, actions = data.states[index], data.actions[index]
     num_steps = actions.shape[1]
-    noisy = tokenizer.normalise(real[:, :-1] + INPUT_NOISE * torch.randn(real[:, :-1].shape, generator=generator))
+    noise = torch.randn(real[:, :-1].shape, generator=generator).to(real.device)
+    noisy = tokenizer.normalise(real[:, :-1] + INPUT_NOISE * noise)
     phase = torch.randint(0, rollout_steps, (len(index), 1), generator=generator)
     anchors = (torch.arange(num_steps) + phase) % rollout_steps == 0
     if rollout_steps >= num_steps:
         anchors = torch.zeros_like(anchors)
     anchors[:, 0] = True
+    one_pass, anchors = bool(anchors.all()), anchors.to(real.device)
     condition = model.condition(actions, states[:, :-1], states[:, 1:])
-    if bool(anchors.all()):
+    if one_pass:
         prediction = model.predict(noisy, condition)
         one_step = tokenizer.normalise(noisy + prediction.change_BTSD)
         return RolloutTerms(one_step, prediction.positions_BTQ, prediction.done_logits_BTKJ)
@@ -227,11 +230,12 @@ def decoded_losses(
     recoded_state: positions that the frozen probe reads after the round trip. Between encoder images, latents that
     predict well may still decode to a blur from which nobody can read positions.
     """
-    share = torch.rand(len(index), DECODED_FRAMES, generator=generator)
+    share = torch.rand(len(index), DECODED_FRAMES, generator=generator).to(index.device)
     steps = (share * data.step_mask[index].sum(1, keepdim=True)).long()
-    rows = torch.arange(len(index)).unsqueeze(1).expand_as(steps).flatten()
+    rows = torch.arange(len(index), device=index.device).unsqueeze(1).expand_as(steps).flatten()
     steps, episodes = steps.flatten(), index[rows]
-    wanted = tokenizer.to_pixels(data.images[episodes, steps + 1])
+    at = data.images.device
+    wanted = tokenizer.to_pixels(data.images[episodes.to(at), (steps + 1).to(at)])
     pixels_R3HW = tokenizer.decode_pixels(terms.next_latents[rows, steps])
     weight = foreground_weight(wanted, tokenizer.background, config.tokenizer.foreground_weight)
     recoded = tokenizer.bottleneck(tokenizer.features(pixels_R3HW.clamp(0, 1)))

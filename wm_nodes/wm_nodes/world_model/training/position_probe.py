@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import TrainingLoop
@@ -39,14 +40,16 @@ def train_position_probe(
         probe = PositionProbe(height, width)
     probe.mean.copy_(torch.from_numpy(truth[frames].mean(0)))
     probe.std.copy_(torch.from_numpy(truth[frames].std(0)).clamp_min(1e-4))
+    device = compute_device(config.device)
+    probe.to(device)
 
     def loss(iteration: int) -> dict[str, Tensor]:
         rows = numpy_stream(seed, "position_probe_batch", iteration).choice(frames, config.tokenizer.batch_size)
-        pixels = torch.from_numpy(images[rows]).permute(0, 3, 1, 2).float() / 255
+        pixels = torch.from_numpy(images[rows]).to(device).permute(0, 3, 1, 2).float() / 255
         half = len(rows) // 2
         pixels = torch.cat((pixels[:half], F.avg_pool2d(pixels[half:], 3, 1, 1, count_include_pad=False)))
-        noise = torch.randn(pixels.shape, generator=torch_stream(seed, "position_probe_noise", iteration))
-        wanted = (torch.from_numpy(truth[rows]) - probe.mean) / probe.std
+        noise = torch.randn(pixels.shape, generator=torch_stream(seed, "position_probe_noise", iteration)).to(device)
+        wanted = (torch.from_numpy(truth[rows]).to(device) - probe.mean) / probe.std
         read = probe(pixels + PIXEL_NOISE * noise)
         return {
             "loss": F.huber_loss(read, wanted, delta=HUBER_DELTA),

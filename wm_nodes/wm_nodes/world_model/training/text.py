@@ -44,6 +44,7 @@ def train_text_model(
         )
     shared = {name: t for name, t in action_model.state_dict().items() if not name.startswith("condition.")}
     model.load_state_dict(shared, strict=False)
+    model.to(tokenizer.device)
     tokenizer.requires_grad_(False)
     by_task = [rows[rows[:, 1] == task] for task in range(len(instructions))]
     tasks = [task for task, its_rows in enumerate(by_task) if len(its_rows)]
@@ -52,9 +53,9 @@ def train_text_model(
         stream = numpy_stream(seed, "text_batch", iteration)
         task = tasks[iteration % len(tasks)]
         chosen = by_task[task][stream.integers(0, len(by_task[task]), settings.batch_size)]
-        index, length = torch.from_numpy(chosen[:, 0]), torch.from_numpy(chosen[:, 2])
-        steps = int(length.max())
-        mask = (torch.arange(steps) < length[:, None]).float()
+        steps = int(chosen[:, 2].max())
+        index, length = (torch.from_numpy(chosen[:, i].copy()).to(tokenizer.device) for i in (0, 2))
+        mask = (torch.arange(steps, device=length.device) < length[:, None]).float()
         caches = model.trunk.new_caches()
 
         def predict(t: int, latents: Tensor) -> Prediction:
@@ -62,7 +63,7 @@ def train_text_model(
 
         with compute_context(tokenizer.device):
             terms = roll_out(predict, tokenizer, data.latents[index][:, :1].float(), steps)
-        all_heads = torch.ones(len(index), settings.num_done_heads)
+        all_heads = torch.ones(len(index), settings.num_done_heads, device=length.device)
         return rollout_losses(terms, tokenizer, data, index, mask, all_heads, settings)
 
     loop = TrainingLoop("text_model", model, settings.text_num_iterations, settings.learning_rate / 2, run_dir)

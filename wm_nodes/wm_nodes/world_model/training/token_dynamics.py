@@ -28,11 +28,11 @@ def train_token_model(
     """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics."""
     settings = config.world_model
     model = new_model(TokenActionModel, "token_model_init", tokenizer, data, settings, seed)
-    heads = bootstrap_masks(len(data), settings.num_done_heads, seed)
+    heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
 
     def loss(iteration: int) -> dict[str, Tensor]:
         rows = numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
-        index = torch.from_numpy(rows)
+        index = torch.from_numpy(rows).to(tokenizer.device)
         generator = torch_stream(seed, "action_model_mask", iteration)
         with compute_context(tokenizer.device):
             return token_losses(model, data, index, heads[index], generator, settings.done_weight)
@@ -48,7 +48,7 @@ def token_losses(
     """Losses of whole episodes with a random part of every next frame masked."""
     bits = data.latents[index].float()
     given, wanted = corrupt(bits[:, :-1], generator), bits[:, 1:]
-    decided = ~mask_tokens(tuple(wanted.shape[:3]), generator)
+    decided = ~mask_tokens(tuple(wanted.shape[:3]), generator).to(wanted.device)
     states = data.states[index]
     condition = model.condition(data.actions[index], states[:, :-1], states[:, 1:])
     prediction = model(given, wanted, decided, condition)
@@ -83,4 +83,4 @@ def corrupt(bits_BTSD: Tensor, generator: torch.Generator) -> Tensor:
     share = share * torch.rand(len(bits_BTSD), 1, 1, generator=generator)
     replaced = torch.rand(bits_BTSD.shape[:3], generator=generator) < share
     random = torch.where(torch.rand(bits_BTSD.shape, generator=generator) < 0.5, 1.0, -1.0)
-    return torch.where(replaced.unsqueeze(-1), random, bits_BTSD)
+    return torch.where(replaced.unsqueeze(-1).to(bits_BTSD.device), random.to(bits_BTSD.device), bits_BTSD)

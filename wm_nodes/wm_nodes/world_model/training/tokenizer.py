@@ -9,6 +9,7 @@ from torch.nn import functional as F
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
@@ -42,6 +43,7 @@ def train_tokenizer(
     with initial_weights(seed, "tokenizer_init"):
         codec = Tokenizer(settings, height, width)
     _set_statistics(codec, images[frames], truth[frames], seed)
+    codec.to(compute_device(config.device))
 
     def loss(iteration: int) -> dict[str, Tensor]:
         rows = numpy_stream(seed, "tokenizer_batch", iteration).choice(frames, settings.batch_size)

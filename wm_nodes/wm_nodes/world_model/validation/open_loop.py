@@ -69,8 +69,8 @@ def imagine(
     Args:
         images: uint8 (E, H, W, 3), first frames. actions: (E, T, A). states: (E, T + 1, S), commanded.
     """
-    actions_ETA, states_ETS = torch.from_numpy(actions), torch.from_numpy(states)
     current = tokenizer.encode(images)
+    actions_ETA, states_ETS = (torch.from_numpy(array).to(current.device) for array in (actions, states))
     caches = model.trunk.new_ring_caches(len(images), current.device)
     frames, signals, spreads = list[Tensor](), list[Tensor](), list[Tensor]()
     for t in range(actions.shape[1]):
@@ -82,7 +82,7 @@ def imagine(
         frames.append(tokenizer.decode(current))
         signals.append(signal)
         spreads.append(spread)
-    return ImaginedEpisodes(*(torch.stack(steps, 1).numpy() for steps in (frames, signals, spreads)))
+    return ImaginedEpisodes(*(torch.stack(steps, 1).cpu().numpy() for steps in (frames, signals, spreads)))
 
 
 def evaluate_rollouts(
@@ -165,7 +165,7 @@ def _picture_metrics(
     wanted = episodes.images[rows, horizon]
     shown = {
         "rollout": imagined.frames[rows, horizon - 1],
-        "recon": tokenizer.decode(tokenizer.encode(wanted)).numpy(),
+        "recon": tokenizer.decode(tokenizer.encode(wanted)).cpu().numpy(),
         "copy": episodes.images[rows, 0],
     }
     return {f"psnr_{key}_db_{label}": psnr(value, wanted) for key, value in shown.items()}
@@ -181,7 +181,7 @@ def _read_frames(tokenizer: Tokenizer, images_ETHW3: UInt8Array) -> FloatArray:
     flat = images_ETHW3.reshape(-1, *images_ETHW3.shape[2:])
     with torch.inference_mode():
         parts = [tokenizer.read_state(tokenizer.encode(flat[i : i + 256])) for i in range(0, len(flat), 256)]
-    positions: FloatArray = torch.cat(parts).numpy().reshape(*images_ETHW3.shape[:2], -1)
+    positions: FloatArray = torch.cat(parts).cpu().numpy().reshape(*images_ETHW3.shape[:2], -1)
     return positions
 
 
