@@ -81,6 +81,7 @@ def test_every_experiment_explains_itself(suite: str, capsys: pytest.CaptureFixt
         (["rescore", "nothing-here"], "nothing-here holds no config.yaml; name the run folder"),
         (["train-policy", "--set", "ppo.updates=many"], "ppo.updates"),
         (["train-policy", "--preset", "nosuch"], "nosuch"),
+        (["train-policy", "--preset", "gpu", "--device", "cpu"], "image_size = 64, the configuration says 128"),
         (["train-video-model", "--set", "width"], "section.key=value"),
     ],
 )

@@ -18,7 +18,7 @@ from wm_nodes.apps.policy_pictures import write_pictures
 from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, start_graph, success_rate
 from wm_nodes.apps.run_options import open_run
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
-from wm_nodes.config.schema import AGENT, RunConfig
+from wm_nodes.config.schema import AGENT, RunConfig, SimulationConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import task_names
 from wm_nodes.core.device import compute_device
@@ -29,7 +29,7 @@ from wm_nodes.core.types import BoolArray
 from wm_nodes.environments.record import HELDOUT_SEEDS, acceptance_plan, collect_plan
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
-from wm_nodes.policy_rl.factories import load_policy
+from wm_nodes.policy_rl.factories import check_scene, load_policy
 from wm_nodes.policy_rl.initial_policy import prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import load_arrays, make_model
 from wm_nodes.reports.html import write_report
@@ -37,6 +37,7 @@ from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import Summary, write_summary
 from wm_nodes.reports.tables import results_table, rounds_table
 from wm_nodes.world_model import load_model_folder
+from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
 ENDOGENOUS = "endogenous"
@@ -138,6 +139,10 @@ def _load(arguments: argparse.Namespace, file: str, changes: dict[str, Any]) -> 
 def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
     if arguments.model_dir and not Path(arguments.model_dir, MANIFEST).is_file():
         raise ConfigError(f"{arguments.model_dir} holds no {MANIFEST}; name the folder of a trained world model")
+    if not arguments.from_scratch:
+        model_dir = Path(arguments.model_dir or shipped_model(config.task))
+        made_in = SimulationConfig.model_validate(read_world_manifest(model_dir)["simulation"])
+        check_scene(config, model_dir, made_in)
     judge = options.judge_settings(arguments)
     if judge and arguments.reward != AGENT:
         raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.schema import RunConfig, SimulationConfig
 from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import simulation_spec
@@ -96,13 +96,7 @@ def make_imagined_environment(
         ValueError: the folder was trained for another scene than the configuration describes.
     """
     models = models_of(Path(model_dir), config.device)
-    for name in ("cameras", "image_size", "control_hz", "max_action_m", "workspace_low_m", "workspace_high_m"):
-        wanted, trained = getattr(config.simulation, name), getattr(models.simulation, name)
-        if wanted != trained:
-            raise ValueError(
-                f"{model_dir} was trained with simulation.{name} = {trained}, the configuration says {wanted}; change "
-                "the configuration or train another model"
-            )
+    check_scene(config, model_dir, models.simulation)
     spec = simulation_spec(config.task, config.simulation, num_envs)
     environment = ImaginedEnvironment(
         models, spec, load_starts(Path(starts_file)), config.reward, num_envs=num_envs, seed=seed,
@@ -110,6 +104,17 @@ def make_imagined_environment(
     )
     environment.cameras = table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
     return environment
+
+
+def check_scene(config: RunConfig, model_dir: Path, simulation: SimulationConfig) -> None:
+    """Raise ValueError unless the model of `model_dir`, made in `simulation`, knows the configuration's scene."""
+    for name in ("cameras", "image_size", "control_hz", "max_action_m", "workspace_low_m", "workspace_high_m"):
+        wanted, trained = getattr(config.simulation, name), getattr(simulation, name)
+        if wanted != trained:
+            raise ValueError(
+                f"{model_dir} was trained with simulation.{name} = {trained}, the configuration says {wanted}; change "
+                "the configuration, or train another model (--from-scratch)"
+            )
 
 
 def policy_actor(

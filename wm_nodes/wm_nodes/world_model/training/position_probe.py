@@ -11,6 +11,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.training.tokenizer import probe_targets
@@ -43,17 +44,24 @@ def train_position_probe(
     device = compute_device(config.device)
     probe.to(device)
 
-    def loss(iteration: int) -> dict[str, Tensor]:
+    def read(iteration: int) -> tuple[Tensor, Tensor, Tensor]:
         rows = numpy_stream(seed, "position_probe_batch", iteration).choice(frames, config.tokenizer.batch_size)
-        pixels = torch.from_numpy(images[rows]).to(device).permute(0, 3, 1, 2).float() / 255
-        half = len(rows) // 2
+        generator = torch_stream(seed, "position_probe_noise", iteration)
+        noise = torch.randn((len(rows), 3, height, width), generator=generator)
+        return torch.from_numpy(images[rows]), torch.from_numpy(truth[rows]), noise
+
+    batches = BackgroundBatches(read, device)
+
+    def loss(iteration: int) -> dict[str, Tensor]:
+        shown, positions, noise = batches(iteration)
+        pixels = shown.permute(0, 3, 1, 2).float() / 255
+        half = len(shown) // 2
         pixels = torch.cat((pixels[:half], F.avg_pool2d(pixels[half:], 3, 1, 1, count_include_pad=False)))
-        noise = torch.randn(pixels.shape, generator=torch_stream(seed, "position_probe_noise", iteration)).to(device)
-        wanted = (torch.from_numpy(truth[rows]).to(device) - probe.mean) / probe.std
-        read = probe(pixels + PIXEL_NOISE * noise)
+        wanted = (positions - probe.mean) / probe.std
+        found = probe(pixels + PIXEL_NOISE * noise)
         return {
-            "loss": F.huber_loss(read, wanted, delta=HUBER_DELTA),
-            "error_m": ((read.detach() - wanted) * probe.std).abs().mean(),
+            "loss": F.huber_loss(found, wanted, delta=HUBER_DELTA),
+            "error_m": ((found.detach() - wanted) * probe.std).abs().mean(),
         }
 
     loop = TrainingLoop("position_probe", probe, config.tokenizer.num_iterations, LEARNING_RATE, run_dir)

@@ -13,6 +13,7 @@ from wm_nodes.core.device import compute_device
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.quantizer import entropy_loss
@@ -45,21 +46,27 @@ def train_tokenizer(
     _set_statistics(codec, images[frames], truth[frames], seed)
     codec.to(compute_device(config.device))
 
-    def loss(iteration: int) -> dict[str, Tensor]:
+    def read(iteration: int) -> tuple[Tensor, Tensor, Tensor]:
         rows = numpy_stream(seed, "tokenizer_batch", iteration).choice(frames, settings.batch_size)
-        pixels = codec.to_pixels(images[rows])
         generator = torch_stream(seed, "latent_noise", iteration)
         noise = torch.randn((len(rows), codec.num_tokens, codec.latent_dim), generator=generator)
+        return torch.from_numpy(images[rows]), torch.from_numpy(truth[rows]), noise
+
+    batches = BackgroundBatches(read, codec.device)
+
+    def loss(iteration: int) -> dict[str, Tensor]:
+        shown, positions, noise = batches(iteration)
+        pixels = codec.to_pixels(shown)
         with compute_context(codec.device):
             features = codec.features(pixels)
             latents = codec.bottleneck(features)
-            noisy = latents + LATENT_NOISE * noise.to(latents.device) if codec.kind == "continuous" else latents
+            noisy = latents + LATENT_NOISE * noise if codec.kind == "continuous" else latents
             reconstruction = codec.decode_pixels(noisy)
             probed = codec.read_state_normalised(noisy)
         error = reconstruction - pixels
         weight = foreground_weight(pixels, codec.background, settings.foreground_weight)
         terms = {"pixel": (weight * (error.abs() + 2 * error.square())).mean() / weight.mean()}
-        terms["probe"] = probe_loss(codec, probed, torch.from_numpy(truth[rows]).to(codec.device))
+        terms["probe"] = probe_loss(codec, probed, positions)
         terms["loss"] = terms["pixel"] + PROBE_WEIGHT * terms["probe"]
         if codec.kind == "lfq":
             terms["entropy"] = entropy_loss(features)
