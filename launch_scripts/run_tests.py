@@ -4,6 +4,7 @@ with a browser, which only the tests of pages need.
 python3 launch_scripts/run_tests.py            # everything
 python3 launch_scripts/run_tests.py --fast     # without the tests marked slow
 python3 launch_scripts/run_tests.py tests/unit -k setup    # other arguments go to pytest; the checks still run
+python3 launch_scripts/run_tests.py --device cuda          # only the tests of a CUDA device, on the GPU that is here
 
 Tests run two at a time, those with deadlines after the others. A test of a graph that fails so is run once more by
 itself, which the output says: deadlines are promised where nothing else keeps the machine busy.
@@ -32,6 +33,8 @@ def main(argv):
     """Run the checks, then pytest, whose closing lines come last. Return 0 if all passed."""
     fast = ["not slow"] if "--fast" in argv else []
     named = [text for text in argv if text != "--fast"]
+    if any(text.split("=")[0] == "--device" for text in named):
+        return _pytest(["-m", " and ".join(["device", *fast]), *named])
     scripts = Path(sys.prefix) / "bin"
     checks = {
         "ruff": [str(scripts / "ruff"), "check", "."],

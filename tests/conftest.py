@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from graph.shm_maps import mapped, processes
 from judge_server import PickyServer, serving
+from pretended_device import Device, on_device
 
 from wm_nodes.launching.domain_lock import DomainLock, first_free
 from wm_nodes.launching.environment import graph_environment
@@ -29,6 +30,17 @@ def server() -> Iterator[PickyServer]:
         yield server
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", choices=("pretended", "cuda"), default="pretended", help="what `device` yields")
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest) -> Iterator[Device]:
+    """A CUDA device: pretended, with counts, or the real one where pytest was given --device cuda."""
+    with on_device(request.config.getoption("--device")) as device:
+        yield device
+
+
 def pytest_configure() -> None:
     """Whatever a test starts without asking for a domain still meets nobody else's nodes."""
     global _session_lock
@@ -38,9 +50,12 @@ def pytest_configure() -> None:
     os.environ.update({name: environment[name] for name in ("AMENT_PREFIX_PATH", "PATH")})
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """run_tests.py looks for tests marked alone in tests/graph only, so that it need not import all others twice."""
+    """Mark what uses a device. run_tests.py looks for tests marked alone in tests/graph only, to import none twice."""
     for item in items:
+        if "device" in getattr(item, "fixturenames", ()):
+            item.add_marker("device")
         if item.get_closest_marker("alone") and "graph" not in item.path.parts:
             raise pytest.UsageError(f"{item.nodeid} is marked alone; run_tests.py looks for such tests in tests/graph")
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import run_tests
+import torch
 
 from setup import entry, interpreter, messages, packages, stamp
 from setup.console import SetupError, isolated_environment, run
@@ -204,6 +205,16 @@ def test_one():
     assert run_tests.repeated() == 1
     first(unit)
     assert run_tests.repeated() == 1 and (tmp_path / "test_unit").read_text() == "."
+
+
+def test_the_tests_of_a_device_can_be_run_on_a_gpu_and_say_that_there_is_none(
+    capfd: pytest.CaptureFixture[str]
+) -> None:
+    some = "tests/unit/core/test_pretended_device.py"
+    assert run_tests.main(["--device", "cuda", "-p", "no:cacheprovider", some]) == 0
+    out = capfd.readouterr().out
+    assert re.search(r"1 passed, \d+ deselected" if torch.cuda.is_available() else r"1 skipped, \d+ deselected", out)
+    assert torch.cuda.is_available() or re.search(r"SKIPPED .*no GPU: torch \S+ sees none, and --device cuda asks", out)
 
 
 def test_sourced_ros_and_other_environments_do_not_leak_into_ours(
