@@ -4,14 +4,17 @@ import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from graph.shm_maps import mapped, processes
 from judge_server import PickyServer, serving
-from pretended_device import Device, on_device
 
 from wm_nodes.launching.domain_lock import DomainLock, first_free
 from wm_nodes.launching.environment import graph_environment
+
+if TYPE_CHECKING:
+    from pretended_device import Device
 
 ROOT = Path(__file__).resolve().parents[1]
 DOMAINS = range(91, 102)
@@ -35,8 +38,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 @pytest.fixture
-def device(request: pytest.FixtureRequest) -> Iterator[Device]:
+def device(request: pytest.FixtureRequest) -> Iterator["Device"]:
     """A CUDA device: pretended, with counts, or the real one where pytest was given --device cuda."""
+    from pretended_device import on_device  # torch takes a second, and graphs' tests have no use for it
+
     with on_device(request.config.getoption("--device")) as device:
         yield device
 
