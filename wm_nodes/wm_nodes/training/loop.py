@@ -90,14 +90,16 @@ class TrainingLoop:
         self.optimizer.step()
         self.optimizer.zero_grad()
         self.iteration += 1
-        decay = min(EMA_DECAY, (1 + self.iteration) / (10 + self.iteration))
-        with torch.no_grad():
-            for key, tensor in self.model.state_dict().items():
-                if tensor.is_floating_point():
-                    self.averaged[key].lerp_(tensor, 1 - decay)
-                else:
-                    self.averaged[key].copy_(tensor)
+        self._average(min(EMA_DECAY, (1 + self.iteration) / (10 + self.iteration)))
         return {key: value.detach() for key, value in terms.items()} | {"grad_norm": norm.detach()}
+
+    @torch.no_grad()
+    def _average(self, decay: float) -> None:
+        tensors = self.model.state_dict()
+        floats = [key for key, tensor in tensors.items() if tensor.is_floating_point()]
+        torch._foreach_lerp_([self.averaged[key] for key in floats], [tensors[key] for key in floats], 1 - decay)
+        for key in tensors.keys() - set(floats):
+            self.averaged[key].copy_(tensors[key])
 
     def save(self) -> None:
         """Write model, average, optimiser and iteration, atomically; nothing without a run_dir."""

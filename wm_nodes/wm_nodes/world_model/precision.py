@@ -13,9 +13,12 @@ def cpu_has_fast_bfloat16() -> bool:
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 
+def has_fast_bfloat16(device: torch.device) -> bool:
+    return torch.cuda.is_bf16_supported() if device.type == "cuda" else cpu_has_fast_bfloat16()
+
+
 def compute_context(device: torch.device, *, exact: bool = False) -> AbstractContextManager[Any]:
     """Autocast to bfloat16 where the device is fast at it; float32 everywhere else, and always if `exact`."""
-    fast = torch.cuda.is_bf16_supported() if device.type == "cuda" else cpu_has_fast_bfloat16()
-    if exact or not fast:
+    if exact or not has_fast_bfloat16(device):
         return nullcontext()
     return torch.autocast(device.type, dtype=torch.bfloat16)

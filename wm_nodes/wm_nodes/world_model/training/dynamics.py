@@ -18,11 +18,13 @@ from torch.nn import functional as F
 from wm_nodes.config.schema import RunConfig, WorldModelConfig
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
 from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
-from wm_nodes.world_model.dynamics import ActionModel, Prediction
-from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.dynamics import ActionModel, FrameModel, Prediction
+from wm_nodes.world_model.precision import compute_context, has_fast_bfloat16
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.training.device_rollout import roll_out_on_device
 from wm_nodes.world_model.training.tokenizer import foreground_weight, probe_loss, probe_targets
 
 M = TypeVar("M", ActionModel, TokenActionModel)
@@ -102,19 +104,31 @@ def train_action_model(
     tokenizer.requires_grad_(False)
     trained = model
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
+    lengths = data.step_mask.sum(1).cpu()
+
+    def steps_at(iteration: int) -> int:
+        return rollout_steps_at(iteration, settings.num_iterations, settings.rollout_steps)
+
+    def read(iteration: int) -> tuple[Tensor, ...]:
+        rows = numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
+        index = torch.from_numpy(rows)
+        batch = index, *starts(data, len(rows), steps_at(iteration), torch_stream(seed, "action_model_noise", iteration))
+        if not settings.decoded_weight:
+            return batch
+        return *batch, *shown_frames(data, index, lengths, torch_stream(seed, "action_model_decoded", iteration))
+
+    batches = BackgroundBatches(read, tokenizer.device)
 
     def loss(iteration: int) -> dict[str, Tensor]:
-        rows = numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
-        steps = rollout_steps_at(iteration, settings.num_iterations, settings.rollout_steps)
-        index = torch.from_numpy(rows).to(tokenizer.device)
+        steps = steps_at(iteration)
+        index, noise, anchors, *shown = batches(iteration)
         with compute_context(tokenizer.device):
-            terms = unroll(trained, tokenizer, data, index, steps, torch_stream(seed, "action_model_noise", iteration))
+            terms = unroll(trained, tokenizer, data, index, noise, anchors, one_pass=min(steps, anchors.shape[1]) == 1)
             losses = rollout_losses(
                 terms, tokenizer, data, index, data.step_mask[index].float(), heads[index], settings, done_loss
             )
             if settings.decoded_weight:
-                generator = torch_stream(seed, "action_model_decoded", iteration)
-                losses |= decoded_losses(terms, tokenizer, data, index, config, generator)
+                losses |= decoded_losses(terms, tokenizer, data, index, *shown, config)
                 decoded = losses["pixel"] + losses["recoded"] + losses["recoded_state"]
                 losses["loss"] = losses["loss"] + settings.decoded_weight * decoded
             return losses | {"rollout_steps": torch.tensor(float(steps))}
@@ -143,27 +157,36 @@ def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> 
     return stages[min(len(stages) - 1, iteration * len(stages) // max(1, num_iterations))]
 
 
-def unroll(
-    model: ActionModel, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, rollout_steps: int,
-    generator: torch.Generator,
-) -> RolloutTerms:
-    """Roll the model out over whole episodes `index`, on its own predictions between real frames."""
-    real = data.latents[index].float()
-    states, actions = data.states[index], data.actions[index]
-    num_steps = actions.shape[1]
-    noise = torch.randn(real[:, :-1].shape, generator=generator).to(real.device)
-    noisy = tokenizer.normalise(real[:, :-1] + INPUT_NOISE * noise)
-    phase = torch.randint(0, rollout_steps, (len(index), 1), generator=generator)
-    anchors = (torch.arange(num_steps) + phase) % rollout_steps == 0
-    if rollout_steps >= num_steps:
+def starts(
+    data: LatentEpisodes, batch: int, rollout_steps: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Noise (B, T, S, D) on real input frames, and anchors (B, T), True where the model goes on from a real frame."""
+    episodes, frames, tokens, values = data.latents.shape
+    noise = torch.randn((batch, frames - 1, tokens, values), generator=generator)
+    phase = torch.randint(0, rollout_steps, (batch, 1), generator=generator)
+    anchors = (torch.arange(frames - 1) + phase) % rollout_steps == 0
+    if rollout_steps >= frames - 1:
         anchors = torch.zeros_like(anchors)
     anchors[:, 0] = True
-    one_pass, anchors = bool(anchors.all()), anchors.to(real.device)
+    return noise, anchors
+
+
+def unroll(
+    model: ActionModel, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, noise: Tensor, anchors: Tensor, *,
+    one_pass: bool,
+) -> RolloutTerms:
+    """Roll the model out over whole episodes `index`, on its own predictions between real frames (see starts).
+    `one_pass`: every frame is real."""
+    real = data.latents[index].float()
+    states, actions = data.states[index], data.actions[index]
+    noisy = tokenizer.normalise(real[:, :-1] + INPUT_NOISE * noise)
     condition = model.condition(actions, states[:, :-1], states[:, 1:])
     if one_pass:
         prediction = model.predict(noisy, condition)
         one_step = tokenizer.normalise(noisy + prediction.change_BTSD)
         return RolloutTerms(one_step, prediction.positions_BTQ, prediction.done_logits_BTKJ)
+    if noisy.device.type != "cpu":
+        return roll_out_for_device(model, tokenizer, noisy, anchors, condition)
     caches = model.trunk.new_caches()
 
     def predict(t: int, latents: Tensor) -> Prediction:
@@ -172,7 +195,7 @@ def unroll(
     def choose_input(t: int, frame: Tensor) -> Tensor:
         return torch.where(anchors[:, t, None, None, None], noisy[:, t : t + 1], frame)
 
-    return roll_out(predict, tokenizer, noisy[:, :1], num_steps, choose_input)
+    return roll_out(predict, tokenizer, noisy[:, :1], actions.shape[1], choose_input)
 
 
 def roll_out(
@@ -194,6 +217,14 @@ def roll_out(
         if t + 1 < num_steps:
             current = choose_input(t + 1, frames[-1])
     return RolloutTerms(torch.cat(frames, 1), torch.cat(positions, 1), torch.cat(logits, 1))
+
+
+def roll_out_for_device(
+    model: FrameModel, tokenizer: Tokenizer, real: Tensor, anchors: Tensor, condition: Tensor
+) -> RolloutTerms:
+    """roll_out in few kernels: the same numbers to rounding. See device_rollout for the arguments."""
+    dtype = torch.bfloat16 if has_fast_bfloat16(real.device) else torch.float32
+    return RolloutTerms(*roll_out_on_device(model, tokenizer, real, anchors, condition, dtype))
 
 
 def rollout_losses(
@@ -220,22 +251,32 @@ def rollout_losses(
     return losses
 
 
+def shown_frames(
+    data: LatentEpisodes, index: Tensor, lengths: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """DECODED_FRAMES random steps (B, 2) of each of the episodes `index`, and the images (B, 2, H, W, 3) after them.
+
+    Args:
+        lengths: int (E,), recorded steps of every episode. All tensors of this function are on the CPU.
+    """
+    share = torch.rand(len(index), DECODED_FRAMES, generator=generator)
+    steps = (share * lengths[index].unsqueeze(1)).long()
+    return steps, data.images[index.unsqueeze(1), steps + 1]
+
+
 def decoded_losses(
-    terms: RolloutTerms, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, config: RunConfig,
-    generator: torch.Generator,
+    terms: RolloutTerms, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, steps_B2: Tensor, images: Tensor,
+    config: RunConfig,
 ) -> dict[str, Tensor]:
-    """What the policy will see: DECODED_FRAMES predicted frames of each episode are decoded and encoded again.
+    """What the policy will see: some predicted frames of each episode (see shown_frames) are decoded and encoded again.
 
     pixel: foreground-weighted L1 against the recorded image. recoded: as the latent loss, after the round trip.
     recoded_state: positions that the frozen probe reads after the round trip. Between encoder images, latents that
     predict well may still decode to a blur from which nobody can read positions.
     """
-    share = torch.rand(len(index), DECODED_FRAMES, generator=generator).to(index.device)
-    steps = (share * data.step_mask[index].sum(1, keepdim=True)).long()
-    rows = torch.arange(len(index), device=index.device).unsqueeze(1).expand_as(steps).flatten()
-    steps, episodes = steps.flatten(), index[rows]
-    at = data.images.device
-    wanted = tokenizer.to_pixels(data.images[episodes.to(at), (steps + 1).to(at)])
+    rows = torch.arange(len(index), device=index.device).unsqueeze(1).expand_as(steps_B2).flatten()
+    steps, episodes = steps_B2.flatten(), index[rows]
+    wanted = tokenizer.to_pixels(images.flatten(0, 1))
     pixels_R3HW = tokenizer.decode_pixels(terms.next_latents[rows, steps])
     weight = foreground_weight(wanted, tokenizer.background, config.tokenizer.foreground_weight)
     recoded = tokenizer.bottleneck(tokenizer.features(pixels_R3HW.clamp(0, 1)))

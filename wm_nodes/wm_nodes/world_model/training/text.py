@@ -16,7 +16,13 @@ from wm_nodes.world_model.dynamics import ActionModel, Prediction
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.text import TextModel, vocabulary_of
 from wm_nodes.world_model.tokenizer import Tokenizer
-from wm_nodes.world_model.training.dynamics import LatentEpisodes, roll_out, rollout_losses
+from wm_nodes.world_model.training.dynamics import (
+    LatentEpisodes,
+    RolloutTerms,
+    roll_out,
+    roll_out_for_device,
+    rollout_losses,
+)
 
 STEPS_AFTER_SUCCESS = 2
 
@@ -56,18 +62,27 @@ def train_text_model(
         steps = int(chosen[:, 2].max())
         index, length = (torch.from_numpy(chosen[:, i].copy()).to(tokenizer.device) for i in (0, 2))
         mask = (torch.arange(steps, device=length.device) < length[:, None]).float()
-        caches = model.trunk.new_caches()
-
-        def predict(t: int, latents: Tensor) -> Prediction:
-            return model(latents, instructions[task], caches)  # type: ignore[no-any-return]
-
         with compute_context(tokenizer.device):
-            terms = roll_out(predict, tokenizer, data.latents[index][:, :1].float(), steps)
+            terms = _roll_out(model, tokenizer, data.latents[index][:, :1].float(), instructions[task], steps)
         all_heads = torch.ones(len(index), settings.num_done_heads, device=length.device)
         return rollout_losses(terms, tokenizer, data, index, mask, all_heads, settings)
 
     loop = TrainingLoop("text_model", model, settings.text_num_iterations, settings.learning_rate / 2, run_dir)
     return model, loop.run(loss)
+
+
+def _roll_out(model: TextModel, tokenizer: Tokenizer, first: Tensor, instruction: str, steps: int) -> RolloutTerms:
+    if first.device.type != "cpu":
+        condition = model.condition(instruction).expand(len(first), steps, -1, -1)
+        real = first.expand(-1, steps, -1, -1)
+        anchors = torch.arange(steps, device=first.device).expand(len(first), -1) == 0
+        return roll_out_for_device(model, tokenizer, real, anchors, condition)
+    caches = model.trunk.new_caches()
+
+    def predict(t: int, latents: Tensor) -> Prediction:
+        return model(latents, instruction, caches)  # type: ignore[no-any-return]
+
+    return roll_out(predict, tokenizer, first, steps)
 
 
 def demonstrators() -> tuple[str, ...]:
