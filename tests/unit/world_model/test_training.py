@@ -21,6 +21,7 @@ from wm_nodes.world_model.training.dynamics import (
     decoded_losses,
     done_losses,
     rollout_steps_at,
+    shown_frames,
     token_weights,
     tokenise_episodes,
     train_action_model,
@@ -145,10 +146,11 @@ def test_decoded_losses_are_smallest_for_the_true_latents_and_reach_the_predicti
     tokenizer.requires_grad_(False)
     data = tokenise_episodes(tokenizer, episodes)
     index = torch.arange(12)
+    steps, images = shown_frames(data, index, data.step_mask.sum(1), torch.Generator().manual_seed(0))
 
     def losses(latents: torch.Tensor) -> dict[str, torch.Tensor]:
         terms = RolloutTerms(latents, torch.zeros(()), torch.zeros(()))
-        return decoded_losses(terms, tokenizer, data, index, config, torch.Generator().manual_seed(0))
+        return decoded_losses(terms, tokenizer, data, index, steps, images, config)
 
     true = data.latents[:, 1:].float().requires_grad_()
     right, wrong = losses(true), losses(true.detach().roll(1, 0))

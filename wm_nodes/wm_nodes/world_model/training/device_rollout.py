@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from wm_nodes.world_model.dynamics import FrameModel
@@ -49,7 +49,7 @@ def roll_out_on_device(
             change, normal = network.step(t, current)
             frames.append(tokenizer.normalise(current + change))
             features.append(normal)
-        normal_BTSD = torch.stack(features, 1).view(batch, steps, -1, condition_BTND.shape[-1])
+        normal_BTSD = torch.stack(features, 1)
         norm = model.trunk.norm
         features_BTSD = normal_BTSD * norm.weight + norm.bias
     logits, positions = model.done(features_BTSD[:, :, :-1], features_BTSD[:, :, -1])
@@ -64,7 +64,8 @@ class _Network:
     ) -> None:
         blocks: list[SpatioTemporalBlock] = list(model.trunk.blocks)  # type: ignore[arg-type]
         spatial, temporal = [block.spatial for block in blocks], [block.temporal for block in blocks]
-        cross, mlp = [block.cross for block in blocks], [block.mlp for block in blocks]
+        cross = [block.cross for block in blocks]
+        norms, wide, _, narrow = (list(parts) for parts in zip(*(block.mlp for block in blocks), strict=True))
         heads, width = spatial[0].num_heads, model.embed.out_features
         self.shape, self.dtype = (batch, tokens, heads, width // heads), dtype
         bias = torch.cat((model.position + model.embed.bias, model.register)).repeat(batch, 1)
@@ -76,33 +77,36 @@ class _Network:
         self.temporal_out = _Layers(*_plain([a.out for a in temporal]), dtype)
         self.cross_in = _Layers(*_after_norm([a.norm for a in cross], [a.project for a in cross]), dtype)
         self.cross_out = _Layers(*_plain([a.out for a in cross]), dtype)
-        self.mlp_in = _Layers(*_after_norm([m[0] for m in mlp], [m[1] for m in mlp]), dtype)
-        self.mlp_out = _Layers(*_plain([m[3] for m in mlp]), dtype)
+        self.mlp_in = _Layers(*_after_norm(norms, wide), dtype)
+        self.mlp_out = _Layers(*_plain(narrow), dtype)
         self.change = _Layers(*_after_norm([model.trunk.norm], [model.change]), dtype)
         conditions = [a.condition for a in cross if a.condition is not None]
         self.conditions = _condition_heads(condition_BTND.to(dtype), *_plain(conditions), heads)
-        window = model.trunk.window
-        self.pasts = [_Past(steps, batch * tokens, heads, width // heads, window, condition_BTND, dtype) for _ in blocks]
+        shape = (steps, batch * tokens, 3, heads, width // heads)
+        self.pasts = [_Past(condition_BTND.new_empty(shape, dtype=dtype), model.trunk.window) for _ in blocks]
         self.steps = steps
 
     def step(self, t: int, current_BSL: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the change of all rows (B, S + 1, L) and the features (R, D) before the last norm's scale."""
+        """Return of all rows the change (B, S + 1, L) and the features (B, S + 1, D) before the last norm's scale."""
         x = self.embed(current_BSL.flatten(0, 1), 0, t)
         for i in range(len(self.pasts)):
-            x, normal = _Normalise.apply(x, self.dtype)
+            x, normal = self._normalise(x)
             x = x + self.spatial_out(self._mix_tokens(self.spatial_in(normal, i, t)), i, t)
-            x, normal = _Normalise.apply(x, self.dtype)
+            x, normal = self._normalise(x)
             qkv = self.temporal_in(normal, i * self.steps + t, t, out=self.pasts[i].slot(t))
-            q, keys, values = _Remember.apply(qkv, self.pasts[i], t)
+            q, keys, values = _Remember.apply(qkv, self.pasts[i], t)  # type: ignore[no-untyped-call]
             x = x + self.temporal_out(F.scaled_dot_product_attention(q, keys, values).flatten(1), i, t)
-            x, normal = _Normalise.apply(x, self.dtype)
+            x, normal = self._normalise(x)
             q = self.cross_in(normal, i, t).view(self.shape).transpose(1, 2)
             mixed = F.scaled_dot_product_attention(q, *self.conditions[i * self.steps + t])
             x = x + self.cross_out(mixed.transpose(1, 2).reshape(x.shape), i, t)
-            x, normal = _Normalise.apply(x, self.dtype)
+            x, normal = self._normalise(x)
             x = x + self.mlp_out(F.silu(self.mlp_in(normal, i, t)), i, t)
-        _, normal = _Normalise.apply(x, self.dtype)
-        return self.change(normal, 0, t).view(current_BSL.shape), normal
+        _, normal = self._normalise(x)
+        return self.change(normal, 0, t).view(current_BSL.shape), normal.view(*current_BSL.shape[:2], -1)
+
+    def _normalise(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return _Normalise.apply(x, self.dtype)  # type: ignore[no-untyped-call, no-any-return]
 
     def _mix_tokens(self, qkv: Tensor) -> Tensor:
         batch, tokens, heads, values = self.shape
@@ -111,15 +115,19 @@ class _Network:
 
 
 class _Layers:
-    """G linear layers of one kind, each used in several steps; matrices (G, in, out), biases (G, out) or (G, R, out)."""
+    """G linear layers of one kind, each used in several steps: matrices (G, in, out), biases (G, out) or (G, R, out).
+
+    The same layer may not be used twice in one step.
+    """
 
     def __init__(self, matrices: Tensor, biases: Tensor, dtype: torch.dtype) -> None:
         self._uses: _Uses = {}
-        parts = _GradientAtTheEnd.apply(self._uses, matrices.to(dtype), biases.to(dtype))
+        parts = _GradientAtTheEnd.apply(self._uses, matrices.to(dtype), biases.to(dtype))  # type: ignore[no-untyped-call]
         self._matrices, self._biases = parts[: len(matrices)], parts[len(matrices) :]
 
     def __call__(self, rows: Tensor, layer: int, step: int, out: Tensor | None = None) -> Tensor:
-        result: Tensor = _Product.apply(rows, self._matrices[layer], self._biases[layer], self._uses, (layer, step), out)
+        matrix, bias = self._matrices[layer], self._biases[layer]
+        result: Tensor = _Product.apply(rows, matrix, bias, self._uses, (layer, step), out)  # type: ignore[no-untyped-call]
         return result
 
 
@@ -187,12 +195,10 @@ class _Normalise(torch.autograd.Function):
 class _Past:
     """Queries, keys and values (T, R, 3, H, E) of one block, where its products write them, and their gradients."""
 
-    def __init__(
-        self, steps: int, rows: int, heads: int, values: int, window: int, like: Tensor, dtype: torch.dtype
-    ) -> None:
-        self._qkv = like.new_empty((steps, rows, 3, heads, values), dtype=dtype)
+    def __init__(self, qkv: Tensor, window: int) -> None:
+        self._qkv, self._window = qkv, window
         self._gradients: Tensor | None = None
-        self._window = window
+        self._next = -1
 
     def slot(self, t: int) -> Tensor:
         """Row (R, 3 D) of step t. `data`: later steps write elsewhere, which autograd would take for a change."""
@@ -230,13 +236,13 @@ class _Remember(torch.autograd.Function):
         return ctx.past.add_gradients(ctx.t, of_q, of_keys, of_values), None, None
 
 
-def _plain(linears: Sequence[nn.Linear]) -> tuple[Tensor, Tensor]:
+def _plain(linears: Sequence[Any]) -> tuple[Tensor, Tensor]:
     """Matrices (G, in, out) and biases (G, out)."""
     matrices = torch.stack([linear.weight for linear in linears]).transpose(1, 2)
     return matrices, torch.stack([linear.bias for linear in linears])
 
 
-def _after_norm(norms: Sequence[nn.LayerNorm], linears: Sequence[nn.Linear]) -> tuple[Tensor, Tensor]:
+def _after_norm(norms: Sequence[Any], linears: Sequence[Any]) -> tuple[Tensor, Tensor]:
     """The same for linear(norm(x)) as a function of x normalised without scale and shift."""
     matrices, biases = _plain(linears)
     scale, shift = (torch.stack(parts).unsqueeze(1) for parts in zip(*((n.weight, n.bias) for n in norms)))
@@ -258,9 +264,11 @@ def _rotated(matrices: Tensor, biases: Tensor, steps: int, heads: int) -> tuple[
     return whole[:, :-1], whole[:, -1]
 
 
-def _condition_heads(condition_BTND: Tensor, matrices: Tensor, biases: Tensor, heads: int) -> list[tuple[Tensor, Tensor]]:
+def _condition_heads(
+    condition_BTND: Tensor, matrices: Tensor, biases: Tensor, heads: int
+) -> list[tuple[Tensor, Tensor]]:
     """Keys and values (B, H, N, E) of the condition, for each block (the slower) and step."""
-    batch, steps, tokens, width = condition_BTND.shape
+    batch, _, tokens, width = condition_BTND.shape
     rows = condition_BTND.transpose(0, 1).reshape(1, -1, width).expand(len(matrices), -1, -1)
     kv = torch.baddbmm(biases.to(rows.dtype).unsqueeze(1), rows, matrices.to(rows.dtype))
     kv = kv.view(-1, batch, tokens, 2, heads, width // heads).transpose(2, 4)

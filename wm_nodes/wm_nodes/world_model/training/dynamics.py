@@ -112,7 +112,8 @@ def train_action_model(
     def read(iteration: int) -> tuple[Tensor, ...]:
         rows = numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
         index = torch.from_numpy(rows)
-        batch = index, *starts(data, len(rows), steps_at(iteration), torch_stream(seed, "action_model_noise", iteration))
+        generator = torch_stream(seed, "action_model_noise", iteration)
+        batch = index, *starts(data, len(rows), steps_at(iteration), generator)
         if not settings.decoded_weight:
             return batch
         return *batch, *shown_frames(data, index, lengths, torch_stream(seed, "action_model_decoded", iteration))
@@ -128,7 +129,8 @@ def train_action_model(
                 terms, tokenizer, data, index, data.step_mask[index].float(), heads[index], settings, done_loss
             )
             if settings.decoded_weight:
-                losses |= decoded_losses(terms, tokenizer, data, index, *shown, config)
+                frames, images = shown
+                losses |= decoded_losses(terms, tokenizer, data, index, frames, images, config)
                 decoded = losses["pixel"] + losses["recoded"] + losses["recoded_state"]
                 losses["loss"] = losses["loss"] + settings.decoded_weight * decoded
             return losses | {"rollout_steps": torch.tensor(float(steps))}
@@ -161,8 +163,8 @@ def starts(
     data: LatentEpisodes, batch: int, rollout_steps: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Noise (B, T, S, D) on real input frames, and anchors (B, T), True where the model goes on from a real frame."""
-    episodes, frames, tokens, values = data.latents.shape
-    noise = torch.randn((batch, frames - 1, tokens, values), generator=generator)
+    frames = data.latents.shape[1]
+    noise = torch.randn((batch, frames - 1, *data.latents.shape[2:]), generator=generator)
     phase = torch.randint(0, rollout_steps, (batch, 1), generator=generator)
     anchors = (torch.arange(frames - 1) + phase) % rollout_steps == 0
     if rollout_steps >= frames - 1:

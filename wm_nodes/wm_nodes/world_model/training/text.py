@@ -60,7 +60,7 @@ def train_text_model(
         task = tasks[iteration % len(tasks)]
         chosen = by_task[task][stream.integers(0, len(by_task[task]), settings.batch_size)]
         steps = int(chosen[:, 2].max())
-        index, length = (torch.from_numpy(chosen[:, i].copy()).to(tokenizer.device) for i in (0, 2))
+        index, _, length = torch.from_numpy(chosen).to(tokenizer.device).unbind(1)
         mask = (torch.arange(steps, device=length.device) < length[:, None]).float()
         with compute_context(tokenizer.device):
             terms = _roll_out(model, tokenizer, data.latents[index][:, :1].float(), instructions[task], steps)
