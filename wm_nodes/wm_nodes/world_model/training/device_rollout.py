@@ -9,7 +9,7 @@ does not depend on the step before is computed once for all T steps and all bloc
 Cost: the rotated weights take T times the memory of the temporal layers' weights, and the outputs' gradients of every
 layer are kept until the end of the backward pass.
 
-Products and attention run in the type of `dtype`; the sums of the residual stream and its gradients stay float32.
+Products and attention run in the type `dtype`; the sums of the residual stream and its gradients stay float32.
 Shapes: B episodes, T steps, S tokens and one register per frame, R = B (S + 1) rows, L values per token, D width,
 H heads, E values per head, N condition tokens, G layers of one kind, K past frames.
 """

@@ -22,6 +22,7 @@ from wm_nodes.world_model.training.dynamics import (
     roll_out,
     roll_out_for_device,
     rollout_losses,
+    wants_few_kernels,
 )
 
 STEPS_AFTER_SUCCESS = 2
@@ -72,7 +73,7 @@ def train_text_model(
 
 
 def _roll_out(model: TextModel, tokenizer: Tokenizer, first: Tensor, instruction: str, steps: int) -> RolloutTerms:
-    if first.device.type != "cpu":
+    if wants_few_kernels(first.device):
         condition = model.condition(instruction).expand(len(first), steps, -1, -1)
         real = first.expand(-1, steps, -1, -1)
         anchors = torch.arange(steps, device=first.device).expand(len(first), -1) == 0
