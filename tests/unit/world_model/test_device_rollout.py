@@ -8,6 +8,7 @@ from torch.testing import assert_close
 from wm_nodes.config.load import load_config
 from wm_nodes.world_model.dynamics import ActionModel, Prediction
 from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.training import device_rollout
 from wm_nodes.world_model.training.device_rollout import _Normalise, _Past, roll_out_on_device
 from wm_nodes.world_model.training.dynamics import RolloutTerms, roll_out
 
@@ -79,7 +80,11 @@ def both(dtype: torch.dtype) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     return on_cpu, results(terms, model)
 
 
-def test_predictions_and_all_gradients_are_those_of_the_plain_rollout() -> None:
+@pytest.mark.parametrize("most_rows", [device_rollout.MOST_ROWS, 10])
+def test_predictions_and_all_gradients_are_those_of_the_plain_rollout(
+    most_rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device_rollout, "MOST_ROWS", most_rows)
     on_cpu, for_device = both(torch.float32)
     assert on_cpu.keys() == for_device.keys()
     assert len(on_cpu) == 3 + sum(1 for _ in make_models()[0].parameters())

@@ -25,6 +25,9 @@ from wm_nodes.world_model.dynamics import FrameModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.transformer import ROPE_BASE, SpatioTemporalBlock
 
+MOST_ROWS = 65535
+"""CUDA's attention kernels refuse a larger batch."""
+
 
 def roll_out_on_device(
     model: FrameModel, tokenizer: Tokenizer, real_BTSL: Tensor, anchors_BT: Tensor, condition_BTND: Tensor,
@@ -95,7 +98,7 @@ class _Network:
             x, normal = self._normalise(x)
             qkv = self.temporal_in(normal, i * self.steps + t, t, out=self.pasts[i].slot(t))
             q, keys, values = _Remember.apply(qkv, self.pasts[i], t)  # type: ignore[no-untyped-call]
-            x = x + self.temporal_out(F.scaled_dot_product_attention(q, keys, values).flatten(1), i, t)
+            x = x + self.temporal_out(_attend(q, keys, values).flatten(1), i, t)
             x, normal = self._normalise(x)
             q = self.cross_in(normal, i, t).view(self.shape).transpose(1, 2)
             mixed = F.scaled_dot_product_attention(q, *self.conditions[i * self.steps + t])
@@ -234,6 +237,13 @@ class _Remember(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, of_q: Tensor, of_keys: Tensor, of_values: Tensor) -> tuple[Tensor, None, None]:
         return ctx.past.add_gradients(ctx.t, of_q, of_keys, of_values), None, None
+
+
+def _attend(q: Tensor, keys: Tensor, values: Tensor) -> Tensor:
+    if len(q) <= MOST_ROWS:
+        return F.scaled_dot_product_attention(q, keys, values)
+    parts = zip(*(torch.split(tensor, MOST_ROWS) for tensor in (q, keys, values)), strict=True)
+    return torch.cat([F.scaled_dot_product_attention(*part) for part in parts])
 
 
 def _plain(linears: Sequence[Any]) -> tuple[Tensor, Tensor]:
