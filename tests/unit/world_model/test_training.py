@@ -14,7 +14,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
-from wm_nodes.training.loop import TrainingLoop
+from wm_nodes.training.loop import EMA_DECAY, TrainingLoop
 from wm_nodes.world_model.training.dynamics import (
     RolloutTerms,
     bootstrap_masks,
@@ -124,6 +124,19 @@ def test_a_resumed_run_takes_the_same_steps_as_one_that_was_not_stopped(tmp_path
     assert second.model.weight.equal(whole.model.weight)
     lines = [json.loads(line) for line in (tmp_path / "metrics_toy.jsonl").read_text().splitlines()]
     assert lines[-1]["iteration"] == 30
+
+
+def test_the_average_has_the_bits_of_one_tensor_after_another_and_counts_are_copied() -> None:
+    torch.manual_seed(0)
+    made = TrainingLoop("toy", torch.nn.Sequential(torch.nn.Linear(3, 5), torch.nn.BatchNorm1d(5)), 4, 0.1, None)
+    expected = {name: tensor.clone() for name, tensor in made.model.state_dict().items()}
+    for i in range(1, 5):
+        made._step(lambda i: {"loss": made.model(torch.randn(4, 3)).exp().mean()})
+        for name, tensor in made.model.state_dict().items():
+            share = 1 - min(EMA_DECAY, (1 + i) / (10 + i))
+            expected[name] = expected[name].lerp(tensor, share) if tensor.is_floating_point() else tensor.clone()
+    assert int(made.averaged["1.num_batches_tracked"]) == 4
+    assert [name for name, tensor in expected.items() if not tensor.equal(made.averaged[name])] == []
 
 
 def test_a_checkpoint_of_another_architecture_is_one_clear_error(tmp_path: Path) -> None:
