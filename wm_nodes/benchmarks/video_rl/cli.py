@@ -27,9 +27,10 @@ from benchmarks.video_rl.learning import train_on_discs, train_sampler
 from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup, diversity_samplers, learning_samplers
 from benchmarks.video_rl.sources import TASK, RecordedSource
 from benchmarks.video_rl.trials import Plan, SamplerTrial, ablation_trials, hacking_trials
-from wm_nodes.apps.options import add_json, add_seed, positive, prepare_torch
+from wm_nodes.apps.options import add_device, add_json, add_seed, positive, prepare_torch
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
@@ -37,10 +38,11 @@ from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.flow_matching import train_video_model
-from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
 from wm_nodes.video_rl.toy_scene import BASE, NETWORK, load_base, training_batch
+from wm_nodes.world_model.position_probe import PositionProbe
 
 BASE_ITERATIONS, BASE_BATCH = 4000, 16
 EPISODES = Path("runs/clip_contexts")
@@ -104,6 +106,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         experiment.add_argument("--samplers", "--arms", nargs="+", metavar="NAME")
     for experiment in (spread, learning, ablations, hacking, cost):
         experiment.add_argument("--base", type=Path, help="weights of another base model than the shipped experiment")
+    for experiment in experiments.choices.values():
+        add_device(experiment)
     for experiment in (spread, learning, ablations, hacking, cost, clips, training, resolution):
         add_json(experiment, "write every row here; trainings go on where the file stops")
 
@@ -113,6 +117,7 @@ def run(arguments: argparse.Namespace) -> None:
     if not console.is_terminal:
         console.width = LOG_COLUMNS
     prepare_torch()
+    arguments.device = compute_device(arguments.device or CPU)
     experiments = {
         "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,
         "cost": _cost, "clips": _clips, "clip-learning": _clip_learning, "resolution": _resolution,
@@ -122,7 +127,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _base(arguments: argparse.Namespace) -> None:
     torch.manual_seed(arguments.seed)
-    model = VideoNetwork(NETWORK)
+    model = VideoNetwork(NETWORK).to(arguments.device)
     train_video_model(
         model, lambda iteration: training_batch(BASE_BATCH, arguments.seed, iteration),
         load_video_config("base").model.training.with_values(num_iterations=arguments.iterations),
@@ -135,7 +140,8 @@ def _base(arguments: argparse.Namespace) -> None:
 
 
 def _diversity(arguments: argparse.Namespace) -> None:
-    model, plan = load_base(arguments.base), {"contexts": arguments.contexts, "group_size": arguments.group_size}
+    model = load_base(arguments.base, arguments.device)
+    plan = {"contexts": arguments.contexts, "group_size": arguments.group_size}
     chosen = _choose_samplers(arguments)
     rows = [
         diversity.measure_discs(model, setup, **plan, seed=arguments.seed)
@@ -155,11 +161,12 @@ def _with_both_noises(setups: list[SamplerSetup]) -> list[SamplerSetup]:
 
 def _clips(arguments: argparse.Namespace) -> None:
     config = load_video_config(arguments.preset, {"seed": arguments.seed})
-    folder, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(config.task))
+    folder, probe = _models(arguments, config.task)
     bags = arguments.context_bags or _episodes(arguments.contexts, HELDOUT_SEEDS, config.task)
     clips = load_clips(bags, folder.clip["stride"])
     drawn = numpy_stream(arguments.seed, "clip_diversity").permutation(len(clips))[: arguments.contexts]
-    contexts, features = clips.select(torch.from_numpy(drawn)), diversity.load_features(arguments.features, config.task)
+    contexts = clips.select(torch.from_numpy(drawn))
+    features = diversity.load_features(arguments.features, config.task, arguments.device)
     chosen, rows = _choose_samplers(arguments), list[dict[str, Any]]()
     source = RecordedContexts(folder, contexts, config, probe)
     with tqdm(total=2 * len(chosen) * len(contexts), desc="clips", unit="context") as bar:
@@ -174,9 +181,15 @@ def _clips(arguments: argparse.Namespace) -> None:
     console.print(tables.clip_table(rows, arguments.seed), tables.clip_comparison_table(compared))
 
 
+def _models(arguments: argparse.Namespace, task: str) -> tuple[VideoFolder, PositionProbe]:
+    """The video model, and the probe of the task's shipped world model."""
+    folder = load_video_folder(arguments.video_model, arguments.device)
+    return folder, load_probe(shipped_model(task), arguments.device)
+
+
 def _resolution(arguments: argparse.Namespace) -> None:
     config = load_video_config(arguments.preset, {"seed": arguments.seed})
-    folder, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(config.task))
+    folder, probe = _models(arguments, config.task)
     sizes = [{"simulation.image_size": side} for side in (probe.height, *arguments.sizes)]
     recordings = [[bag] for bag in arguments.context_bags] or [
         _episodes(arguments.contexts, HELDOUT_SEEDS, config.task, size) for size in sizes
@@ -201,7 +214,7 @@ def _episodes(clips: int, first_seed: int, task: str, settings: Mapping[str, Any
 
 
 def _clip_learning(arguments: argparse.Namespace) -> None:
-    base, probe = load_video_folder(arguments.video_model), load_probe(shipped_model(TASK))
+    base, probe = _models(arguments, TASK)
     bags = arguments.context_bags or _episodes(arguments.contexts, NEW_SEEDS, TASK)
     heldout_bags = arguments.heldout_bags or _episodes(arguments.eval_contexts, HELDOUT_SEEDS, TASK)
     contexts, heldout = (load_clips(recorded, base.clip["stride"]) for recorded in (bags, heldout_bags))
@@ -210,7 +223,7 @@ def _clip_learning(arguments: argparse.Namespace) -> None:
     trials = [SamplerTrial(sampler, plan) for sampler in samplers.clip_learning_samplers()]
 
     def train(trial: SamplerTrial[LearningPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
-        folder = load_video_folder(arguments.video_model)
+        folder = load_video_folder(arguments.video_model, arguments.device)
         source = RecordedSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed)
         return train_sampler(source, trial.sampler, trial.plan, seed, on_iteration)
 
@@ -249,7 +262,8 @@ def _plan(arguments: argparse.Namespace, eval_every: int) -> DiscPlan:
 
 def _train_discs(arguments: argparse.Namespace, trials: list[SamplerTrial[DiscPlan]]) -> list[dict[str, Any]]:
     def train(trial: SamplerTrial[DiscPlan], seed: int, on_iteration: Callable[[], object]) -> dict[str, Any]:
-        return train_on_discs(load_base(arguments.base), trial.sampler, trial.plan, seed, on_iteration)
+        base = load_base(arguments.base, arguments.device)
+        return train_on_discs(base, trial.sampler, trial.plan, seed, on_iteration)
 
     return _train(arguments, trials, train, _base_of(arguments))
 
@@ -311,12 +325,12 @@ def _base_of(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _cost(arguments: argparse.Namespace) -> None:
-    model = load_base(arguments.base)
+    model = load_base(arguments.base, arguments.device)
     repeats, seed = arguments.repeats, arguments.seed
-    rollouts = [toy_rollout(model, repeats, seed), pushcube_rollout(repeats, seed)]
+    rollouts = [toy_rollout(model, repeats, seed), pushcube_rollout(repeats, seed, arguments.device)]
     rows = [
         *measure_anchors("moving disc", model, toy_buffer(model, seed), LEARNER, repeats),
-        *measure_anchors("PushCube", *pushcube_buffer(seed), LEARNER, repeats),
+        *measure_anchors("PushCube", *pushcube_buffer(seed, arguments.device), LEARNER, repeats),
     ]
     of = {"seed": seed, "learner": LEARNER.model_dump(), **_base_of(arguments)}
     write_results(arguments, {**of, "rollouts": rollouts, "rows": rows})

@@ -16,6 +16,7 @@ from benchmarks.video_rl.sources import sample_scenes
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import Anchor, GrpoConfig
+from wm_nodes.core.device import device_of, synchronize
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model import (
     Condition,
@@ -81,14 +82,20 @@ def measure_rollout(
     """
     cps = replace(rollout, sampler=SamplerSettings("cps", rollout.sampler.eta))
     seeds = torch.arange(len(condition.frames)) + seed
-    noise = sampling.initial_noise(shape, seeds)
+    device = device_of(network)
+    condition, noise = condition.to(device), sampling.initial_noise(shape, seeds).to(device)
     found: dict[str, list[float]] = {"cps_s": [], "rollout_s": [], "mask_share": [], "cache_share": []}
     network.eval()
     for turn in range(repeats + 1):  # the first one warms up
         for name, settings in (("cps_s", cps), ("rollout_s", rollout)):
-            with clocked(kernels, "rollout_mask") as mask, clocked(sampling, *CACHING) as caching:
+            with (
+                clocked(kernels, "rollout_mask", device=device) as mask,
+                clocked(sampling, *CACHING, device=device) as caching,
+            ):
+                synchronize(device)
                 start = time.perf_counter()
                 sampling.sample_videos(network, condition, noise, seeds, settings)
+                synchronize(device)
                 total = time.perf_counter() - start
             if turn:
                 found[name].append(total)
@@ -113,17 +120,17 @@ def toy_buffer(model: VideoNetwork, seed: int) -> tuple[RolloutBuffer, RolloutSe
     return sample_scenes(model, sampler, draw_scenes(SCENES, seed, "cost"), GROUP, seed), sampler.rollout
 
 
-def pushcube_rollout(repeats: int, seed: int) -> dict[str, Any]:
+def pushcube_rollout(repeats: int, seed: int, device: torch.device) -> dict[str, Any]:
     """measure_rollout of the shipped PushCube network by the recommended preset."""
-    network, condition, shape, rollout = _pushcube(seed)
+    network, condition, shape, rollout = _pushcube(seed, device)
     return {"model": "PushCube", **measure_rollout(network, condition, shape, rollout, repeats, seed)}
 
 
-def pushcube_buffer(seed: int) -> tuple[VideoNetwork, tuple[RolloutBuffer, RolloutSettings]]:
+def pushcube_buffer(seed: int, device: torch.device) -> tuple[VideoNetwork, tuple[RolloutBuffer, RolloutSettings]]:
     """The shipped PushCube network and SCENES x GROUP of its videos with random rewards, by the recommended preset."""
-    network, condition, shape, rollout = _pushcube(seed)
+    network, condition, shape, rollout = _pushcube(seed, device)
     index = torch.arange(SCENES * GROUP)
-    noise = sampling.initial_noise(shape, index + seed)
+    noise = sampling.initial_noise(shape, index + seed).to(device)
     videos = sampling.sample_videos(network, condition, noise, index + seed, rollout)
     rewards = torch.rand(len(index), generator=torch_stream(seed, "cost_rewards"), dtype=torch.float64)
     buffer = RolloutBuffer(
@@ -133,11 +140,11 @@ def pushcube_buffer(seed: int) -> tuple[VideoNetwork, tuple[RolloutBuffer, Rollo
     return network, (buffer.with_rewards({"total": rewards}), rollout)
 
 
-def _pushcube(seed: int) -> tuple[VideoNetwork, Condition, tuple[int, ...], RolloutSettings]:
+def _pushcube(seed: int, device: torch.device) -> tuple[VideoNetwork, Condition, tuple[int, ...], RolloutSettings]:
     """The shipped network, what it is asked for, the shape of its latents, and how it samples; given frames and actions
     are random, because times depend on sizes only."""
     config = load_video_config("recommended")
-    folder = load_video_folder(shipped_model(config.task) / "video_model")
+    folder = load_video_folder(shipped_model(config.task) / "video_model", device)
     settings, codec, videos, frames = folder.network.settings, folder.manifest["codec"], SCENES * GROUP, CLIP_FRAMES
     H, W = (codec[side] // codec["config"]["patch_px"] for side in ("height", "width"))
     draw = partial(torch.randn, generator=torch_stream(seed, "cost"))
@@ -146,4 +153,4 @@ def _pushcube(seed: int) -> tuple[VideoNetwork, Condition, tuple[int, ...], Roll
         draw(videos, frames - 1, settings.action_dim), draw(videos, 4, settings.text_dim),
     )
     shape = (settings.channels, frames, H, W)
-    return folder.network.eval(), condition, shape, rollout_settings(config.rollout)
+    return folder.network.eval(), condition.to(device), shape, rollout_settings(config.rollout)

@@ -47,7 +47,7 @@ def measure_discs(
     buffer = sample_scenes(model, sampler, scenes, group_size, seed)
     groups = buffer.rollout.latents.view(contexts, group_size, *buffer.rollout.latents.shape[1:])
     reach = opacity_at(scenes.path(scenes.action)[:, :1].expand(-1, groups.shape[3], -1), REACH)
-    moving = (reach > 0.3).float()[:, None]
+    moving = (reach > 0.3).float()[:, None].to(groups.device)
     scores = {name: values.view(contexts, group_size) for name, values in buffer.rewards.items()}
     return {
         **_named(sampler),
@@ -80,9 +80,10 @@ def measure_clips(
         buffer = source.score(request, source.sample(request))
         frames, K = source.folder.codec.decode(buffer.rollout.latents), buffer.condition.num_conditioning
         last = source.probe.read(frames[:, -1:])[:, 0][..., OBJECT]
+        moving = moving_part(source.contexts.frames[index]).to(frames.device)
         values = {
             "diversity": group_diversity(frames[:, K:], features),
-            "diversity_dynamic": group_diversity(frames[:, K:] * moving_part(source.contexts.frames[index]), features),
+            "diversity_dynamic": group_diversity(frames[:, K:] * moving, features),
             "object_spread_cm": 100 * float(np.sqrt(((last - last.mean(0)) ** 2).sum(-1).mean())),
             "reward": float(buffer.rewards["total"].mean()),
             "reward_std": float(buffer.rewards["total"].std(correction=0)),
@@ -95,16 +96,17 @@ def measure_clips(
     return {**_named(sampler), "features": features.name, **found}
 
 
-def load_features(name: str, task: str) -> FrameFeatures:
-    """Frame features by name: pixels, random, tokenizer (of the task's shipped world model), or a backbone's folder."""
+def load_features(name: str, task: str, device: torch.device) -> FrameFeatures:
+    """Frame features by name, on `device`: pixels, random, tokenizer (of the task's shipped world model), or the folder
+    of a backbone."""
     if name == "pixels":
         return frame_features.CentredPixels()
     if name == "random":
         return frame_features.RandomFeatures()
     if name == "tokenizer":
         folder = shipped_model(task)
-        return frame_features.TokenizerFeatures(load_model_folder(folder).tokenizer, folder.name)
-    return frame_features.load_backbone(Path(name))
+        return frame_features.TokenizerFeatures(load_model_folder(folder, device).tokenizer, folder.name)
+    return frame_features.load_backbone(Path(name), device)
 
 
 def group_diversity(frames: Tensor, features: FrameFeatures) -> float:

@@ -9,6 +9,7 @@ import torch
 from benchmarks.video_rl.clock import clocked
 from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup
 from benchmarks.video_rl.sources import DiscSource, TrainingSource
+from wm_nodes.core.device import device_of
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reward_hacking import find_hacked_metrics
@@ -29,7 +30,11 @@ def train_sampler(
     learner = GrpoLearner(source.network, sampler.grpo, sampler.rollout, seed=seed)
     before = after = source.validate()
     evaluations, buffers = [{"iteration": 0, **_means(before)}], list[dict[str, float]]()
-    with clocked(source, "request", "sample", "score") as rollout, clocked(learner, "train") as train:
+    device = device_of(source.network)
+    with (
+        clocked(source, "request", "sample", "score", device=device) as rollout,
+        clocked(learner, "train", device=device) as train,
+    ):
         for iteration, (buffer, report) in enumerate(post_train(learner, source, plan.iterations), 1):
             buffers.append({**flatten_metrics(report), **source.measure(buffer)})
             if iteration % plan.eval_every == 0 or iteration == plan.iterations:

@@ -4,6 +4,7 @@
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from torch import nn
 from wm_nodes.apps.options import add_preset, settings
 from wm_nodes.config.load import VIDEO, load_video_config, preset_names
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import compute_device
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.video_model import Condition
 from wm_nodes.video_model.clips import load_clips
@@ -61,14 +63,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _model_to_check(arguments: argparse.Namespace, config: VideoRlConfig) -> ModelToCheck:
+    device = compute_device(config.device)
     if arguments.public:
-        return _public(arguments, config)
+        return _public(arguments, config, str(device))
     if arguments.video_model is None:
         toy = draw_scenes(VIDEOS, config.seed, "doctor").condition()
-        return load_base(), toy, (CHANNELS, FRAMES, SIDE, SIDE), config
+        return load_base(device=device), toy.to(device), (CHANNELS, FRAMES, SIDE, SIDE), config
     if not arguments.context_bags:
         raise ValueError("--video-model needs --context-bags: recorded episodes to take first frames and actions from")
-    folder = load_video_folder(arguments.video_model)
+    folder = load_video_folder(arguments.video_model, device)
     clips = load_clips(arguments.context_bags, folder.clip["stride"])
     clips = clips.select(torch.arange(min(VIDEOS, len(clips))))
     condition = clips.condition(folder.codec, folder.clip["num_conditioning"], folder.network.settings.text_dim)
@@ -77,24 +80,22 @@ def _model_to_check(arguments: argparse.Namespace, config: VideoRlConfig) -> Mod
     return folder.network, condition, (C, F, H, W), config
 
 
-def _public(arguments: argparse.Namespace, config: VideoRlConfig) -> ModelToCheck:
+def _public(arguments: argparse.Namespace, config: VideoRlConfig, device: str) -> ModelToCheck:
     from wm_nodes.video_model.adapters import LoadSettings, add_lora, load_public_model
 
-    loading = LoadSettings(dtype=arguments.dtype, device=config.device, offload=arguments.offload)
+    loading = LoadSettings(dtype=arguments.dtype, device=device, offload=arguments.offload)
     public = load_public_model(arguments.public, loading)
     if public.text is None:
         raise ValueError(f"{arguments.public} has no text encoder; one is needed to embed the prompt")
     frames = torch.from_numpy(np.stack([_picture(arguments)] * arguments.frames))[None]
-    latents = public.codec.encode(frames)
-    C, F, H, W = latents.shape[1:]
-    text = public.text.encode([arguments.prompt])
-    actions = torch.zeros(1, F - 1, 0)
-    given = latents[:, :, : 0 if arguments.text_only else 1].float()
-    condition = Condition(given, actions, text.float()).repeat_interleave(VIDEOS)
+    C, F, H, W = public.codec.encode(frames).shape[1:]
+    condition = public.condition(frames[:, :1], [arguments.prompt], F).repeat_interleave(VIDEOS)
+    if arguments.text_only:
+        condition = replace(condition, frames=condition.frames[:, :, :0])
     model: Any = public.velocity
     if arguments.lora_rank:
         add_lora(model, arguments.lora_rank, 2 * arguments.lora_rank)
-    return model, condition.to(config.device), (C, F, H, W), config.with_values(
+    return model, condition, (C, F, H, W), config.with_values(
         rollout=config.rollout.with_values(shift=public.shift)
     )
 

@@ -21,12 +21,13 @@ from rich.table import Table
 from torch import Tensor
 from tqdm import tqdm
 
-from wm_nodes.apps.options import add_json, add_judge, judge_settings, prepare_torch
+from wm_nodes.apps.options import add_device, add_json, add_judge, judge_settings, prepare_torch
 from wm_nodes.apps.policy_run import console
 from wm_nodes.config.load import REWARDS, judge_or_embedded, load_config, reward_overrides
 from wm_nodes.config.schema import AGENT
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
@@ -55,6 +56,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="agent: a judge's verdicts; reference: how well clips follow their recordings (default: as recorded)",
     )
     add_judge(parser)
+    add_device(parser)
     add_json(parser, f"every score (default of a run folder: <run>/{RESCORED})")
     more = parser.add_argument_group("for a bag of train-policy")
     more.add_argument("--config", help="a preset or .yaml (default: config.yaml of the run that the bag lies in)")
@@ -118,8 +120,10 @@ def _judge_episodes(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dic
 def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any], Path]:
     """Every recorded picture of a run of loop 2."""
     chosen = {**reward_overrides(arguments.reward), **judge_settings(arguments)}
+    if arguments.device is not None:
+        chosen["device"] = arguments.device
     run_dir, config = recorded_buffers.read_run(arguments.recording, chosen)
-    probe = load_probe(shipped_model(config.task))
+    probe = load_probe(shipped_model(config.task), compute_device(config.device))
     bags = recorded_buffers.recorded_episodes(run_dir, "train")
     contexts = load_clips(bags, config.model.stride)
     with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:

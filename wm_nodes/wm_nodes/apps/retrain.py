@@ -12,13 +12,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from wm_nodes.apps.options import add_run_dir, add_set, add_tensorboard, prepare_torch, settings
+from wm_nodes.apps.options import add_device, add_run_dir, add_set, add_tensorboard, prepare_torch, settings
 from wm_nodes.apps.policy_run import Stages
 from wm_nodes.apps.run_options import open_run
 from wm_nodes.apps.video_results import conclude
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import compute_device
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers
@@ -31,6 +32,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_folder", type=Path, metavar="run", help="run folder with all of its rollout buffers")
     add_run_dir(parser)
     add_set(parser)
+    add_device(parser)
     add_tensorboard(parser)
     parser.set_defaults(tensorboard=None)
 
@@ -69,7 +71,8 @@ def _run(
     stage(f"training on {len(clips)} buffers of {source} in {run_dir}")
     base, judge = source / "video_model", shipped_model(config.task)
     heldout = recorded_buffers.recorded_episodes(source, "heldout")
-    folder = load_video_folder(base)
+    device = compute_device(config.device)
+    folder = load_video_folder(base, device)
     training = VideoRun(
         folder.network, config, run_dir, tensorboard=arguments.tensorboard,
         heldout=validation_scores(folder, heldout, judge, config) if config.evaluation.every else None,
@@ -82,6 +85,6 @@ def _run(
         training.close()
     conclude(
         config, run_dir, base=base, iterations=training.iterations, version=training.version,
-        heldout=load_clips(heldout, folder.clip["stride"]), probe=load_probe(judge), preset=f"as in {source.name}",
-        bag="", command=arguments.command, minutes=stage.minutes,
+        heldout=load_clips(heldout, folder.clip["stride"]), probe=load_probe(judge, device),
+        preset=f"as in {source.name}", bag="", command=arguments.command, minutes=stage.minutes,
     )

@@ -32,6 +32,7 @@ from wm_nodes.config.load import (
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import compute_device
 from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
 from wm_nodes.judge.backends.factory import check_clips, check_judge
 from wm_nodes.launching import arguments as launch_arguments
@@ -99,7 +100,7 @@ def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) ->
     stage = Stages()
     stage(f"run folder {run_dir}")
     scene = load_config("cpu", {"task": config.task, "seed": config.seed})
-    probe = load_probe(shipped_model(config.task))
+    probe = load_probe(shipped_model(config.task), compute_device(config.device))
     shipped = None if arguments.from_scratch else shipped_video_model(config)
     if arguments.bags:
         stage(f"{len(arguments.bags)} + {len(arguments.heldout_bags)} held-out recordings")

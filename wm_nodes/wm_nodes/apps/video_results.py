@@ -10,6 +10,7 @@ import torch
 from wm_nodes.apps.policy_run import console
 from wm_nodes.config.load import dump_config
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.reports.clip_report import TITLES, ClipSummary, ScoreChange, clip_panels, scores_table, write_clip_report
 from wm_nodes.reports.curves import curves
@@ -42,7 +43,7 @@ def conclude(
     Raises:
         OSError: the version's weights are gone.
     """
-    base_folder, trained = load_video_folder(base), load_video_folder(base)
+    base_folder, trained = (load_video_folder(base, compute_device(config.device)) for _ in range(2))
     uri = evaluated_uri(version, config)
     if version:
         load_weights(trained.network, (run_dir / uri).read_bytes())
@@ -59,7 +60,7 @@ def conclude(
              "slopes": {alarm.metric: alarm.true_slope for alarm in alarms}, "text": alarm_text(alarms)}
             for line in watched if (alarms := alarms_of(line))
         ],
-        bag=bag, minutes=minutes, command=command, machine=machine_facts(), date=time.strftime("%Y-%m-%d"),
+        bag=bag, minutes=minutes, command=command, machine=machine_facts(config.device), date=time.strftime("%Y-%m-%d"),
     )
     path = write_summary(run_dir, summary)
     generators = [ClipGenerator(folder, heldout, config) for folder in (base_folder, trained)]
@@ -88,7 +89,7 @@ def score_change(name: str, before: Sequence[float], after: Sequence[float], see
 def _strips(config: VideoRlConfig, run_dir: Path, heldout: Clips, generators: Sequence[ClipGenerator]) -> list[Picture]:
     """The recording, the base model and the trained model from the same first frames and noise."""
     shown = heldout.select(torch.arange(min(STRIPS, len(heldout))))
-    frames = [generator.evaluate(shown, config.evaluation.num_steps) for generator in generators]
+    frames = [generator.evaluate(shown, config.evaluation.num_steps).cpu() for generator in generators]
     rows = dict(zip(("recorded", "before", "after"), [shown.frames, *frames], strict=True))
     pictures = []
     for index, instruction in enumerate(shown.instructions):

@@ -143,6 +143,8 @@ class RolloutConfig(SettingsSection):
     1e-6 at its own anchor; seed: only the seed it was drawn from, needs float32 latents."""
     micro_batch: PositiveInt
     """Videos per network call."""
+    buffer_device: Literal["model", "cpu"]
+    """Where rollout buffers lie: with the model, or in the host's memory, from where training moves micro-batches."""
 
     @field_validator("noise_store")
     @classmethod

@@ -3,10 +3,12 @@
 Nothing here runs when a module is imported: a process that forks must not have started CUDA.
 """
 
+import itertools
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import torch
+from torch import nn
 
 AUTO, CPU, CUDA = "auto", "cpu", "cuda"
 
@@ -33,6 +35,17 @@ def compute_device(name: str) -> torch.device:
     if (device.index or 0) >= count:
         raise DeviceError(f"device is {name}, but the GPUs here are cuda:0 to cuda:{count - 1}; name one of them")
     return device
+
+
+def device_of(module: nn.Module) -> torch.device:
+    """Return where a module's first parameter, or else its first buffer, is."""
+    return next(itertools.chain(module.parameters(), module.buffers())).device
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until a GPU has done what it was told, so that a clock read next counts it; nothing on the CPU."""
+    if device.type == CUDA:
+        torch.cuda.synchronize(device)
 
 
 def device_label(device: torch.device) -> str:

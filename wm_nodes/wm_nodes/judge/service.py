@@ -348,7 +348,7 @@ def buffer_jobs(
         frames: decoded clips, uint8 (N, F, H, W, 3). references: the recordings of their contexts, a row per clip.
         sha256: of the buffer's file; names the clips. given: frames. fps: clip frames per second.
     """
-    shown = torch.cat([references.frames[:, :given], frames[:, given:]], 1).numpy()
+    shown = torch.cat([references.frames[:, :given], frames[:, given:].cpu()], 1).numpy()
     first = references.frames[:, 0].numpy()
     actions = references.actions.numpy().astype(np.float32)
     return [

@@ -15,6 +15,7 @@ from wm_msgs.action import EvaluateClips
 from wm_msgs.msg import ClipScores, ClipVerdict
 from wm_nodes.config.load import judge_or_embedded, load_video_config
 from wm_nodes.config.schema import AGENT
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.named_files import BUFFER, NamedFiles, shown
 from wm_nodes.judge.agent.contract import check_one_judge
 from wm_nodes.judge.agent.types import GATED
@@ -32,9 +33,8 @@ from wm_nodes.ros.worker import Work
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
-from wm_nodes.video_rl.reference_reward import mix_rewards, score_clips
+from wm_nodes.video_rl.reference_reward import load_probe, mix_rewards, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.world_model import load_model_folder
 
 PARAMS = (
     Param("video_model_dir", "", "Folder of the video model; its codec decodes the clips", read_only=True),
@@ -56,14 +56,12 @@ class ClipEvaluatorNode(ManagedNode):
 
     def configure(self) -> None:
         self._config = load_video_config(str(self.param("config_file")))
-        folder = load_video_folder(Path(str(self.param("video_model_dir"))))
+        device = compute_device(self._config.device)
+        folder = load_video_folder(Path(str(self.param("video_model_dir"))), device)
         bags = [Path(text) for text in self.param("context_bags") if text]
         contexts = load_clips(bags, folder.clip["stride"])
         self._generator = ClipGenerator(folder, contexts, self._config)
-        probe = load_model_folder(Path(str(self.param("model_dir")))).probe
-        if probe is None:
-            raise ValueError(f"{self.param('model_dir')} has no position probe; take the shipped world model")
-        self._probe = probe
+        self._probe = load_probe(Path(str(self.param("model_dir"))), device)
         self._fps = clip_fps(bags[0], folder.clip["stride"])
         self._files = named_files(self)
         self._agent = None

@@ -38,7 +38,7 @@ from wm_nodes.ros.params import COMMON, Param, named_files
 from wm_nodes.ros.sequence_numbers import check_session
 from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
-from wm_nodes.training.ranks import Ranks
+from wm_nodes.training.ranks import Ranks, own_device
 from wm_nodes.training.weights import INLINE_LIMIT_BYTES, WeightsError, load_weights
 
 MAX_CHUNK_BYTES = 4 << 20
@@ -345,6 +345,7 @@ class LearnerNode(TrainingNode):
 def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> PolicyTraining:
     """The run that a node's parameters describe."""
     config = load_config(str(values["config_file"]))
+    config = config.with_values(device=str(own_device(config.device)))
     policy = make_policy(config, str(values["model_dir"]), str(values["policy_factory"]))
     if values["initial_policy"]:
         path = existing(str(values["initial_policy"]), "initial_policy")
@@ -360,7 +361,7 @@ def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> PolicyTr
 
 
 def main() -> int:
-    return run_learner(LearnerNode, PARAMS, make_run)
+    return run_learner(LearnerNode, PARAMS, make_run, lambda file: load_config(file).device)
 
 
 if __name__ == "__main__":

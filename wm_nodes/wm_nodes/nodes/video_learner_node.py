@@ -25,7 +25,7 @@ from wm_nodes.ros.endpoint_matching import StartBarrier
 from wm_nodes.ros.params import COMMON, Param, named_files
 from wm_nodes.ros.wire import Cancelled, PeerLost
 from wm_nodes.ros.worker import Work
-from wm_nodes.training.ranks import Ranks
+from wm_nodes.training.ranks import Ranks, own_device
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import BufferReport
@@ -206,8 +206,8 @@ def with_scores(buffer: RolloutBuffer, scores: ClipScores) -> RolloutBuffer:
 
 def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun:
     """The run that a node's parameters describe."""
-    folder = load_video_folder(Path(str(values["video_model_dir"])))
     config = load_video_config(str(values["config_file"]))
+    folder = load_video_folder(Path(str(values["video_model_dir"])), own_device(config.device))
     bags = [Path(text) for text in values["heldout_bags"] if text]
     watched = bool(bags) and config.evaluation.every > 0 and ranks.rank == 0
     return VideoRun(
@@ -218,7 +218,7 @@ def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> VideoRun
 
 
 def main() -> int:
-    return run_learner(VideoLearnerNode, PARAMS, make_run)
+    return run_learner(VideoLearnerNode, PARAMS, make_run, lambda file: load_video_config(file).device)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import torch
 from wm_msgs.action import GenerateClips
 from wm_msgs.msg import ClipBatch, PolicyVersion
 from wm_nodes.config.load import load_video_config
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.nodes.policy.weights import read_weights
@@ -50,7 +51,7 @@ class VideoModelNode(ManagedNode):
 
     def configure(self) -> None:
         config = load_video_config(str(self.param("config_file")))
-        folder = load_video_folder(Path(str(self.param("video_model_dir"))))
+        folder = load_video_folder(Path(str(self.param("video_model_dir"))), compute_device(config.device))
         bags = [Path(text) for text in self.param("context_bags") if text]
         self._generator = ClipGenerator(folder, load_clips(bags, folder.clip["stride"]), config)
         self._files = named_files(self)
@@ -140,7 +141,7 @@ class VideoModelNode(ManagedNode):
 def film_strip(frames: torch.Tensor) -> UInt8Array:
     """One picture of uint8 clips (N, F, H, W, 3): a row per clip, a column per frame, (N H, F W, 3)."""
     N, F, H, W, _ = frames.shape
-    return Tiles(N, F, H, W).tile(frames.flatten(0, 1).numpy())
+    return Tiles(N, F, H, W).tile(frames.flatten(0, 1).cpu().numpy())
 
 
 def main() -> int:

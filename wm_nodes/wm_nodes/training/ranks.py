@@ -1,8 +1,8 @@
 """Several learner processes under torchrun: every rank holds the whole rollout and a share of each minibatch; gradients
 are summed, so R ranks make the update of one.
 
-They talk by gloo, on every device: rollouts, flags and sums are host memory, which nccl cannot send, and gloo takes a
-GPU's gradients through the host. The policies and video models here are small enough for that.
+Host memory (rollouts, flags, sums) goes by gloo; where the learner computes on GPUs, one for each rank, gradients go by
+nccl.
 """
 
 import json
@@ -16,9 +16,11 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from wm_nodes.core.device import CPU, CUDA, compute_device
 from wm_nodes.core.types import Rollout
 
-BACKEND = "gloo"
+BACKENDS = {CPU: "gloo", CUDA: "cpu:gloo,cuda:nccl"}
+"""By the type of the device that the learner computes on."""
 
 
 class Ranks:
@@ -57,14 +59,33 @@ class Ranks:
         return bool(votes.item() > 0)
 
 
-def join() -> Ranks:
-    """Join the process group that torchrun announces (RANK, WORLD_SIZE); one rank without torchrun."""
+def own_device(name: str) -> torch.device:
+    """Return compute_device(name), but under torchrun the GPU of this rank (LOCAL_RANK) where name has no number.
+
+    Raises:
+        DeviceError: there is no such device, or there are fewer GPUs than ranks.
+    """
+    device, number = compute_device(name), os.environ.get("LOCAL_RANK")
+    if device.type == CPU or number is None or ":" in name:
+        return device
+    return compute_device(f"{CUDA}:{number}")
+
+
+def join(device: str = CPU) -> Ranks:
+    """Join the process group that torchrun announces (RANK, WORLD_SIZE); one rank without torchrun.
+
+    Args:
+        device: that the learner computes on, by its setting.
+
+    Raises:
+        DeviceError: as own_device.
+    """
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:
         return Ranks()
     if not dist.is_initialized():
         # A rank waits for the next rollout as long as the learner has no goal; torchrun ends it when another one dies.
-        dist.init_process_group(BACKEND, timeout=timedelta(days=365))
+        dist.init_process_group(BACKENDS[own_device(device).type], timeout=timedelta(days=365))
     return Ranks(dist.get_rank(), size)
 
 

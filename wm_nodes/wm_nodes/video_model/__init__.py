@@ -1,6 +1,6 @@
 """A flow-matching video model, its stochastic samplers, and what GRPO stores of them. DD-3 to DD-12."""
 
-from wm_nodes.video_model.buffer import RolloutBuffer, RolloutBufferError, config_hash
+from wm_nodes.video_model.buffer import RolloutBuffer, RolloutBufferError, concatenate_buffers, config_hash
 from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.kernels import SamplerSettings, Step, StepContext, estimates, step
 from wm_nodes.video_model.mask import MaskSettings, dynamic_mask
@@ -13,6 +13,6 @@ from wm_nodes.video_model.transitions import GaussianTransition, transition
 __all__ = [
     "Condition", "GaussianTransition", "MaskSettings", "NetworkSettings", "RolloutBuffer", "RolloutBufferError",
     "RolloutSettings", "SamplerSettings", "Step", "StepContext", "VelocityModel", "VideoNetwork", "VideoRollout",
-    "config_hash", "dynamic_mask", "estimates", "flow_times", "guided_velocity", "initial_noise", "sample_videos",
-    "select_steps", "step", "step_noise", "stochastic_steps", "transition",
+    "concatenate_buffers", "config_hash", "dynamic_mask", "estimates", "flow_times", "guided_velocity", "initial_noise",
+    "sample_videos", "select_steps", "step", "step_noise", "stochastic_steps", "transition",
 ]

@@ -5,7 +5,7 @@ Shapes: N videos, S stochastic steps. The file is one safetensors; nothing in it
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -19,7 +19,8 @@ from wm_nodes.video_model.conditions import Condition
 from wm_nodes.video_model.sampling import RolloutSettings, VideoRollout
 
 _METADATA_KEY = "rollout_buffer"
-_ROLLOUT_TENSORS = ("latents", "states", "mask", "sigma_base", "zeta", "seeds", "noise_share", "times")
+_ROWS = ("latents", "states", "mask", "sigma_base", "zeta", "seeds")
+_ROLLOUT_TENSORS = (*_ROWS, "noise_share", "times")
 
 
 class RolloutBufferError(ValueError):
@@ -29,7 +30,8 @@ class RolloutBufferError(ValueError):
 def config_hash(settings: RolloutSettings) -> str:
     """Return the sha256 of what decides the Gaussian of a transition; storage_dtype does, since it rounds states."""
     knobs = asdict(settings)
-    knobs.pop("micro_batch"), knobs.pop("noise_store")
+    for name in ("micro_batch", "noise_store", "buffer_device"):
+        knobs.pop(name)
     return hashlib.sha256(json.dumps(knobs, sort_keys=True).encode()).hexdigest()
 
 
@@ -40,6 +42,9 @@ class RolloutBuffer:
     condition: of every video (rows repeat within a group). group_ids, sample_ids: int64 (N,). rewards: raw values by
     name, float64 (N,), NaN where missing. valid: bool (N,), False where any reward is missing or was refused.
     policy_version: optimizer steps of the weights that sampled. iteration: of the training run.
+
+    rollout and condition may lie on any device; what says which video is which, the rewards and `valid` are in the
+    host's memory.
     """
 
     rollout: VideoRollout
@@ -59,13 +64,17 @@ class RolloutBuffer:
     def num_bytes(self) -> int:
         return sum(tensor.nbytes for tensor in self._tensors().values())
 
+    def to(self, device: torch.device | str) -> "RolloutBuffer":
+        """The same buffer with its videos and condition on a device."""
+        return replace(self, rollout=self.rollout.to(device), condition=self.condition.to(device))
+
     def with_rewards(self, rewards: Mapping[str, Tensor]) -> "RolloutBuffer":
-        """The same videos with rewards; a video is valid while all of its rewards are finite.
+        """The same videos with rewards, from any device; a video is valid while all of its rewards are finite.
 
         Raises:
             RolloutBufferError: a reward is not one number per video.
         """
-        values = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in rewards.items()}
+        values = {name: torch.as_tensor(value, dtype=torch.float64).cpu() for name, value in rewards.items()}
         for name, value in values.items():
             if value.shape != (len(self),):
                 raise RolloutBufferError(f"reward {name} has shape {tuple(value.shape)}, the buffer {len(self)} videos")
@@ -103,6 +112,7 @@ class RolloutBuffer:
             if tensor.data_ptr() in seen:
                 tensors[name] = tensor.clone()
             seen.add(tensor.data_ptr())
+        tensors = {name: tensor.cpu() for name, tensor in tensors.items()}
         data: bytes = save(tensors, {_METADATA_KEY: json.dumps(header)})
         return data
 
@@ -139,3 +149,38 @@ class RolloutBuffer:
         tensors |= {f"reward.{name}": value for name, value in self.rewards.items()}
         tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids, "valid": self.valid}
         return {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
+
+
+def concatenate_buffers(parts: Sequence[RolloutBuffer]) -> RolloutBuffer:
+    """Return one buffer of the groups of all parts, which must agree on settings, version, iteration and steps.
+
+    Raises:
+        RolloutBufferError: they do not, or a group is in two parts.
+    """
+    first, groups = parts[0], [set(part.group_ids.tolist()) for part in parts]
+    of = [(part.config_hash[:12], part.policy_version, part.iteration, part.rollout.steps) for part in parts]
+    if different := [other for other in of if other != of[0]]:
+        raise RolloutBufferError(
+            f"buffers of (settings, version, iteration, steps) {of[0]} and {different[0]} do not belong together; "
+            "sample all parts by the same weights and settings"
+        )
+    if sum(map(len, groups)) != len(set.union(*groups)):
+        raise RolloutBufferError("a group is in two parts of a buffer; give each context its own group id")
+    rollouts, conditions = [part.rollout for part in parts], [part.condition for part in parts]
+    shares = torch.tensor([len(part) for part in parts]) / sum(map(len, parts))
+    squares = torch.stack([rollout.noise_share.cpu().square() for rollout in rollouts])
+    noise_share = (shares.unsqueeze(1) * squares).sum(0).sqrt()
+    return replace(
+        first,
+        rollout=replace(first.rollout, **{name: _cat(rollouts, name) for name in _ROWS}, noise_share=noise_share),
+        condition=Condition(*(_cat(conditions, name) for name in ("frames", "actions", "text"))),
+        group_ids=torch.cat([part.group_ids for part in parts]),
+        sample_ids=torch.cat([part.sample_ids for part in parts]),
+        rewards={name: torch.cat([part.rewards[name] for part in parts]) for name in first.rewards},
+        valid=torch.cat([part.valid for part in parts]),
+    )
+
+
+def _cat(parts: Sequence[Any], name: str) -> Any:
+    values = [getattr(part, name) for part in parts]
+    return None if values[0] is None else torch.cat(values)

@@ -41,9 +41,9 @@ class Clips:
         )
 
     def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:
-        """Return the first frames, the actions and the instruction."""
+        """Return the first frames, the actions and the instruction, where the codec is."""
         first = codec.encode(self.frames[:, :num_conditioning])
-        return Condition(first, self.actions, hashed_words(self.instructions, text_dim))
+        return Condition(first, self.actions, hashed_words(self.instructions, text_dim)).to(first.device)
 
 
 def load_clips(bags: Sequence[Path], stride: int) -> Clips:

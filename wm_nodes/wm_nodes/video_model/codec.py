@@ -77,7 +77,7 @@ class PatchCodec(nn.Module):
         if latents.shape[1] != self.channels:
             raise ValueError(f"this codec has {self.channels} channels, got latents of {latents.shape[1]}")
         B, _, F, h, w = latents.shape
-        patches = (latents.float().permute(0, 2, 3, 4, 1) * self.scale) @ self.basis + self.mean
+        patches = (latents.to(self.basis.device).float().permute(0, 2, 3, 4, 1) * self.scale) @ self.basis + self.mean
         p = self.patch
         pixels = patches.view(B, F, h, w, p, p, 3).permute(0, 1, 2, 4, 3, 5, 6).reshape(B, F, h * p, w * p, 3)
         return (pixels * 255).round().clamp(0, 255).to(torch.uint8)
@@ -88,5 +88,6 @@ class PatchCodec(nn.Module):
         p = self.patch
         if frames.dtype != torch.uint8 or H % p or W % p:
             raise ValueError(f"frames must be uint8 with sides that {p} divides, got {frames.dtype} of {H} x {W}")
+        frames = frames.to(self.basis.device)
         cut = frames.view(N, H // p, p, W // p, p, 3).permute(0, 1, 3, 2, 4, 5)
         return cut.reshape(N, H // p, W // p, -1).float() / 255

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.video import FlowMatchingConfig
+from wm_nodes.core.device import device_of
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.video_model import Condition, VideoNetwork
@@ -26,11 +27,16 @@ Batches = Callable[[int], tuple[Tensor, Condition]]
 def train_video_model(
     model: VideoNetwork, batches: Batches, settings: FlowMatchingConfig, *, seed: int, run_dir: Path | None,
 ) -> dict[str, float]:
-    """Train in place to the last iteration (resuming run_dir's checkpoint), ending with the averaged weights."""
+    """Train in place to the last iteration (resuming run_dir's checkpoint), ending with the averaged weights.
+
+    The batches may be elsewhere than the model, which computes where it is.
+    """
+    device = device_of(model)
     loop = TrainingLoop("video_model", model, settings.num_iterations, settings.learning_rate, run_dir)
 
     def loss(iteration: int) -> dict[str, Tensor]:
         latents, condition = batches(iteration)
+        latents, condition = latents.to(device), condition.to(device)
         return {"loss": flow_matching_loss(model, latents, condition, settings.drop, seed, iteration)}
 
     return loop.run(loss)
@@ -44,11 +50,11 @@ def flow_matching_loss(
     generator = torch_stream(seed, "flow_matching", iteration)
     t = torch.rand(B, generator=generator, dtype=torch.float64)
     shifted = SHIFT * t / (1 + (SHIFT - 1) * t)
-    t = torch.where(torch.arange(B) % 2 == 0, t, shifted)
+    t = torch.where(torch.arange(B) % 2 == 0, t, shifted).to(latents.device)
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
     hidden = (torch.rand(B, generator=generator) < drop).to(latents.device)
-    share = t.to(latents.device, latents.dtype).view(-1, 1, 1, 1, 1)
+    share = t.to(latents.dtype).view(-1, 1, 1, 1, 1)
     x_t = with_conditioning((1 - share) * latents + share * noise, condition.frames)
-    error = model(x_t, t.to(latents.device), condition, hidden) - (noise - latents)
+    error = model(x_t, t, condition, hidden) - (noise - latents)
     loss: Tensor = error[:, :, K:].square().mean()
     return loss

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
 from wm_nodes.config.schema import TokenizerConfig
@@ -45,8 +46,8 @@ def save_video_folder(
     return write_model_folder(folder, {name: weights.data for name, weights in packed.items()}, manifest)
 
 
-def load_video_folder(folder: Path) -> VideoFolder:
-    """Load and verify a folder, in evaluation mode.
+def load_video_folder(folder: Path, device: torch.device | str = "cpu") -> VideoFolder:
+    """Load and verify a folder, onto `device`, in evaluation mode.
 
     Raises:
         ModelFolderError: names the file, what is wrong, and the remedy.
@@ -55,7 +56,7 @@ def load_video_folder(folder: Path) -> VideoFolder:
     network = VideoNetwork(NetworkSettings(**manifest["network"]))
     _load(Path(folder) / NETWORK, network, manifest["sha256"][NETWORK])
     codec = _load_codec(Path(folder), manifest["sha256"][CODEC], **manifest["codec"])
-    return VideoFolder(codec, network, manifest["clip"], manifest)
+    return VideoFolder(codec.to(device), network.to(device), manifest["clip"], manifest)
 
 
 def _load_codec(folder: Path, sha256: str, kind: str, **settings: Any) -> Codec:

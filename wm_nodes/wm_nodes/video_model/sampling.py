@@ -25,7 +25,8 @@ class RolloutSettings:
     cfg: guidance g of v_u + g (v_c - v_u); 1 is off. storage_dtype: of the kept latents; x_s is rounded to it before
     its log-probability is taken. noise_store: keep the normalised noise of each step (zeta: exact, as large as the
     latents; zeta_bfloat16: half as large, with a KL of 1e-6 at its own anchor), or only the seed it was drawn from
-    (seed: no memory; needs float32 latents). micro_batch: videos per network call.
+    (seed: no memory; needs float32 latents). micro_batch: videos per network call. buffer_device: where the rollout is
+    kept, beside the model or in the host's memory.
     """
 
     num_steps: int = 10
@@ -35,6 +36,7 @@ class RolloutSettings:
     storage_dtype: Literal["float32", "bfloat16"] = "float32"
     noise_store: Literal["zeta", "zeta_bfloat16", "seed"] = "zeta"
     micro_batch: int = 16
+    buffer_device: Literal["model", "cpu"] = "model"
 
     def __post_init__(self) -> None:
         if self.noise_store == "seed" and self.storage_dtype != "float32":
@@ -86,6 +88,12 @@ class VideoRollout:
         tensors = {name: getattr(self, name)[index] for name in ("latents", "states", "mask", "sigma_base", "seeds")}
         return replace(self, **tensors, zeta=None if self.zeta is None else self.zeta[index])
 
+    def to(self, device: torch.device | str) -> "VideoRollout":
+        """The same videos on a device; seeds and times stay in the host's memory."""
+        names = ("latents", "states", "mask", "sigma_base", "noise_share", "zeta")
+        tensors = {name: tensor.to(device) for name in names if (tensor := getattr(self, name)) is not None}
+        return replace(self, **tensors)
+
     def state(self, k: int) -> Tensor:
         """x before step k, (N, C, F, H, W), storage dtype."""
         return self.states[:, self.state_steps.index(k)]
@@ -113,6 +121,8 @@ def sample_videos(
 ) -> VideoRollout:
     """Sample one video per row of `noise` (N, C, F, H, W), stochastic at the given steps, by ODE elsewhere.
 
+    It computes where `noise` and `condition` are, with the model.
+
     Args:
         seeds: int64 (N,), of each video's step noise.
         stochastic: None: every step but the last. Empty: the ODE.
@@ -130,13 +140,14 @@ def sample_videos(
         )
     chosen = [k for k in chosen if settings.trains_at(k)]
     rollout = _unsampled(noise, seeds, condition.num_conditioning, settings, chosen)
+    spent = torch.zeros(len(chosen), device=noise.device)
     for i in range(0, len(noise), settings.micro_batch):
         rows = slice(i, i + settings.micro_batch)
         part = rollout.rows(rows)
         squares = _sample(model, condition.rows(rows), noise[rows], settings, part)
-        rollout.noise_share.add_(squares, alpha=len(part.latents) / len(noise))
+        spent.add_(squares, alpha=len(part.latents) / len(noise))
         on_progress(min(rows.stop, len(noise)), len(noise))
-    return replace(rollout, noise_share=rollout.noise_share.sqrt())
+    return replace(rollout, noise_share=spent.sqrt().to(rollout.latents.device))
 
 
 def _unsampled(
@@ -146,7 +157,8 @@ def _unsampled(
     N, C, frames, H, W = noise.shape
     S, steps = len(stochastic), tuple(sorted({*stochastic, *(k + 1 for k in stochastic)}))
     kept = torch.bfloat16 if settings.noise_store == "zeta_bfloat16" else torch.float32
-    room = partial(torch.empty, dtype=torch.float32, device=noise.device)
+    device = noise.device if settings.buffer_device == "model" else torch.device("cpu")
+    room = partial(torch.empty, dtype=torch.float32, device=device)
     return VideoRollout(
         latents=room(N, C, frames, H, W),
         steps=tuple(stochastic),
@@ -156,7 +168,7 @@ def _unsampled(
         sigma_base=room(N, S),
         zeta=None if settings.noise_store == "seed" else room(N, S, C, frames - num_conditioning, H, W, dtype=kept),
         seeds=seeds.clone(),
-        noise_share=torch.zeros(S, device=noise.device),
+        noise_share=room(S),
         times=settings.times,
     )
 
@@ -166,15 +178,16 @@ def _sample(
 ) -> Tensor:
     """Sample one micro-batch into its rows of `rollout`; return the squared noise_share of its steps, (S,)."""
     times, N = settings.times, len(noise)
+    at = times.to(noise.device)
     storage = getattr(torch, settings.storage_dtype)
     context = StepContext(condition.frames.float(), first_time=float(times[1]))
     x = with_conditioning(noise.float(), context.conditioning)
-    squares = torch.empty_like(rollout.noise_share)
+    squares = torch.empty(len(rollout.steps), device=noise.device)
     for k in range(settings.num_steps):
         if k in rollout.state_steps:
             x = with_conditioning(x.to(storage).float(), context.conditioning)
             keep_state(rollout, k, x)
-        t, s = times[k].expand(N), times[k + 1].expand(N)
+        t, s = at[k].expand(N), at[k + 1].expand(N)
         v = guided_velocity(model, x, t, condition, settings.cfg).float()
         if k not in rollout.steps:
             x = with_conditioning(ode_step(x, v, t, s, context, settings.sampler).mean, context.conditioning)
@@ -201,7 +214,7 @@ def keep_transition(rollout: VideoRollout, k: int, x_s: Tensor, law: Step) -> No
     rollout.sigma_base[:, i] = law.sigma_base
     if rollout.zeta is not None:
         num_conditioning = x_s.shape[2] - rollout.zeta.shape[3]
-        if rollout.zeta.dtype == torch.float32:
+        if rollout.zeta.dtype == torch.float32 and rollout.zeta.device == x_s.device:
             normalised_noise(x_s, law, num_conditioning, out=rollout.zeta[:, i])
         else:
             rollout.zeta[:, i] = normalised_noise(x_s, law, num_conditioning)

@@ -62,7 +62,8 @@ class TokenizerCodec(nn.Module):
         if channels != self.channels:
             raise ValueError(f"this codec has {self.channels} channels, got latents of {channels}")
         tokenizer = self._resize(h * self.patch, w * self.patch)
-        tokens = tokenizer.normalise(latents.float().permute(0, 2, 3, 4, 1).reshape(B * count, h * w, channels))
+        cells = latents.to(tokenizer.device).float().permute(0, 2, 3, 4, 1)
+        tokens = tokenizer.normalise(cells.reshape(B * count, h * w, channels))
         parts = torch.split(tokens, BATCH)  # type: ignore[no-untyped-call]
         frames = torch.cat([tokenizer.decode(part) for part in parts])
         return frames.view(B, count, *frames.shape[1:]).clone()
@@ -80,7 +81,7 @@ class TokenizerCodec(nn.Module):
 
 
 def codec_of_world_model(folder: Path) -> TokenizerCodec:
-    """Return the tokenizer of a world-model folder as a codec. Raises ModelFolderError."""
+    """Return the tokenizer of a world-model folder as a codec, on the CPU. Raises ModelFolderError."""
     models = load_model_folder(folder)
     config = TokenizerConfig.model_validate(models.manifest["tokenizer"])
     codec = TokenizerCodec(config, models.tokenizer.height, models.tokenizer.width)

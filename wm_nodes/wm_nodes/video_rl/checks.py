@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import GrpoConfig
+from wm_nodes.core.device import device_of
 from wm_nodes.video_model import (
     Condition,
     RolloutBuffer,
@@ -51,7 +52,7 @@ def examine(
     """Sample a few videos of shape (C, F, H, W) and check them; the model's weights are as before afterwards.
 
     Args:
-        condition: of N >= 2 videos; two of them at least should move.
+        condition: of N >= 2 videos, where the model is; two of them at least should move.
         buffer_videos: of one buffer in training, for its memory; 0: as many as are sampled here.
 
     Raises:
@@ -59,7 +60,7 @@ def examine(
             anchor lora_off without an adapter.
     """
     seeds = torch.arange(len(condition.actions)) + seed
-    noise = initial_noise(shape, seeds).to(next(model.parameters()).device)
+    noise = initial_noise(shape, seeds).to(device_of(model))
     model.eval()
     sampled = sample_videos(model, condition, noise, seeds, rollout)
     if not bool(sampled.latents.isfinite().all()):

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from wm_nodes.core.device import device_of
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model.adapters.packages import package
 from wm_nodes.world_model import Tokenizer
@@ -51,8 +52,8 @@ class RandomFeatures:
 
     def __call__(self, frames: Tensor) -> Tensor:
         pixels = frames.permute(0, 3, 1, 2).float() / 127.5 - 1
-        hidden = F.relu(F.conv2d(pixels, self._first, stride=2, padding=2))
-        hidden = F.relu(F.conv2d(hidden, self._second, stride=2, padding=1))
+        hidden = F.relu(F.conv2d(pixels, self._first.to(pixels.device), stride=2, padding=2))
+        hidden = F.relu(F.conv2d(hidden, self._second.to(pixels.device), stride=2, padding=1))
         return F.adaptive_avg_pool2d(hidden, 4).flatten(1)
 
 
@@ -77,7 +78,8 @@ class BackboneFeatures:
 
     def __init__(self, model: nn.Module, size: int, mean: tuple[float, ...], std: tuple[float, ...], name: str) -> None:
         self._model, self._size, self.name = model.eval().requires_grad_(False), size, name
-        self._mean, self._std = (torch.tensor(values).view(1, 3, 1, 1) for values in (mean, std))
+        device = device_of(model)
+        self._mean, self._std = (torch.tensor(values, device=device).view(1, 3, 1, 1) for values in (mean, std))
 
     @torch.no_grad()
     def __call__(self, frames: Tensor) -> Tensor:
@@ -85,15 +87,16 @@ class BackboneFeatures:
         return torch.cat([self._pool(part) for part in parts])
 
     def _pool(self, frames: Tensor) -> Tensor:
-        pixels = frames.permute(0, 3, 1, 2).float() / 255
+        pixels = frames.to(self._mean.device).permute(0, 3, 1, 2).float() / 255
         pixels = F.interpolate(pixels, (self._size, self._size), mode="bicubic", antialias=True).clamp(0, 1)
         output: Any = self._model(pixel_values=(pixels - self._mean) / self._std)
         pooled: Tensor | None = getattr(output, "pooler_output", None)
         return (output.last_hidden_state[:, 0] if pooled is None else pooled).float()
 
 
-def load_backbone(folder: Path) -> BackboneFeatures:
-    """Load a vision backbone (config.json, model.safetensors, preprocessor_config.json if there) from a local folder.
+def load_backbone(folder: Path, device: torch.device | str = "cpu") -> BackboneFeatures:
+    """Load a vision backbone (config.json, model.safetensors, preprocessor_config.json if there) from a local folder,
+    onto `device`.
 
     Raises:
         ValueError: no config.json there, weights are missing or of another shape, or the model takes no pictures.
@@ -118,4 +121,5 @@ def load_backbone(folder: Path) -> BackboneFeatures:
     path = folder / "preprocessor_config.json"
     settings = json.loads(path.read_text()) if path.is_file() else {}
     mean, std = settings.get("image_mean", IMAGENET_MEAN), settings.get("image_std", IMAGENET_STD)
-    return BackboneFeatures(model, size, tuple(mean), tuple(std), f"{model.config.model_type} of {folder.name}")
+    name = f"{model.config.model_type} of {folder.name}"
+    return BackboneFeatures(model.to(device), size, tuple(mean), tuple(std), name)

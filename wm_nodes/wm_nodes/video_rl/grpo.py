@@ -4,6 +4,9 @@ Shapes: N videos, S stochastic steps, M transitions (video, step) of one network
 
 One buffer serves `updates_per_buffer` optimizer steps. Each one accumulates over every kept (video, step) pair, divided
 by their number, so that micro-batches and ranks do not change it. On the first one the ratio is 1 and DD-20 is 0.
+
+Everything is computed where the model is; a buffer may lie there or in the host's memory, from where it is moved by
+micro-batches.
 """
 
 import copy
@@ -13,6 +16,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +26,7 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.video import GrpoConfig
+from wm_nodes.core.device import device_of, synchronize
 from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError, check_same_layout
@@ -40,6 +45,7 @@ from wm_nodes.video_rl.group_advantages import (
 from wm_nodes.video_rl.grpo_math import clip_tails, clipped_objective
 from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
 
+SUMS = ("objective", "kl", "ratio", "low", "high", "forward_s", "kl_s", "backward_s")
 MAX_SKIPPED = 5
 """So many buffers in a row whose rewards differ in no group end a training: nothing can be learned from the reward."""
 
@@ -185,35 +191,34 @@ class GrpoLearner:
 
     def gradients(self, buffer: RolloutBuffer, rows: "Rows", advantages: GroupAdvantages) -> dict[str, float]:
         """Accumulate the gradient of L = -J + beta KL over the rows into .grad; return the sums for a report."""
-        device, total = next(self.model.parameters()).device, len(rows)
-        sums = dict.fromkeys(("objective", "kl", "ratio", "low", "high", "forward_s", "kl_s", "backward_s"), 0.0)
+        device, total, seconds = device_of(self.model), len(rows), [0.0, 0.0, 0.0]
+        sums = torch.zeros(5, dtype=torch.float64, device=device)
+        signals = advantages.advantages_N.to(device, torch.float32)
         weights = self._terms.step_weights(buffer, rows.videos[:1]) if self.settings.equalise else None
         limits = {"clip_low": self.settings.clip_low, "clip_high": self.settings.clip_high}
         own = self.ranks.share(torch.arange(total))
         for index in torch.split(own, self.settings.micro_batch):  # type: ignore[no-untyped-call]
-            start, part = time.perf_counter(), rows.part(index)
+            clock, part = [self._now(device)], rows.part(index)
             terms = self._terms.ratio(buffer, part)
-            ratio, signal = terms.log_ratio, advantages.advantages_N[part.videos].to(device, torch.float32)
+            ratio, signal = terms.log_ratio, signals[part.videos.to(device)]
             objective = clipped_objective(ratio, signal, **limits)
             if weights is not None:
                 objective = objective * weights[part.positions].to(device)
-            forward_end = time.perf_counter()
+            clock.append(self._now(device))
             kl = self._terms.kl(terms, buffer, part, self.version)
-            kl_end = time.perf_counter()
+            clock.append(self._now(device))
             loss = (self.settings.kl.beta * kl - objective).sum() / total
             loss.backward()  # type: ignore[no-untyped-call]
-            sums["forward_s"] += forward_end - start
-            sums["kl_s"] += kl_end - forward_end
-            sums["backward_s"] += time.perf_counter() - kl_end
-            low, high = clip_tails(ratio.detach(), **limits)
-            sums["objective"] += float(objective.detach().sum())
-            sums["kl"] += float(kl.detach().sum())
-            sums["ratio"] += float(ratio.detach().exp().sum())
-            sums["low"] += low * len(index) if len(index) else 0.0  # a share of none is not a number
-            sums["high"] += high * len(index) if len(index) else 0.0
-        values = torch.tensor(list(sums.values()), dtype=torch.float64)
+            clock.append(self._now(device))
+            seconds = [spent + end - start for spent, (start, end) in zip(seconds, pairwise(clock), strict=True)]
+            if len(index):  # a share of none is not a number
+                ratio = ratio.detach()
+                tails = [share * len(index) for share in clip_tails(ratio, **limits)]
+                means = (objective.detach().sum(), kl.detach().sum(), ratio.exp().sum())
+                sums += torch.stack([*(value.double() for value in means), *tails])
+        values = torch.cat([sums.cpu(), torch.tensor(seconds, dtype=torch.float64)])  # the only wait for the device
         self.ranks.sum_(values)
-        return dict(zip(sums, values.tolist(), strict=True))
+        return dict(zip(SUMS, values.tolist(), strict=True))
 
     def averaged_weights(self) -> AbstractContextManager[None]:
         """Return a context in which the model has its averaged weights, for evaluation; without EMA, its own."""
@@ -234,6 +239,11 @@ class GrpoLearner:
             return mixed_advantages(values, self.reward_weights, buffer.group_ids, trains, **shared)
         running = self._running if settings.std_scope == "running" else None
         return group_advantages(signal(rewards), buffer.group_ids, trains, **shared, running=running)
+
+    @staticmethod
+    def _now(device: torch.device) -> float:
+        synchronize(device)
+        return time.perf_counter()
 
     def _passes(self, buffer: RolloutBuffer, kept: Tensor) -> Iterator[Rows]:
         chosen = select_steps(
@@ -277,11 +287,12 @@ class GrpoLearner:
         )
 
     def _snapshot(self) -> dict[str, Any]:
-        """Copy to the host's memory what a failed train() puts back."""
+        """Copy what a failed train() puts back, where it is: on a GPU that is once more the memory of the weights that
+        train, of their two moments and of their average, and nothing crosses to the host."""
         return {
-            "model": {name: _copy_to_cpu(p) for name, p in _trained_parameters(self.model)},
-            "optimizer": {k: _copy_to_cpu(v) for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
-            "averaged": {name: _copy_to_cpu(value) for name, value in self.averaged.items()},
+            "model": {name: p.detach().clone() for name, p in _trained_parameters(self.model)},
+            "optimizer": {k: v.detach().clone() for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
+            "averaged": {name: value.clone() for name, value in self.averaged.items()},
             "anchor": self._terms.anchor,  # replaced, never changed
             "running": copy.copy(self._running),
             "version": self.version,
@@ -326,7 +337,7 @@ class GrpoLearner:
             if bool(values) != bool(checkpoint.section(tensors, prefix)):
                 raise ValueError(f"{path} was made with another grpo.{setting}; resume with its settings")
         _set_trained(self.model, weights)
-        device = next(self.model.parameters()).device
+        device = device_of(self.model)
         self.averaged, self._terms.anchor = (
             {name: value.to(device) for name, value in checkpoint.section(tensors, prefix).items()} for prefix in own
         )
@@ -370,10 +381,6 @@ def _swap_weights(model: nn.Module, values: dict[str, Tensor]) -> Iterator[None]
 
 def _trained_parameters(model: nn.Module) -> Iterator[tuple[str, Tensor]]:
     return ((name, p) for name, p in model.named_parameters() if p.requires_grad)
-
-
-def _copy_to_cpu(tensor: Tensor) -> Tensor:
-    return tensor.detach().to("cpu", copy=True)
 
 
 @torch.no_grad()

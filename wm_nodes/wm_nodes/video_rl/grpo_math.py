@@ -44,10 +44,10 @@ def clipped_objective(log_ratio_M: Tensor, advantages_M: Tensor, *, clip_low: fl
     return torch.minimum(ratio * advantages_M, ratio.clamp(1 - clip_low, 1 + clip_high) * advantages_M)
 
 
-def clip_tails(log_ratio_M: Tensor, *, clip_low: float, clip_high: float) -> tuple[float, float]:
-    """Return the shares of transitions whose ratio lies below 1 - clip_low, and above 1 + clip_high."""
+def clip_tails(log_ratio_M: Tensor, *, clip_low: float, clip_high: float) -> tuple[Tensor, Tensor]:
+    """Return the shares of transitions whose ratio lies below 1 - clip_low, and above 1 + clip_high, float64 ()."""
     ratio = log_ratio_M.exp()
-    return float((ratio < 1 - clip_low).float().mean()), float((ratio > 1 + clip_high).float().mean())
+    return (ratio < 1 - clip_low).float().mean().double(), (ratio > 1 + clip_high).float().mean().double()
 
 
 def mean_kl(new_zeta_MU: Tensor, target_zeta_MU: Tensor) -> Tensor:

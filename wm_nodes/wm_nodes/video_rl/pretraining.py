@@ -9,6 +9,7 @@ from torch import Tensor
 
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import compute_device, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
@@ -39,9 +40,9 @@ def make_video_model(
     Args:
         shipped: what shipped_video_model() gives; None: train one.
     """
-    folder = run_dir / "video_model"
+    folder, device = run_dir / "video_model", compute_device(config.device)
     if (folder / MANIFEST).is_file():
-        return load_video_folder(folder)
+        return load_video_folder(folder, device)
     story: dict[str, Any]
     if shipped is not None:
         model, kept = shipped, ("command", "date", "seed", "episodes", "training")
@@ -57,39 +58,41 @@ def make_video_model(
     means = {name: sum(values) / len(values) for name, values in scores.items()}
     story["heldout"] = means | _score_baselines(model, heldout, probe, config)
     save_video_folder(folder, model.codec, model.network, model.clip, story)
-    return load_video_folder(folder)
+    return load_video_folder(folder, device)
 
 
 def shipped_video_model(config: VideoRlConfig) -> VideoFolder | None:
-    """The video model that is shipped with the task's world model; None where there is none of these settings."""
+    """The video model that is shipped with the task's world model, on config.device; None where there is none of these
+    settings."""
     try:
         folder = shipped_model(config.task) / "video_model"
     except FileNotFoundError:
         return None
     if not (folder / MANIFEST).is_file():
         return None
-    shipped = load_video_folder(folder)
+    shipped = load_video_folder(folder, compute_device(config.device))
     return shipped if shipped.manifest["model"] == config.model.model_dump() else None
 
 
 def _train(config: VideoRlConfig, clips: Clips, run_dir: Path) -> tuple[VideoFolder, dict[str, float]]:
-    """Fit the codec and train the network; return both, and the last training losses."""
-    settings, K = config.model, config.model.num_conditioning
-    codec = _make_codec(config, clips)
+    """Fit the codec and train the network; return both, on config.device, and the last training losses."""
+    device, settings, K = compute_device(config.device), config.model, config.model.num_conditioning
+    codec = _make_codec(config, clips).to(device)
     latents, condition = codec.encode(clips.frames), clips.condition(codec, K, settings.text_dim)
     sizes = NetworkSettings(
         codec.channels, clips.actions.shape[2], settings.text_dim, settings.width, settings.depth,
         patch=CELLS[settings.codec], change_std=change_std(latents, K),
     )
     torch.manual_seed(stream_seed(config.seed, "video_network") % 2**32)
-    network = VideoNetwork(sizes)
+    network = VideoNetwork(sizes).to(device)
 
     def batch(iteration: int) -> tuple[Tensor, Condition]:
         drawn = numpy_stream(config.seed, "video_batches", iteration).choice(len(clips), settings.batch_size)
-        rows = torch.from_numpy(drawn)
+        rows = torch.from_numpy(drawn).to(device)
         return latents[rows], condition.rows(rows)
 
-    losses = train_video_model(network, batch, settings.training, seed=config.seed, run_dir=run_dir)
+    with explain_memory(device, model__batch_size=settings.batch_size):
+        losses = train_video_model(network, batch, settings.training, seed=config.seed, run_dir=run_dir)
     return VideoFolder(codec, network, {"stride": settings.stride, "num_conditioning": K}, {}), losses
 
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from wm_nodes.config.video import GrpoConfig
+from wm_nodes.core.device import device_of
 from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_model.kernels import masked_deviation
 from wm_nodes.video_model.sampling import RolloutSettings, step_noise
@@ -30,7 +31,7 @@ from wm_nodes.video_rl.grpo_math import (
 
 @dataclass(frozen=True)
 class Rows:
-    """Transitions of a buffer: videos, and positions among its stochastic steps, int64 (M,)."""
+    """Transitions of a buffer: videos, and positions among its stochastic steps, int64 (M,), in the host's memory."""
 
     videos: Tensor
     positions: Tensor
@@ -40,6 +41,11 @@ class Rows:
 
     def part(self, index: Tensor) -> "Rows":
         return Rows(self.videos[index], self.positions[index])
+
+    def of(self, stored: Tensor, positions: Tensor | None = None) -> Tensor:
+        """Return the rows (M, ...) of a tensor (N, S, ...) where that lies; positions: others than their own."""
+        places = self.positions if positions is None else positions
+        return stored[self.videos.to(stored.device), places.to(stored.device)]
 
 
 class Pass(NamedTuple):
@@ -108,19 +114,19 @@ class GrpoTerms:
     def _transition(
         self, model: Callable[..., Any], buffer: RolloutBuffer, rows: Rows, mask: Tensor | None
     ) -> GaussianTransition:
-        device = next(self.model.parameters()).device
+        device = device_of(self.model)
         rollout, times = buffer.rollout, self.rollout.times
         steps = torch.tensor(rollout.steps)[rows.positions]
         where = torch.tensor([rollout.state_steps.index(k) for k in rollout.steps])[rows.positions]
-        return transition(
-            model, buffer.condition.rows(rows.videos).to(device), rollout.states[rows.videos, where].to(device),
-            rollout.states[rows.videos, where + 1].to(device), times[steps], times[steps + 1],
-            None if mask is None else mask.to(device), self.rollout, cfg=self.settings.cfg,
-        )
+        x_t, x_s = (rows.of(rollout.states, places).to(device) for places in (where, where + 1))
+        t, s = times[torch.stack([steps, steps + 1])].to(device)
+        condition = buffer.condition.rows(rows.videos.to(buffer.condition.frames.device)).to(device)
+        mask = None if mask is None else mask.to(device)
+        return transition(model, condition, x_t, x_s, t, s, mask, self.rollout, cfg=self.settings.cfg)
 
     @staticmethod
     def _mask(buffer: RolloutBuffer, rows: Rows) -> Tensor:
-        return buffer.rollout.mask[rows.videos, rows.positions]
+        return rows.of(buffer.rollout.mask)
 
     def _log_ratio(self, new: GaussianTransition, old_zeta: Tensor, buffer: RolloutBuffer, rows: Rows) -> Tensor:
         if self.settings.mask_source == "recompute":
@@ -178,7 +184,7 @@ class GrpoTerms:
 def _stored_zeta(buffer: RolloutBuffer, rows: Rows) -> Tensor:
     """Return the normalised noise of the rollout, float32 (M, U); drawn again where only seeds are kept."""
     if buffer.rollout.zeta is not None:
-        return buffer.rollout.zeta[rows.videos, rows.positions].flatten(1).float()
+        return rows.of(buffer.rollout.zeta).flatten(1).float()
     shape, K = tuple(buffer.rollout.latents.shape[1:]), buffer.condition.num_conditioning
     steps = [buffer.rollout.steps[position] for position in rows.positions.tolist()]
     pairs = zip(rows.videos.tolist(), steps, strict=True)

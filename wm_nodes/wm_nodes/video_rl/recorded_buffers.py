@@ -17,6 +17,7 @@ from torch import Tensor
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.schema import AGENT
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import device_of
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.recording import Bag, BagError, topics
 from wm_nodes.recording.layout import Tiles
@@ -182,7 +183,7 @@ def rescore(
             f"{len(contexts)}; name the folder of the run that recorded it"
         )
     references = contexts.select(recorded.contexts)
-    frames = recorded.frames(*references.frames.shape[2:4])
+    frames = recorded.frames(*references.frames.shape[2:4]).to(device_of(probe))
     scores = score_clips(frames, references, probe, num_conditioning).named()
     unknown, verdicts = sorted(set(recorded.scores) - set(scores) - {AGENT}), tuple[Mapping[str, Any], ...]()
     if judge is not None and rewards.get(AGENT):

@@ -33,10 +33,10 @@ ERRORS = ("scenery", "object_cm", "tool_cm")
 
 @dataclass(frozen=True)
 class ClipScores:
-    """Per clip, float64 (N,). tracking: mean exp(-error / 3 cm) of object and tool over generated frames, in (0, 1].
-    scenery: mean absolute error, [0, 1], where the recording stands still. psnr_db: of generated frames. object_cm,
-    tool_cm: mean position errors. motion: object path length, share of the recorded one, at most 2; 1 where the
-    recorded object stands still.
+    """Per clip, float64 (N,), in the host's memory. tracking: mean exp(-error / 3 cm) of object and tool over generated
+    frames, in (0, 1]. scenery: mean absolute error, [0, 1], where the recording stands still. psnr_db: of generated
+    frames. object_cm, tool_cm: mean position errors. motion: object path length, share of the recorded one, at most 2;
+    1 where the recorded object stands still.
     """
 
     tracking: Tensor
@@ -51,27 +51,27 @@ class ClipScores:
 
 
 def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_conditioning: int) -> ClipScores:
-    """Score decoded clips, uint8 (N, F, H, W, 3), against the recordings of their contexts.
+    """Score decoded clips, uint8 (N, F, H, W, 3), against the recordings of their contexts, where the clips are.
 
     Raises:
         ValueError: clips and recordings differ in number or size.
     """
     if frames.shape != references.frames.shape:
         raise ValueError(f"clips are {tuple(frames.shape)}, their recordings {tuple(references.frames.shape)}")
-    generated = slice(num_conditioning, None)
+    generated, recorded = slice(num_conditioning, None), references.frames.to(frames.device)
     positions = probe.read(frames[:, generated])
     truth = probe_targets(references.ground_truth[:, generated], references.task)
     object_m = np.linalg.norm(positions[..., OBJECT] - truth[..., OBJECT], axis=-1)
     tool_m = np.linalg.norm(positions[..., TOOL] - truth[..., TOOL], axis=-1)
     tracking = (np.exp(-object_m / TRACKING_SCALE_M) + np.exp(-tool_m / TRACKING_SCALE_M)) / 2
-    error = (frames[:, generated].float() - references.frames[:, generated].float()) / 255
-    changed = (references.frames.int() - references.frames[:, :1].int()).abs().amax((1, 4)) > SEEN_MOTION
+    error = (frames[:, generated].float() - recorded[:, generated].float()) / 255
+    changed = (recorded.int() - recorded[:, :1].int()).abs().amax((1, 4)) > SEEN_MOTION
     still = (~changed)[:, None, :, :, None].float()
     weight = still.sum((1, 2, 3, 4)).clamp_min(1) * error.shape[1] * error.shape[4]
     return ClipScores(
         tracking=torch.from_numpy(tracking.mean(1)).double(),
-        scenery=((error.abs() * still).sum((1, 2, 3, 4)) / weight).double(),
-        psnr_db=(-10 * error.square().mean((1, 2, 3, 4)).clamp_min(1e-8).log10()).double(),
+        scenery=((error.abs() * still).sum((1, 2, 3, 4)) / weight).double().cpu(),
+        psnr_db=(-10 * error.square().mean((1, 2, 3, 4)).clamp_min(1e-8).log10()).double().cpu(),
         object_cm=torch.from_numpy(100 * object_m.mean(1)).double(),
         tool_cm=torch.from_numpy(100 * tool_m.mean(1)).double(),
         motion=torch.from_numpy(_path_share(positions[..., OBJECT], truth[..., OBJECT])).double(),
@@ -86,9 +86,9 @@ def more_is_better(name: str, values: ArrayLike) -> NDArray[np.float64]:
     return -scores if name in ERRORS else scores
 
 
-def load_probe(folder: Path) -> PositionProbe:
-    """Load the judge's probe of a world model's folder. Raises ValueError where it has none."""
-    probe = load_model_folder(folder).probe
+def load_probe(folder: Path, device: torch.device | str = "cpu") -> PositionProbe:
+    """Load the judge's probe of a world model's folder onto `device`. Raises ValueError where it has none."""
+    probe = load_model_folder(folder, device).probe
     if probe is None:
         raise ValueError(f"{folder} has no position probe to judge with; take the shipped world model")
     return probe
@@ -108,8 +108,9 @@ def mix_rewards(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> T
 
 def attach_rewards(buffer: RolloutBuffer, scores: Mapping[str, Tensor], total: Tensor) -> RolloutBuffer:
     """Return the buffer with raw scores and the mixed reward `total`; a clip whose total is NaN does not train."""
-    raw = {name: values.double() for name, values in scores.items()}
-    return replace(buffer.with_rewards({"total": total}), rewards={**raw, "total": total.double()})
+    raw = {name: values.double().cpu() for name, values in scores.items()}
+    scored = buffer.with_rewards({"total": total})
+    return replace(scored, rewards={**raw, **scored.rewards})
 
 
 def _path_share(positions: FloatArray, truth: FloatArray) -> FloatArray:

@@ -5,15 +5,15 @@ from dataclasses import dataclass
 
 import torch
 from pydantic import TypeAdapter
-from torch import Tensor
+from torch import Tensor, nn
 
 from wm_nodes.config.video import RolloutConfig, VideoRlConfig
+from wm_nodes.core.device import device_of, explain_memory
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.video_model import (
     Condition,
     RolloutBuffer,
     RolloutSettings,
-    VideoNetwork,
     config_hash,
     initial_noise,
     sample_videos,
@@ -44,17 +44,22 @@ class GroupRequest:
 
 
 def sample_buffer(
-    network: VideoNetwork, config: VideoRlConfig, condition: Condition, noise: Tensor, seeds: Tensor, groups: Tensor,
+    network: nn.Module, config: VideoRlConfig, condition: Condition, noise: Tensor, seeds: Tensor, groups: Tensor,
     samples: Tensor, iteration: int, policy_version: int,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RolloutBuffer:
     """Sample one video per row of `noise`, stochastic at the window's steps of `iteration`; the buffer has no rewards.
 
-    seeds: of each video's step noise. groups, samples: int64 (N,), see RolloutBuffer.
+    Noise and condition are moved to the network. seeds: of each video's step noise. groups, samples: int64 (N,), see
+    RolloutBuffer.
     """
     settings = rollout_settings(config.rollout)
     steps = stochastic_steps(settings.num_steps, config.window, iteration, config.seed)
-    rollout = sample_videos(network, condition, noise, seeds, settings, steps, on_progress)
+    device = device_of(network)
+    condition = condition.to(device)
+    with explain_memory(device, rollout__micro_batch=settings.micro_batch, groups__contexts=config.groups.contexts):
+        rollout = sample_videos(network, condition, noise.to(device), seeds, settings, steps, on_progress)
+    condition = condition.to(rollout.latents.device)
     valid = torch.ones(len(groups), dtype=torch.bool)
     return RolloutBuffer(
         rollout, condition, groups, samples, {}, valid, policy_version, iteration, config_hash(settings)
@@ -105,7 +110,7 @@ class ClipGenerator:
         rows = torch.arange(len(contexts))
         seeds = _seeds(self.config.seed, "clip_evaluation", 0, rows, torch.zeros_like(rows))
         settings = RolloutSettings(num_steps, self.config.rollout.shift, self.config.rollout.cfg)
-        noise = initial_noise(generator._shape(), seeds)
+        noise = initial_noise(generator._shape(), seeds).to(device_of(self.folder.network))
         rollout = sample_videos(self.folder.network, generator._condition(rows), noise, seeds, settings, [])
         return self.folder.codec.decode(rollout.latents)
 

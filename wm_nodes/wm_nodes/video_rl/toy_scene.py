@@ -15,6 +15,7 @@ from torch import Tensor
 
 from wm_nodes.config.shipped import PRETRAINED
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import device_of
 from wm_nodes.core.seeding import stream_seed, torch_stream
 from wm_nodes.training.weights import check_same_layout, unpack_weights
 from wm_nodes.video_model import (
@@ -69,17 +70,21 @@ class Scenes:
 
     def path(self, direction: Tensor) -> Tensor:
         """Centres (B, F, 2) of discs that go in `direction`, int64 (B,)."""
-        steps = torch.arange(FRAMES, dtype=torch.float32)
-        return self.start[:, None] + steps[None, :, None] * self.speed[:, None, None] * DIRECTIONS[direction][:, None]
+        steps = torch.arange(FRAMES, dtype=torch.float32, device=self.start.device)
+        way = DIRECTIONS.to(self.start.device)[direction]
+        return self.start[:, None] + steps[None, :, None] * self.speed[:, None, None] * way[:, None]
 
     def videos(self, direction: Tensor) -> Tensor:
         """Render (B, C, F, H, W)."""
         alpha = opacity_at(self.path(direction), RADIUS * self.scale, self.side)[:, None]
-        return self.background[:, :, None] * (1 - alpha) + COLOUR.view(1, 2, 1, 1, 1) * alpha
+        return self.background[:, :, None] * (1 - alpha) + COLOUR.to(alpha.device).view(1, 2, 1, 1, 1) * alpha
 
     def rows(self, index: Tensor) -> "Scenes":
         """Return the scenes of `index`, int64 (B,)."""
         return Scenes(self.background[index], self.start[index], self.speed[index], self.action[index])
+
+    def to(self, device: torch.device) -> "Scenes":
+        return Scenes(*(tensor.to(device) for tensor in vars(self).values()))
 
     def condition(self) -> Condition:
         """The clean first frame and the commanded action, one-hot on every frame."""
@@ -131,12 +136,13 @@ def training_batch(count: int, seed: int, iteration: int) -> tuple[Tensor, Condi
 
 
 def score(videos: Tensor, scenes: Scenes) -> Scores:
-    """Score videos (B, C, F, H, W) of the scenes, from their pixels and the known background."""
-    contrast = (COLOUR.view(1, 2, 1, 1) - scenes.background)[:, :, None]
+    """Score videos (B, C, F, H, W) of the scenes, from their pixels and the known background, where the videos are."""
+    scenes = scenes.to(videos.device)
+    contrast = (COLOUR.to(videos.device).view(1, 2, 1, 1) - scenes.background)[:, :, None]
     seen = ((videos.float() - scenes.background[:, :, None]) * contrast).sum(1) / contrast.square().sum(1)
     alpha = seen.clamp(0, 1)
     alpha = torch.where(alpha > 0.15, alpha, 0.0)  # texture errors are no disc
-    rows = torch.arange(scenes.side, dtype=torch.float32)
+    rows = torch.arange(scenes.side, dtype=torch.float32, device=videos.device)
     weight = alpha.sum((2, 3)).clamp_min(1e-6)
     centre = torch.stack([(alpha.sum(3) * rows).sum(2) / weight, (alpha.sum(2) * rows).sum(2) / weight], 2)
     wanted = scenes.path(scenes.action)
@@ -147,7 +153,7 @@ def score(videos: Tensor, scenes: Scenes) -> Scores:
     near = torch.maximum(*(opacity_at(place, reach, scenes.side) for place in (centre, wanted)))
     away = (near < 0.6)[:, None]
     wrong = (videos.float() - scenes.background[:, :, None]).square() * away
-    travelled = ((centre[:, -1] - centre[:, 0]) * DIRECTIONS[scenes.action]).sum(1) / scenes.scale
+    travelled = ((centre[:, -1] - centre[:, 0]) * DIRECTIONS.to(videos.device)[scenes.action]).sum(1) / scenes.scale
     change = videos.float().diff(dim=2).square().mean((1, 2, 3, 4))
     return Scores(
         task=torch.exp(-error[:, 1:] / 2).mean(1).double(),
@@ -209,7 +215,8 @@ class ToyContexts:
         seeds, settings = self._seeds("evaluation", 0, torch.arange(len(scenes))), rollout_settings(self.config.rollout)
         self.network.eval()
         noise = self._noise(scenes, seeds)
-        rollout = sample_videos(self.network, scenes.condition(), noise, seeds, settings, stochastic=[])
+        device = device_of(self.network)
+        rollout = sample_videos(self.network, scenes.condition().to(device), noise.to(device), seeds, settings, [])
         return score(rollout.latents, scenes)
 
     def _noise(self, scenes: Scenes, seeds: Tensor) -> Tensor:
@@ -228,16 +235,16 @@ def centred_pixels(videos: Tensor) -> Tensor:
 
 def opacity_at(centres: Tensor, radius: float = RADIUS, side: int = SIDE) -> Tensor:
     """A Gaussian disc at each centre (B, F, 2): (B, F, side, side), 1 in its middle."""
-    rows = torch.arange(side, dtype=torch.float32)
+    rows = torch.arange(side, dtype=torch.float32, device=centres.device)
     down = (rows - centres[..., :1]).square()[..., :, None]
     across = (rows - centres[..., 1:]).square()[..., None, :]
     return torch.exp(-(down + across) / (2 * radius**2))
 
 
-def load_base(path: Path | None = None) -> VideoNetwork:
-    """The base model: the one at `path`, or the shipped one."""
+def load_base(path: Path | None = None, device: torch.device | str = "cpu") -> VideoNetwork:
+    """The base model on `device`: the one at `path`, or the shipped one."""
     model = VideoNetwork(NETWORK)
     tensors, _ = unpack_weights((path or BASE).read_bytes())
     check_same_layout(model.state_dict(), tensors, what=str(path or BASE))
     model.load_state_dict(tensors)
-    return model.eval()
+    return model.to(device).eval()

@@ -16,6 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import device_of, explain_memory
 from wm_nodes.training.checkpoint import read_metadata
 from wm_nodes.training.metrics import MetricsWriter, read_metrics
 from wm_nodes.training.ranks import Ranks, broadcast_bytes
@@ -112,7 +113,11 @@ class VideoRun(TrainingRun):
             if self.ranks.size > 1 and self.ranks.rank == 0:
                 broadcast_bytes(buffer.to_bytes(), self.ranks)
             before, self.staleness = self.version, self.version - buffer.policy_version
-            with self.network.register_forward_pre_hook(lambda *_: check() if self.ranks.size == 1 else None):
+            stops = self.network.register_forward_pre_hook(lambda *_: check() if self.ranks.size == 1 else None)
+            device, micro_batch = device_of(self.network), self.config.grpo.micro_batch
+            with stops, explain_memory(device, grpo__micro_batch=micro_batch):
+                if self.config.rollout.buffer_device == "model":
+                    buffer = buffer.to(device)
                 report = self.learner.train(buffer)
             self.iterations += 1
             self.previous_version = before

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.device import device_of
 from wm_nodes.core.files import write_atomic
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips, load_clips
@@ -63,7 +64,7 @@ def validation_scores(
     Raises:
         BagError: an unusable bag. ValueError: model_dir has no position probe.
     """
-    clips, probe = load_clips(bags, folder.clip["stride"]), load_probe(model_dir)
+    clips, probe = load_clips(bags, folder.clip["stride"]), load_probe(model_dir, device_of(folder.network))
 
     def scores() -> dict[str, float]:
         values = context_scores(folder, clips, probe, config)

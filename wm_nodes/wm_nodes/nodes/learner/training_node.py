@@ -1,5 +1,6 @@
 """What the learners of both loops share: an action that trains, the announcement of versions, ranks behind the node."""
 
+import os
 import signal
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -113,17 +114,20 @@ class TrainingNode(ManagedNode):
 
 def run_learner(
     make_node: Callable[[Ranks], TrainingNode], params: Sequence[Param],
-    make_run: Callable[[Mapping[str, Any], Path, Ranks], TrainingRun],
+    make_run: Callable[[Mapping[str, Any], Path, Ranks], TrainingRun], device: Callable[[str], str],
 ) -> int:
     """One process, or under torchrun rank 0 as the node and the other ranks behind it; return the exit code.
 
     Args:
         make_run: the run of another rank, of the values of the node's parameters and the run folder.
+        device: the setting of a configuration file.
     """
-    ranks = join()
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return run_node(lambda: make_node(Ranks()))
+    values = read_parameters("learner", (*COMMON, *params))
+    ranks = join(device(str(values["config_file"])))
     if ranks.rank == 0:
         return run_node(lambda: make_node(ranks))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # rank 0 ends the others
-    values = read_parameters("learner", (*COMMON, *params))
     make_run(values, Path(str(values["run_dir"])), ranks).follow()
     return 0

@@ -4,7 +4,7 @@ Shapes: B batch, N camera frames, H W camera pixels, C latent channels, h w late
 frames.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,11 +17,14 @@ class VideoCodec:
 
     Args:
         device: where it computes. offload: it rests on the CPU and visits the device for each call.
+        clips_per_call: of the VAE, whose memory grows with them.
     """
 
-    def __init__(self, vae: Any, *, device: str | torch.device = "cpu", offload: bool = False) -> None:
+    def __init__(
+        self, vae: Any, *, device: str | torch.device = "cpu", offload: bool = False, clips_per_call: int = 1
+    ) -> None:
         self.vae = vae.requires_grad_(False).eval()
-        self.device, self.offload = torch.device(device), offload
+        self.device, self.offload, self.clips_per_call = torch.device(device), offload, clips_per_call
         self.frames_per_latent = int(vae.config.scale_factor_temporal)
         self.pixels_per_cell = int(vae.config.scale_factor_spatial)
         self.channels = int(vae.config.z_dim)
@@ -40,14 +43,21 @@ class VideoCodec:
             ValueError: another dtype or layout, or a size that the VAE does not divide.
         """
         self._check(frames)
-        pixels = frames.to(self.device).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
-        return self._encode(pixels)
+
+        def part(some: Tensor) -> Tensor:
+            return self._encode(some.to(self.device).permute(0, 4, 1, 2, 3).float() / 127.5 - 1)
+
+        return self._in_calls(part, frames)
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
         """Return uint8 camera frames (B, N, H, W, 3)."""
-        pixels = ((self._decode(latents) + 1) * 127.5).round().clamp(0, 255)
-        return pixels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous()
+
+        def part(some: Tensor) -> Tensor:
+            pixels = ((self._decode(some) + 1) * 127.5).round().clamp(0, 255)
+            return pixels.to(torch.uint8).permute(0, 2, 3, 4, 1).contiguous()
+
+        return self._in_calls(part, latents)
 
     @torch.no_grad()
     def continuation(self, latents: Tensor, num_frames: int) -> Tensor:
@@ -55,21 +65,25 @@ class VideoCodec:
 
         Their first frames are exactly those given; the rest is encoded from the frames as the VAE decodes them.
         """
-        pixels = self._decode(latents)
         N = 1 + (num_frames - 1) * self.frames_per_latent
-        grey = pixels.new_zeros((*pixels.shape[:2], N - pixels.shape[2], *pixels.shape[3:]))
-        rest = self._encode(torch.cat([pixels, grey], 2))
+        with self._present():
+            pixels = self._decode(latents)
+            grey = pixels.new_zeros((*pixels.shape[:2], N - pixels.shape[2], *pixels.shape[3:]))
+            rest = self._encode(torch.cat([pixels, grey], 2))
         return torch.cat([latents.to(rest), rest[:, :, latents.shape[2] :]], 2)
 
-    def _encode(self, pixels: Tensor) -> Tensor:
+    def _in_calls(self, function: Callable[[Tensor], Tensor], clips: Tensor) -> Tensor:
+        """The results for clips_per_call clips at a time, one below the other."""
         with self._present():
-            latents: Tensor = self.vae.encode(pixels.to(self.vae.dtype)).latent_dist.mode().float()
+            return torch.cat([function(some) for some in torch.split(clips, self.clips_per_call)])  # type: ignore[no-untyped-call]
+
+    def _encode(self, pixels: Tensor) -> Tensor:
+        latents: Tensor = self.vae.encode(pixels.to(self.vae.dtype)).latent_dist.mode().float()
         return (latents - self._mean) / self._std
 
     def _decode(self, latents: Tensor) -> Tensor:
         raw = latents.to(self.device, torch.float32) * self._std + self._mean
-        with self._present():
-            pixels: Tensor = self.vae.decode(raw.to(self.vae.dtype), return_dict=False)[0].float()
+        pixels: Tensor = self.vae.decode(raw.to(self.vae.dtype), return_dict=False)[0].float()
         return pixels
 
     @contextmanager

@@ -7,6 +7,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from wm_nodes.core.device import device_of
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.video_model.adapters.codec import VideoCodec
 from wm_nodes.video_model.adapters.cosmos import CosmosVelocity, CosmosVersion
@@ -15,6 +16,7 @@ from wm_nodes.video_model.adapters.packages import package
 from wm_nodes.video_model.adapters.text import MAX_TOKENS, TextEncoder, TextStyle
 from wm_nodes.video_model.adapters.velocity import PublicVelocity
 from wm_nodes.video_model.adapters.wan import GivenFrames, WanVelocity
+from wm_nodes.video_model.conditions import Condition
 
 Precision = Literal["float32", "bfloat16", "float16"]
 WAN = ("WanPipeline", "WanImageToVideoPipeline")
@@ -24,18 +26,23 @@ COSMOS2_FPS = 16
 
 @dataclass(frozen=True)
 class LoadSettings:
-    """dtype: of the weights. autocast: of the network's arithmetic (see PublicVelocity); None: that of the weights.
-    device: where the network lives. offload: VAE and text encoder rest on the CPU and visit the device. tiling: the VAE
-    works through large pictures in tiles. gradient_checkpointing: see PublicVelocity. text: load the text encoder;
+    """dtype: of the weights of network and text encoder; vae_dtype: of the VAE, whose pictures suffer from less than
+    float32. autocast: of the network's arithmetic (see PublicVelocity); None: that of the weights.
+    device: where everything computes; text_device: the text encoder, where elsewhere. offload: VAE and text encoder
+    rest on the CPU and visit the device. tiling: the VAE works through large pictures in tiles. vae_clips: clips per
+    call of the VAE. gradient_checkpointing: see PublicVelocity. text: load the text encoder;
     without it, Conditions bring text embedded elsewhere and guidance needs null_text. negative_prompt: what the
     unconditional branch is told. action_dim: see PublicVelocity.
     """
 
     dtype: Precision = "float32"
+    vae_dtype: Precision = "float32"
     autocast: Precision | None = None
     device: str = "cpu"
+    text_device: str | None = None
     offload: bool = False
     tiling: bool = False
+    vae_clips: int = 1
     gradient_checkpointing: bool = False
     text: bool = True
     max_tokens: int = MAX_TOKENS
@@ -51,6 +58,24 @@ class PublicVideoModel:
     codec: VideoCodec
     text: TextEncoder | None
     shift: float
+
+    def condition(self, frames: Tensor, prompts: list[str], latent_frames: int) -> Condition:
+        """Return what videos of `latent_frames` latent frames are made from, without actions, where the network is.
+
+        The text is projected once where the network has a frozen projection of it (see CosmosVelocity.project_text).
+
+        Args:
+            frames: given camera frames, uint8 (B, N, H, W, 3). prompts: one each.
+
+        Raises:
+            ValueError: there is no text encoder, or as VideoCodec.encode.
+        """
+        if self.text is None:
+            raise ValueError("there is no text encoder to embed a prompt with; load the folder with text=True")
+        device = device_of(self.velocity)
+        text = torch.cat([self.velocity.project_text(self.text.encode([p]).to(device)).float() for p in prompts])
+        actions = torch.zeros(len(frames), latent_frames - 1, 0)
+        return Condition(self.codec.encode(frames), actions, text).to(device)
 
 
 def load_public_model(
@@ -71,10 +96,10 @@ def load_public_model(
     if files.pipeline not in (*WAN, *COSMOS):
         raise ModelFolderError(f"{files.folder} holds a {files.pipeline}; supported are {', '.join((*WAN, *COSMOS))}")
     dtype = getattr(torch, settings.dtype)
-    vae = files.model("vae", "AutoencoderKLWan", dtype)
+    vae = files.model("vae", "AutoencoderKLWan", getattr(torch, settings.vae_dtype))
     if settings.tiling:
         vae.enable_tiling()
-    codec = VideoCodec(vae, device=settings.device, offload=settings.offload)
+    codec = VideoCodec(vae, device=settings.device, offload=settings.offload, clips_per_call=settings.vae_clips)
     text = _text(files, settings, dtype)
     if null_text is None and text is not None:
         null_text = text.encode([settings.negative_prompt])[0]
@@ -100,8 +125,8 @@ def _text(files: ModelFolder, settings: LoadSettings, dtype: torch.dtype) -> Tex
     version = COSMOS.get(files.pipeline)
     style: TextStyle = "wan" if version is None else "cosmos2" if version == "2" else "cosmos2.5"
     return TextEncoder(
-        files.text_encoder(dtype), files.tokenizer(), style, device=settings.device, offload=settings.offload,
-        max_tokens=settings.max_tokens,
+        files.text_encoder(dtype), files.tokenizer(), style, device=settings.text_device or settings.device,
+        offload=settings.offload, max_tokens=settings.max_tokens,
     )
 
 

@@ -68,6 +68,10 @@ class PublicVelocity(nn.Module):
         """Every network that samples, in order of falling noise."""
         return [self.transformer]
 
+    def project_text(self, text: Tensor) -> Tensor:
+        """Return the text as a Condition should keep it, (B, L, E)."""
+        return text
+
     def enable_gradient_checkpointing(self) -> None:
         """Trade a second forward pass for the activations' memory; same gradients."""
         for transformer in self.transformers():
