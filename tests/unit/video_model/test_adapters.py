@@ -581,6 +581,21 @@ class TestCodec:
             VideoCodec(tiny_vae()).encode(picture().repeat(1, 8, 1, 1, 1))
 
 
+def run_documented(folder: Path, out: Path, device: str, dtype: str) -> dict[str, Any]:
+    """The documented training of a public model, on two contexts; the reward stays where the clips are."""
+    page = (Path(__file__).parents[3] / "wm_nodes" / "docs" / "public_video_models.md").read_text()
+    (block,) = re.findall(r"## Training a public model.*?```python\n(.*?)```", page, re.DOTALL)
+    small = {"rollout.num_steps": 4, "groups.group_size": 4, "grpo.advantage.best_of_n": 2}
+    scope: dict[str, Any] = {
+        "folder": folder, "dtype": dtype, "device": device, "frames": torch.cat([picture(), picture(1)]),
+        "prompts": ["push the cube", "push left"], "settings": {**small, "grpo.learning_rate": 1e-3},
+        "latent_frames": FRAMES, "iterations": 2, "out": out,
+        "reward": lambda clips: clips.double().mean((1, 2, 3, 4)),
+    }
+    exec(block, scope)
+    return scope
+
+
 class TestFolder:
     @pytest.fixture(scope="class")
     def folder(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -616,16 +631,7 @@ class TestFolder:
         assert str(tmp_path) in capsys.readouterr().err
 
     def test_the_documented_training_runs_as_written_and_its_adapter_loads(self, folder: Path, tmp_path: Path) -> None:
-        page = (Path(__file__).parents[3] / "wm_nodes" / "docs" / "public_video_models.md").read_text()
-        (block,) = re.findall(r"## Training a public model.*?```python\n(.*?)```", page, re.DOTALL)
-        small = {"rollout.num_steps": 4, "groups.group_size": 4, "grpo.advantage.best_of_n": 2}
-        scope: dict[str, Any] = {
-            "folder": folder, "dtype": "bfloat16", "device": "cpu", "frames": torch.cat([picture(), picture(1)]),
-            "prompts": ["push the cube", "push left"],
-            "settings": {**small, "grpo.learning_rate": 1e-3}, "latent_frames": FRAMES, "iterations": 2,
-            "out": tmp_path, "reward": lambda clips: clips.double().mean((1, 2, 3, 4)),
-        }
-        exec(block, scope)
+        scope = run_documented(folder, tmp_path, "cpu", "bfloat16")
         assert scope["report"].kept == 4 and scope["learner"].version == 4
         trained = dict(scope["public"].velocity.named_parameters())
         other = load_public_model(folder, LoadSettings(dtype="bfloat16", text=False)).velocity

@@ -29,6 +29,7 @@ from wm_nodes.video_model import (
     RolloutSettings,
     SamplerSettings,
     StepContext,
+    concatenate_buffers,
     config_hash,
     step,
     step_noise,
@@ -258,6 +259,7 @@ def test_how_a_rollout_is_batched_or_its_noise_is_kept_does_not_make_it_another_
         config_hash(toy_rollout_settings(micro_batch=3))
         == config_hash(toy_rollout_settings(noise_store="seed"))
         == config_hash(toy_rollout_settings(noise_store="zeta_bfloat16"))
+        == config_hash(toy_rollout_settings(buffer_device="cpu"))
         == plain
     )
 
@@ -282,6 +284,31 @@ def test_a_video_is_valid_while_all_of_its_rewards_are_finite() -> None:
     assert buffer.with_rewards(rewards).valid.tolist() == [True, False, False, True]
     with pytest.raises(RolloutBufferError, match=r"reward a has shape \(3,\), the buffer 4 videos"):
         buffer.with_rewards({"a": torch.zeros(3)})
+
+
+def test_groups_sampled_in_parts_make_the_whole_buffer() -> None:
+    settings, model = toy_rollout_settings(), tiny_network()
+    first, second = (toy_buffer(model, settings, groups=1, size=size) for size in (4, 2))
+    second = replace(second, group_ids=second.group_ids + 1)
+    whole = concatenate_buffers([first, second])
+    assert len(whole) == 6 and whole.group_ids.tolist() == [0] * 4 + [1] * 2
+    assert whole.rollout.zeta is not None and whole.rollout.zeta.shape[0] == len(whole.rewards["brightness"]) == 6
+    assert torch.equal(whole.rollout.latents[4:], second.rollout.latents) and whole.valid.tolist() == [True] * 6
+    assert torch.equal(whole.condition.actions[4:], second.condition.actions)
+    rms = (4 * first.rollout.noise_share.square() + 2 * second.rollout.noise_share.square()) / 6
+    assert_close(whole.rollout.noise_share, rms.sqrt())
+    whole.check(settings, 0, 0)
+    part = toy_buffer(model, toy_rollout_settings(noise_store="seed"), groups=1)
+    assert concatenate_buffers([part, replace(part, group_ids=part.group_ids + 1)]).rollout.zeta is None
+
+
+@pytest.mark.parametrize("changes", [{"policy_version": 9}, {"config_hash": "x" * 64}, {"iteration": 7}])
+def test_parts_of_different_runs_or_of_one_group_do_not_make_a_buffer(changes: dict[str, object]) -> None:
+    part = toy_buffer(Analytic(swirl), toy_rollout_settings(), groups=1)
+    with pytest.raises(RolloutBufferError, match="do not belong together"):
+        concatenate_buffers([part, replace(part, **changes)])  # type: ignore[arg-type]
+    with pytest.raises(RolloutBufferError, match="a group is in two parts"):
+        concatenate_buffers([part, part])
 
 
 def test_rows_of_a_condition_are_repeated_in_groups() -> None:

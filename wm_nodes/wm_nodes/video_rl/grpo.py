@@ -11,6 +11,7 @@ micro-batches.
 
 import copy
 import json
+import math
 import time
 import warnings
 from collections.abc import Iterator, Mapping
@@ -267,8 +268,8 @@ class GrpoLearner:
         self._optimizer.zero_grad(set_to_none=True)
         sums = self.gradients(buffer, rows, advantages)
         self.ranks.sum_gradients(self.model)
-        norm = clip_grad_norm_(self.parameters, self.settings.max_grad_norm)
-        if not bool(torch.isfinite(norm)):
+        norm = float(clip_grad_norm_(self.parameters, self.settings.max_grad_norm))
+        if not math.isfinite(norm):
             raise FloatingPointError(
                 f"GRPO: the gradient is not finite at version {self.version}; lower the learning rate"
             )
@@ -281,7 +282,7 @@ class GrpoLearner:
         total = len(rows.videos)
         return UpdateReport(
             objective=sums["objective"] / total, kl=sums["kl"] / total, ratio_mean=sums["ratio"] / total,
-            clip_low_share=sums["low"] / total, clip_high_share=sums["high"] / total, grad_norm=float(norm),
+            clip_low_share=sums["low"] / total, clip_high_share=sums["high"] / total, grad_norm=norm,
             transitions=total, forward_seconds=sums["forward_s"],
             kl_seconds=sums["kl_s"], backward_seconds=sums["backward_s"],
         )

@@ -45,7 +45,8 @@ class Rows:
     def of(self, stored: Tensor, positions: Tensor | None = None) -> Tensor:
         """Return the rows (M, ...) of a tensor (N, S, ...) where that lies; positions: others than their own."""
         places = self.positions if positions is None else positions
-        return stored[self.videos.to(stored.device), places.to(stored.device)]
+        index = torch.stack([self.videos, places]).to(stored.device)
+        return stored[index[0], index[1]]
 
 
 class Pass(NamedTuple):

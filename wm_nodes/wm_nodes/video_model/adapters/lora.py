@@ -30,7 +30,7 @@ def add_lora(
         r=rank, lora_alpha=rank if alpha is None else alpha, target_modules=list(targets), lora_dropout=0.0
     )
     model.requires_grad_(False)
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):  # the weights are drawn on the CPU, then moved
         torch.manual_seed(seed)
         for transformer in model.transformers():
             transformer.add_adapter(config)
