@@ -22,6 +22,8 @@ diffusers = pytest.importorskip("diffusers")
 transformers = pytest.importorskip("transformers")
 pytest.importorskip("peft")
 
+from pretended_device import Device  # noqa: E402
+from safetensors.torch import load_file  # noqa: E402
 from video_toys import grpo_config, kl_config  # noqa: E402
 
 from wm_nodes.apps.cli import main  # noqa: E402
@@ -690,7 +692,7 @@ class TestFolder:
         refused("cannot be loaded as AutoencoderKLWan", short)
 
     def test_missing_weights_shards_and_other_models_are_refused(self, folder: Path, tmp_path: Path) -> None:
-        from safetensors.torch import load_file, save_file
+        from safetensors.torch import save_file
 
         part, weights = "transformer", "diffusion_pytorch_model.safetensors"
         lacking = self.copy(folder, tmp_path / "lacking")
@@ -708,6 +710,57 @@ class TestFolder:
         (other / "model_index.json").write_text(json.dumps({"_class_name": "LTXPipeline"}))
         with pytest.raises(ModelFolderError, match="LTXPipeline; supported are WanPipeline"):
             load_public_model(other)
+
+
+class TestDevice:
+    """Public models on a device as on the CPU."""
+
+    @pytest.mark.parametrize("kind", ["wan", "cosmos2.5"])
+    def test_a_lora_is_trained_by_the_documented_lines_as_on_the_cpu(
+        self, device: Device, kind: str, tmp_path: Path
+    ) -> None:
+        projected = {
+            "use_crossattn_projection": True, "crossattn_proj_in_channels": 32, "encoder_hidden_states_channels": E
+        }
+        pipeline = wan_image_pipeline() if kind == "wan" else cosmos25_pipeline(
+            transformer=cosmos_transformer(text_embed_dim=E, **projected)
+        )
+        if kind != "wan":
+            pipeline.register_modules(safety_checker=None)
+        pipeline.save_pretrained(tmp_path / "model", safe_serialization=True)
+        plain = run_documented(tmp_path / "model", tmp_path / "cpu", "cpu", "float32")
+        there = run_documented(tmp_path / "model", tmp_path / "device", device.name, "float32")
+        assert device.counts is None or device.counts.kernels > 10_000
+        buffer = there["parts"][0]
+        assert buffer.condition.frames.device.type == buffer.rollout.states.device.type == "cpu", "the preset's"
+        assert there["contexts"].text.device.type == there["public"].velocity.null_text.device.type == "cuda"
+        assert there["contexts"].text.shape[2] == E, "projected once"
+        assert there["learner"].version == 4 and plain["report"].kept == there["report"].kept == 4
+        assert there["report"].reward_mean == pytest.approx(plain["report"].reward_mean, rel=1e-4)
+        files = [path.relative_to(tmp_path / "cpu") for path in (tmp_path / "cpu").rglob("*.safetensors")]
+        for file in files:
+            wanted = load_file(tmp_path / "cpu" / file)
+            for name, tensor in load_file(tmp_path / "device" / file).items():
+                assert_close(tensor, wanted[name], rtol=1e-4, atol=1e-6 if device.counts else 5e-3)
+        assert files
+
+    def test_the_vae_takes_a_few_clips_at_a_time_and_the_text_encoder_may_live_elsewhere(
+        self, device: Device, tmp_path: Path
+    ) -> None:
+        wan_image_pipeline().save_pretrained(tmp_path, safe_serialization=True)
+        frames = torch.cat([picture(i).repeat(1, 5, 1, 1, 1) for i in range(5)])
+        whole = load_public_model(tmp_path, LoadSettings(max_tokens=12, vae_clips=8)).codec
+        settings = LoadSettings(max_tokens=12, vae_clips=2, device=device.name, text_device="cpu")
+        public, sizes = load_public_model(tmp_path, settings), list[int]()
+        public.codec.vae.encoder.register_forward_pre_hook(lambda _module, inputs: sizes.append(len(inputs[0])))
+        latents = public.codec.encode(frames)
+        assert set(sizes) == {1, 2} and latents.device.type == "cuda"
+        assert public.text is not None and public.text.encode(["push"]).device.type == "cpu"
+        condition = public.condition(frames[:2, :1], ["push", "left"], FRAMES)
+        assert condition.text.device.type == condition.frames.device.type == condition.actions.device.type == "cuda"
+        assert_close(latents.cpu(), whole.encode(frames), rtol=1e-4, atol=1e-5 if device.counts else 1e-2)
+        shown = public.codec.decode(latents).cpu().int() - whole.decode(latents.cpu()).int()
+        assert int(shown.abs().max()) <= (1 if device.counts else 3)
 
 
 class TestOptionalPackages:
