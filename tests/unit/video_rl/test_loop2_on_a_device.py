@@ -229,7 +229,7 @@ def test_clips_of_the_tokenizer_are_scored_shown_and_judged_from_the_device(devi
         codec = codec_of_world_model(world_model).to(where)
         torch.manual_seed(0)
         network = VideoNetwork(NetworkSettings(codec.channels, ACTION_DIM, 4, width=16, depth=1, patch=1)).to(where)
-        config = small_config(where)
+        config = small_config(where, **{"rollout.buffer_device": "cpu"})  # as what arrives from another process
         folder = VideoFolder(codec, network.eval(), {"stride": 1, "num_conditioning": 1}, {})
         source = RecordedContexts(folder, contexts, config, probe_on(where, 64, 128))
         request = source.request(0, 0)
