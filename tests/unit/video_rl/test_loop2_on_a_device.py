@@ -24,7 +24,7 @@ from benchmarks.video_rl.cost import toy_rollout
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import VideoRlConfig
-from wm_nodes.core.device import device_of
+from wm_nodes.core.device import DeviceError, device_of
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.judge.service import buffer_jobs
@@ -269,3 +269,25 @@ def test_the_benchmarks_measure_on_the_device(device: Device, tmp_path: Path) ->
     assert main(["benchmark", "video-rl", "learning", *sizes, *more]) == 0
     (row,) = json.loads((tmp_path / "rows.json").read_text())["rows"]
     assert row["seconds"]["train"] > 0 and len(row["after"]["obeyed"]) == 2
+
+
+def test_too_little_memory_for_clips_or_for_an_update_names_what_to_lower_and_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = small_config("cpu")
+    source = ToyContexts(load_base(), config)
+    request = source.request(0, 0)
+    buffer, before = source.score(request, source.sample(request)), weights_of(source.network)
+    run = VideoRun(source.network, config, tmp_path)
+
+    def full(*arguments: Any) -> Tensor:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
+
+    monkeypatch.setattr(VideoNetwork, "forward", full)
+    with pytest.raises(DeviceError, match=r"lower rollout.micro_batch from 4 to 2, groups.contexts from 2 to 1"):
+        source.sample(request)
+    with pytest.raises(DeviceError, match=r"lower grpo.micro_batch from 5 to 2"):
+        run.train(buffer)
+    run.close()
+    assert all(torch.equal(weights_of(source.network)[name], weight) for name, weight in before.items())
+    assert (run.version, run.iterations) == (0, 0)
