@@ -101,8 +101,7 @@ class ImaginedEnvironment:
         begins, first = self._tensor(mask), self._start_latents[self._tensor(self._starts)]
         self._latents = torch.where(begins[:, None, None], first, self._latents)
         for rows, caches in self._parts:
-            for cache in caches:
-                cache.restart(begins[rows])
+            caches[0].restart(begins[rows])
         self._steps[mask] = 0
         self._ended[mask] = False
         return self.current()

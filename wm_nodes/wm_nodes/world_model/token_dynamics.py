@@ -78,14 +78,10 @@ class TokenActionModel(nn.Module):
             prediction = self(now, drafts.unsqueeze(1), decided.unsqueeze(1), condition, caches)
             return tuple(part[:, 0] for part in prediction.logits)
 
-        _set_peeking(caches, True)
+        times = caches[0].times
+        times.peeking = True
         frame = decode_frame(predict, bits_NSD, self.num_passes).bits_BSD
-        _set_peeking(caches, False)
+        times.peeking = False
         everything = torch.ones(now.shape[:-1], dtype=torch.bool, device=now.device)
         committed = self(now, frame.unsqueeze(1), everything, condition, caches)
         return frame, committed.done_logits_BTKJ[:, 0]
-
-
-def _set_peeking(caches: list[RingCache], peeking: bool) -> None:
-    for cache in caches:
-        cache.peeking = peeking

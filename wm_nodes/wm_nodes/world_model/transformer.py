@@ -16,12 +16,13 @@ ROPE_BASE = 100.0
 class TemporalCache:
     """Keys and values of past frames for one block. Subclasses decide where they are kept."""
 
-    def extend(self, keys_BTSHE: Tensor, values_BTSHE: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Add T frames; return the keys, values (B, K, S, H, E) and the mask (B or 1, T, K), True where visible."""
+    def extend(self, keys_BTSHE: Tensor, values_BTSHE: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Add T frames; return the keys, values (B, K, S, H, E) and the mask (B or 1, T, K), True where visible; None
+        where everything is."""
         raise NotImplementedError
 
-    def rotation(self, num_frames: int, device: torch.device) -> Tensor:
-        """Time index (B or 1, T) of the next `num_frames` frames, for the rotary embedding."""
+    def angles(self, num_frames: int, num_values: int, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Cosine and sine (B or 1, T, 1, 1, E / 2) of the rotary embedding of the next `num_frames` frames."""
         raise NotImplementedError
 
 
@@ -31,79 +32,107 @@ class GrowingCache(TemporalCache):
     def __init__(self, window: int) -> None:
         self._window, self._keys, self._values, self._time = window, list[Tensor](), list[Tensor](), 0
 
-    def rotation(self, num_frames: int, device: torch.device) -> Tensor:
-        return torch.arange(self._time, self._time + num_frames, device=device).unsqueeze(0)
+    def angles(self, num_frames: int, num_values: int, device: torch.device) -> tuple[Tensor, Tensor]:
+        return _rotary_angles(torch.arange(self._time, self._time + num_frames, device=device).unsqueeze(0), num_values)
 
-    def extend(self, keys_BTSHE: Tensor, values_BTSHE: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def extend(self, keys_BTSHE: Tensor, values_BTSHE: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         num_new = keys_BTSHE.shape[1]
         self._keys.append(keys_BTSHE)
         self._values.append(values_BTSHE)
         self._time += num_new
         keys, values = torch.cat(self._keys, 1), torch.cat(self._values, 1)
         first = max(0, self._time - num_new - self._window + 1)
+        if num_new == 1:  # nothing behind the window was returned, and nothing later is there
+            return keys[:, first:], values[:, first:], None
         queries = torch.arange(self._time - num_new, self._time, device=keys.device).unsqueeze(1)
         past = torch.arange(first, self._time, device=keys.device).unsqueeze(0)
         mask = (past <= queries) & (past > queries - self._window)
         return keys[:, first:], values[:, first:], mask.unsqueeze(0)
 
 
-class RingCache(TemporalCache):
-    """Fixed memory for inference, one frame at a time; each of the B environments has its own time.
+class RingTimes:
+    """Each of B environments' own time, which the ring caches of all blocks share; what a frame needs of it (slots,
+    mask, rotary angles) is computed once, not in every block.
 
-    A frame is kept in slot (its time mod window). Attention runs over the slots that any environment has filled; those
-    that one has not filled yet weigh exactly 0 and come after its own, so that its numbers do not depend on when the
-    others were reset. On a GPU it runs over all slots and times change in place, without a question to the device, so
-    that a step can be captured as one graph. While `peeking`, a frame is seen but its slot is written again by the next
-    one: for trying drafts of a frame before the final one.
+    Attention runs over the slots that any environment has filled; those that one has not filled yet weigh exactly 0 and
+    come after its own, so that its numbers do not depend on when the others were reset. `fixed`, as on a GPU: it runs
+    over all slots and times change in place, without a question to the device, so that a step can be captured as one
+    graph. While `peeking`, a frame is seen but its slot is written again by the next one: for trying drafts of a frame
+    before the final one.
     """
 
-    def __init__(self, window: int) -> None:
-        self._window = window
-        self.peeking = False
-        self._keys: Tensor | None = None
-        self._values: Tensor | None = None
-        self._num_filled = 0
-        self._fixed = False
-        self.times_B: Tensor | None = None
-
-    def start(self, batch: int, device: torch.device) -> None:
+    def __init__(self, window: int, batch: int, device: torch.device, *, fixed: bool) -> None:
+        self.window, self.fixed, self.peeking = window, fixed, False
         self.times_B = torch.zeros(batch, dtype=torch.long, device=device)
+        self.rows_B = torch.arange(batch, device=device)
         self._num_filled = 0
-        self._fixed = device.type != "cpu"
+        self.forget_frame()
+
+    def forget_frame(self) -> None:
+        self.slots_B: Tensor | None = None
+        self._mask_B1K: Tensor | None = None
+        self._angles: tuple[Tensor, Tensor] | None = None
 
     def restart(self, mask_B: Tensor) -> None:
         """Forget the history of the environments in `mask_B`."""
-        if self.times_B is None:
-            raise RuntimeError("start the cache before restarting parts of it")
-        if self._fixed:
+        self.forget_frame()
+        if self.fixed:
             self.times_B.masked_fill_(mask_B, 0)
             return
         self.times_B = torch.where(mask_B, 0, self.times_B)
-        self._num_filled = min(self._window, int(self.times_B.max()))
+        self._num_filled = min(self.window, int(self.times_B.max()))
 
-    def rotation(self, num_frames: int, device: torch.device) -> Tensor:
-        if num_frames != 1 or self.times_B is None:
-            raise ValueError(f"a RingCache takes one frame at a time after start(), got {num_frames} frames")
-        return self.times_B.unsqueeze(1)
+    def angles(self, num_values: int) -> tuple[Tensor, Tensor]:
+        if self._angles is None:
+            self._angles = _rotary_angles(self.times_B.unsqueeze(1), num_values)
+        return self._angles
 
-    def extend(self, keys_BTSHE: Tensor, values_BTSHE: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        if self.times_B is None:
-            raise RuntimeError("start the cache before extending it")
-        batch, _, *rest = keys_BTSHE.shape
-        if self._keys is None or self._values is None:
-            self._keys = keys_BTSHE.new_zeros(batch, self._window, *rest)
-            self._values = torch.zeros_like(self._keys)
-        slots, rows = self.times_B % self._window, torch.arange(batch, device=keys_BTSHE.device)
-        self._keys[rows, slots] = keys_BTSHE[:, 0]
-        self._values[rows, slots] = values_BTSHE[:, 0]
-        visible = self._window if self._fixed else min(self._window, self._num_filled + 1)
-        filled = torch.arange(visible, device=keys_BTSHE.device) <= self.times_B.unsqueeze(1)
-        if not self.peeking and self._fixed:
+    def frame(self) -> tuple[Tensor, int, Tensor | None]:
+        """Slots (B,) of the frame, the number of slots to look at, and the mask (B, 1, K), None where all count."""
+        visible = self.window if self.fixed else min(self.window, self._num_filled + 1)
+        if self.slots_B is None:
+            self.slots_B = self.times_B % self.window
+            filled = torch.arange(visible, device=self.times_B.device) <= self.times_B.unsqueeze(1)
+            self._mask_B1K = filled.unsqueeze(1) if self.fixed or not bool(filled.all()) else None
+        return self.slots_B, visible, self._mask_B1K
+
+    def advance(self) -> None:
+        """The frame has passed through all blocks."""
+        if self.peeking:
+            return
+        self.forget_frame()
+        if self.fixed:
             self.times_B.add_(1)
-        elif not self.peeking:
+        else:
             self.times_B = self.times_B + 1
-            self._num_filled = visible
-        return self._keys[:, :visible], self._values[:, :visible], filled.unsqueeze(1)
+            self._num_filled = min(self.window, self._num_filled + 1)
+
+
+class RingCache(TemporalCache):
+    """Fixed memory of one block for inference, one frame at a time; a frame is kept in slot (its time mod window)."""
+
+    def __init__(self, times: RingTimes) -> None:
+        self.times = times
+        self._keys: Tensor | None = None
+        self._values: Tensor | None = None
+
+    def restart(self, mask_B: Tensor) -> None:
+        """Forget the history of the environments in `mask_B`, in all blocks."""
+        self.times.restart(mask_B)
+
+    def angles(self, num_frames: int, num_values: int, device: torch.device) -> tuple[Tensor, Tensor]:
+        if num_frames != 1:
+            raise ValueError(f"a RingCache takes one frame at a time, got {num_frames} frames")
+        return self.times.angles(num_values)
+
+    def extend(self, keys_BTSHE: Tensor, values_BTSHE: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        if self._keys is None or self._values is None:
+            self._keys = keys_BTSHE.new_zeros(keys_BTSHE.shape[0], self.times.window, *keys_BTSHE.shape[2:])
+            self._values = torch.zeros_like(self._keys)
+        slots, visible, mask = self.times.frame()
+        self._keys[self.times.rows_B, slots] = keys_BTSHE[:, 0]
+        self._values[self.times.rows_B, slots] = values_BTSHE[:, 0]
+        return self._keys[:, :visible], self._values[:, :visible], mask
 
 
 class Attention(nn.Module):
@@ -137,14 +166,14 @@ class TemporalAttention(Attention):
     def forward(self, x_BTSD: Tensor, cache: TemporalCache) -> Tensor:
         qkv = self.project(self.norm(x_BTSD)).unflatten(-1, (3, self.num_heads, -1))
         q_BTSHE, k_BTSHE, v_BTSHE = qkv.unbind(3)
-        cos, sin = _rotary_angles(cache.rotation(x_BTSD.shape[1], x_BTSD.device), q_BTSHE.shape[-1])
+        cos, sin = cache.angles(x_BTSD.shape[1], q_BTSHE.shape[-1], x_BTSD.device)
         q_BTSHE, k_BTSHE = _rotate(q_BTSHE, cos, sin), _rotate(k_BTSHE, cos, sin)
         keys, values, mask = cache.extend(k_BTSHE, v_BTSHE)
         if x_BTSD.shape[1] == 1:
             mixed = _attend_one_frame(q_BTSHE, keys, values, mask)
         else:
             q, k, v = (t.permute(0, 2, 3, 1, 4) for t in (q_BTSHE, keys, values))
-            mixed = attend(q, k, v, mask[:, None, None]).permute(0, 3, 1, 2, 4)
+            mixed = attend(q, k, v, None if mask is None else mask[:, None, None]).permute(0, 3, 1, 2, 4)
         out: Tensor = self.out(mixed.flatten(3))
         return out
 
@@ -197,11 +226,10 @@ class SpatioTemporalTransformer(nn.Module):
     def new_caches(self) -> list[TemporalCache]:
         return [GrowingCache(self.window) for _ in self.blocks]
 
-    def new_ring_caches(self, batch: int, device: torch.device) -> list[RingCache]:
-        caches = [RingCache(self.window) for _ in self.blocks]
-        for cache in caches:
-            cache.start(batch, device)
-        return caches
+    def new_ring_caches(self, batch: int, device: torch.device, *, fixed: bool | None = None) -> list[RingCache]:
+        """Caches of all blocks, which share their times. fixed: see RingTimes; by default on all devices but the CPU."""
+        times = RingTimes(self.window, batch, device, fixed=device.type != "cpu" if fixed is None else fixed)
+        return [RingCache(times) for _ in self.blocks]
 
     def forward(
         self, x_BTSD: Tensor, condition_BTND: Tensor, caches: list[TemporalCache] | list[RingCache] | None = None
@@ -209,6 +237,8 @@ class SpatioTemporalTransformer(nn.Module):
         """Features (B, T, S, D). With caches, frames continue where the caches' frames end."""
         for block, cache in zip(self.blocks, caches or self.new_caches(), strict=True):
             x_BTSD = block(x_BTSD, condition_BTND, cache)
+        if caches and isinstance(caches[0], RingCache):
+            caches[0].times.advance()
         out: Tensor = self.norm(x_BTSD)
         return out
 
@@ -222,10 +252,10 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None = None) -> Tenso
     return mixed
 
 
-def _attend_one_frame(q_B1SHE: Tensor, keys_BKSHE: Tensor, values_BKSHE: Tensor, mask_B1K: Tensor) -> Tensor:
+def _attend_one_frame(q_B1SHE: Tensor, keys_BKSHE: Tensor, values_BKSHE: Tensor, mask_B1K: Tensor | None) -> Tensor:
     """Attention of one frame over its past; products and sums, as matrices of one row are slow to multiply."""
     scores_BKSH = ((q_B1SHE * q_B1SHE.shape[-1] ** -0.5) * keys_BKSHE).sum(-1)
-    if mask_B1K.device.type != "cpu" or not bool(mask_B1K.all()):  # a GPU is not asked: the answer would be waited for
+    if mask_B1K is not None:
         scores_BKSH = scores_BKSH.masked_fill(~mask_B1K[:, 0, :, None, None], torch.finfo(scores_BKSH.dtype).min)
     mixed: Tensor = (scores_BKSH.softmax(1).unsqueeze(-1) * values_BKSHE).sum(1, keepdim=True)
     return mixed
