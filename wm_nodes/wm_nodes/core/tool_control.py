@@ -1,6 +1,8 @@
 """The controller's rule, equal in every environment (RS-9): legal actions, and where they command the tool."""
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray
@@ -17,6 +19,19 @@ def next_state(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -
         high = np.maximum(np.asarray(spec.state_high, np.float32), states)
         moved = np.clip(moved, low, high)
     return moved.astype(np.float32)
+
+
+def next_state_tensor(
+    states_NS: Tensor, actions_NA: Tensor, scale_A: Tensor, box_2S: Tensor | None
+) -> Tensor:
+    """next_state, to the bit, of tensors on one device. scale_A: the spec's action_scale. box_2S: state_low and
+    state_high; None: no box."""
+    moved = states_NS + scale_A * actions_NA
+    if box_2S is None:
+        return moved
+    return torch.minimum(
+        torch.maximum(moved, torch.minimum(box_2S[0], states_NS)), torch.maximum(box_2S[1], states_NS)
+    )
 
 
 def check_actions(actions: FloatArray, spec: EnvironmentSpec) -> None:

@@ -17,7 +17,13 @@ from wm_nodes.environments.maniskill.cameras import hand_over, table_top_cameras
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.reward import EncoderDistance, EndogenousReward
 from wm_nodes.training.weights import load_weights
-from wm_nodes.world_model import ImaginedEnvironment, WorldModels, load_model_folder, load_starts
+from wm_nodes.world_model import (
+    DeviceEnvironment,
+    ImaginedEnvironment,
+    WorldModels,
+    load_model_folder,
+    load_starts,
+)
 
 STATE_DIM, ACTION_DIM = 3, 3
 
@@ -104,6 +110,28 @@ def make_imagined_environment(
     )
     environment.cameras = table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
     return environment
+
+
+def make_device_environment(
+    config: RunConfig, model_dir: Path, starts_file: Path, *, num_envs: int
+) -> DeviceEnvironment:
+    """Return the world model as a device program for config.task, for DeviceCollector. Raises as
+    make_imagined_environment."""
+    models = models_of(Path(model_dir), config.device)
+    check_scene(config, model_dir, models.simulation)
+    return DeviceEnvironment(
+        models, simulation_spec(config.task, config.simulation, num_envs), load_starts(Path(starts_file)),
+        config.reward, num_envs=num_envs, with_goals=config.reward.dense_weight > 0,
+    )
+
+
+def make_training_environment(
+    config: RunConfig, model_dir: Path, starts_file: Path, *, num_envs: int, seed: int
+) -> ImaginedEnvironment | DeviceEnvironment:
+    """Return the environment that policy_rl.train trains in fastest: on a GPU rollouts stay there."""
+    if compute_device(config.device).type == CPU:
+        return make_imagined_environment(config, model_dir, starts_file, num_envs=num_envs, seed=seed)
+    return make_device_environment(config, model_dir, starts_file, num_envs=num_envs)
 
 
 def check_scene(config: RunConfig, model_dir: Path, simulation: SimulationConfig) -> None:

@@ -9,11 +9,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
@@ -24,6 +21,7 @@ from wm_nodes.policy_rl.advantages import explained_variance, gae, masked_normal
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.losses import approximate_kl, clip_fraction, clipped_policy_loss, value_loss
 from wm_nodes.policy_rl.rollouts import Canceled
+from wm_nodes.policy_rl.tensor_rollout import TensorRollout, tensors_of
 from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import check_same_layout
@@ -83,8 +81,10 @@ class PpoLearner:
             eps=1e-5,
         )
 
-    def update(self, rollout: Rollout, *, should_stop: Callable[[], bool] | None = None) -> PpoMetrics:
-        """Train on one rollout.
+    def update(
+        self, rollout: Rollout | TensorRollout, *, should_stop: Callable[[], bool] | None = None
+    ) -> PpoMetrics:
+        """Train on one rollout, of which a TensorRollout is on the policy's device.
 
         Raises:
             Canceled: should_stop, asked before every minibatch, said so on some rank; nothing has changed then.
@@ -124,9 +124,9 @@ class PpoLearner:
         checkpoint.restore_optimizer(self._optimizer, checkpoint.section(tensors, "optimizer."))
         self.updates = int(metadata["updates"])
 
-    def _update(self, rollout: Rollout, should_stop: Callable[[], bool] | None) -> PpoMetrics:
+    def _update(self, rollout: Rollout | TensorRollout, should_stop: Callable[[], bool] | None) -> PpoMetrics:
         config = self.config
-        samples = self._samples(rollout)
+        samples = self._samples(tensors_of(rollout, self.policy) if isinstance(rollout, Rollout) else rollout)
         count = len(samples.actions)
         totals: dict[str, float] = {}
         trained = 0
@@ -147,7 +147,7 @@ class PpoLearner:
                     break
             if stop:
                 break
-        if not all(bool(torch.isfinite(parameter).all()) for parameter in self.policy.parameters()):
+        if not bool(torch.stack([torch.isfinite(parameter).all() for parameter in self.policy.parameters()]).all()):
             raise self._not_finite("weight")
         return PpoMetrics(
             **{name: value / trained for name, value in totals.items()}, learning_rate=config.learning_rate,
@@ -177,8 +177,6 @@ class PpoLearner:
         (loss / len(index)).backward()  # type: ignore[no-untyped-call]
         self.ranks.sum_gradients(self.policy)
         norm = clip_grad_norm_(self.policy.parameters(), config.max_grad_norm)
-        if not torch.isfinite(norm):
-            raise self._not_finite("gradient")
         with torch.no_grad():
             sums = torch.stack([
                 policy_losses.sum(), value_losses.sum(), entropies.sum(), approximate_kl(logprobs, old).sum(),
@@ -186,11 +184,14 @@ class PpoLearner:
             ])
         self.ranks.sum_(sums)
         names = ("loss_policy", "loss_value", "entropy", "approx_kl", "kl_reference", "clip_fraction")
-        means = dict(zip(names, (sums / len(index)).tolist(), strict=True))
+        *told, grad_norm = torch.cat((sums / len(index), norm.view(1))).tolist()  # the one wait for the device
+        if not math.isfinite(grad_norm):
+            raise self._not_finite("gradient")
+        means = dict(zip(names, told, strict=True))
         if not all(math.isfinite(means[name]) for name in ("loss_policy", "loss_value", "entropy", "kl_reference")):
             raise self._not_finite("loss")
         self._optimizer.step()
-        return means | {"grad_norm": float(norm)}
+        return means | {"grad_norm": grad_norm}
 
     def _not_finite(self, what: str) -> FloatingPointError:
         return FloatingPointError(
@@ -198,52 +199,36 @@ class PpoLearner:
         )
 
     @torch.no_grad()
-    def _samples(self, rollout: Rollout) -> _Samples:
-        steps, num_envs = rollout.valid_TN.shape
-        valid_TN = self._tensor(rollout.valid_TN)
-        if not bool(valid_TN.any()):
+    def _samples(self, rollout: TensorRollout) -> _Samples:
+        valid_TN = rollout.valid_TN
+        chosen = valid_TN.reshape(-1).nonzero().squeeze(1)
+        if not len(chosen):
             raise ValueError("the rollout has no valid transition: no valid reward or step; see the reward's reason")
-        unknown = rollout.valid_TN & ~(np.isfinite(rollout.logprobs_TN) & np.isfinite(rollout.values_TN))
+        unknown = valid_TN & ~(torch.isfinite(rollout.logprobs_TN) & torch.isfinite(rollout.values_TN))
         if unknown.any():
             raise ValueError(
-                f"{unknown.sum()} of {rollout.valid_TN.sum()} valid transitions have no log_prob or value; PPO trains "
+                f"{int(unknown.sum())} of {len(chosen)} valid transitions have no log_prob or value; PPO trains "
                 "on rollouts of a policy that publishes both"
             )
-        flat = (steps * num_envs, -1)
-        features = self.policy.features(rollout.images_TN.reshape(-1, *rollout.images_TN.shape[2:]))
-        states = self._tensor(rollout.states_TN).reshape(flat)
-        next_values = self._next_values(rollout)
-        rewards = self._tensor(np.where(rollout.valid_TN, rollout.rewards_TN, 0.0).astype(np.float32))
-        values = self._tensor(rollout.values_TN)
         advantages, returns = gae(
-            rewards, values, next_values, self._tensor(rollout.terminated_TN),
-            self._tensor(rollout.truncated_TN), valid_TN, gamma=self.config.gamma, lambda_=self.config.gae_lambda,
+            torch.where(valid_TN, rollout.rewards_TN, 0.0), rollout.values_TN, self._next_values(rollout),
+            rollout.terminated_TN, rollout.truncated_TN, valid_TN,
+            gamma=self.config.gamma, lambda_=self.config.gae_lambda,
         )
         advantages = masked_normalise(advantages, valid_TN)
-        chosen = valid_TN.reshape(-1)
-        return _Samples(
-            features=features[chosen], states=states[chosen],
-            actions=self._tensor(rollout.actions_TN).reshape(flat)[chosen],
-            logprobs=self._tensor(rollout.logprobs_TN).reshape(-1)[chosen], values=values.reshape(-1)[chosen],
-            advantages=advantages.reshape(-1)[chosen], returns=returns.reshape(-1)[chosen],
+        columns = (
+            rollout.features_TN, rollout.states_TN, rollout.actions_TN, rollout.logprobs_TN, rollout.values_TN,
+            advantages, returns,
         )
+        return _Samples(*(column.flatten(0, 1)[chosen] for column in columns))
 
-    def _next_values(self, rollout: Rollout) -> Tensor:
+    def _next_values(self, rollout: TensorRollout) -> Tensor:
         """Values (T, N) of the observations that steps reached: the next row's where the episode goes on, else the
         critic's own, computed only where a bootstrap needs it."""
-        steps = rollout.valid_TN.shape[0]
-        following = np.concatenate([rollout.values_TN[1:], np.zeros_like(rollout.values_TN[:1])])
-        needed = (
-            rollout.valid_TN & ~rollout.terminated_TN
-            & (rollout.truncated_TN | (np.arange(steps)[:, None] == steps - 1))
-        )
-        values = self._tensor(np.where(rollout.valid_TN, following, 0.0).astype(np.float32))
-        if needed.any():
-            features = self.policy.features(rollout.next_images_TN[needed])
-            states = self._tensor(rollout.next_states_TN[needed])
-            values[self._tensor(needed)] = self.policy.value(features, states)
+        following = torch.cat([rollout.values_TN[1:], torch.zeros_like(rollout.values_TN[:1])])
+        values = torch.where(rollout.valid_TN, following, 0.0)
+        needed = rollout.needs_bootstrap().flatten().nonzero().squeeze(1)
+        if len(needed):
+            features, states = (c.flatten(0, 1)[needed] for c in (rollout.next_features_TN, rollout.next_states_TN))
+            values.view(-1)[needed] = self.policy.value(features, states)
         return values
-
-    def _tensor(self, array: NDArray[Any]) -> Tensor:
-        """The array on the policy's device."""
-        return torch.from_numpy(array).to(self.policy.device)

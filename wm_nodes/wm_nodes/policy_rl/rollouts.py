@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.core.types import BoolArray, Environment, FloatArray, Rollout, UInt8Array, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.tensor_rollout import Outcomes, TensorRollout
 from wm_nodes.reward import RewardInput, RewardModel
 
 TRAINING_SEED_LIMIT = 1_000_000
@@ -129,11 +130,13 @@ def terminate_at_episode_end(rollout: Rollout) -> Rollout:
     return replace(rollout, terminated_TN=ended, truncated_TN=np.zeros_like(ended))
 
 
-def rollout_statistics(rollout: Rollout) -> RolloutStatistics:
+def rollout_statistics(rollout: Outcomes | TensorRollout) -> RolloutStatistics:
     """Return counts and means of the episodes that ended inside the rollout.
 
     The return of an episode with an invalid step in its middle leaves that step out.
     """
+    if isinstance(rollout, TensorRollout):
+        rollout = rollout.outcomes()
     returns: list[float] = []
     lengths: list[int] = []
     successes = cut = 0

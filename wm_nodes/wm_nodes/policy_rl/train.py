@@ -2,46 +2,53 @@
 
 The ROS graph is this loop with the environment, the policy, the reward and the learner in a process each, and gives the
 same weights bit for bit (tests/graph/test_training.py). `python -m wm_nodes.policy_rl.train` runs it: a policy that
-knows nothing learns to reach in the shipped world model, seconds per update, no simulator.
+knows nothing learns to reach in the shipped world model, seconds per update, no simulator. With `--device cuda` whole
+rollouts stay on the GPU.
 """
 
+import argparse
 from collections.abc import Iterator
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import Environment, Rollout
-from wm_nodes.policy_rl.factories import make_endogenous_reward, make_imagined_environment, make_policy
+from wm_nodes.policy_rl.device_rollout import make_collector
+from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy, make_training_environment
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.ppo import PpoLearner, PpoMetrics
-from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics
+from wm_nodes.policy_rl.rollouts import rollout_statistics
+from wm_nodes.policy_rl.tensor_rollout import TensorRollout
 from wm_nodes.reward import RewardModel
+from wm_nodes.world_model import DeviceEnvironment
 
 
 def train_policy(
-    policy: ImagePolicy, env: Environment, reward: RewardModel, config: RunConfig
-) -> Iterator[tuple[Rollout, PpoMetrics]]:
+    policy: ImagePolicy, env: Environment | DeviceEnvironment, reward: RewardModel, config: RunConfig
+) -> Iterator[tuple[Rollout | TensorRollout, PpoMetrics]]:
     """Train `policy` in place for ppo.updates updates; yield the rollout and the metrics of each.
 
     A rollout has ppo.num_steps x ppo.num_envs environment steps, however many environments `env` steps at a time.
     """
     learner = PpoLearner(policy, config.ppo, seed=config.seed)
+    collect = make_collector(env, policy, reward)  # act, step, reward
     num_steps = config.ppo.num_steps * config.ppo.num_envs // env.spec.num_envs
     for version in range(1, config.ppo.updates + 1):
-        rollout = collect_rollout(env, policy, reward, num_steps, config.seed, version)  # act, step, reward
-        metrics = learner.update(rollout)  # the policy is version + 1 from here on
-        yield rollout, metrics
+        rollout = collect(num_steps, config.seed, version)
+        yield rollout, learner.update(rollout)  # the policy is version + 1 from here on
 
 
-def main() -> None:
-    config = load_config("cpu", {"task": "reach", "ppo.updates": 12})
-    model_dir = shipped_model(config.task)
-    policy = make_policy(config, model_dir)
-    env = make_imagined_environment(
-        config, model_dir, model_dir / STARTS, num_envs=config.ppo.num_envs, seed=config.seed
-    )
-    reward = make_endogenous_reward(config, model_dir)
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m wm_nodes.policy_rl.train")
+    for name, default in (("preset", "cpu"), ("device", ""), ("task", "reach"), ("updates", "12")):
+        parser.add_argument(f"--{name}", default=default)
+    options = parser.parse_args(words)
+    device = {"device": options.device} if options.device else {}
+    config = load_config(options.preset, {"task": options.task, "ppo.updates": int(options.updates), **device})
+    model = shipped_model(config.task)
+    policy, reward = make_policy(config, model), make_endogenous_reward(config, model)
+    env = make_training_environment(config, model, model / STARTS, num_envs=config.ppo.num_envs, seed=config.seed)
     for version, (rollout, metrics) in enumerate(train_policy(policy, env, reward, config), 1):
         success = rollout_statistics(rollout).success_rate
         print(f"version {version}: imagined success {success:.1%}, {metrics.kl_reference:.3f} nats from version 1")

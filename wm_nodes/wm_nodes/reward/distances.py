@@ -73,16 +73,17 @@ class EncoderDistance:
         keys = [hashlib.blake2b(image.tobytes(), digest_size=16).digest() for image in images]
         new = list({key: index for index, key in enumerate(keys) if key not in self._known}.items())
         if new:
-            for (key, _), feature in zip(new, self._encode(images[[index for _, index in new]]), strict=True):
+            for (key, _), feature in zip(new, self.encode(images[[index for _, index in new]]), strict=True):
                 self._known[key] = feature
         features = torch.stack([self._known[key] for key in keys])
         for key in list(self._known)[: max(0, len(self._known) - CACHED_IMAGES)]:
             del self._known[key]
         return features
 
-    def _encode(self, images: UInt8Array) -> Tensor:
-        """Encode in batches of one size, the last one filled up, so that an image's features do not depend on how many
-        others were new: a recorded reward is computed again bit by bit."""
+    @torch.no_grad()
+    def encode(self, images: UInt8Array) -> Tensor:
+        """Features (N, F), in batches of one size, the last one filled up, so that an image's features do not depend on
+        how many others were new: a recorded reward is computed again bit by bit."""
         missing = -len(images) % BATCH
         filled = np.concatenate([images, np.zeros((missing, *images.shape[1:]), np.uint8)])
         parts = [self.encoder(torch.from_numpy(filled[i : i + BATCH])).float() for i in range(0, len(filled), BATCH)]

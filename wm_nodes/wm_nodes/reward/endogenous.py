@@ -43,6 +43,14 @@ class EndogenousReward:
     def version(self) -> int:
         return version_of(self.name, self._config.model_dump_json(), self._distance.name)
 
+    @property
+    def config(self) -> RewardConfig:
+        return self._config
+
+    @property
+    def distance(self) -> Distance:
+        return self._distance
+
     def evaluate(self, step: RewardInput) -> RewardResult:
         config = self._config
         dense = np.zeros(len(step.images), np.float32)

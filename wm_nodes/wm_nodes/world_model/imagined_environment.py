@@ -47,6 +47,41 @@ def load_starts(path: Path) -> tuple[UInt8Array, FloatArray]:
     return tensors["images"].numpy(), tensors["states"].numpy()
 
 
+def imagined_spec(models: WorldModels, spec: EnvironmentSpec, num_envs: int) -> EnvironmentSpec:
+    """The spec of the simulator as that of `models`, which stand in for it."""
+    return replace(
+        spec, env_id=f"wm/{spec.task}", source=SOURCE_IMAGINED, num_envs=num_envs, ground_truth_names=(),
+        world_model_sha256=models.sha256,
+    )
+
+
+def encode_starts(models: WorldModels, images: UInt8Array) -> Tensor:
+    """Latents (M, S, D) of first frames (M, H, W, 3)."""
+    return torch.cat([models.tokenizer.encode(images[i : i + 256]) for i in range(0, len(images), 256)])
+
+
+def start_of(seed: int, num_starts: int) -> int:
+    """The start at which a reset with `seed` begins."""
+    return int(numpy_stream(seed, "start").integers(num_starts))
+
+
+def imagine_start_goals(
+    models: WorldModels, images: UInt8Array, spec: EnvironmentSpec, reward: RewardConfig
+) -> tuple[UInt8Array, BoolArray] | None:
+    """Goal frame and found flag of every start: one per (first frame, instruction), so computed once; None without a
+    text model."""
+    if models.text is None:
+        return None
+    parts = [
+        imagine_goals(
+            models.text, models.tokenizer, images[i : i + GOAL_BATCH], spec.instruction, models.task_index(spec.task),
+            horizon=spec.max_episode_steps, threshold=reward.goal_threshold,
+        )
+        for i in range(0, len(images), GOAL_BATCH)
+    ]
+    return np.concatenate([part.goals for part in parts]), np.concatenate([part.found for part in parts])
+
+
 class ImaginedEnvironment:
     """N imagined environments in lock-step. An episode terminates when the done signal exceeds
     reward.success_threshold (RS-7), and is truncated at the step limit or above reward.uncertainty_limit.
@@ -65,18 +100,13 @@ class ImaginedEnvironment:
         self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
         *, num_envs: int, seed: int = 0, with_goals: bool = True, exact: bool = False,
     ) -> None:
-        self.spec = replace(
-            spec, env_id=f"wm/{spec.task}", source=SOURCE_IMAGINED, num_envs=num_envs, ground_truth_names=(),
-            world_model_sha256=models.sha256,
-        )
+        self.spec = imagined_spec(models, spec, num_envs)
         self._models, self._reward, self._exact = models, reward, exact
         self._task = models.task_index(spec.task)
         self._images, self._start_states = starts
         tokenizer = models.tokenizer
-        self._start_latents = torch.cat(
-            [tokenizer.encode(self._images[i : i + 256]) for i in range(0, len(self._images), 256)]
-        )
-        self._goals = self._imagine_goals() if with_goals and models.text is not None else None
+        self._start_latents = encode_starts(models, self._images)
+        self._goals = imagine_start_goals(models, self._images, self.spec, reward) if with_goals else None
         self._seed, self._num_resets = seed, 0
         self._parts = cached_parts(models.action.trunk, num_envs, tokenizer.device)
         self._latents = self._start_latents[:1].repeat(num_envs, 1, 1)
@@ -93,7 +123,7 @@ class ImaginedEnvironment:
         for i in np.flatnonzero(mask):
             self._num_resets += 1
             seed = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else int(seeds[i])
-            self._starts[i] = numpy_stream(seed, "start").integers(len(self._images))
+            self._starts[i] = start_of(seed, len(self._images))
             self._episode_ids[i] = self._num_resets
         chosen = self._starts[mask]
         self._shown[mask] = self._images[chosen]
@@ -169,15 +199,3 @@ class ImaginedEnvironment:
     def _tensor(self, array: NDArray[Any]) -> Tensor:
         """The array on the models' device."""
         return torch.from_numpy(array).to(self._models.tokenizer.device)
-
-    def _imagine_goals(self) -> tuple[UInt8Array, BoolArray]:
-        """Goal frame and found flag of every start: one per (first frame, instruction), so computed once."""
-        assert self._models.text is not None
-        parts = [
-            imagine_goals(
-                self._models.text, self._models.tokenizer, self._images[i : i + GOAL_BATCH], self.spec.instruction,
-                self._task, horizon=self.spec.max_episode_steps, threshold=self._reward.goal_threshold,
-            )
-            for i in range(0, len(self._images), GOAL_BATCH)
-        ]
-        return np.concatenate([part.goals for part in parts]), np.concatenate([part.found for part in parts])

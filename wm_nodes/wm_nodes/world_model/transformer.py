@@ -227,7 +227,7 @@ class SpatioTemporalTransformer(nn.Module):
         return [GrowingCache(self.window) for _ in self.blocks]
 
     def new_ring_caches(self, batch: int, device: torch.device, *, fixed: bool | None = None) -> list[RingCache]:
-        """Caches of all blocks, which share their times. fixed: see RingTimes; by default on all devices but the CPU."""
+        """Caches of all blocks, which share their times. fixed: see RingTimes; by default on any device but the CPU."""
         times = RingTimes(self.window, batch, device, fixed=device.type != "cpu" if fixed is None else fixed)
         return [RingCache(times) for _ in self.blocks]
 

@@ -1,0 +1,249 @@
+"""Collects rollouts of an imagined environment that never leave its device: collect_rollout as a tensor program.
+
+A lock-step (reset, encode, act, step) is fixed in shape and in place; on a GPU it is captured once as a CUDA graph and
+replayed. Up go action noise and starts, once per rollout; nothing comes down but the answer whether all was finite.
+
+Shapes: T time, N environments, M starts, F features, S state, A action.
+"""
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.types import Environment, Rollout
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.rollouts import action_noise, collect_rollout, reset_seeds
+from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel
+from wm_nodes.world_model.device_environment import DeviceEnvironment
+from wm_nodes.world_model.imagined_environment import start_of
+
+MOST_HASHED_STARTS = 1024
+WARM_UP_STEPS = 3
+
+Step = Callable[[], None]
+
+
+def rollout_starts(
+    seed: int, policy_version: int, steps: int, num_envs: int, num_starts: int
+) -> NDArray[np.int64]:
+    """Return (T, N) starts; entry (t, i) is used where environment i begins an episode before lock-step t.
+
+    Up to MOST_HASHED_STARTS entries they are those of ImaginedEnvironment with collect_rollout's reset_seeds, a hash in
+    Python for each (29 us); above, one draw of the stream `starts` at (seed, policy version).
+    """
+    if steps * num_envs > MOST_HASHED_STARTS:
+        return numpy_stream(seed, "starts", policy_version).integers(num_starts, size=(steps, num_envs))
+    rows = [
+        [start_of(int(s), num_starts) for s in reset_seeds(seed, policy_version, max(0, step - 1), num_envs)]
+        for step in range(steps)
+    ]
+    return np.array(rows, np.int64)
+
+
+def make_collector(
+    env: Environment | DeviceEnvironment, policy: ImagePolicy, reward: RewardModel
+) -> Callable[[int, int, int], Rollout | TensorRollout]:
+    """Return collect(steps, seed, policy version): on the device where `env` is a DeviceEnvironment, else lock-step."""
+    if isinstance(env, DeviceEnvironment):
+        return DeviceCollector(env, policy, reward).collect
+    return partial(collect_rollout, env, policy, reward)
+
+
+class DeviceCollector:
+    """Makes rollouts of `policy` in `env` with the endogenous reward (sparse; dense with mode delta or abs).
+
+    The policy is read where it is: train it in place.
+
+    Args:
+        capture: makes a faster function of a lock-step, or raises RuntimeError, which is warned of once and leaves the
+            lock-step as it is; by default capture_graph on a GPU, nothing on a CPU.
+
+    Raises:
+        ValueError: another reward, or a policy or reward that sees through another encoder than the environment's.
+    """
+
+    def __init__(
+        self, env: DeviceEnvironment, policy: ImagePolicy, reward: RewardModel, *,
+        capture: Callable[[Step], Step] | None = None,
+    ) -> None:
+        self.env, self.policy = env, policy
+        self._reward = _checked(reward, policy, env)
+        self._goals = self._encode_goals()
+        num_envs, device = env.spec.num_envs, env.device
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(num_envs, *shape, dtype=dtype, device=device)
+
+        self._noise_NA, self._starts_N = zeros(env.spec.action_dim), zeros(dtype=torch.int64)
+        self._begins_N, self._just_ended_N = zeros(dtype=torch.bool), zeros(dtype=torch.bool)
+        self._row: dict[str, Tensor] = {
+            "images": torch.zeros_like(env.frames_NHWC), "features": zeros(policy.encoder.feature_dim),
+            "states": zeros(env.spec.state_dim), "actions": zeros(env.spec.action_dim), "logprobs": zeros(),
+            "values": zeros(), "signal": zeros(), "uncertainty": zeros(), "terminated": zeros(dtype=torch.bool),
+            "truncated": zeros(dtype=torch.bool), "valid": zeros(dtype=torch.bool), "starts": zeros(dtype=torch.int64),
+        }
+        self._run = self._captured(capture or (capture_graph if device.type == "cuda" else None))
+
+    @torch.no_grad()
+    def collect(
+        self, steps: int, seed: int, policy_version: int, *, starts_TN: NDArray[np.int64] | None = None
+    ) -> TensorRollout:
+        """Reset all environments and make `steps` lock-steps, as collect_rollout does.
+
+        Args:
+            starts_TN: where episodes begin, see rollout_starts, which gives them by default.
+
+        Raises:
+            ValueError: steps < 1, or starts of another shape or outside the environment's.
+            FloatingPointError: the model predicted NaN.
+        """
+        env, num_envs = self.env, self.env.spec.num_envs
+        if steps < 1:
+            raise ValueError(f"steps must be >= 1, got {steps}; see ppo.num_steps in presets/policy/base.yaml")
+        if starts_TN is None:
+            starts_TN = rollout_starts(seed, policy_version, steps, num_envs, env.num_starts)
+        if starts_TN.shape != (steps, num_envs) or not 0 <= starts_TN.min() <= starts_TN.max() < env.num_starts:
+            raise ValueError(
+                f"starts_TN must be ({steps}, {num_envs}) numbers of 0..{env.num_starts - 1}, got {starts_TN.shape} in "
+                f"{starts_TN.min()}..{starts_TN.max()}"
+            )
+        draws = [action_noise(seed, policy_version, step, num_envs, env.spec.action_dim) for step in range(steps)]
+        noise, starts = torch.from_numpy(np.stack(draws)).to(env.device), torch.from_numpy(starts_TN).to(env.device)
+        self._begins_N.fill_(True)
+        self._just_ended_N.fill_(False)
+        self.env.finite.fill_(True)
+        reached = ("images", "features", "states")  # one row more: what the last step reached
+        columns = {
+            name: row.new_empty(steps + (name in reached), *row.shape) for name, row in self._row.items()
+        }
+        for step in range(steps):
+            self._noise_NA.copy_(noise[step])
+            self._starts_N.copy_(starts[step])
+            self._run()
+            for name, column in columns.items():
+                column[step].copy_(self._row[name])
+        columns["images"][-1].copy_(env.frames_NHWC)
+        columns["features"][-1].copy_(env.encode().flatten(1))
+        columns["states"][-1].copy_(env.states_NP)
+        rewards, rewarded = self._rewards(columns)
+        if not bool(env.finite):
+            raise FloatingPointError(
+                "the world model predicted NaN; its weights are damaged or were trained too hot"
+            )
+        features, states = columns["features"], columns["states"]
+        return TensorRollout(
+            features[:-1], features[1:], states[:-1], states[1:], columns["actions"], columns["logprobs"],
+            columns["values"], rewards, columns["terminated"], columns["truncated"], columns["valid"] & rewarded,
+            policy_version, columns["images"],
+        )
+
+    def _captured(self, capture: Callable[[Step], Step] | None) -> Step:
+        if capture is None:
+            return self._step
+        try:
+            return capture(self._step)
+        except (RuntimeError, AssertionError) as error:  # a torch without CUDA asserts
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            warnings.warn(f"imagined lock-steps run without a CUDA graph, more slowly: {reason}", stacklevel=3)
+            return self._step
+
+    @torch.no_grad()
+    def _step(self) -> None:
+        """One lock-step; its results are in the row. An environment that ended is reset after one idle lock-step."""
+        env, policy = self.env, self.policy
+        env.reset(self._begins_N, self._starts_N)
+        features = env.encode().flatten(1)
+        distribution = policy.distribution(features, env.states_NP)
+        actions = distribution.executed(self._noise_NA)
+        self._put(
+            images=env.frames_NHWC, features=features, states=env.states_NP, actions=actions,
+            logprobs=distribution.logprob(actions), values=policy.value(features, env.states_NP), starts=env.starts_N,
+        )
+        result = env.step(actions)
+        self._put(
+            signal=result.signal_N, uncertainty=result.uncertainty_N, terminated=result.terminated_N,
+            truncated=result.truncated_N, valid=result.valid_N,
+        )
+        self._begins_N.copy_(self._just_ended_N)
+        self._just_ended_N.copy_(result.terminated_N | result.truncated_N)
+
+    def _put(self, **values: Tensor) -> None:
+        for name, value in values.items():
+            self._row[name].copy_(value)
+
+    def _rewards(self, columns: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Rewards (T, N), NaN where there is none, and where there is one: EndogenousReward.evaluate."""
+        config, signal, spread = self._reward.config, columns["signal"], columns["uncertainty"]
+        valid = columns["valid"] & torch.isfinite(signal) & torch.isfinite(spread)
+        crossed = signal > config.success_threshold
+        if config.uncertainty_limit > 0:
+            crossed = crossed & (spread <= config.uncertainty_limit)
+        rewards = config.sparse_weight * crossed.float()
+        if self._goals is not None:
+            goals, found = self._goals
+            dense = config.dense_weight * self._dense(columns["features"], goals[columns["starts"]])
+            valid = valid & found[columns["starts"]] & torch.isfinite(dense)
+            rewards = dense + rewards
+        return torch.where(valid, rewards, float("nan")), valid
+
+    def _dense(self, features: Tensor, goals_TNF: Tensor) -> Tensor:
+        scale = _distance_of(self._reward).scale
+        after, before = (1 - (f - goals_TNF).abs().mean(-1) / scale for f in (features[1:], features[:-1]))
+        if self._reward.config.mode == "abs":
+            return after
+        limit = self._reward.config.dense_clip
+        return (after - before).clamp(-limit, limit)
+
+    def _encode_goals(self) -> tuple[Tensor, Tensor] | None:
+        """Features (M, F) and found flags (M,) of the starts' goals; None where the reward needs no goal."""
+        if self._reward.config.dense_weight == 0:
+            return None
+        if self.env.goals is None:
+            raise ValueError("reward.dense_weight needs goals, and this environment was made without; set it to 0")
+        frames, found = self.env.goals
+        features = _distance_of(self._reward).encode(frames).flatten(1)
+        return features.to(self.env.device), torch.from_numpy(found).to(self.env.device)
+
+
+def capture_graph(step: Step) -> Step:
+    """Return the replay of `step` as one CUDA graph, on the current device. Raises RuntimeError where it cannot be
+    captured."""
+    stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(WARM_UP_STEPS):
+            step()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        step()
+    replay: Step = graph.replay
+    return replay
+
+
+def _checked(reward: RewardModel, policy: ImagePolicy, env: DeviceEnvironment) -> EndogenousReward:
+    remedy = "use collect_rollout with an ImaginedEnvironment, where every reward and policy goes"
+    if not isinstance(reward, EndogenousReward):
+        raise ValueError(f"reward {reward.name} cannot be computed on the device; {remedy}")
+    if reward.config.dense_weight > 0 and reward.config.mode == "progress":
+        raise ValueError(f"reward.mode progress cannot be computed on the device; {remedy}")
+    if policy.encoder.sha256 != env.tokenizer_sha256:
+        raise ValueError(f"the policy's encoder is not the tokenizer of the world model; {remedy}")
+    if reward.config.dense_weight > 0 and _distance_of(reward).identity != env.tokenizer_sha256[:16]:
+        raise ValueError(f"the reward's distance is not that of the world model's tokenizer; {remedy}")
+    return reward
+
+
+def _distance_of(reward: EndogenousReward) -> EncoderDistance:
+    if not isinstance(reward.distance, EncoderDistance):
+        raise ValueError(
+            f"distance {reward.distance.name} cannot be computed on the device; use EncoderDistance, or collect_rollout"
+        )
+    return reward.distance
