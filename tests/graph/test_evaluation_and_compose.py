@@ -3,18 +3,26 @@
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from graph import toy
 from graph.harness import Graph, Probe, wait_until
+from model_folders import make_model_folder
+from safetensors.torch import save_file
 
 from wm_msgs.action import Evaluate, Rollout, Train
 from wm_nodes.config.load import load_config
+from wm_nodes.nodes.compose import make_nodes
 from wm_nodes.policy_rl.evaluation import evaluate
-from wm_nodes.training.weights import save_weights
+from wm_nodes.policy_rl.factories import make_endogenous_reward, make_imagined_environment, make_policy
+from wm_nodes.policy_rl.initial_policy import STARTS
+from wm_nodes.policy_rl.train import train_policy
+from wm_nodes.training.weights import pack_weights, save_weights, unpack_weights
 
 pytestmark = pytest.mark.graph
 
@@ -60,26 +68,81 @@ def test_cancel_ends_an_evaluation_and_a_rollout_within_a_second(graph: Graph, p
         assert time.monotonic() - began < 1.0, name
 
 
-def test_a_composed_process_steps_by_direct_call_and_trains_to_the_same_weights(graph: Graph, probe: Probe) -> None:
-    transitions = probe.listen("env/transition")
+def start_composed(graph: Graph, params: dict[str, dict[str, Any]], *options: str) -> None:
     command = [
-        sys.executable, "-m", "wm_nodes.nodes.compose", "environment", "policy", "reward_evaluator", "learner",
+        sys.executable, "-m", "wm_nodes.nodes.compose", *options, *params,
         "--ros-args", "-r", "__ns:=/wm", "-p", f"config_file:={graph.folder / 'config.yaml'}",
         "-p", f"run_dir:={graph.folder}", "--params-file", str(graph.folder / "nodes.yaml"),
     ]
-    params: dict[str, dict[str, Any]] = {
-        "environment": {"backend": "factory", "backend_factory": "toy:make_environment", "num_envs": 4},
-        "policy": {"policy_factory": "toy:make_policy"},
-        "learner": {"policy_factory": "toy:make_policy"},
-        "reward_evaluator": {"reward": "rule"},
-    }
     content = {f"/**/{node}": {"ros__parameters": values} for node, values in params.items()}
     (graph.folder / "nodes.yaml").write_text(yaml.safe_dump(content))
     log = open(graph.log_path("composed"), "wb")  # noqa: SIM115
     graph.processes["composed"] = subprocess.Popen(command, env=graph.environment(), stdout=log, stderr=log)
+
+
+def test_a_composed_process_steps_by_direct_call_and_trains_to_the_same_weights(graph: Graph, probe: Probe) -> None:
+    transitions = probe.listen("env/transition")
+    start_composed(graph, {
+        "environment": {"backend": "factory", "backend_factory": "toy:make_environment", "num_envs": 4},
+        "policy": {"policy_factory": "toy:make_policy"},
+        "learner": {"policy_factory": "toy:make_policy"},
+        "reward_evaluator": {"reward": "rule"},
+    })
     result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=2)))
     assert (result.termination_reason, result.policy_version) == (Train.Result.FINISHED, 3)
     toy.assert_trained_in_one_process(graph.folder / "policies" / "policy_000003.safetensors", updates=2)
     assert probe.value("/wm/environment", "step_p50_ms") is None, "the step service was used"
     rollout = probe.finish(probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=3, reset=True)))
     wait_until("the topics", lambda: transitions and transitions[-1].step_id == rollout.last_step_id)
+
+
+@pytest.fixture
+def imagined(tmp_path: Path) -> dict[str, dict[str, Any]]:
+    """Parameters of nodes that train in an untrained world model of 8 environments."""
+    model, rng = make_model_folder(tmp_path / "model"), np.random.default_rng(0)
+    images, states = rng.integers(0, 256, (5, 64, 128, 3), dtype=np.uint8), rng.uniform(0.5, 0.7, (5, 3))
+    starts = model / STARTS
+    save_file({"images": torch.from_numpy(images), "states": torch.from_numpy(states).float()}, starts)
+    params = {
+        "environment": {"backend": "world_model", "starts_file": str(starts), "num_envs": 8}, "policy": {},
+        "reward_evaluator": {"reward": "endogenous"}, "learner": {},
+    }
+    return {node: {"model_dir": str(model), **values} for node, values in params.items()}
+
+
+def test_device_rollouts_give_the_weights_of_policy_rl_train_and_leave_the_topics_of_steps_silent(
+    graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]]
+) -> None:
+    transitions, versions, metrics = (probe.listen(t) for t in ("env/transition", "policy/version", "learner/metrics"))
+    start_composed(graph, imagined, "--device-rollouts")
+    result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=2)))
+    assert (result.termination_reason, result.policy_version) == (Train.Result.FINISHED, 3), result.message
+    wait_until("versions and metrics", lambda: versions and versions[-1].version == 3 and len(metrics) == 2)
+    assert not transitions
+
+    config, model = load_config("smoke"), Path(imagined["learner"]["model_dir"])
+    policy, reward = make_policy(config, model), make_endogenous_reward(config, model)
+    env = make_imagined_environment(config, model, model / STARTS, num_envs=8, seed=0)
+    samples = sum(int(rollout.valid_TN.sum()) for rollout, _ in train_policy(policy, env, reward, config))
+    assert result.samples == samples
+    found, _ = unpack_weights((graph.folder / "policies" / "policy_000003.safetensors").read_bytes())
+    for name, tensor in unpack_weights(pack_weights(policy).data)[0].items():
+        np.testing.assert_array_equal(found[name].numpy(), tensor.numpy(), err_msg=name)
+
+    rollout = probe.finish(probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=3, reset=True)))
+    wait_until("steps for whoever asks", lambda: transitions and transitions[-1].step_id == rollout.last_step_id)
+
+
+def test_device_rollouts_refuse_a_reward_that_is_not_theirs_and_name_it(
+    graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]]
+) -> None:
+    imagined["reward_evaluator"]["reward"] = "rule"
+    start_composed(graph, imagined, "--device-rollouts")
+    result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=1)))
+    assert result.termination_reason == Train.Result.FAILED
+    assert "--device-rollouts has the endogenous reward, and the reward evaluator's is rule" in result.message
+
+
+def test_device_rollouts_need_environment_and_learner() -> None:
+    with pytest.raises(ValueError, match="needs environment and learner in one process; got policy learner"):
+        make_nodes(["policy", "learner"], device_rollouts=True)

@@ -3,7 +3,7 @@
 import sys
 import time
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -19,16 +19,18 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import AGENT
 from wm_nodes.core.named_files import NamedFiles
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.types import Rollout
+from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.judge.episode_reward import check_horizon, unjudged_reason
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.factories import existing, expected_spec, make_learner, make_policy, refuse_other
+from wm_nodes.nodes.learner.device_rollouts import DeviceRollouts
 from wm_nodes.nodes.learner.replay_assembler import ReplayAssembler
 from wm_nodes.nodes.learner.report import LearnerReport
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.nodes.learner.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
 from wm_nodes.policy_rl.rollouts import Canceled
+from wm_nodes.policy_rl.tensor_rollout import TensorRollout
 from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
@@ -66,12 +68,21 @@ PARAMS = (
 
 
 class LearnerNode(TrainingNode):
-    """Action train; services learner/save, learner/get_weights; publishes policy/version, learner/metrics."""
+    """Action train; services learner/save, learner/get_weights; publishes policy/version, learner/metrics.
+
+    Args:
+        local_environment: in a composed process, returns what the environment node serves; live rollouts are then made
+            here, on the device.
+    """
 
     inline_limit_bytes = INLINE_LIMIT_BYTES
 
-    def __init__(self, ranks: Ranks | None = None, **node_arguments: Any) -> None:
+    def __init__(
+        self, ranks: Ranks | None = None, local_environment: Callable[[], Environment | None] | None = None,
+        **node_arguments: Any,
+    ) -> None:
         super().__init__(PARAMS, ranks, **node_arguments)
+        self._device_rollouts = None if local_environment is None else DeviceRollouts(local_environment)
 
     def configure(self) -> None:
         self.hold_run_folder()
@@ -151,12 +162,15 @@ class LearnerNode(TrainingNode):
                 self._count_dropped(following[1])
                 self._update(work, goal, update, *following)
 
-    def _next(self, source: RolloutSource, *, live: bool) -> tuple[Rollout, DroppedTransitions] | None:
+    def _next(
+        self, source: RolloutSource, *, live: bool
+    ) -> tuple[Rollout | TensorRollout, DroppedTransitions] | None:
         """The next rollout to train on. One whose episodes the agent could not judge pauses live training, which then
         repeats it; in a recording it is passed over. Raises as RolloutSource.next, check_horizon; TrainingPaused.
         """
         while (following := source.next()) is not None and self._reward_name == AGENT:
             check_horizon(self._config.ppo.num_steps, self._max_episode_steps)
+            assert isinstance(following[0], Rollout)  # device rollouts have another reward
             if not (reason := unjudged_reason(following[0])):
                 break
             if live:
@@ -187,6 +201,10 @@ class LearnerNode(TrainingNode):
             if uris:
                 self._refused = None
             return ReplayedRollouts(self, check, progress, self._replayed, self._replay, uris, num_steps=num_steps)
+        if self._device_rollouts is not None:
+            self._reward_name = "endogenous"
+            named = str(self.param("model_dir")), str(self.param("learner_factory"))
+            return self._device_rollouts.begin(check, self._training, self._config, *named)
         return LiveRollouts(
             self, work, check, progress, self._assembler, self._rollouts, num_steps=num_steps, seed=self._config.seed
         )
@@ -213,7 +231,9 @@ class LearnerNode(TrainingNode):
             goal.max_minutes and minutes >= goal.max_minutes
         )
 
-    def _update(self, work: Work, goal: Train.Goal, update: int, rollout: Rollout, dropped: DroppedTransitions) -> None:
+    def _update(
+        self, work: Work, goal: Train.Goal, update: int, rollout: Rollout | TensorRollout, dropped: DroppedTransitions
+    ) -> None:
         began = time.perf_counter()
         try:
             metrics = self._training.update(

@@ -21,7 +21,9 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.core.named_files import CHECKPOINT, read_regular
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import Canceled, rollout_statistics, terminate_at_episode_end
+from wm_nodes.policy_rl.tensor_rollout import TensorRollout
 from wm_nodes.training.ranks import Ranks, broadcast_rollout
 from wm_nodes.training.run_folder import TrainingRun, VersionFiles
 from wm_nodes.training.weights import PackedWeights, load_weights, pack_weights
@@ -108,7 +110,7 @@ class PolicyTraining(TrainingRun):
         return self.progress.updates
 
     def update(
-        self, rollout: Rollout, dropped: DroppedTransitions, should_stop: Callable[[], bool], *,
+        self, rollout: Rollout | TensorRollout, dropped: DroppedTransitions, should_stop: Callable[[], bool], *,
         paid_at_end: bool = False,
     ) -> dict[str, float]:
         """Make one update and one new version; return the metrics.
@@ -121,9 +123,13 @@ class PolicyTraining(TrainingRun):
             OSError: the update was made, but its files were not written; ensure_saved() tries again.
         """
         began = time.perf_counter()
-        trained = terminate_at_episode_end(rollout) if paid_at_end else rollout
-        broadcast_rollout(trained, self.ranks)
-        learner_metrics = self.learner.update(trained, should_stop=should_stop)
+        if isinstance(rollout, Rollout):
+            trained = terminate_at_episode_end(rollout) if paid_at_end else rollout
+            broadcast_rollout(trained, self.ranks)
+            learner_metrics = self.learner.update(trained, should_stop=should_stop)
+        else:  # of PPO alone, in one process
+            assert isinstance(self.learner, PpoLearner) and self.ranks.size == 1 and not paid_at_end
+            learner_metrics = self.learner.update(rollout, should_stop=should_stop)
         statistics = rollout_statistics(rollout)
         progress = self.progress
         progress.updates += 1

@@ -19,7 +19,12 @@ from wm_nodes.core.tool_control import next_state_tensor
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import ActionModel, done_signal
 from wm_nodes.world_model.folder import WorldModels
-from wm_nodes.world_model.imagined_environment import encode_starts, imagine_start_goals, imagined_spec
+from wm_nodes.world_model.imagined_environment import (
+    ImaginedEnvironment,
+    encode_starts,
+    imagine_start_goals,
+    imagined_spec,
+)
 from wm_nodes.world_model.precision import copy_in_bfloat16, has_fast_bfloat16
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
@@ -83,6 +88,14 @@ class DeviceEnvironment:
         self._steps_N = torch.zeros(num_envs, dtype=torch.int32, device=self.device)
         self._ended_N = torch.ones(num_envs, dtype=torch.bool, device=self.device)
         self.finite = torch.ones((), dtype=torch.bool, device=self.device)
+
+    @classmethod
+    def beside(cls, environment: ImaginedEnvironment) -> "DeviceEnvironment":
+        """The same model, starts, rules and number of environments, with a state of its own."""
+        return cls(
+            environment.models, environment.spec, environment.starts, environment.reward,
+            num_envs=environment.spec.num_envs, with_goals=environment.reward.dense_weight > 0,
+        )
 
     def reset(self, begins_N: Tensor, starts_N: Tensor) -> None:
         """Begin an episode at start starts_N (int64, below M) where begins_N is True."""

@@ -101,7 +101,7 @@ class ImaginedEnvironment:
         *, num_envs: int, seed: int = 0, with_goals: bool = True, exact: bool = False,
     ) -> None:
         self.spec = imagined_spec(models, spec, num_envs)
-        self._models, self._reward, self._exact = models, reward, exact
+        self.models, self.reward, self.starts, self._exact = models, reward, starts, exact
         self._task = models.task_index(spec.task)
         self._images, self._start_states = starts
         tokenizer = models.tokenizer
@@ -145,9 +145,9 @@ class ImaginedEnvironment:
         self._states = np.where(valid[:, None], moved, self._states)
         self._steps += valid.astype(np.uint32)
         self._shown = np.where(valid[:, None, None, None], frames, self._shown)
-        terminated = valid & (signal > self._reward.success_threshold)
+        terminated = valid & (signal > self.reward.success_threshold)
         too_long = self._steps >= self.spec.max_episode_steps
-        unsure = (self._reward.uncertainty_limit > 0) & (spread > self._reward.uncertainty_limit)
+        unsure = (self.reward.uncertainty_limit > 0) & (spread > self.reward.uncertainty_limit)
         truncated = valid & ~terminated & (too_long | unsure)
         self._ended = self._ended | terminated | truncated
         return StepResult(
@@ -176,7 +176,7 @@ class ImaginedEnvironment:
         self, actions: FloatArray, moved: FloatArray, valid: BoolArray
     ) -> tuple[UInt8Array, FloatArray, FloatArray]:
         """Take the step where `valid`; return frames (N, H, W, 3), done signal (N,) and disagreement (N,)."""
-        tokenizer, model = self._models.tokenizer, self._models.action
+        tokenizer, model = self.models.tokenizer, self.models.action
         acted, before, after = (self._tensor(array) for array in (actions, self._states, moved))
         keep = self._tensor(valid)[:, None, None]
 
@@ -198,4 +198,4 @@ class ImaginedEnvironment:
 
     def _tensor(self, array: NDArray[Any]) -> Tensor:
         """The array on the models' device."""
-        return torch.from_numpy(array).to(self._models.tokenizer.device)
+        return torch.from_numpy(array).to(self.models.tokenizer.device)
