@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from graph import toy
 
@@ -32,6 +33,14 @@ def test_a_rollout_has_the_same_number_of_steps_in_fewer_environments() -> None:
     config = load_config("smoke", {"ppo.num_envs": 8, "ppo.updates": 1})
     ((rollout, _),) = train_policy(toy.make_policy(config), toy.ReachToy(2, seed=0), RuleReward(), config)
     assert rollout.valid_TN.shape == (4 * config.ppo.num_steps, 2)
+
+
+def test_the_command_trains_and_names_a_device_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
+    train.main(["--task", "reach", "--updates", "1", "--device", "cpu"])
+    assert capsys.readouterr().out.startswith("version 1: imagined success ")
+    with pytest.raises(SystemExit):
+        train.main(["--device", "cuda:99"])
+    assert "error: device is cuda:99, but " in capsys.readouterr().err
 
 
 def test_the_loop_fits_one_screen() -> None:

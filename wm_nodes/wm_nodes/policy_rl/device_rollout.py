@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from wm_nodes.core.device import explain_memory
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
@@ -89,7 +90,7 @@ class DeviceCollector:
             "values": zeros(), "signal": zeros(), "uncertainty": zeros(), "terminated": zeros(dtype=torch.bool),
             "truncated": zeros(dtype=torch.bool), "valid": zeros(dtype=torch.bool), "starts": zeros(dtype=torch.int64),
         }
-        self._run = self._captured(capture or (capture_graph if device.type == "cuda" else None))
+        self._run = self._captured(capture or (partial(capture_graph, device) if device.type == "cuda" else None))
 
     @torch.no_grad()
     def collect(
@@ -102,7 +103,7 @@ class DeviceCollector:
 
         Raises:
             ValueError: steps < 1, or starts of another shape or outside the environment's.
-            FloatingPointError: the model predicted NaN.
+            FloatingPointError: the model predicted NaN. DeviceError: the GPU's memory is too small.
         """
         env, num_envs = self.env, self.env.spec.num_envs
         if steps < 1:
@@ -115,10 +116,15 @@ class DeviceCollector:
                 f"{starts_TN.min()}..{starts_TN.max()}"
             )
         draws = [action_noise(seed, policy_version, step, num_envs, env.spec.action_dim) for step in range(steps)]
-        noise, starts = torch.from_numpy(np.stack(draws)).to(env.device), torch.from_numpy(starts_TN).to(env.device)
+        with explain_memory(env.device, ppo__num_envs=num_envs, ppo__num_steps=steps):
+            noise, starts = (torch.from_numpy(array).to(env.device) for array in (np.stack(draws), starts_TN))
+            return self._collect(noise, starts, policy_version)
+
+    def _collect(self, noise: Tensor, starts: Tensor, policy_version: int) -> TensorRollout:
+        env, steps = self.env, len(noise)
         self._begins_N.fill_(True)
         self._just_ended_N.fill_(False)
-        self.env.finite.fill_(True)
+        env.finite.fill_(True)
         reached = ("images", "features", "states")  # one row more: what the last step reached
         columns = {
             name: row.new_empty(steps + (name in reached), *row.shape) for name, row in self._row.items()
@@ -134,9 +140,7 @@ class DeviceCollector:
         columns["states"][-1].copy_(env.states_NP)
         rewards, rewarded = self._rewards(columns)
         if not bool(env.finite):
-            raise FloatingPointError(
-                "the world model predicted NaN; its weights are damaged or were trained too hot"
-            )
+            raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
         features, states = columns["features"], columns["states"]
         return TensorRollout(
             features[:-1], features[1:], states[:-1], states[1:], columns["actions"], columns["logprobs"],
@@ -212,18 +216,18 @@ class DeviceCollector:
         return features.to(self.env.device), torch.from_numpy(found).to(self.env.device)
 
 
-def capture_graph(step: Step) -> Step:
-    """Return the replay of `step` as one CUDA graph, on the current device. Raises RuntimeError where it cannot be
-    captured."""
-    stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        for _ in range(WARM_UP_STEPS):
-            step()
-    torch.cuda.current_stream().wait_stream(stream)
+def capture_graph(device: torch.device, step: Step) -> Step:
+    """Return the replay of `step` as one CUDA graph on `device`. Raises RuntimeError where it cannot be captured."""
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads may use the GPU meanwhile
-        step()
+    with torch.cuda.device(device):
+        stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(WARM_UP_STEPS):
+                step()
+        torch.cuda.current_stream().wait_stream(stream)
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads may use the GPU meanwhile
+            step()
     replay: Step = graph.replay
     return replay
 

@@ -2,8 +2,7 @@
 
 The ROS graph is this loop with the environment, the policy, the reward and the learner in a process each, and gives the
 same weights bit for bit (tests/graph/test_training.py). `python -m wm_nodes.policy_rl.train` runs it: a policy that
-knows nothing learns to reach in the shipped world model, seconds per update, no simulator. With `--device cuda` whole
-rollouts stay on the GPU.
+knows nothing learns to reach in the shipped world model, no simulator. `--device cuda`: rollouts never leave the GPU.
 """
 
 import argparse
@@ -41,14 +40,17 @@ def train_policy(
 
 def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m wm_nodes.policy_rl.train")
-    for name, default in (("preset", "cpu"), ("device", ""), ("task", "reach"), ("updates", "12")):
-        parser.add_argument(f"--{name}", default=default)
-    options = parser.parse_args(words)
-    device = {"device": options.device} if options.device else {}
-    config = load_config(options.preset, {"task": options.task, "ppo.updates": int(options.updates), **device})
-    model = shipped_model(config.task)
-    policy, reward = make_policy(config, model), make_endogenous_reward(config, model)
-    env = make_training_environment(config, model, model / STARTS, num_envs=config.ppo.num_envs, seed=config.seed)
+    for name, default in (("--preset", "cpu"), ("--task", "reach"), ("--device", argparse.SUPPRESS)):
+        parser.add_argument(name, default=default)
+    parser.add_argument("--updates", dest="ppo.updates", type=int, default=12)
+    given = vars(parser.parse_args(words))
+    try:
+        config = load_config(given.pop("preset"), given)
+        model = shipped_model(config.task)
+        policy, reward = make_policy(config, model), make_endogenous_reward(config, model)
+        env = make_training_environment(config, model, model / STARTS, num_envs=config.ppo.num_envs, seed=config.seed)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
     for version, (rollout, metrics) in enumerate(train_policy(policy, env, reward, config), 1):
         success = rollout_statistics(rollout).success_rate
         print(f"version {version}: imagined success {success:.1%}, {metrics.kl_reference:.3f} nats from version 1")
