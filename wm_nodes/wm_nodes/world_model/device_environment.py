@@ -17,17 +17,16 @@ from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import next_state_tensor
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
-from wm_nodes.world_model.dynamics import ActionModel, done_signal
+from wm_nodes.world_model.dynamics import done_signal
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.imagined_environment import (
     ImaginedEnvironment,
     encode_starts,
     imagine_start_goals,
     imagined_spec,
+    models_to_infer,
 )
-from wm_nodes.world_model.precision import copy_in_bfloat16, has_fast_bfloat16
-from wm_nodes.world_model.token_dynamics import TokenActionModel
-from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.precision import has_fast_bfloat16
 
 
 @dataclass(frozen=True)
@@ -70,10 +69,7 @@ class DeviceEnvironment:
             imagine_start_goals(models, images, self.spec, reward) if with_goals else None
         )
         self._fast, self._exact = has_fast_bfloat16(self.device), exact
-        self._tokenizer: Tokenizer = copy_in_bfloat16(models.tokenizer) if self._fast else models.tokenizer
-        self._action: ActionModel | TokenActionModel = (
-            copy_in_bfloat16(models.action) if self._fast and not exact else models.action
-        )
+        self._tokenizer, self._action = models_to_infer(models, exact=exact)
         self._start_frames = torch.from_numpy(images).to(self.device)
         self._start_states = torch.from_numpy(states).to(self.device, torch.float32)
         self._start_latents = encode_starts(models, images).clone()

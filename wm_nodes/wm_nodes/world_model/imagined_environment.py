@@ -20,11 +20,13 @@ from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
-from wm_nodes.world_model.dynamics import done_signal
+from wm_nodes.world_model.dynamics import ActionModel, done_signal
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.parts import in_parallel, parts_of
-from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.precision import compute_context, copy_in_bfloat16, has_fast_bfloat16
 from wm_nodes.world_model.text import imagine_goals
+from wm_nodes.world_model.token_dynamics import TokenActionModel
+from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer
 
 GOAL_BATCH = 64
@@ -53,6 +55,13 @@ def imagined_spec(models: WorldModels, spec: EnvironmentSpec, num_envs: int) -> 
         spec, env_id=f"wm/{spec.task}", source=SOURCE_IMAGINED, num_envs=num_envs, ground_truth_names=(),
         world_model_sha256=models.sha256,
     )
+
+
+def models_to_infer(models: WorldModels, *, exact: bool) -> tuple[Tokenizer, ActionModel | TokenActionModel]:
+    """Tokenizer and action model with their weights cast once for compute_context; the same bits."""
+    if not has_fast_bfloat16(models.tokenizer.device):
+        return models.tokenizer, models.action
+    return copy_in_bfloat16(models.tokenizer), models.action if exact else copy_in_bfloat16(models.action)
 
 
 def encode_starts(models: WorldModels, images: UInt8Array) -> Tensor:
@@ -103,6 +112,7 @@ class ImaginedEnvironment:
         self.spec = imagined_spec(models, spec, num_envs)
         self.models, self.reward, self.starts, self._exact = models, reward, starts, exact
         self._task = models.task_index(spec.task)
+        self._tokenizer, self._action = models_to_infer(models, exact=exact)
         self._images, self._start_states = starts
         tokenizer = models.tokenizer
         self._start_latents = encode_starts(models, self._images)
@@ -176,7 +186,7 @@ class ImaginedEnvironment:
         self, actions: FloatArray, moved: FloatArray, valid: BoolArray
     ) -> tuple[UInt8Array, FloatArray, FloatArray]:
         """Take the step where `valid`; return frames (N, H, W, 3), done signal (N,) and disagreement (N,)."""
-        tokenizer, model = self.models.tokenizer, self.models.action
+        tokenizer, model = self._tokenizer, self._action
         acted, before, after = (self._tensor(array) for array in (actions, self._states, moved))
         keep = self._tensor(valid)[:, None, None]
 
