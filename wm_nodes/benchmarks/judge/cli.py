@@ -22,8 +22,9 @@ from benchmarks.judge.run import JudgeTrial, Outcome, judge_rows
 from benchmarks.judge.search_starts import hacking_starts
 from benchmarks.judge.test_split_log import judge_name, notice, record_evaluation
 from benchmarks.speed.results import write_results
-from wm_nodes.apps.options import add_json, add_seed
+from wm_nodes.apps.options import add_device, add_json, add_seed
 from wm_nodes.config.load import load_config
+from wm_nodes.core.device import CPU
 from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Stage, TaskSpec
@@ -82,6 +83,7 @@ def _common() -> argparse.ArgumentParser:
     common.add_argument("--again", default="", metavar="REASON", help="for a further evaluation on the test split")
     add_json(common)
     add_seed(common)
+    add_device(common, CPU)
     common.add_argument("--at-once", type=int, default=1, help="clips under way together, behind a server")
     common.add_argument("--folder", type=Path, help="of the embedded judge; the shipped one by default")
     common.add_argument(

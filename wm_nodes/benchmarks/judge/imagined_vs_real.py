@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
-from wm_nodes.apps.options import add_json
+from wm_nodes.apps.options import add_device, add_json
 from wm_nodes.config.load import default_task, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.types import BoolArray
 from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.judge.agent.machine import RewardAgent
@@ -111,15 +112,18 @@ async def _judge_clips(agent: RewardAgent, asked: Sequence[ClipJob]) -> list[Ver
 
 
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    given = {"task": arguments.task, "judge.kind": "embedded", "judge.folder": str(arguments.judge or "")}
+    given = {
+        "task": arguments.task, "device": arguments.device, "judge.kind": "embedded",
+        "judge.folder": str(arguments.judge or ""),
+    }
     config = load_config("cpu", given)
-    models = load_model_folder(arguments.model_dir or shipped_model(config.task))
+    models = load_model_folder(arguments.model_dir or shipped_model(config.task), compute_device(config.device))
     bags = collect_plan(scripted_plan(config, arguments.episodes, FIRST_SEED), config, arguments.folder)
     episodes = load_arrays(bags, config)
     imagined = imagine_episodes(models.tokenizer, models.action, episodes)
     last, succeeded = episode_ends(episodes, config.task)
     rubric = load_rubric(config.judge.rubric)
-    opened = make_judge(episode_judge(config), rubric)
+    opened = make_judge(episode_judge(config), rubric, device=config.device)
     agent = RewardAgent(opened.judge, rubric, seed=config.seed)
     asked = list(jobs(episodes, imagined, config, last))
     verdicts = asyncio.run(_judge_clips(agent, [job for _, job in asked]))
@@ -148,6 +152,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--judge", type=Path, help="folder of a trained judge; default: the shipped one")
     parser.add_argument("--model-dir", type=Path, help="world model; default: the shipped one")
+    add_device(parser, CPU)
     add_json(parser)
 
 

@@ -10,6 +10,7 @@ from benchmarks.judge.comparisons.chat import ChatComparison
 from benchmarks.judge.label_judge import KnownClip, LabelJudge
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import JudgeConfig, StageJudge
+from wm_nodes.core.device import compute_device
 from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
@@ -38,7 +39,8 @@ async def open_judge(
         yield LabelJudge(clips, rubric, error=arguments.error, seed=arguments.seed)
         return
     if arguments.judge == "embedded" and not arguments.stages:
-        yield EmbeddedJudge(load_head(arguments.folder or shipped_head()), arguments.conformal)
+        head = load_head(arguments.folder or shipped_head(), compute_device(arguments.device))
+        yield EmbeddedJudge(head, arguments.conformal)
         return
     settings = server_settings(arguments)
     if arguments.judge == "embedded":
@@ -47,7 +49,7 @@ async def open_judge(
             "kind": "embedded", "folder": str(arguments.folder or ""), "conformal": arguments.conformal,
             "endpoints": [], "model": "", "routes": [StageJudge(stages=arguments.stages, **server)],
         })
-    opened = make_judge(settings, rubric, reads)
+    opened = make_judge(settings, rubric, reads, device=arguments.device)
     try:
         yield opened.judge
     finally:

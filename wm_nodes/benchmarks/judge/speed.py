@@ -16,8 +16,9 @@ import numpy as np
 import torch
 
 from benchmarks.speed.results import write_results
-from wm_nodes.apps.options import add_json, positive
+from wm_nodes.apps.options import add_device, add_json, positive
 from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.backends.embedded import shipped_head
@@ -41,12 +42,12 @@ def moving_clip(seed: int) -> UInt8Array:
     return frames.astype(np.uint8)
 
 
-def read_clips(folder: Path, count: int, seed: int) -> tuple[float, float]:
+def read_clips(folder: Path, count: int, seed: int, device: str = CPU) -> tuple[float, float]:
     """Processor and wall seconds per clip of evidence and every head, on one thread."""
     keep_freed_memory()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    head, clip = load_head(folder), moving_clip(seed)
+    head, clip = load_head(folder, compute_device(device)), moving_clip(seed)
     started = [0.0, 0.0]
     for index in range(count + 1):
         if index == 1:  # the first one pays for what is loaded late
@@ -62,13 +63,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, nargs="?", default=shipped_head(), help="a trained judge; the shipped one")
     parser.add_argument("--cores", type=positive, default=2)
     parser.add_argument("--clips", type=positive, default=40, help="per core")
+    add_device(parser, CPU)
     add_json(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Measure, write --json and print."""
     with ProcessPoolExecutor(arguments.cores, mp_context=mp.get_context("spawn")) as pool:
-        jobs = [pool.submit(read_clips, arguments.folder, arguments.clips, seed) for seed in range(arguments.cores)]
+        jobs = [
+            pool.submit(read_clips, arguments.folder, arguments.clips, seed, arguments.device)
+            for seed in range(arguments.cores)
+        ]
         seconds = [job.result() for job in jobs]
     processor_s, wall_s = (float(np.mean(column)) for column in zip(*seconds))
     clips_per_s, clips_per_s_now = arguments.cores / processor_s, arguments.cores / wall_s
@@ -77,7 +82,7 @@ def run(arguments: argparse.Namespace) -> None:
         "processes": arguments.cores, "clips_each": arguments.clips, "processor_s_per_clip": processor_s,
         "wall_s_per_clip": wall_s, "clips_per_s": clips_per_s, "clips_per_s_by_the_clock": clips_per_s_now,
     }, exact=True)
-    facts = machine_facts()
+    facts = machine_facts(arguments.device)
     print(f"{FRAMES} frames of {SIDE_PX} px on {arguments.cores} processes, {facts['processor']}, {facts['date']}")
     print(f"processor {1000 * processor_s:.1f} ms a clip: {clips_per_s:.1f} clips/s on idle cores")
     print(f"wall      {1000 * wall_s:.1f} ms a clip: {clips_per_s_now:.1f} clips/s now")

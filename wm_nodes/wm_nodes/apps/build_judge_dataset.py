@@ -16,9 +16,10 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
-from wm_nodes.apps.options import add_seed
+from wm_nodes.apps.options import add_device, add_seed
 from wm_nodes.config.load import default_task, load_config
 from wm_nodes.config.tasks import task_names
+from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.judge.dataset.build import BENCHMARK, SHAPES, SIDE_PX, SetPlan, build
 from wm_nodes.judge.dataset.edits.recipes import RECIPES
 from wm_nodes.judge.dataset.policy_camera import PolicyCamera, policy_models
@@ -44,6 +45,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="scene and camera of the policy, most frames as a world model draws them; default: the shipped one",
     )
     parser.add_argument("--stride", type=int, default=1, help="of --policy-view: steps between two frames of a clip")
+    add_device(parser, CPU)
     parser.add_argument("--benchmark", action="store_true", help="the set that judges are compared on; nothing else")
     parser.add_argument("--check", action="store_true", help="build nothing, verify the set that is there")
 
@@ -64,7 +66,8 @@ def run(arguments: argparse.Namespace) -> None:
         plan = BENCHMARK if arguments.benchmark else plan
         camera = None
         if plan.policy:
-            camera = PolicyCamera(load_model_folder(policy_models(arguments.policy_view)), SIDE_PX, arguments.stride)
+            models = load_model_folder(policy_models(arguments.policy_view), compute_device(arguments.device))
+            camera = PolicyCamera(models, SIDE_PX, arguments.stride)
         manifest, skipped = build(arguments.folder, plan, load_config("cpu").simulation, camera)
     splits = Counter(row.split for row in manifest.rows)
     parts = Counter(row.part for row in manifest.rows)

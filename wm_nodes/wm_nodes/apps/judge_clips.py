@@ -21,7 +21,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from wm_nodes.apps.options import add_json, add_judge, judge_settings
+from wm_nodes.apps.options import add_device, add_json, add_judge, judge_settings
 from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
@@ -35,6 +35,7 @@ VERDICTS = "verdicts.jsonl"
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("clips", type=Path, help="folder of clips.jsonl and its files")
     parser.add_argument("--config", default="cpu", help="a preset or .yaml with a judge section (default: cpu)")
+    add_device(parser)
     add_judge(parser)
     parser.add_argument("--mode", choices=("reward", "benchmark"), help="benchmark: every component is read")
     parser.add_argument("--audit", type=Path, help="folder of an audit log to write, for the viewer and for people")
@@ -44,13 +45,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Judge what is not judged yet and print a summary; return 1 where the judge failed on a clip."""
-    overrides = judge_settings(arguments) | ({"judge.mode": arguments.mode} if arguments.mode else {})
+    given = {"judge.mode": arguments.mode, "device": arguments.device}
+    overrides = judge_settings(arguments) | {name: value for name, value in given.items() if value}
     config, lines = load_config(arguments.config, overrides), read_list(arguments.clips)
     path = arguments.json or arguments.clips / VERDICTS
     settings = judge_or_embedded(config.judge)
     if lines:
         settings = for_clips(settings, read_job(arguments.clips, lines[0]).clip.frames.shape)
-    judge = JudgeService(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit)
+    judge = JudgeService(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit, device=config.device)
     with closing(judge), path.open("a+") as written:
         asked = {"judge_id": judge.judge_ids[0], "rubric": judge.rubric.version}
         by = {**asked, "mode": settings.mode, "seed": config.seed}

@@ -10,7 +10,9 @@ from pathlib import Path
 import yaml
 from tqdm import tqdm
 
+from wm_nodes.apps.options import add_device
 from wm_nodes.config.load import named_pack
+from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.training.normal_ranges import Row, bands_of, clip_rows, count_outside
@@ -26,13 +28,15 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rubric", default="robot", help="pack that it extends")
     parser.add_argument("--stride", type=int, default=1, help="steps between two frames of a clip")
     parser.add_argument("--tail", type=float, default=0.005, help="share of the clips outside of each band")
+    add_device(parser, CPU)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the pack and print its bands."""
     if arguments.stride < 1 or arguments.output.suffix != ".yaml":
         raise ValueError(f"--stride must be >= 1 and --output a .yaml, got {arguments.stride}, {arguments.output}")
-    base, models = load_rubric(arguments.rubric), load_model_folder(arguments.model_dir)
+    device = compute_device(arguments.device)
+    base, models = load_rubric(arguments.rubric), load_model_folder(arguments.model_dir, device)
     rows = _rows(models, arguments.bags, arguments.stride)
     pack = {
         "extends": named_pack(arguments.rubric), "name": arguments.output.stem, "revision": base.revision,

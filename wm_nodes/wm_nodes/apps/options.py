@@ -19,8 +19,12 @@ def add_preset(parser: argparse.ArgumentParser, default: str, names: Sequence[st
     add_device(parser)
 
 
-def add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--device", help="where models compute: cpu, cuda, cuda:N or auto (default: the preset's)")
+def add_device(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """default: None leaves it to the preset."""
+    shown = default or "the preset's"
+    parser.add_argument(
+        "--device", default=default, help=f"where models compute: cpu, cuda, cuda:N or auto (default: {shown})"
+    )
 
 
 def add_set(parser: argparse.ArgumentParser) -> None:

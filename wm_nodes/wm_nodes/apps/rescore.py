@@ -86,7 +86,7 @@ def _rescore_rewards(arguments: argparse.Namespace, bag: Path) -> tuple[bool, di
     """The endogenous or rule rewards of a bag of loop 1."""
     if arguments.reward is not None:
         raise ValueError(f"--reward {arguments.reward} is of clips; {bag} holds a policy's episodes")
-    model = recorded_model(bag, arguments.config, arguments.model_dir)
+    model = recorded_model(bag, arguments.config, arguments.model_dir, arguments.device)
     report = rescore_bag(bag, model, namespace=arguments.namespace)
     print("\n".join([*report.different[:SHOWN], report.text()]))
     return report.equal, {"compared": report.compared, "different": report.different}
@@ -97,12 +97,14 @@ def _judge_episodes(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dic
     run_dir = bag.absolute().parent.parent
     saved = run_dir / "config.yaml"
     file = arguments.config or (str(saved) if saved.is_file() else "cpu")
-    config = load_config(file, judge_settings(arguments))
+    config = load_config(file, judge_settings(arguments) | ({"device": arguments.device} if arguments.device else {}))
     own, kept = run_dir / "model", Path(file).parent / READS
-    evidence = ClipEvidence(arguments.model_dir or (own if own.is_dir() else shipped_model(config.task)))
+    evidence = ClipEvidence(
+        arguments.model_dir or (own if own.is_dir() else shipped_model(config.task)), config.device
+    )
     judge = JudgeService(
         episode_judge(config), seed=config.seed, reads=arguments.reads or (kept if kept.is_dir() else None),
-        audit=arguments.audit, evidence=evidence,
+        audit=arguments.audit, evidence=evidence, device=config.device,
     )
     with closing(judge):
         found = judge_bag(bag, judge, namespace=arguments.namespace)
@@ -161,9 +163,12 @@ def _clip_judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: floa
         found = judge.judge(jobs, by=recorded.judge_id if recorded.judge_id in judge.judge_ids else "")
         return JudgedBuffer(agent_scores(found), tuple(verdict_row(verdict) for verdict in found))
 
-    evidence = ClipEvidence(shipped_model(config.task))
+    evidence = ClipEvidence(shipped_model(config.task), config.device)
     settings = for_clips(judge_or_embedded(config.judge), tuple(contexts.frames.shape[1:]))
-    with closing(JudgeService(settings, seed=config.seed, reads=run_dir / READS, evidence=evidence)) as judge:
+    judge = JudgeService(
+        settings, seed=config.seed, reads=run_dir / READS, evidence=evidence, device=config.device
+    )
+    with closing(judge):
         yield verdicts
 
 

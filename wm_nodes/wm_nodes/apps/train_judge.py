@@ -14,7 +14,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from wm_nodes.apps.options import add_seed, add_threads, positive, prepare_torch
+import torch
+
+from wm_nodes.apps.options import add_device, add_seed, add_threads, positive, prepare_torch
+from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.dataset.build import SIDE_PX
 from wm_nodes.judge.dataset.policy_camera import policy_models, policy_window
@@ -37,6 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--reader-epochs", type=positive, default=JudgePlan.reader_epochs, help="times each sees it")
     parser.add_argument("--trees", type=int, default=TreeSettings.num_trees, help="per question")
+    add_device(parser, CPU)
     add_threads(parser)
     parser.add_argument(
         "--policy-view", nargs="?", type=Path, const=Path(), metavar="MODEL_DIR",
@@ -50,10 +54,11 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.readers < 0:
         raise ValueError(f"--readers must be at least 0, got {arguments.readers}")
     prepare_torch(arguments.threads)
-    print(table(_measured(arguments) if arguments.measure else _trained(arguments)))
+    device = compute_device(arguments.device)
+    print(table(_measured(arguments, device) if arguments.measure else _trained(arguments, device)))
 
 
-def _trained(arguments: argparse.Namespace) -> dict[str, Any]:
+def _trained(arguments: argparse.Namespace, device: torch.device) -> dict[str, Any]:
     window = None
     if arguments.policy_view is not None:
         models = load_model_folder(policy_models(arguments.policy_view))
@@ -62,14 +67,15 @@ def _trained(arguments: argparse.Namespace) -> dict[str, Any]:
         tuple(arguments.sets), arguments.segmenter_steps, arguments.readers, arguments.reader_epochs,
         TreeSettings(arguments.trees), arguments.seed, window,
     )
-    head = make_judge(arguments.out, plan)
-    head = replace(head, story={"made": {"command": arguments.command, "machine": machine_facts()}, **head.story})
+    head = make_judge(arguments.out, plan, device=device)
+    made = {"command": arguments.command, "machine": machine_facts(arguments.device)}
+    head = replace(head, story={"made": made, **head.story})
     save_head(arguments.out, head)
     return dict(head.story["validation"])
 
 
-def _measured(arguments: argparse.Namespace) -> dict[str, Any]:
-    head = load_head(arguments.out)
+def _measured(arguments: argparse.Namespace, device: torch.device) -> dict[str, Any]:
+    head = load_head(arguments.out, device)
     part = arguments.measure
     examples = collect_evidence(arguments.out, load_sets(arguments.sets), part, head.segmenter, head.readers)
     if not len(examples.rows):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import ClipRef, TaskSpec
 from wm_nodes.judge.evidence.pictures import pictures_of
@@ -24,10 +25,11 @@ class ClipEvidence:
 
     Args:
         model_dir: folder of the world model, loaded when a band first needs it; None: there is none.
+        device: the setting `device` (core/device.py), where the world model computes.
     """
 
-    def __init__(self, model_dir: Path | None = None) -> None:
-        self._model_dir = model_dir
+    def __init__(self, model_dir: Path | None = None, device: str = CPU) -> None:
+        self._model_dir, self._device = model_dir, device
         self._models: WorldModels | None = None
         self._one_at_a_time = threading.Lock()
 
@@ -72,7 +74,7 @@ class ClipEvidence:
     def _load(self) -> WorldModels:
         assert self._model_dir is not None  # check refuses such bands
         if self._models is None:
-            self._models = load_model_folder(self._model_dir)
+            self._models = load_model_folder(self._model_dir, compute_device(self._device))
         return self._models
 
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import AGENT, JudgeConfig
+from wm_nodes.core.device import CPU
 from wm_nodes.core.named_files import RUBRIC, NamedFiles
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.judge.agent.judge import Cost, Health
@@ -125,6 +126,7 @@ class JudgeService:
         reads: folder that keeps the judge's answers; None: none are kept.
         audit: folder of the audit log that every question, answer and verdict goes into; None: none is written.
         evidence: measures what the rubric's bands name; None: pixels only.
+        device: the setting `device` (core/device.py), where embedded judges compute.
 
     Raises:
         ValueError, MissingPackageError: as make_judge, and as ClipEvidence.check. ConfigError: the rubric is refused.
@@ -133,9 +135,9 @@ class JudgeService:
 
     def __init__(
         self, settings: JudgeConfig, *, seed: int, reads: Path | None = None, audit: Path | None = None,
-        evidence: ClipEvidence | None = None,
+        evidence: ClipEvidence | None = None, device: str = CPU,
     ) -> None:
-        self.settings, self._seed, self._reads = settings, seed, reads
+        self.settings, self._seed, self._reads, self._device = settings, seed, reads, device
         self._evidence = evidence or ClipEvidence()
         self._log = None if audit is None else AuditLog(audit)
         self.pack, self.tally, self.health = settings.rubric, VerdictCounts(), Health(True, "not asked yet")
@@ -266,9 +268,9 @@ class JudgeService:
             "budget_s": settings.clip_budget_s, "call_plan": settings.call_plan,
         }
         if log is None:
-            opened = make_judge(settings, rubric, self._reads)
+            opened = make_judge(settings, rubric, self._reads, device=self._device)
             return _JudgeSlot(opened, RewardAgent(opened.judge, rubric, **limits))
-        opened = make_judge(settings, rubric, self._reads, partial(write_exchange, log))
+        opened = make_judge(settings, rubric, self._reads, partial(write_exchange, log), device=self._device)
         return _JudgeSlot(opened, AuditedAgent(opened.judge, rubric, log, **limits))
 
     def _round(

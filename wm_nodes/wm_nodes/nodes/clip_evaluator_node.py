@@ -69,7 +69,7 @@ class ClipEvaluatorNode(ManagedNode):
             shape = tuple(contexts.frames.shape[1:])
             judge = for_clips(judge_or_embedded(self._config.judge), shape)
             check_clips(judge, shape)
-            self._agent = JudgeServices(self, judge, self._config.seed, lambda: self._action.busy)
+            self._agent = JudgeServices(self, judge, self._config, lambda: self._action.busy)
         self._scores = self.publish_on("clips/scores")
         self._action = WorkerAction(self, EvaluateClips, "clips/evaluate", self._evaluate)
 

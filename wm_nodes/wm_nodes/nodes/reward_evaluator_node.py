@@ -58,7 +58,7 @@ class RewardEvaluatorNode(ManagedNode):
         self._undecided: deque[tuple[float, Transition, PendingReward]] = deque()
         self._model: RewardModel | EpisodeReward
         if kind == AGENT and not factory:
-            agent = JudgeServices(self, episode_judge(config), config.seed, lambda: bool(self._undecided))
+            agent = JudgeServices(self, episode_judge(config), config, lambda: bool(self._undecided))
             self._model = EpisodeReward(agent.judge)
             self._agent = agent
         else:

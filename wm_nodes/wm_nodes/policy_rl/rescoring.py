@@ -67,19 +67,22 @@ def rescore_bag(path: Path, model: RewardModel, *, namespace: str | None = None)
     return report
 
 
-def recorded_model(bag: Path, config_file: str | None = None, model_dir: Path | None = None) -> RewardModel:
+def recorded_model(
+    bag: Path, config_file: str | None = None, model_dir: Path | None = None, device: str | None = None
+) -> RewardModel:
     """Build the reward model of the run that a bag lies in.
 
     Args:
         config_file: default: config.yaml two folders above the bag.
         model_dir: its world model; default: `model` beside that file, else the shipped one.
+        device: as the setting; default: the run's.
 
     Raises:
         BagError: the bag holds rewards that no reward model gives.
     """
     name = recorded_reward_name(bag)
     run_dir = bag.absolute().parent.parent
-    config = load_config(config_file or str(run_dir / "config.yaml"))
+    config = load_config(config_file or str(run_dir / "config.yaml"), {"device": device} if device else {})
     if name == "rule":
         return RuleReward(config.reward.sparse_weight)
     if name != "endogenous":

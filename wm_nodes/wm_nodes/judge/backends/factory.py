@@ -3,10 +3,12 @@
 import re
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from wm_nodes.config.schema import JudgeConfig, OtherJudge, StageJudge
+from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import Stage
@@ -134,23 +136,26 @@ def judge_name(settings: JudgeConfig) -> str:
 
 def make_judge(
     settings: JudgeConfig, rubric: Rubric, reads: Path | None = None,
-    on_exchange: Callable[[Exchange], None] = lambda exchange: None,
+    on_exchange: Callable[[Exchange], None] = lambda exchange: None, *, device: str = CPU,
 ) -> OpenedJudge:
     """Make the judge that the settings name; nothing is asked yet.
 
     Args:
         reads: folder of the reads that were bought before, see VerdictCache; None: none are kept. Of servers only.
         on_exchange: called with the words of every request to a server and its raw reply.
+        device: the setting `device` (core/device.py), where an embedded judge computes.
 
     Raises:
-        ValueError: as check_judge; the key's environment variable is not set, or the folder holds no judge.
+        ValueError: as check_judge and compute_device; the key's environment variable is not set, or the folder holds no
+            judge.
         MissingPackageError: the client package is not installed.
     """
     check_judge(settings)
-    first = _open(settings, rubric, reads, on_exchange)
+    open_judge = partial(_open, rubric=rubric, reads=reads, on_exchange=on_exchange, device=device)
+    first = open_judge(settings)
     if not settings.routes:
         return first
-    routed = [_open(_single_judge(settings, route), rubric, reads, on_exchange) for route in settings.routes]
+    routed = [open_judge(_single_judge(settings, route)) for route in settings.routes]
     routes = [([Stage(s) for s in r.stages], o.judge) for r, o in zip(settings.routes, routed, strict=True)]
 
     async def close() -> None:
@@ -161,11 +166,12 @@ def make_judge(
 
 
 def _open(
-    settings: JudgeConfig, rubric: Rubric, reads: Path | None, on_exchange: Callable[[Exchange], None]
+    settings: JudgeConfig, rubric: Rubric, reads: Path | None, on_exchange: Callable[[Exchange], None], device: str
 ) -> OpenedJudge:
     """The judge itself, whatever its routes."""
     if settings.kind == "embedded":
-        return OpenedJudge(EmbeddedJudge(load_head(_folder(settings)), settings.conformal), _close_nothing)
+        head = load_head(_folder(settings), compute_device(device))
+        return OpenedJudge(EmbeddedJudge(head, settings.conformal), _close_nothing)
     transport = ChatTransport(
         [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
         retry=RetryPolicy(settings.tries),

@@ -170,7 +170,7 @@ def num_questions(target: str) -> int:
 def save_head(folder: Path, head: JudgeHead) -> Path:
     """Write the folder; equal heads give equal bytes of judge.safetensors."""
     arrays: dict[str, NDArray[Any]] = {
-        f"{part}.{name}": tensor.numpy().astype(np.float16)
+        f"{part}.{name}": tensor.cpu().numpy().astype(np.float16)
         for part, network in (("segmenter", head.segmenter), *((f"reader{k}", r) for k, r in enumerate(head.readers)))
         for name, tensor in network.state_dict().items()
     }
@@ -191,14 +191,19 @@ def save_head(folder: Path, head: JudgeHead) -> Path:
     return write_model_folder(folder, {TENSORS: data}, manifest, MANIFEST)
 
 
-def load_head(folder: Path) -> JudgeHead:
-    """Load and verify a judge's folder. Raises ModelFolderError: names the file, what is wrong, and the remedy."""
+def load_head(folder: Path, device: torch.device | str = "cpu") -> JudgeHead:
+    """Load and verify a judge's folder; its networks compute on `device`.
+
+    Raises:
+        ModelFolderError: names the file, what is wrong, and the remedy.
+    """
     manifest = read_manifest(folder, "judge", FORMAT, MANIFEST)
     data = read_model_file(folder / TENSORS, manifest["sha256"])
     try:
         arrays = load(data)
-        segmenter = _network(Segmenter(), "segmenter", arrays)
-        readers = tuple(_network(TemporalNetwork(), f"reader{k}", arrays) for k in range(manifest.get("readers", 0)))
+        segmenter = _network(Segmenter(), "segmenter", arrays).to(device)
+        num_readers = manifest.get("readers", 0)
+        readers = tuple(_network(TemporalNetwork(), f"reader{k}", arrays).to(device) for k in range(num_readers))
         questions = {
             target: tuple(
                 HeadQuestion(Trees(**{p: arrays[f"{target}.{k}.{p}"] for p in TREE_ARRAYS}, bias=bias), slope, offset)

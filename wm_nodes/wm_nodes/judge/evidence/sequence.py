@@ -124,8 +124,9 @@ class TemporalNetwork(nn.Module):
     @torch.inference_mode()
     def log_odds(self, sequence: ObjectSequence) -> FloatArray:
         """(K,) of one clip."""
-        crops, numbers = (torch.from_numpy(array)[None] for array in (sequence.crops, sequence.numbers))
-        answers: FloatArray = self(crops, numbers)[0].numpy()
+        both = (sequence.crops, sequence.numbers)
+        crops, numbers = (torch.from_numpy(array)[None].to(self.mean.device) for array in both)
+        answers: FloatArray = self(crops, numbers)[0].cpu().numpy()
         return answers
 
 

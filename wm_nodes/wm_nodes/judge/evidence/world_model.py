@@ -67,16 +67,17 @@ def model_evidence(
     index = models.task_index(task.task_id)
     tokenizer = models.tokenizer
     latents = tokenizer.encode(frames)
-    difference = np.abs(tokenizer.decode(latents).numpy().astype(np.float32) - frames).mean(3)
+    difference = np.abs(tokenizer.decode(latents).cpu().numpy().astype(np.float32) - frames).mean(3)
     blocks = F.avg_pool2d(torch.from_numpy(difference)[:, None], BLOCK_PX)
     read = tokenizer.read_state(latents)[:, TOOL]
-    actions = torch.from_numpy(np.asarray(task.actions, np.float32)).reshape(-1, action_dim)
-    start = read[0] if start_state is None else torch.from_numpy(np.asarray(start_state, np.float32))
+    device = latents.device
+    actions = torch.from_numpy(np.asarray(task.actions, np.float32)).reshape(-1, action_dim).to(device)
+    start = read[0] if start_state is None else torch.from_numpy(np.asarray(start_state, np.float32)).to(device)
     states, turned_states = (commanded_states(models, start, sign * actions) for sign in (1, -1))
     errors, logits = _errors(action_model, latents, actions, states, per_frame)
     turned, _ = _errors(action_model, latents, -actions, turned_states, per_frame)
     still = (latents[1:] - latents[:-1]).square().mean((1, 2))
-    signal = torch.cat([torch.zeros(1), done_signal(logits)[0][:, index]])
+    signal = F.pad(done_signal(logits)[0][:, index], (1, 0))
     shown = states[::per_frame]
     moved = (read[1:] - read[:-1]) - (shown[1:] - shown[:-1])
     evidence = {
@@ -124,10 +125,11 @@ def _imagined_errors(
 
 def commanded_states(models: WorldModels, start_S: Tensor, actions_TA: Tensor) -> Tensor:
     """Commanded tool positions (T, S), m: each action moves at most max_action_m, inside the workspace (control.py)."""
-    low, high = torch.tensor(models.simulation.workspace_low_m), torch.tensor(models.simulation.workspace_high_m)
+    simulation = models.simulation
+    low, high = (torch.tensor(edge).to(start_S) for edge in (simulation.workspace_low_m, simulation.workspace_high_m))
     states = [start_S]
     for action in actions_TA:
-        moved = states[-1] + models.simulation.max_action_m * action
+        moved = states[-1] + simulation.max_action_m * action
         states.append(torch.minimum(torch.maximum(moved, torch.minimum(low, start_S)), torch.maximum(high, start_S)))
     return torch.stack(states)
 
@@ -135,6 +137,6 @@ def commanded_states(models: WorldModels, start_S: Tensor, actions_TA: Tensor) -
 def _goal(latents_TSD: Tensor, goal_SD: Tensor) -> dict[str, float]:
     distance = (latents_TSD - goal_SD).abs().mean((1, 2))
     first = float(distance[0]) + 1e-6
-    time = torch.linspace(-0.5, 0.5, len(distance))
+    time = torch.linspace(-0.5, 0.5, len(distance), device=distance.device)
     slope = float((time * -distance).sum() / time.square().sum())
     return {"goal_similarity": 1 - float(distance[-1]) / first, "goal_slope": slope / first}

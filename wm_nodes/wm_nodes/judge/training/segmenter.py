@@ -24,6 +24,7 @@ from wm_nodes.judge.training.data import SetClip
 FRAMES_PER_CLIP = 4
 BATCH = 16
 LEARNING_RATE = 3e-3
+CPU = torch.device("cpu")
 CLASS_WEIGHTS = (1.0, 1.5, 5.0, 4.0)
 """Of scene, robot, object, clutter in the loss: small things count more."""
 WHOLE_PICTURE = frozenset({
@@ -56,20 +57,22 @@ def segmentation_data(clips: Iterable[SetClip], seed: int) -> tuple[UInt8Array, 
 
 
 def train_segmenter(
-    images: UInt8Array, masks: UInt8Array, *, num_steps: int, seed: int, progress: bool = True
+    images: UInt8Array, masks: UInt8Array, *, num_steps: int, seed: int, progress: bool = True,
+    device: torch.device = CPU,
 ) -> Segmenter:
     """Minimise weighted cross-entropy with AdamW; equal arguments give equal weights on one machine."""
     with torch.random.fork_rng([]):
         torch.manual_seed(seed)
-        model = Segmenter().train()
+        model = Segmenter().train().to(device)
     optimiser = torch.optim.AdamW(model.parameters(), LEARNING_RATE, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, total_steps=num_steps, pct_start=0.1)
-    generator, weights = torch_stream(seed, "segmenter_batches"), torch.tensor(CLASS_WEIGHTS)
+    generator, weights = torch_stream(seed, "segmenter_batches"), torch.tensor(CLASS_WEIGHTS).to(device)
     pictures, labels = torch.from_numpy(images), torch.from_numpy(masks)
     steps = trange(num_steps, desc="segmenter", disable=not progress)
     for _ in steps:
         chosen = torch.randint(len(pictures), (BATCH,), generator=generator)
-        pixels, wanted = _augment(pictures[chosen].permute(0, 3, 1, 2).float() / 255, labels[chosen].long(), generator)
+        shown, meant = pictures[chosen].to(device), labels[chosen].to(device)
+        pixels, wanted = _augment(shown.permute(0, 3, 1, 2).float() / 255, meant.long(), generator)
         loss = F.cross_entropy(model(pixels), wanted, weights)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -86,7 +89,8 @@ def _augment(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator
     turned by up to 15 degrees and scaled by 0.8 to 1.25.
     """
     count = len(pixels_N3HW)
-    chosen, amount = torch.rand(4, count, generator=generator) < 0.5, torch.rand(4, count, generator=generator) * 2 - 1
+    draws = (torch.rand(4, count, generator=generator).to(pixels_N3HW.device) for _ in range(2))
+    chosen, amount = next(draws) < 0.5, next(draws) * 2 - 1
     angle = torch.where(chosen[0], amount[0] * math.pi, 0.0)
     cos, up, down = angle.cos(), *((1 - angle.cos()) / 3 + side * angle.sin() / math.sqrt(3) for side in (-1, 1))
     same = cos + (1 - cos) / 3
@@ -95,7 +99,7 @@ def _augment(pixels_N3HW: Tensor, labels_NHW: Tensor, generator: torch.Generator
     pixels = pixels * torch.where(chosen[1], 1 + 0.3 * amount[1], 1.0).view(-1, 1, 1, 1)
     roll, scale = (chosen[3] * amount[3]) * math.radians(15), 1.25 ** torch.where(chosen[3], amount[2], 0.0)
     side = torch.where(chosen[2], -1.0, 1.0)
-    zero = torch.zeros(count)
+    zero = torch.zeros_like(roll)
     affine = torch.stack(
         [scale * roll.cos() * side, -scale * roll.sin(), zero, scale * roll.sin() * side, scale * roll.cos(), zero], 1
     ).view(count, 2, 3)

@@ -27,6 +27,7 @@ from wm_nodes.judge.evidence.sequence import READS, RIGHTWARD, ObjectSequence, T
 from wm_nodes.judge.training.heads import LAST_FAIL, UNKNOWN, Levels, true_levels
 from wm_nodes.world_model.precision import compute_context
 
+CPU = torch.device("cpu")
 FOLDS = 2
 BATCH = 64
 LEARNING_RATE, WEIGHT_DECAY = 1.5e-3, 0.05
@@ -60,12 +61,14 @@ def _answers(question: str, rows: Sequence[ManifestRow]) -> Levels:
 
 
 def cross_fit(
-    folder: Path, data: TemporalData, *, count: int, epochs: int, seed: int, progress: bool = True
+    folder: Path, data: TemporalData, *, count: int, epochs: int, seed: int, progress: bool = True,
+    device: torch.device = CPU,
 ) -> tuple[tuple[TemporalNetwork, ...], FloatArray]:
     """`count` readers per fold, and log-odds (N, K) of every clip, the mean of those that have not seen its recording.
 
     Args:
-        folder: of finished readers, which are loaded; the file names hash everything they depend on.
+        folder: of finished readers, which are loaded, whatever device made them; the file names hash everything else
+            that they depend on.
 
     Raises:
         ValueError: one of the folds has no clips. OSError: a full disk.
@@ -76,7 +79,7 @@ def cross_fit(
         if not len(trained) or len(trained) == len(data.folds):
             raise ValueError(f"recordings of one parity of seeds only: {len(data.folds)} clips; build larger sets")
         seeds = [stream_seed(seed, "reader", fold + FOLDS * number) for number in range(count)]
-        own = [_load_or_train_reader(folder, data, trained, epochs, each, progress) for each in seeds]
+        own = [_load_or_train_reader(folder, data, trained, epochs, each, progress, device) for each in seeds]
         for i in np.flatnonzero(data.folds == fold):
             log_odds[i] = list(readings(own, data.sequences[i]).values())
         readers += own
@@ -84,15 +87,16 @@ def cross_fit(
 
 
 def _load_or_train_reader(
-    folder: Path, data: TemporalData, trained: Levels, epochs: int, seed: int, progress: bool
+    folder: Path, data: TemporalData, trained: Levels, epochs: int, seed: int, progress: bool,
+    device: torch.device,
 ) -> TemporalNetwork:
     path = folder / f"reader-{_key(data, trained, epochs, seed)}.safetensors"
     if not path.exists():
-        reader = train_temporal_network(data, trained, epochs=epochs, seed=seed, progress=progress)
+        reader = train_temporal_network(data, trained, epochs=epochs, seed=seed, progress=progress, device=device)
         write_atomic(path, save(dict(reader.state_dict())))
     reader = TemporalNetwork().eval().requires_grad_(False)
     reader.load_state_dict(load_file(path))
-    return reader
+    return reader.to(device)
 
 
 def _key(data: TemporalData, chosen: Levels, epochs: int, seed: int) -> str:
@@ -104,28 +108,29 @@ def _key(data: TemporalData, chosen: Levels, epochs: int, seed: int) -> str:
 
 
 def train_temporal_network(
-    data: TemporalData, chosen: Levels, *, epochs: int, seed: int, progress: bool = True
+    data: TemporalData, chosen: Levels, *, epochs: int, seed: int, progress: bool = True,
+    device: torch.device = CPU,
 ) -> TemporalNetwork:
     """Minimise the weighted logistic loss of the known answers with AdamW; batches are of clips of one length."""
     with torch.random.fork_rng([]):
         torch.manual_seed(seed)
-        reader = TemporalNetwork().train()
+        reader = TemporalNetwork().train().to(device)
         rng = numpy_stream(seed, "reader_batches")
         numbers = np.concatenate([data.sequences[i].numbers for i in chosen])
         reader.mean.copy_(torch.from_numpy(numbers.mean(0)))
         reader.scale.copy_(torch.from_numpy(numbers.std(0) + 1e-2))
-        weights = _weights(data.answers[chosen])
+        weights = _weights(data.answers[chosen]).to(device)
         batches = [batch for _ in range(epochs) for batch in _batches(data, chosen, rng)]
         optimiser = torch.optim.AdamW(reader.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimiser, LEARNING_RATE, total_steps=max(MIN_STEPS, len(batches)), pct_start=0.1
         )
         for batch in (steps := tqdm(batches, "reader", disable=not progress)):
-            crops, known = _augment(*_stack(data, batch), rng)
-            wanted = torch.from_numpy(data.answers[batch])
+            crops, known = _augment(*_stack(data, batch, device), rng)
+            wanted = torch.from_numpy(data.answers[batch]).to(device)
             weight = torch.where(wanted > 0, weights[1], weights[0]) * (wanted != UNKNOWN)
             aim = wanted.clamp(0).float() * (1 - 2 * SMOOTHING) + SMOOTHING
-            with compute_context(torch.device("cpu")):
+            with compute_context(device):
                 answers = reader(crops, known)
             loss = F.binary_cross_entropy_with_logits(answers.float(), aim, weight, reduction="sum")
             loss = loss / (wanted != UNKNOWN).sum().clamp(min=1)
@@ -156,21 +161,23 @@ def _batches(data: TemporalData, chosen: Levels, rng: np.random.Generator) -> It
     yield from (batches[i] for i in rng.permutation(len(batches)))
 
 
-def _stack(data: TemporalData, batch: Levels) -> tuple[Tensor, Tensor]:
-    crops = np.stack([data.sequences[i].crops for i in batch])
-    return torch.from_numpy(crops), torch.from_numpy(np.stack([data.sequences[i].numbers for i in batch]))
+def _stack(data: TemporalData, batch: Levels, device: torch.device) -> tuple[Tensor, Tensor]:
+    crops, numbers = (np.stack([getattr(data.sequences[i], name) for i in batch]) for name in ("crops", "numbers"))
+    return torch.from_numpy(crops).to(device), torch.from_numpy(numbers).to(device)
 
 
 def _augment(crops: Tensor, numbers: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     """Augment clips: half mirrored, half with exchanged colours; random colour gains and offsets, noise on numbers."""
-    count = len(crops)
-    mirrored = torch.from_numpy(rng.random(count) < 0.5)
+    count, device = len(crops), crops.device
+    mirrored = torch.from_numpy(rng.random(count) < 0.5).to(device)
     crops = torch.where(mirrored[:, None, None, None, None], crops.flip(3), crops)
     sign = torch.ones(numbers.shape[-1])
     sign[list(RIGHTWARD)] = -1
-    numbers = torch.where(mirrored[:, None, None], numbers * sign, numbers) + NUMBER_NOISE * torch.randn(numbers.shape)
+    noise = NUMBER_NOISE * torch.randn(numbers.shape)
+    numbers = torch.where(mirrored[:, None, None], numbers * sign.to(device), numbers) + noise.to(device)
     kinds = np.where(rng.random(count) < 0.5, 0, rng.integers(0, len(EXCHANGES), count))
-    order = EXCHANGES[torch.from_numpy(kinds)][:, None, None, None, :].expand(*crops.shape[:-1], 3)
-    gain, offset = (torch.from_numpy(rng.uniform(-1, 1, (count, 1, 1, 1, 3)).astype(np.float32)) for _ in range(2))
+    order = EXCHANGES[torch.from_numpy(kinds)].to(device)[:, None, None, None, :].expand(*crops.shape[:-1], 3)
+    draws = (rng.uniform(-1, 1, (count, 1, 1, 1, 3)).astype(np.float32) for _ in range(2))
+    gain, offset = (torch.from_numpy(draw).to(device) for draw in draws)
     colours = torch.gather(crops[..., :3], -1, order).float() * (1 + GAIN * gain) + OFFSET_LEVELS * offset
     return torch.cat((colours.clamp_(0, 255).to(torch.uint8), crops[..., 3:]), -1), numbers

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save
 from tqdm import tqdm
@@ -32,7 +33,7 @@ from wm_nodes.judge.evidence.trees import TreeSettings
 from wm_nodes.judge.evidence.window import Window
 from wm_nodes.judge.training.data import load_sets, rows_of, set_clips
 from wm_nodes.judge.training.heads import TARGETS, Examples, conformal_limits, fit_all, fit_familiarity, measure_target
-from wm_nodes.judge.training.segmenter import overlaps, segmentation_data, train_segmenter
+from wm_nodes.judge.training.segmenter import CPU, overlaps, segmentation_data, train_segmenter
 from wm_nodes.judge.training.temporal_networks import cross_fit, temporal_data
 
 SEGMENTER = "segmenter.safetensors"
@@ -56,8 +57,12 @@ class JudgePlan:
     """The part of the judged pictures that the clips show, for sets of the policy's camera (policy_camera.py)."""
 
 
-def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> JudgeHead:
+def make_judge(
+    folder: Path, plan: JudgePlan, *, progress: bool = True, device: torch.device = CPU
+) -> JudgeHead:
     """Train every part of a judge; the head's story holds the data, the seeds and the metrics on the validation part.
+
+    device: that the networks compute on. A stage that another device finished is taken up.
 
     Raises:
         ManifestError: a damaged set. ValueError: sets too small to learn from. OSError: a full disk.
@@ -69,7 +74,7 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
             "a judge reads either the clips of --policy-view or others: give --policy-view to sets that were made so, "
             "and to no other"
         )
-    segmenter, segmenter_story = _load_or_train_segmenter(folder, sets, plan, progress)
+    segmenter, segmenter_story = _load_or_train_segmenter(folder, sets, plan, progress, device)
     train, validation = (
         collect_evidence(folder, sets, part, segmenter, progress=progress) for part in ("train", "validation")
     )
@@ -79,7 +84,8 @@ def make_judge(folder: Path, plan: JudgePlan, *, progress: bool = True) -> Judge
     if plan.readers:
         data = temporal_data(collect_sequences(folder, sets, "train", segmenter), train.rows)
         readers, log_odds = cross_fit(
-            folder, data, count=plan.readers, epochs=plan.reader_epochs, seed=plan.seed, progress=progress
+            folder, data, count=plan.readers, epochs=plan.reader_epochs, seed=plan.seed, progress=progress,
+            device=device,
         )
         train = with_readings(train, log_odds)
         validation = _add_readings(folder, sets, "validation", segmenter, readers, validation)
@@ -188,13 +194,15 @@ def _key(rows: Sequence[ManifestRow], segmenter: Segmenter) -> str:
 
 
 def _load_or_train_segmenter(
-    folder: Path, sets: Sets, plan: JudgePlan, progress: bool
+    folder: Path, sets: Sets, plan: JudgePlan, progress: bool, device: torch.device
 ) -> tuple[Segmenter, dict[str, Any]]:
     """Load the segmenter of the folder, or train it; return it and how it was trained. Weights are of float16."""
     path = folder / SEGMENTER
     if not path.exists():
         images, masks = segmentation_data(set_clips(sets, ["train"]), plan.seed)
-        model = train_segmenter(images, masks, num_steps=plan.segmenter_steps, seed=plan.seed, progress=progress)
+        model = train_segmenter(
+            images, masks, num_steps=plan.segmenter_steps, seed=plan.seed, progress=progress, device=device
+        )
         validation = segmentation_data(set_clips(sets, ["validation"]), plan.seed)
         story = {
             "sets": [str(folder.name) for folder, _ in sets], "pictures": len(images), "steps": plan.segmenter_steps,
@@ -205,7 +213,7 @@ def _load_or_train_segmenter(
     segmenter = Segmenter()
     segmenter.load_state_dict({name: tensor.float() for name, tensor in load_file(path).items()})
     story = json.loads(path.with_suffix(".json").read_text())
-    return segmenter.eval().requires_grad_(False), story
+    return segmenter.eval().requires_grad_(False).to(device), story
 
 
 def _describe_set(path: Path, manifest: Manifest) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from wm_msgs.action import JudgeClips
 from wm_msgs.msg import ClipVerdict, ErrorCode
 from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import ConfigError
-from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.config.schema import JudgeConfig, RunConfig
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.named_files import FileKind, shown
 from wm_nodes.judge.agent.contract import pause_reason
 from wm_nodes.judge.agent.types import GATED, Status
@@ -41,18 +42,21 @@ class JudgeServices:
     the rubric has bands of. Rounds are judged one after the other; the node calls stop when it is deactivated.
 
     Args:
+        config: of the run; its seed and device are taken.
         busy: whether the node has clips of its own judged: the rubric is not changed meanwhile.
 
     Raises:
         ValueError, ConfigError: as JudgeService.
     """
 
-    def __init__(self, node: ManagedNode, settings: JudgeConfig, seed: int, busy: Callable[[], bool]) -> None:
+    def __init__(
+        self, node: ManagedNode, settings: JudgeConfig, config: RunConfig | VideoRlConfig, busy: Callable[[], bool]
+    ) -> None:
         self._node, self._busy = node, busy
         audit, models = str(node.param("audit_dir")), str(node.param("model_dir"))
         self.judge = JudgeService(
-            settings, seed=seed, reads=node.run_dir / READS, audit=node.run_dir / audit if audit else None,
-            evidence=ClipEvidence(Path(models) if models else None),
+            settings, seed=config.seed, reads=node.run_dir / READS, audit=node.run_dir / audit if audit else None,
+            evidence=ClipEvidence(Path(models) if models else None, config.device), device=config.device,
         )
         node.own(self.judge.close)
         self._files = named_files(node, *([settings.rubric] if settings.rubric.endswith((".yaml", ".yml")) else []))
