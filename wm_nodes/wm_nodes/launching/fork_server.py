@@ -30,6 +30,10 @@ ANSWER_S = 60.0
 CLOSE_S, ORPHAN_S = 1.0, 5.0
 """Time for the server's end, and for a node's whose server is gone; then they are killed."""
 MESSAGE_BYTES = 2**20
+CUDA_RUNS = (
+    "error: importing the nodes has started CUDA, which a fork cannot use, so every node starts in an interpreter of "
+    "its own; let modules ask for a GPU in configure, not when they are imported\n"
+)
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -140,7 +144,10 @@ def end_group(pid: int) -> None:
 
 
 def serve(connection: socket.socket, modules: Sequence[str]) -> dict[str, Any]:
-    """Fork for each request until the client hangs up. Returns in a child only, with its request."""
+    """Fork for each request until the client hangs up. Returns in a child only, with its request.
+
+    Where the imports have started CUDA it says so in the output of the first request, and ends.
+    """
     for name in modules:
         importlib.import_module(name)
     gc.collect()
@@ -164,6 +171,9 @@ def serve(connection: socket.socket, modules: Sequence[str]) -> dict[str, Any]:
             message, files, _, _ = socket.recv_fds(connection, MESSAGE_BYTES, 1)
             if not message:
                 os._exit(0)  # the kernel sends SIGTERM to what still runs
+            if _cuda_runs():
+                os.write(files[0], CUDA_RUNS.encode())
+                os._exit(1)
             pid = os.fork()
             if pid == 0:
                 end_with_parent()
@@ -182,6 +192,12 @@ def serve(connection: socket.socket, modules: Sequence[str]) -> dict[str, Any]:
             os.close(files[0])
             children.add(pid)
             connection.send(json.dumps({"pid": pid}).encode())
+
+
+def _cuda_runs() -> bool:
+    """Whether something in this process has started CUDA."""
+    torch = sys.modules.get("torch")
+    return torch is not None and bool(torch.cuda.is_initialized())
 
 
 def main() -> None:

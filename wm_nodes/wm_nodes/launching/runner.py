@@ -86,10 +86,9 @@ class Runner:
             if self._log_dir is not None:
                 self._log_dir.mkdir(parents=True, exist_ok=True)
             self._starter = ThreadPoolExecutor(max_workers=1, thread_name_prefix="runner")
-            modules = [node.module for node in self.graph.nodes if _can_fork(node)]
-            if len(modules) > 1:
-                ours = sorted(module for module in {*modules} if module.startswith("wm_nodes."))
-                self._forks = self._starter.submit(ForkServer, self._python, ours, self.environment).result()
+            if sum(map(_can_fork, self.graph.nodes)) > 1:
+                modules = preloaded(self.graph)
+                self._forks = self._starter.submit(ForkServer, self._python, modules, self.environment).result()
             for index, node in enumerate(self.graph.nodes):
                 self._processes[node.label] = NodeProcess(
                     node, self._python, self.environment, log=self._log, colour=index if self._colour else None,
@@ -330,6 +329,12 @@ def _raise(runner: Runner, received: Sequence[int]) -> None:
     if received:
         raise KeyboardInterrupt
     runner.check()
+
+
+def preloaded(graph: Graph) -> list[str]:
+    """The modules that the fork server imports before it forks."""
+    modules = {node.module for node in graph.nodes if _can_fork(node)}
+    return sorted(module for module in modules if module.startswith("wm_nodes."))
 
 
 def _can_fork(node: NodeSpec) -> bool:
