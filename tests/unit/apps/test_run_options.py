@@ -8,10 +8,13 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+import torch
+import yaml
 
 from wm_nodes.apps import train_policy, train_video_model
 from wm_nodes.apps.run_options import BEGUN
 from wm_nodes.config.load import ConfigError, dump_config, load_config
+from wm_nodes.core.device import DeviceError
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.run_lock import NAME
 
@@ -154,3 +157,48 @@ def test_settings_that_are_refused_leave_no_folder_and_a_preset_file_is_known_by
     monkeypatch.chdir("/")
     assert opened(["--preset", tmp_path / "mine.yaml", *run])[1] == dump_config(load_config("base", {"seed": 3}))
     assert "--preset is" in refused(["--preset", "other.yaml", *run])
+
+
+@pytest.mark.parametrize("app", [train_policy, train_video_model])
+def test_the_device_may_change_and_nothing_else_does(app: ModuleType, tmp_path: Path) -> None:
+    run = ["--run-dir", tmp_path / "run"]
+    saved = tmp_path / "run" / "config.yaml"
+    _, config = opened(["--preset", "smoke", *run], app)
+    kept = (tmp_path / "run" / BEGUN).read_bytes()
+    saved.write_text(config.replace("device: cpu\n", "device: cuda\n"))  # begun on a machine with a GPU
+    _, there = opened(["--device", "cpu", *run], app)
+    assert there == config and yaml.safe_load(saved.read_text()) == yaml.safe_load(config)
+    assert opened(["--set", "device=auto", *run], app)[1] == config.replace("device: cpu\n", "device: auto\n")
+    for words in (run, ["--preset", "smoke", *run]):
+        assert "device: auto\n" in opened(words, app)[1], "what is not said again stays"
+    assert (tmp_path / "run" / BEGUN).read_bytes() == kept
+    assert "--seed is 0 in this run, 1 is given" in refused(["--device", "cpu", "--seed", "1", *run], app)
+    assert "device: auto\n" in saved.read_text(), "a refused command changes nothing"
+    saved.write_text(saved.read_text().replace("seed: 0\n", "seed: 1\n"))
+    assert "sha256 differs" in refused(["--device", "cpu", *run], app)
+
+
+def test_an_old_folder_that_names_no_device_goes_on_with_any(tmp_path: Path) -> None:
+    run_dir, run = tmp_path / "run", ["--run-dir", tmp_path / "run"]
+    _, config = opened(["--preset", "smoke", *run])
+    old = config.replace("device: cpu\n", "") + "# begun with --reward endogenous\n"
+    (run_dir / BEGUN).unlink()
+    (run_dir / "config.yaml").write_text(old)
+    opened(run)
+    assert (run_dir / "config.yaml").read_text() == old
+    opened(["--device", "auto", *run])
+    assert (run_dir / "config.yaml").read_text() == f"{old}device: auto\n"
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+@pytest.mark.parametrize("app", [train_policy, train_video_model])
+def test_a_gpu_that_is_not_there_is_refused_before_anything_is_written(app: ModuleType, tmp_path: Path) -> None:
+    run = ["--preset", "smoke", "--run-dir", tmp_path / "run"]
+    with pytest.raises(DeviceError, match=r"device is cuda, but torch .* sees no GPU"):
+        opened(["--device", "cuda", *run], app)
+    assert not (tmp_path / "run" / "config.yaml").exists()
+    opened(run, app)
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    with pytest.raises(DeviceError, match=r"device is cuda, but torch .* sees no GPU"):
+        opened(["--device", "cuda", *run], app)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir()} == kept

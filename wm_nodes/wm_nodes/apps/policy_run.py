@@ -19,6 +19,7 @@ from rich.console import Console
 from tqdm import tqdm
 
 from wm_nodes.config.load import dump_config
+from wm_nodes.config.saved import keep_device
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.statistics import wilson_interval
@@ -104,7 +105,9 @@ def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
     """Start the processes of one training; the caller stops the runner."""
     start.folder.mkdir(parents=True, exist_ok=True)
     config_file = start.folder / "config.yaml"
-    if not config_file.exists():
+    if config_file.exists():
+        keep_device(config_file, start.config.device)
+    else:
         config_file.write_text(dump_config(start.config))
     name = "_".join(["training", *start.label.split(), time.strftime("%H%M%S")])
     bag = job.run_dir / "bags" / name

@@ -48,6 +48,7 @@ def run(arguments: argparse.Namespace) -> None:
         return load_video_config(file or str(source / "config.yaml"), changes)
 
     def check(config: VideoRlConfig) -> None:
+        compute_device(config.device)
         if config.seed != live.seed:
             raise ValueError(
                 f"the clips of {source} were drawn with seed {live.seed}, not {config.seed}; do not set it"

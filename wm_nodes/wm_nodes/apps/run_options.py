@@ -1,6 +1,6 @@
 """What a run was begun with, kept in its folder, so that --run-dir alone goes on with it.
 
-config.yaml holds the settings, begun_with.json the other options that decide the run.
+config.yaml holds the settings, begun_with.json the other options that decide the run. The device is no such option.
 """
 
 import argparse
@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.load import Config, ConfigError, dump_config
-from wm_nodes.config.saved import Load, differs, load_saved, refuse_differences
+from wm_nodes.config.saved import (
+    DEVICE,
+    Load,
+    differs,
+    keep_device,
+    load_saved,
+    refuse_differences,
+    without_device,
+)
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import read_json
 from wm_nodes.core.run_lock import RunLock
@@ -69,6 +77,8 @@ def open_run(
             config, more = load_saved(load, saved, preset, settings, OPTION_OF)
             refuse_differences(run_dir, told + more)
             check(config)
+            if DEVICE in settings:
+                keep_device(saved, config.device)
         else:
             _fill(arguments, given, {}, defaults)
             config = load(getattr(arguments, "preset", ""), dict(settings))
@@ -78,7 +88,7 @@ def open_run(
         kept = {"verb": verb, **{option: getattr(arguments, option) for option in given}}
         if not (run_dir / CONFIG).exists():
             data = dump_config(config).encode()
-            _write(run_dir, {**kept, "config_sha256": hashlib.sha256(data).hexdigest()})
+            _write(run_dir, {**kept, "config_sha256": _sha256(data)})
             write_atomic(run_dir / CONFIG, data)
         elif (run_dir / BEGUN).exists() and begun != {**begun, **kept}:
             _write(run_dir, {**begun, **kept})
@@ -106,6 +116,11 @@ def _write(run_dir: Path, begun: Mapping[str, Any]) -> None:
     write_atomic(run_dir / BEGUN, (json.dumps(begun, indent=1) + "\n").encode())
 
 
+def _sha256(config: bytes) -> str:
+    """Of all that a run's settings fix."""
+    return hashlib.sha256(without_device(config)).hexdigest()
+
+
 def _read_begun(run_dir: Path, verb: str, fixed: Mapping[str, Any]) -> dict[str, Any]:
     """Options by name. fixed: what they are where a folder without the file does not say otherwise."""
     data = (run_dir / CONFIG).read_bytes() if (run_dir / CONFIG).is_file() else b""
@@ -120,7 +135,7 @@ def _read_begun(run_dir: Path, verb: str, fixed: Mapping[str, Any]) -> dict[str,
     begun = read_json(run_dir / BEGUN, "restore it, or begin another run folder")
     if begun.get("verb") != verb:
         raise ConfigError(f"{run_dir} is a run of {begun.get('verb')!r}, not of {verb!r}; name another run folder")
-    if data and hashlib.sha256(data).hexdigest() != begun.get("config_sha256"):
+    if data and _sha256(data) != begun.get("config_sha256"):
         raise ConfigError(
             f"{run_dir / CONFIG} is not what the run was begun with (sha256 differs); restore it, or begin another run "
             "folder"

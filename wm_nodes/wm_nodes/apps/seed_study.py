@@ -23,6 +23,7 @@ from wm_nodes.config.load import default_task, dump_config, load_config, preset_
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import model_tasks
+from wm_nodes.core.device import compute_device
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.record import acceptance_plan, collect_plan
@@ -63,6 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
     for task in arguments.tasks:
         for seed in arguments.seeds:
             config = load_config(arguments.preset, {"task": task, "seed": seed, **settings(arguments)})
+            compute_device(config.device)
             for arm in arguments.arms:
                 if not any((row["task"], row["seed"], row["arm"]) == (task, seed, arm) for row in read_results(folder)):
                     _run(config, arm, arguments.model_dir or shipped_model(task), folder)

@@ -137,6 +137,7 @@ def _load(arguments: argparse.Namespace, file: str, changes: dict[str, Any]) -> 
 
 
 def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
+    compute_device(config.device)
     if arguments.model_dir and not Path(arguments.model_dir, MANIFEST).is_file():
         raise ConfigError(f"{arguments.model_dir} holds no {MANIFEST}; name the folder of a trained world model")
     if not arguments.from_scratch:

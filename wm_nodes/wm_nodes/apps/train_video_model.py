@@ -197,6 +197,7 @@ def _load(file: str, changes: dict[str, Any]) -> VideoRlConfig:
 
 
 def _check(config: VideoRlConfig) -> None:
+    compute_device(config.device)
     if config.rewards.get(AGENT):
         check_judge(config.judge)
     if config.grpo.kl.anchor == "lora_off":

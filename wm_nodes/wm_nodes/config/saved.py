@@ -1,20 +1,27 @@
-"""A run goes on with the configuration in its folder; what is given again must be what the folder says."""
+"""A run goes on with the configuration in its folder; what is given again must be what the folder says.
 
+Only the device is free: a run that was begun on a GPU may go on where there is none, and the other way round.
+"""
+
+import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.load import Config, ConfigError
+from wm_nodes.core.files import write_atomic
 
 Load = Callable[[str, dict[str, Any]], Config]
 """(preset or YAML file, dotted changes) -> configuration."""
 MOST_NAMED = 5
+DEVICE = "device"
+_DEVICE_LINE = re.compile(rb"^device: .*\n", re.MULTILINE)
 
 
 def load_saved(
     load: Load[Config], saved: Path, preset: str | None, changes: Mapping[str, Any], names: Mapping[str, str]
 ) -> tuple[Config, list[str]]:
-    """Return the saved configuration, and in what the given settings differ from it.
+    """Return the saved configuration, with the device of the given changes, and in what else these differ from it.
 
     Args:
         preset: given, without knowing which one the run was begun with: all settings are compared; None: `changes` are.
@@ -31,9 +38,22 @@ def load_saved(
         chosen = list({**run, **given})
     told = {
         differs(_named(name, names), run.get(name), given.get(name)): None
-        for name in chosen if run.get(name) != given.get(name)
+        for name in chosen if name != DEVICE and run.get(name) != given.get(name)
     }
-    return config, list(told)
+    return (config.with_values(device=other.device) if DEVICE in changes else config), list(told)
+
+
+def keep_device(saved: Path, device: str) -> None:
+    """Have a run's saved configuration name the device that it goes on with; nothing else in the file changes."""
+    data = saved.read_bytes()
+    line = f"{DEVICE}: {device}\n".encode()
+    if line not in _DEVICE_LINE.findall(data):
+        write_atomic(saved, without_device(data).rstrip() + b"\n" + line)
+
+
+def without_device(data: bytes) -> bytes:
+    """The text of a saved configuration without the one line that may change."""
+    return _DEVICE_LINE.sub(b"", data)
 
 
 def differs(option: str, run: Any, given: Any) -> str:

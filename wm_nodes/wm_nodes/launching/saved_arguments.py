@@ -1,7 +1,7 @@
 """What a run folder was launched with, so that run_dir:=<folder> alone goes on with it.
 
 launch.json holds the arguments of each scenario that was started there; config.yaml, and video_config.yaml of loop 2,
-the settings, which are never written again.
+the settings, of which only the device is ever written again.
 """
 
 import json
@@ -17,7 +17,7 @@ from wm_nodes.config.load import (
     load_video_config,
     reward_overrides,
 )
-from wm_nodes.config.saved import Load, differs, load_saved, refuse_differences
+from wm_nodes.config.saved import DEVICE, Load, differs, keep_device, load_saved, refuse_differences
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import read_json
 from wm_nodes.launching.scenarios import parse_arguments, scenario_of
@@ -65,6 +65,8 @@ def take_up(scenario: str, given: Mapping[str, str], run_dir: Path) -> dict[str,
     told = [differs(name, before[name], given[name]) for name in sorted(by_name) if before[name] != given[name]]
     config, more = _compare(saved, given, by_name)
     refuse_differences(run_dir, [*told, *more])
+    if given.get("config_file"):
+        keep_device(saved, config.device)
     values = {**(kept or {}), **given}
     if kept is None and "seed" in scenario_of(scenario).arguments:
         values.setdefault("seed", str(config.seed))
@@ -80,6 +82,8 @@ def _compare(saved: Path, given: Mapping[str, str], by_name: set[str]) -> tuple[
     file = None if file == str(saved) else file
     if given.get("seed", "").isdigit() and (file or "seed" not in by_name):
         changes["seed"] = int(given["seed"])
+    if file is not None and file == given.get("config_file"):
+        changes[DEVICE] = load(file, {}).device
     if load is load_video_config:
         changes |= reward_overrides(given.get("reward") or None)
     embedded = load(str(saved), {}).judge.kind == EMBEDDED

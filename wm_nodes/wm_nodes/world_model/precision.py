@@ -1,5 +1,6 @@
 """Which floating-point type the models compute in on a device."""
 
+import sys
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from functools import cache
@@ -7,6 +8,8 @@ from typing import Any, TypeVar
 
 import torch
 from torch import nn
+
+from wm_nodes.core.device import device_label
 
 _Model = TypeVar("_Model", bound=nn.Module)
 
@@ -17,8 +20,17 @@ def cpu_has_fast_bfloat16() -> bool:
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 
+@cache
+def _gpu_has_bfloat16(device: torch.device) -> bool:
+    """True where the GPU multiplies bfloat16 in hardware; says once where it does not, and what follows."""
+    fast = bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    if not fast:
+        print(f"warning: {device_label(device)} has no bfloat16; models compute in float32 there", file=sys.stderr)
+    return fast
+
+
 def has_fast_bfloat16(device: torch.device) -> bool:
-    return torch.cuda.is_bf16_supported() if device.type == "cuda" else cpu_has_fast_bfloat16()
+    return _gpu_has_bfloat16(device) if device.type == "cuda" else cpu_has_fast_bfloat16()
 
 
 def compute_context(device: torch.device, *, exact: bool = False) -> AbstractContextManager[Any]:
