@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from wm_nodes.config.load import load_config
+from wm_nodes.core.device import DeviceError
 from wm_nodes.environments.maniskill import collection
+from wm_nodes.policy_rl import pretraining
 from wm_nodes.policy_rl.pretraining import _make_tokenizer_folder, make_model
 from wm_nodes.recording import read_episodes
 from wm_nodes.world_model import Tokenizer, load_model_folder, load_starts
@@ -57,3 +59,32 @@ def test_a_model_from_scratch_is_collected_in_parallel_and_resumed_where_it_stop
     make_model(config, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept and shards[1].is_dir()
     assert {path.name: path.read_bytes() for path in folder.glob("*.safetensors")} == files
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_gpu_that_is_not_there_is_found_out_before_anything_is_collected(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match="device is cuda:0, but torch"):
+        make_model(load_config("smoke", {"device": "cuda:0"}), tmp_path)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize(
+    ("training", "section"), [("train_tokenizer", "tokenizer"), ("train_action_model", "world_model")]
+)
+def test_too_little_memory_in_training_names_the_batch_of_the_model(
+    training: str, section: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = load_config("smoke", {"data.policy_episodes": 0, f"{section}.batch_size": 48})
+
+    def full(*arguments: object) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory.\nTried to allocate 20.00 GiB.")
+
+    skipped = {
+        "collect_plan": [], "load_arrays": None, "train_tokenizer": (None, {}), "train_position_probe": (None, {}),
+        "tokenise_episodes": None,
+    }
+    for name, answer in skipped.items():
+        monkeypatch.setattr(pretraining, name, lambda *arguments, answer=answer: answer)
+    monkeypatch.setattr(pretraining, training, full)
+    with pytest.raises(DeviceError, match=rf"memory of cpu is too small; lower {section}\.batch_size from 48 to 24"):
+        make_model(config, tmp_path)

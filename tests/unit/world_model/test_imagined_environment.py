@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.device import DeviceError
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.tool_control import next_state
@@ -241,3 +242,17 @@ def test_starts_are_read_from_a_file_and_an_empty_or_foreign_one_is_refused(tmp_
 def test_files_hold_half_precision(tmp_path: Path) -> None:
     tensors = load_file(make_folder(tmp_path / "model") / "tokenizer.safetensors")
     assert {tensor.dtype for tensor in tensors.values()} == {torch.float16}
+
+
+def test_too_little_memory_names_the_number_of_environments(
+    models: WorldModels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = make(models)
+    env.reset()
+
+    def full(*arguments: object) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory.\nTried to allocate 20.00 GiB.")
+
+    monkeypatch.setattr(models.action, "advance", full)
+    with pytest.raises(DeviceError, match=r"^the memory of cpu is too small; lower ppo\.num_envs from 3 to 1, or take"):
+        env.step(actions(0))

@@ -6,14 +6,14 @@ from contextlib import nullcontext
 import pytest
 import torch
 
-from wm_nodes.world_model.precision import compute_context, gpu_has_bfloat16
+from wm_nodes.world_model.precision import _gpu_has_bfloat16, compute_context
 
 
 @pytest.fixture(autouse=True)
 def asked_anew() -> Iterator[None]:
-    gpu_has_bfloat16.cache_clear()
+    _gpu_has_bfloat16.cache_clear()
     yield
-    gpu_has_bfloat16.cache_clear()
+    _gpu_has_bfloat16.cache_clear()
 
 
 @pytest.mark.parametrize("fast", [True, False])

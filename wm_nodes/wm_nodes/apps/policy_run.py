@@ -19,7 +19,7 @@ from rich.console import Console
 from tqdm import tqdm
 
 from wm_nodes.config.load import dump_config
-from wm_nodes.config.saved import keep_device
+from wm_nodes.config.saved import with_device
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.statistics import wilson_interval
@@ -105,10 +105,8 @@ def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
     """Start the processes of one training; the caller stops the runner."""
     start.folder.mkdir(parents=True, exist_ok=True)
     config_file = start.folder / "config.yaml"
-    if config_file.exists():
-        keep_device(config_file, start.config.device)
-    else:
-        config_file.write_text(dump_config(start.config))
+    kept = config_file.read_bytes() if config_file.exists() else dump_config(start.config).encode()
+    write_atomic(config_file, with_device(kept, start.config.device))
     name = "_".join(["training", *start.label.split(), time.strftime("%H%M%S")])
     bag = job.run_dir / "bags" / name
     graph, _ = launch_arguments.prepare("online_training", {
@@ -176,7 +174,7 @@ def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path,
         weights = load_policy(job.config, model_dir, policy)
         return evaluate(weights, env, episodes, job.config.evaluation.first_seed).success
 
-    identity = {"policy_sha256": file_sha256(policy), "model_sha256": models_of(model_dir).sha256}
+    identity = {"policy_sha256": file_sha256(policy), "model_sha256": models_of(model_dir, job.config.device).sha256}
     success = cached_success(folder / "evaluations" / f"imagined_{label}.json", identity, measure)
     job.stage(f"imagined success of {policy.stem}: {int(success.sum())}/{len(success)}")
     return success

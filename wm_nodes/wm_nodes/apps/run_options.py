@@ -17,9 +17,9 @@ from wm_nodes.config.saved import (
     DEVICE,
     Load,
     differs,
-    keep_device,
     load_saved,
     refuse_differences,
+    with_device,
     without_device,
 )
 from wm_nodes.core.files import write_atomic
@@ -78,7 +78,7 @@ def open_run(
             refuse_differences(run_dir, told + more)
             check(config)
             if DEVICE in settings:
-                keep_device(saved, config.device)
+                write_atomic(saved, with_device(saved.read_bytes(), config.device))
         else:
             _fill(arguments, given, {}, defaults)
             config = load(getattr(arguments, "preset", ""), dict(settings))

@@ -177,7 +177,7 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         "success_before": real_before.success.astype(int).tolist(),
         "success_after": real_after.success.astype(int).tolist(), "course": course,
         "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(config.device),
-        "config": dump_config(config), "world_model_sha256": models_of(model_dir).sha256,
+        "config": dump_config(config), "world_model_sha256": models_of(model_dir, config.device).sha256,
     }
     with open(folder / "results.jsonl", "a") as file:
         file.write(json.dumps(row) + "\n")

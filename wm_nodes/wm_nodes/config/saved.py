@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.load import Config, ConfigError
-from wm_nodes.core.files import write_atomic
 
 Load = Callable[[str, dict[str, Any]], Config]
 """(preset or YAML file, dotted changes) -> configuration."""
@@ -43,12 +42,10 @@ def load_saved(
     return (config.with_values(device=other.device) if DEVICE in changes else config), list(told)
 
 
-def keep_device(saved: Path, device: str) -> None:
-    """Have a run's saved configuration name the device that it goes on with; nothing else in the file changes."""
-    data = saved.read_bytes()
+def with_device(data: bytes, device: str) -> bytes:
+    """The text of a saved configuration with the device that a run goes on with; nothing else in it changes."""
     line = f"{DEVICE}: {device}\n".encode()
-    if line not in _DEVICE_LINE.findall(data):
-        write_atomic(saved, without_device(data).rstrip() + b"\n" + line)
+    return data if line in _DEVICE_LINE.findall(data) else without_device(data).rstrip() + b"\n" + line
 
 
 def without_device(data: bytes) -> bytes:

@@ -17,7 +17,7 @@ from wm_nodes.config.load import (
     load_video_config,
     reward_overrides,
 )
-from wm_nodes.config.saved import DEVICE, Load, differs, keep_device, load_saved, refuse_differences
+from wm_nodes.config.saved import DEVICE, Load, differs, load_saved, refuse_differences, with_device
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import read_json
 from wm_nodes.launching.scenarios import parse_arguments, scenario_of
@@ -66,7 +66,7 @@ def take_up(scenario: str, given: Mapping[str, str], run_dir: Path) -> dict[str,
     config, more = _compare(saved, given, by_name)
     refuse_differences(run_dir, [*told, *more])
     if given.get("config_file"):
-        keep_device(saved, config.device)
+        write_atomic(saved, with_device(saved.read_bytes(), config.device))
     values = {**(kept or {}), **given}
     if kept is None and "seed" in scenario_of(scenario).arguments:
         values.setdefault("seed", str(config.seed))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import RunConfig, SimulationConfig
-from wm_nodes.core.device import CPU, compute_device
+from wm_nodes.core.device import CPU, compute_device, explain_memory
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import FloatArray, Observation, UInt8Array
@@ -104,10 +104,11 @@ def make_imagined_environment(
     models = models_of(Path(model_dir), config.device)
     check_scene(config, model_dir, models.simulation)
     spec = simulation_spec(config.task, config.simulation, num_envs)
-    environment = ImaginedEnvironment(
-        models, spec, load_starts(Path(starts_file)), config.reward, num_envs=num_envs, seed=seed,
-        with_goals=config.reward.dense_weight > 0,
-    )
+    with explain_memory(compute_device(config.device), ppo__num_envs=num_envs):
+        environment = ImaginedEnvironment(
+            models, spec, load_starts(Path(starts_file)), config.reward, num_envs=num_envs, seed=seed,
+            with_goals=config.reward.dense_weight > 0,
+        )
     environment.cameras = table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
     return environment
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.config.tasks import get_task, model_tasks
-from wm_nodes.core.device import compute_device
+from wm_nodes.core.device import compute_device, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.environments.maniskill.collection import CollectionPlan
 from wm_nodes.environments.record import TRAINING_SEEDS, acceptance_plan, collect_plan, scripted_plan
@@ -123,7 +123,8 @@ def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], fold
     check_refreshable(model_dir)
     if (folder / MANIFEST).exists():
         return folder
-    models = load_model_folder(model_dir, compute_device(config.device))
+    device = compute_device(config.device)
+    models = load_model_folder(model_dir, device)
     manifest = models.manifest
     settings = WorldModelConfig.model_validate(manifest["world_model"]).model_copy(
         update={
@@ -141,10 +142,11 @@ def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], fold
     assert isinstance(action, ActionModel)
     recorded = (episode for bag in bags for episode in read_episodes(bag))
     episodes = stack_episodes(recorded, models.tasks, num_steps=config.simulation.max_episode_steps)
-    action, metrics = train_action_model(
-        models.tokenizer, episodes, training, config.seed + number, folder.with_name(f"{folder.name}_training"),
-        model=action.requires_grad_(True),
-    )
+    with explain_memory(device):
+        action, metrics = train_action_model(
+            models.tokenizer, episodes, training, config.seed + number, folder.with_name(f"{folder.name}_training"),
+            model=action.requires_grad_(True),
+        )
     refreshed = {
         "source_sha256": models.sha256, "round": number, "episodes": len(episodes), "metrics": metrics,
         "model_refresh": config.model_refresh.model_dump(),

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from wm_nodes.config.schema import PpoConfig
+from wm_nodes.core.device import DeviceError, explain_memory
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.advantages import explained_variance, gae, masked_normalise
@@ -89,13 +90,16 @@ class PpoLearner:
         Raises:
             Canceled: should_stop, asked before every minibatch, said so on some rank; nothing has changed then.
             FloatingPointError: a loss, a gradient or a new weight is not finite; nothing has changed then.
+            DeviceError: too little memory for the minibatches; nothing has changed then.
             ValueError: no valid sample, or samples whose log_prob or value is unknown (NaN).
         """
         before = {name: tensor.clone() for name, tensor in self.policy.state_dict().items()}
         optimizer_before = {name: t.clone() for name, t in checkpoint.optimizer_tensors(self._optimizer).items()}
         try:
-            metrics = self._update(rollout, should_stop)
-        except (Canceled, FloatingPointError):
+            settings = {"ppo__num_envs": self.config.num_envs, "ppo__minibatch_size": self.config.minibatch_size}
+            with explain_memory(self.policy.device, **settings):
+                metrics = self._update(rollout, should_stop)
+        except (Canceled, FloatingPointError, DeviceError):
             self.policy.load_state_dict(before)
             checkpoint.restore_optimizer(self._optimizer, optimizer_before)
             raise

@@ -11,6 +11,7 @@ import torch
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, model_tasks
+from wm_nodes.core.device import compute_device, device_label, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.environments.maniskill.collection import CollectionPlan
@@ -42,10 +43,14 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     """Collect, train tokenizer, action model and text model, measure on held-out episodes; returns run_dir/model.
 
     tokenizer.kind lfq has no text model, so no goals: set reward.dense_weight to 0 there.
+
+    Raises:
+        DeviceError: there is no such device, which is found out first, or its memory is too small.
     """
     folder = run_dir / "model"
     if (folder / MANIFEST).exists():
         return folder
+    device = compute_device(config.device)
     bags = collect_plan(
         scripted_plan(config, config.data.num_episodes, TRAINING_SEEDS), config, run_dir / "data" / "train"
     )
@@ -53,7 +58,8 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         scripted_plan(config, config.data.num_heldout, HELDOUT_SEEDS), config, run_dir / "data" / "heldout"
     )
     episodes = load_arrays(bags, config)
-    tokenizer, tokenizer_metrics = train_tokenizer(episodes, config, config.seed, run_dir)
+    with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
+        tokenizer, tokenizer_metrics = train_tokenizer(episodes, config, config.seed, run_dir)
     if config.data.policy_episodes:
         policy_bags = _collect_policy_bags(config, run_dir, tokenizer)
         episodes = EpisodeArrays.concatenate([episodes, load_arrays(policy_bags, config)])
@@ -61,19 +67,20 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     data = tokenise_episodes(tokenizer, episodes)
     action: ActionModel | TokenActionModel
     text, text_metrics = None, dict[str, float]()
-    if config.tokenizer.kind == "lfq":
-        action, action_metrics = train_token_model(tokenizer, data, config, config.seed, run_dir)
-    else:
-        action, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir)
-        golden = episodes.select(np.flatnonzero(np.isin(episodes.behaviours, demonstrators())))
-        texts = tuple(get_task(task).instruction for task in model_tasks(config.task))
-        text, text_metrics = train_text_model(
-            tokenizer, action, golden, tokenise_episodes(tokenizer, golden), texts, config, config.seed, run_dir
-        )
+    with explain_memory(device, world_model__batch_size=config.world_model.batch_size):
+        if config.tokenizer.kind == "lfq":
+            action, action_metrics = train_token_model(tokenizer, data, config, config.seed, run_dir)
+        else:
+            action, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir)
+            golden = episodes.select(np.flatnonzero(np.isin(episodes.behaviours, demonstrators())))
+            texts = tuple(get_task(task).instruction for task in model_tasks(config.task))
+            text, text_metrics = train_text_model(
+                tokenizer, action, golden, tokenise_episodes(tokenizer, golden), texts, config, config.seed, run_dir
+            )
     story: dict[str, Any] = {
         "made": {
             "command": command, "date": date.today().isoformat(), "seed": config.seed, "torch": torch.__version__,
-            "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+            "machine": f"{platform.machine()}, {torch.get_num_threads()} threads", "device": device_label(device),
         },
         "data": {
             "episodes": len(episodes), "policy_episodes": len(episodes) - config.data.num_episodes,

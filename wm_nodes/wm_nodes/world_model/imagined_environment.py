@@ -16,6 +16,7 @@ from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.cameras import CameraModel
+from wm_nodes.core.device import explain_memory
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
@@ -151,7 +152,8 @@ class ImaginedEnvironment:
         check_actions(actions, self.spec)
         valid = ~self._ended
         moved = next_state(self._states, actions, self.spec)
-        frames, signal, spread = self._predict(actions, moved, valid)
+        with explain_memory(self._models.tokenizer.device, ppo__num_envs=self.spec.num_envs):
+            frames, signal, spread = self._predict(actions, moved, valid)
         self._states = np.where(valid[:, None], moved, self._states)
         self._steps += valid.astype(np.uint32)
         self._shown = np.where(valid[:, None, None, None], frames, self._shown)
