@@ -14,23 +14,24 @@ from wm_nodes.apps import cli
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 
 OPTIONS = {
-    "train-policy": "--preset --set --task --seed --run-dir --model-dir --from-scratch --force --rounds --reward "
-    "--judge --judge-model --judge-key-env --rubric --compose --domain-id --verbose",
+    "train-policy": "--preset --set --device --task --seed --run-dir --model-dir --from-scratch --force --rounds "
+    "--reward --judge --judge-model --judge-key-env --rubric --compose --domain-id --verbose",
     "train-video-model": "--preset --set --seed --run-dir --from-scratch --bags --heldout-bags --keep-buffers --reward "
     "--judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",
     "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset --set",
-    "seed-study": "--tasks --seeds --arms --preset --set --model-dir --threads --out",
+    "seed-study": "--tasks --seeds --arms --preset --set --device --model-dir --threads --out",
     "rescore": "recording --reward --judge --judge-model --judge-key-env --rubric --json --config --model-dir "
     "--namespace --reads --audit",
     "retrain": "run --run-dir --set --tensorboard",
     "recover-bag": "bag --output",
-    "judge-clips": "clips --config --judge --judge-model --judge-key-env --rubric --mode --audit --reads --json",
+    "judge-clips": "clips --config --device --judge --judge-model --judge-key-env --rubric --mode --audit --reads "
+    "--json",
     "audit": "verify recover sample view agree people replay adopt",
     "build-judge-dataset": "folder --tasks --episodes --edits --stacks --seed --shapes --recipes --development "
-    "--diverse --policy-view --stride --benchmark --check",
-    "train-judge": "out sets --seed --segmenter-steps --readers --reader-epochs --trees --threads --policy-view "
-    "--measure",
-    "normal-ranges": "model_dir bags --check --output --rubric --stride --tail",
+    "--diverse --policy-view --stride --device --benchmark --check",
+    "train-judge": "out sets --seed --segmenter-steps --readers --reader-epochs --trees --device --threads "
+    "--policy-view --measure",
+    "normal-ranges": "model_dir bags --check --output --rubric --stride --tail --device",
     "benchmark speed": "--json --quick --preset --model-dir --untrained --seed",
     "benchmark video-rl": "base diversity learning ablations hacking cost clips clip-learning resolution",
     "benchmark judge": "table efficiency hacking comparisons imagined-vs-real speed fault-visibility pai-bench",

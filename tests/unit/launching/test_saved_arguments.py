@@ -1,6 +1,7 @@
 """A launch of an existing run folder goes on with its settings and arguments; what differs is named."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -176,3 +177,20 @@ def test_the_plain_starter_refuses_a_folder_in_use_and_forgets_a_wrong_start(
     folder.rmdir()
     assert main("evaluate", [*words, "simulator_envs:=many"]) == 2
     assert "simulator_envs must be a whole number" in capsys.readouterr().err and not folder.exists()
+
+
+def test_a_settings_file_may_name_another_device_for_the_same_run(tmp_path: Path, model: str) -> None:
+    saved, named = tmp_path / "run" / "config.yaml", tmp_path / "mine.yaml"
+    named.write_text(dump_config(load_config("smoke", {"device": "cuda"})))
+    given = {**run_in(tmp_path), "model_dir": model, "config_file": str(named)}
+    saved.parent.mkdir()
+    shutil.copy(named, saved)
+    for device in ("cuda", "cpu"):
+        named.write_text(dump_config(load_config("smoke", {"device": device})))
+        _, values = launch_arguments.begin("rollout_record", given)
+        assert load_config(values["config_file"]) == load_config("smoke", {"device": device})
+        for again in ({}, {"preset": "smoke"}):
+            _, values = launch_arguments.begin("rollout_record", run_in(tmp_path) | again)
+            assert values["config_file"] == str(saved) and load_config(str(saved)).device == device
+    named.write_text(dump_config(load_config("smoke", {"device": "cuda", "ppo.num_steps": 16})))
+    assert "ppo.num_steps is" in refused("rollout_record", given) and load_config(str(saved)).device == "cpu"

@@ -3,6 +3,7 @@
 import threading
 
 from wm_msgs.msg import ErrorCode, PolicyVersion
+from wm_nodes.core.device import explain_memory
 from wm_nodes.core.named_files import WEIGHTS, FileRefused, NamedFiles, shown
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy, PolicyOutput
@@ -34,8 +35,12 @@ class PolicyHolder:
         return self._policy
 
     def act(self, images: UInt8Array, states: FloatArray, noise: FloatArray | None) -> tuple[PolicyOutput, int]:
-        """Return actions for (N, H, W, 3) images and (N, S) states, and the version that chose them."""
-        with self._lock:
+        """Return actions for (N, H, W, 3) images and (N, S) states, and the version that chose them.
+
+        Raises:
+            DeviceError: too little memory for so many environments.
+        """
+        with self._lock, explain_memory(self._policy.device, ppo__num_envs=len(images)):
             return self._policy.act(images, states, noise=noise), self.version
 
     def follow(self, message: PolicyVersion, files: NamedFiles) -> bool:
