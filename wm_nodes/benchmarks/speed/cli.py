@@ -1,4 +1,8 @@
-"""Speed, side by side in one run: DDS against one process, the world model against the simulator, stage by stage."""
+"""Speed, side by side in one run: DDS against one process, the world model against the simulator, stage by stage.
+
+With --device: what a GPU makes of both loops, in five minutes and one process: kernels and copies, imagined steps/s by
+number of environments and size of model, training, PPO, GRPO, memory, and how far its numbers are from the CPU's.
+"""
 
 import argparse
 import os
@@ -10,6 +14,7 @@ from typing import Any
 
 import torch
 
+from benchmarks.speed.device import run_device
 from benchmarks.speed.graph import measure_graph
 from benchmarks.speed.inputs import Effort, console, prepare_model, random_model
 from benchmarks.speed.results import write_results
@@ -29,6 +34,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
     parser.add_argument("--quick", action="store_true", help="a tenth of the work, for a first look; less exact")
     parser.add_argument("--preset", default="cpu", help=f"model size: one of {', '.join(preset_names())}, or a .yaml")
+    device = parser.add_argument_group("on a device")
+    device.add_argument("--device", help="measure both loops there instead: cpu, cuda, cuda:N or auto")
+    device.add_argument(
+        "--minutes", type=float, metavar="M",
+        help="of --device: what would begin later is left out, and listed (default: 5)",
+    )
     model = parser.add_mutually_exclusive_group()
     model.add_argument("--model-dir", type=Path, help="world model to measure instead of the shipped one")
     model.add_argument(
@@ -36,10 +47,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="measure a model with random weights, of the preset's size but for these settings",
     )
     add_seed(parser)
+    parser.set_defaults(plan=None)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Measure, show the tables, write --json."""
+def run(arguments: argparse.Namespace) -> int | None:
+    """Measure, show the tables, write --json; with --device, return an exit code.
+
+    Raises:
+        ValueError: options that do not go together.
+    """
+    if arguments.device is not None:
+        if arguments.preset != "cpu" or arguments.model_dir or arguments.untrained is not None:
+            raise ValueError("--device has models of its own; leave out --preset, --model-dir and --untrained")
+        return run_device(arguments)
+    if arguments.minutes is not None:
+        raise ValueError("--minutes needs --device")
     untrained = None if arguments.untrained is None else dict(map(parse_override, arguments.untrained))
     config = load_config(arguments.preset, {**(untrained or {}), "seed": arguments.seed})
     with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as name:
@@ -50,6 +72,7 @@ def run(arguments: argparse.Namespace) -> None:
     results |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
     show(results)
     write_results(arguments, results, exact=True)
+    return None
 
 
 def measure(config: RunConfig, effort: Effort, folder: Path, model_dir: Path | None = None) -> dict[str, Any]:

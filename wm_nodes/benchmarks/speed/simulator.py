@@ -31,26 +31,23 @@ STOCK = {"push_cube": "PushCube-v1", "pull_cube": "PullCube-v1"}
 """ManiSkill's own tasks."""
 WORKER_TIMEOUT_S = 300.0
 
+Serve = Callable[[RunConfig, int, Connection], None]
+"""What a simulator's process runs: configuration, core, its end of the connection."""
+
 
 def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Path) -> dict[str, Any]:
     """imagined_steps_per_s: environment steps with reward, 64 imagined environments, a torch thread per core;
     imagined_over_simulator: over those of our scene in ManiSkill with rendering and rule reward, a process per core.
     imagined_over_stock_simulator: over those of ManiSkill's own task with its own reward, as installed, two cameras of
     the same size and as much time per step. Resets are not counted on any side."""
-    from wm_nodes.environments.maniskill.backend import NoRendererError, render_backend
-
     endless = config.model_copy(update={"reward": config.reward.model_copy(update={"success_threshold": 1.0})})
     imagined = make_imagined_environment(endless, model, starts, num_envs=IMAGINED_ENVS, seed=config.seed)
     reward = make_endogenous_reward(config, model)
     cores = sorted(os.sched_getaffinity(0))
-    missing = ""
-    try:
-        render_backend(config.simulation.render_device)
-    except NoRendererError as error:
-        missing = str(error)
-        console.print(f"simulator left out: {error}", highlight=False)
+    kinds, missing = simulator_kinds(config)
+    if missing:
+        console.print(f"simulator left out: {missing}", highlight=False)
     console.print(f"world model against ManiSkill with rendering, {len(cores)} cores each", highlight=False)
-    kinds = {} if missing else {"simulator": _serve_blocks, **({"stock": _serve_stock} if config.task in STOCK else {})}
     with ExitStack() as stack:
         contenders = {"imagined": lambda block: rate_episode(imagined, reward, block)}
         for kind, serve in kinds.items():
@@ -71,10 +68,19 @@ def measure_simulator(config: RunConfig, effort: Effort, model: Path, starts: Pa
     }
 
 
+def simulator_kinds(config: RunConfig) -> tuple[dict[str, Serve], str]:
+    """The simulators that can render here, by name, or else why none can."""
+    from wm_nodes.environments.maniskill.backend import NoRendererError, render_backend
+
+    try:
+        render_backend(config.simulation.render_device)
+    except NoRendererError as error:
+        return {}, str(error)
+    return {"simulator": _serve_blocks, **({"stock": _serve_stock} if config.task in STOCK else {})}, ""
+
+
 @contextmanager
-def simulator_workers(
-    config: RunConfig, cores: list[int], serve: Callable[[RunConfig, int, Connection], None]
-) -> Iterator[list[Connection]]:
+def simulator_workers(config: RunConfig, cores: list[int], serve: Serve) -> Iterator[list[Connection]]:
     """One process per core that runs serve(config, core, connection); idle until a block number comes."""
     context = mp.get_context("spawn")
     ends: list[Connection] = []

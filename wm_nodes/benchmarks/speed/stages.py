@@ -79,9 +79,9 @@ def fresh_pictures(images: UInt8Array) -> Iterator[UInt8Array]:
 
 def measure_stage(work: Callable[[], object], repeats: int) -> dict[str, float]:
     work()
-    before = _restart_peak()
+    before = restart_peak()
     work()
-    peak = _memory_mib("VmHWM")
+    peak = memory_mib("VmHWM")
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -90,19 +90,20 @@ def measure_stage(work: Callable[[], object], repeats: int) -> dict[str, float]:
     return {"ms": 1e3 * float(np.median(seconds)), "peak_mib": peak - before, "process_peak_mib": peak}
 
 
-def _restart_peak() -> float:
+def restart_peak() -> float:
     """Give freed memory back, start the kernel's peak anew, and return the present level, MiB; NaN where it cannot."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5")
     except (AttributeError, OSError):
         return float("nan")
-    return _memory_mib("VmRSS")
+    return memory_mib("VmRSS")
 
 
-def _memory_mib(name: str) -> float:
+def memory_mib(name: str, file: str = "/proc/self/status") -> float:
+    """A level of this process, e.g. VmRSS, or of another file of the kernel; NaN where there is none."""
     try:
-        lines = Path("/proc/self/status").read_text().splitlines()
+        lines = Path(file).read_text().splitlines()
     except OSError:
         return float("nan")
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{name}:")), float("nan"))

@@ -45,7 +45,7 @@ GROUPS = {
         "normal-ranges": "of the world model's evidence, for a rubric",
     },
     "benchmarks, where the repository is": {
-        "benchmark speed": "graph against one process, world model against simulator",
+        "benchmark speed": "how fast graph, world model and simulator are; or a GPU (--device)",
         "benchmark video-rl": "DynDiff-GRPO against its rivals",
         "benchmark judge": "the reward agent against labels, and its speed",
     },

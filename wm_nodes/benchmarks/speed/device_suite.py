@@ -1,0 +1,263 @@
+"""What a short time with a GPU should bring home: a list of points, each measured or left out with a reason."""
+
+import gc
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.speed.stages import memory_mib, restart_peak
+from wm_nodes.core.device import CPU, DeviceError, synchronize
+from wm_nodes.core.errors import RunError
+
+NOT_HERE = (RunError, DeviceError, OSError, ImportError)
+"""Errors of a machine that lacks something, e.g. a renderer; any other is a fault, which the exit code tells."""
+MOST_REPEATS, FEWEST_REPEATS = 30, 3
+DISC = "moving disc"
+"""The small one of the shipped video models."""
+RUNNING, INTERRUPTED, FINISHED = "running", "interrupted", "finished"
+WORDS = {
+    "px": "{} px", "envs": "{} environments", "batch": "batch {}", "preset": "preset {}", "processes": "{} processes",
+    "clips": "{} clips",
+}
+"""How a column of that name is put in words."""
+LAST_LINES = 2000
+"""Characters of a failed point's traceback that are kept."""
+
+
+@dataclass(frozen=True)
+class ModelSize:
+    """preset: of policies, whose tokenizer and world model it is. sizes_px: of each camera's picture. shipped_px: at
+    which such a model is shipped; 0: none is, and weights are random."""
+
+    name: str
+    preset: str
+    sizes_px: tuple[int, ...]
+    shipped_px: int = 0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is measured.
+
+    models: in which imagined steps are counted. trained: whose training is timed, at their presets' picture size, with
+    batch_shares of their presets' batches.
+    envs: of rollouts on the device. loop_envs: of the lock-step loop. host_envs: of that loop with costless models.
+    ppo: (preset, environments). videos: shipped video models, for loop 2. iterations: of each training of loop 1.
+    threads: of torch; 0: one per core. seconds: of the repeats of a point. minutes: points that would begin later are
+    left out.
+    memory_mib: of the device that may be used; None: what is free.
+    """
+
+    models: tuple[ModelSize, ...]
+    envs: tuple[int, ...]
+    loop_envs: tuple[int, ...]
+    host_envs: tuple[int, ...]
+    trained: tuple[ModelSize, ...]
+    batch_shares: tuple[float, ...]
+    ppo: tuple[tuple[str, int], ...]
+    videos: tuple[str, ...] = (DISC, "PushCube")
+    agreement_envs: int = 64
+    num_steps: int = 16
+    iterations: int = 10
+    kernels: int = 2000
+    product_size: int = 8192
+    copy_mib: int = 2048
+    simulator_blocks: int = 3
+    captured: bool = True
+    threads: int = 0
+    seconds: float = 0.3
+    minutes: float = 5.0
+    memory_mib: float | None = None
+
+
+SHIPPED = ModelSize("shipped", "cpu_full", (64, 128), shipped_px=64)
+LARGE, SMALL = ModelSize("gpu", "gpu", (64, 128)), ModelSize("smoke", "smoke", (64, 128))
+GPU_PLAN = Plan(
+    models=(SHIPPED, LARGE), envs=(64, 256, 1024, 4096), loop_envs=(64,), host_envs=(64, 256, 1024, 4096),
+    trained=(SHIPPED, LARGE), batch_shares=(0.25, 1.0), ppo=(("cpu", 64), ("gpu", 1024)),
+)
+CPU_PLAN = Plan(
+    models=(replace(SHIPPED, sizes_px=(64,)), SMALL), envs=(64,), loop_envs=(64,), host_envs=(64,),
+    trained=(SHIPPED, SMALL), batch_shares=(0.125,), ppo=(("cpu", 64),), iterations=4, kernels=500, product_size=1024,
+    videos=(DISC,), copy_mib=64, simulator_blocks=1, captured=False, threads=1,
+)
+"""The same code where there is no GPU, or for a first look at one."""
+
+
+@dataclass(frozen=True)
+class Stopwatch:
+    """Wall time of work on `device`, which is waited for."""
+
+    device: torch.device
+    seconds: float
+
+    def once(self, work: Callable[[], object]) -> float:
+        synchronize(self.device)
+        start = time.perf_counter()
+        work()
+        synchronize(self.device)
+        return time.perf_counter() - start
+
+    def repeats(self, work: Callable[[], object]) -> list[float]:
+        """Seconds of each repeat, for `seconds` together; a first one warms up and does not count."""
+        found: list[float] = []
+        self.once(work)
+        while len(found) < MOST_REPEATS and (
+            sum(found) < self.seconds or (len(found) < FEWEST_REPEATS and sum(found) < 10 * self.seconds)
+        ):
+            found.append(self.once(work))
+        return found
+
+
+@dataclass(frozen=True)
+class Point:
+    """One measurement.
+
+    group: of results. what: the columns that name it among those of its group. unit: of its values.
+    measure: returns the values of its repeats, or several named numbers. grows_with: the column its memory grows with.
+    """
+
+    group: str
+    what: Mapping[str, Any]
+    unit: str
+    measure: Callable[[Stopwatch], Sequence[float] | Mapping[str, float]]
+    grows_with: str = ""
+
+    @property
+    def name(self) -> str:
+        return f"{self.group}: {described(self.what)}"
+
+    @property
+    def kin(self) -> str:
+        """The same for points that differ only in the column that memory grows with."""
+        return str([self.group, *((key, value) for key, value in self.what.items() if key != self.grows_with)])
+
+
+class Suite:
+    """Measures points. results: {group: [numbers]}; skipped: [point, reason]; state: RUNNING, INTERRUPTED or FINISHED.
+
+    A point that fails does not end the others: `failed` then. Ctrl-C keeps what was measured.
+
+    Args:
+        say: is told each line of progress. keep: is called after every point, to save what there is.
+    """
+
+    def __init__(
+        self, device: torch.device, plan: Plan, say: Callable[[str], None],
+        keep: Callable[["Suite"], None] = lambda suite: None,
+    ) -> None:
+        self.device, self.plan, self.say, self._keep = device, plan, say, keep
+        self.results: dict[str, list[dict[str, Any]]] = {}
+        self.skipped: list[dict[str, str]] = []
+        self.state, self.failed = RUNNING, False
+        self._watch, self._began = Stopwatch(device, plan.seconds), time.monotonic()
+        self._grown: dict[str, tuple[int, float]] = {}
+
+    @property
+    def spent_s(self) -> float:
+        return time.monotonic() - self._began
+
+    def run(self, points: Sequence[Point]) -> None:
+        self.results |= {point.group: [] for point in points if point.group not in self.results}
+        handled = 0
+        try:
+            for point in points:
+                outcome = self._reason_to_skip(point) or self._measure(point)
+                handled += 1
+                self.say(f"{self.spent_s:4.0f} s  {handled:2}/{len(points)}  {point.name}: {outcome}")
+                self._keep(self)
+            self.state = FINISHED
+        except KeyboardInterrupt:
+            self.state = INTERRUPTED
+            self.skipped += [{"point": left.name, "reason": "interrupted"} for left in points[handled:]]
+            self.say(f"interrupted; {len(points) - handled} of {len(points)} points are left out")
+
+    def _measure(self, point: Point) -> str:
+        level = self._restart_peak()
+        try:
+            found = point.measure(self._watch)
+        except (torch.OutOfMemoryError, MemoryError):
+            return self._skip(point, f"the memory of {self.device} is too small")
+        except NOT_HERE as error:
+            return self._skip(point, " ".join(str(error).split()))
+        except Exception as error:  # the rest of a short time with a GPU is worth more than an early end
+            self.failed = True
+            return self._skip(point, f"failed: {error!r}"[:300], traceback=traceback.format_exc()[-LAST_LINES:])
+        finally:
+            gc.collect()
+            peak = self._peak()
+        numbers = dict(found) if isinstance(found, Mapping) else spread(found)
+        if point.grows_with:
+            self._grown[point.kin] = int(point.what[point.grows_with]), peak - level
+        self.results[point.group].append(
+            {"point": described(point.what), **point.what, **numbers, "unit": point.unit, "peak_mib": peak}
+        )
+        shown = "median" if "median" in numbers else next(iter(numbers))
+        return f"{number_text(numbers[shown])} {point.unit}"
+
+    def _reason_to_skip(self, point: Point) -> str:
+        if self.spent_s > 60 * self.plan.minutes:
+            return self._skip(point, f"the {self.plan.minutes:g} minutes were over")
+        if point.kin not in self._grown:
+            return ""
+        before, grown = self._grown[point.kin]
+        wanted, free = grown * int(point.what[point.grows_with]) / before, self._free_mib()
+        if wanted <= free:
+            return ""
+        return self._skip(
+            point, f"needs about {wanted / 1024:.1f} GiB (it took {grown / 1024:.2f} with {before}), "
+            f"{free / 1024:.1f} GiB are free",
+        )
+
+    def _skip(self, point: Point, reason: str, **more: str) -> str:
+        self.skipped.append({"point": point.name, "reason": reason, **more})
+        return f"left out: {reason}"
+
+    def _restart_peak(self) -> float:
+        """Start the peak anew and return the present level, MiB."""
+        if self.device.type == CPU:
+            return restart_peak()
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(self.device)
+        return torch.cuda.memory_allocated(self.device) / 2**20
+
+    def _peak(self) -> float:
+        if self.device.type == CPU:
+            return memory_mib("VmHWM")
+        return torch.cuda.max_memory_allocated(self.device) / 2**20
+
+    def _free_mib(self) -> float:
+        limit = float("inf") if self.plan.memory_mib is None else self.plan.memory_mib
+        if self.device.type == CPU:
+            return min(limit, memory_mib("MemAvailable", "/proc/meminfo"))
+        torch.cuda.empty_cache()
+        return min(limit, torch.cuda.mem_get_info(self.device)[0] / 2**20)
+
+
+def described(what: Mapping[str, Any]) -> str:
+    """The columns that name a point, as one text."""
+    return ", ".join(WORDS.get(key, "{}").format(value) for key, value in what.items())
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Median, 10 % and 90 % quantiles, and number of the values."""
+    low, middle, high = np.quantile(values, [0.1, 0.5, 0.9]).tolist()
+    return {"median": middle, "p10": low, "p90": high, "n": len(values)}
+
+
+def spread_text(row: Mapping[str, Any]) -> str:
+    """The median, and half the distance of the quantiles as a share of it."""
+    middle, half = row["median"], (row["p90"] - row["p10"]) / 2
+    return number_text(middle) + (f" ±{100 * half / middle:.0f} %" if row["n"] > 1 else "")
+
+
+def number_text(value: float) -> str:
+    """Three digits, with thousands apart."""
+    if value != value or abs(value) >= 1000:
+        return f"{value:,.0f}"
+    return f"{value:.3g}"
