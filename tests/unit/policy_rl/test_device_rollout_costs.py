@@ -1,11 +1,11 @@
 """What a rollout that stays on the device costs it: kernels, waits and copies."""
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import torch
+from pretended_device import Device
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
@@ -22,11 +22,6 @@ from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.tensor_rollout import TensorRollout
 from wm_nodes.world_model import DeviceEnvironment
-
-if TYPE_CHECKING:
-    from pretended_device import Device
-else:
-    Device = pytest.importorskip("pretended_device").Device
 
 MODEL = shipped_model("reach")
 MOST_KERNELS = 530

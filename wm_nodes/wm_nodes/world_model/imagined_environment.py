@@ -152,7 +152,7 @@ class ImaginedEnvironment:
         check_actions(actions, self.spec)
         valid = ~self._ended
         moved = next_state(self._states, actions, self.spec)
-        with explain_memory(self._models.tokenizer.device, ppo__num_envs=self.spec.num_envs):
+        with explain_memory(self.models.tokenizer.device, ppo__num_envs=self.spec.num_envs):
             frames, signal, spread = self._predict(actions, moved, valid)
         self._states = np.where(valid[:, None], moved, self._states)
         self._steps += valid.astype(np.uint32)
