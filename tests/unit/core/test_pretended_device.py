@@ -70,7 +70,7 @@ def test_the_device_is_there_inside_and_gone_outside():
     lambda x, y: y.index_put_((y[:, 0].long(),), x),
     lambda x, y: torch._foreach_add([x], [y]),
     lambda x, y: torch.equal(x, y),
-], ids=str)
+])
 def test_operands_on_two_devices_are_refused(counts, mixed):
     with pytest.raises(RuntimeError, match="Expected all tensors to be on the same device, but found at least two"):
         mixed(on_device(3, 3), torch.ones(3, 3))
