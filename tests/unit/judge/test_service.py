@@ -33,6 +33,7 @@ from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import GraphError
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import terminate_at_episode_end
+from wm_nodes.policy_rl.tensor_rollout import tensors_of
 
 JUDGE = ("--judge", "http://127.0.0.1:9/v1", "--judge-model", "judge")
 SPEC = make_spec(num_envs=2, height=8, width=8)
@@ -232,10 +233,10 @@ def test_a_cut_episode_is_worth_what_the_critic_says_and_an_ended_one_its_verdic
     rollout = replace(base, rewards_TN=rewards, valid_TN=~none, terminated_TN=terminated, truncated_TN=truncated)
     monkeypatch.setattr(policy, "value", lambda features, states: torch.full((len(features),), 0.6))
     learner = PpoLearner(policy, toy_ppo(gamma=1.0, gae_lambda=1.0), seed=0)
-    returns = learner._samples(terminate_at_episode_end(rollout)).returns.reshape(none.shape)
+    returns = learner._samples(tensors_of(terminate_at_episode_end(rollout), policy)).returns.reshape(none.shape)
     for column, worth in enumerate((0.6, 0.25, 0.75)):
         assert returns[:, column].tolist() == pytest.approx([worth] * 2)
-    twice = learner._samples(rollout).returns.reshape(none.shape)
+    twice = learner._samples(tensors_of(rollout, policy)).returns.reshape(none.shape)
     assert float(twice[1, 1]) == pytest.approx(0.85), "the failure would have beaten the success"
 
 

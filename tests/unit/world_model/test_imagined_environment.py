@@ -253,6 +253,6 @@ def test_too_little_memory_names_the_number_of_environments(
     def full(*arguments: object) -> None:
         raise torch.cuda.OutOfMemoryError("CUDA out of memory.\nTried to allocate 20.00 GiB.")
 
-    monkeypatch.setattr(models.action, "advance", full)
+    monkeypatch.setattr(type(models.action), "advance", full)
     with pytest.raises(DeviceError, match=r"^the memory of cpu is too small; lower ppo\.num_envs from 3 to 1, or take"):
         env.step(actions(0))
