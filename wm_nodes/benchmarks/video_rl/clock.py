@@ -7,9 +7,7 @@ from typing import Any
 
 import torch
 
-from wm_nodes.core.device import CPU, synchronize
-
-CPU_DEVICE = torch.device(CPU)
+from wm_nodes.core.device import CPU_DEVICE, synchronize
 
 
 @contextmanager

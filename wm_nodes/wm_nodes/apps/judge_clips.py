@@ -21,7 +21,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from wm_nodes.apps.options import add_device, add_json, add_judge, judge_settings
+from wm_nodes.apps.options import add_device, add_json, add_judge, device_settings, judge_settings
 from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
@@ -45,8 +45,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Judge what is not judged yet and print a summary; return 1 where the judge failed on a clip."""
-    given = {"judge.mode": arguments.mode, "device": arguments.device}
-    overrides = judge_settings(arguments) | {name: value for name, value in given.items() if value}
+    overrides = judge_settings(arguments) | device_settings(arguments)
+    overrides |= {"judge.mode": arguments.mode} if arguments.mode else {}
     config, lines = load_config(arguments.config, overrides), read_list(arguments.clips)
     path = arguments.json or arguments.clips / VERDICTS
     settings = judge_or_embedded(config.judge)

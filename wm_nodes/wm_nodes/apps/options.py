@@ -89,8 +89,15 @@ def judge_settings(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """The dotted settings that --set and a given --seed or --device stand for."""
-    named = {name: value for name in ("seed", "device") if (value := getattr(arguments, name, None)) is not None}
-    return dict(parse_override(text) for text in arguments.set) | named
+    overrides = dict(parse_override(text) for text in arguments.set) | device_settings(arguments)
+    seed = getattr(arguments, "seed", None)
+    return overrides if seed is None else overrides | {"seed": seed}
+
+
+def device_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The setting that a given --device stands for."""
+    device = getattr(arguments, "device", None)
+    return {} if device is None else {"device": device}
 
 
 def prepare_torch(count: int | None = None) -> None:

@@ -21,7 +21,7 @@ from rich.table import Table
 from torch import Tensor
 from tqdm import tqdm
 
-from wm_nodes.apps.options import add_device, add_json, add_judge, judge_settings, prepare_torch
+from wm_nodes.apps.options import add_device, add_json, add_judge, device_settings, judge_settings, prepare_torch
 from wm_nodes.apps.policy_run import console
 from wm_nodes.config.load import REWARDS, judge_or_embedded, load_config, reward_overrides
 from wm_nodes.config.schema import AGENT
@@ -97,7 +97,7 @@ def _judge_episodes(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dic
     run_dir = bag.absolute().parent.parent
     saved = run_dir / "config.yaml"
     file = arguments.config or (str(saved) if saved.is_file() else "cpu")
-    config = load_config(file, judge_settings(arguments) | ({"device": arguments.device} if arguments.device else {}))
+    config = load_config(file, judge_settings(arguments) | device_settings(arguments))
     own, kept = run_dir / "model", Path(file).parent / READS
     evidence = ClipEvidence(
         arguments.model_dir or (own if own.is_dir() else shipped_model(config.task)), config.device
@@ -121,9 +121,7 @@ def _judge_episodes(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dic
 
 def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any], Path]:
     """Every recorded picture of a run of loop 2."""
-    chosen = {**reward_overrides(arguments.reward), **judge_settings(arguments)}
-    if arguments.device is not None:
-        chosen["device"] = arguments.device
+    chosen = {**reward_overrides(arguments.reward), **judge_settings(arguments), **device_settings(arguments)}
     run_dir, config = recorded_buffers.read_run(arguments.recording, chosen)
     probe = load_probe(shipped_model(config.task), compute_device(config.device))
     bags = recorded_buffers.recorded_episodes(run_dir, "train")

@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 AUTO, CPU, CUDA = "auto", "cpu", "cuda"
+CPU_DEVICE = torch.device(CPU)
 
 
 class DeviceError(ValueError):
@@ -24,7 +25,7 @@ def compute_device(name: str) -> torch.device:
         DeviceError: there is no such device; says what to do.
     """
     if name == CPU or (name == AUTO and not torch.cuda.is_available()):
-        return torch.device(CPU)
+        return CPU_DEVICE
     if not torch.cuda.is_available():
         raise DeviceError(
             f"device is {name}, but torch {torch.__version__} sees no GPU; set device to cpu or auto, or install a "

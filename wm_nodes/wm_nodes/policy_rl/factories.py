@@ -2,7 +2,9 @@
 
 import functools
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -26,6 +28,7 @@ from wm_nodes.world_model import (
 )
 
 STATE_DIM, ACTION_DIM = 3, 3
+_Imagined = TypeVar("_Imagined", ImaginedEnvironment, DeviceEnvironment)
 
 
 @functools.lru_cache(maxsize=4)
@@ -101,14 +104,7 @@ def make_imagined_environment(
     Raises:
         ValueError: the folder was trained for another scene than the configuration describes.
     """
-    models = models_of(Path(model_dir), config.device)
-    check_scene(config, model_dir, models.simulation)
-    spec = simulation_spec(config.task, config.simulation, num_envs)
-    with explain_memory(compute_device(config.device), ppo__num_envs=num_envs):
-        environment = ImaginedEnvironment(
-            models, spec, load_starts(Path(starts_file)), config.reward, num_envs=num_envs, seed=seed,
-            with_goals=config.reward.dense_weight > 0,
-        )
+    environment = _imagine(partial(ImaginedEnvironment, seed=seed), config, model_dir, starts_file, num_envs)
     environment.cameras = table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
     return environment
 
@@ -118,12 +114,20 @@ def make_device_environment(
 ) -> DeviceEnvironment:
     """Return the world model as a device program for config.task, for DeviceCollector. Raises as
     make_imagined_environment."""
+    return _imagine(DeviceEnvironment, config, model_dir, starts_file, num_envs)
+
+
+def _imagine(
+    make: Callable[..., _Imagined], config: RunConfig, model_dir: Path, starts_file: Path, num_envs: int
+) -> _Imagined:
     models = models_of(Path(model_dir), config.device)
     check_scene(config, model_dir, models.simulation)
-    return DeviceEnvironment(
-        models, simulation_spec(config.task, config.simulation, num_envs), load_starts(Path(starts_file)),
-        config.reward, num_envs=num_envs, with_goals=config.reward.dense_weight > 0,
-    )
+    spec = simulation_spec(config.task, config.simulation, num_envs)
+    with explain_memory(compute_device(config.device), ppo__num_envs=num_envs):
+        return make(
+            models, spec, load_starts(Path(starts_file)), config.reward, num_envs=num_envs,
+            with_goals=config.reward.dense_weight > 0,
+        )
 
 
 def make_training_environment(

@@ -62,9 +62,7 @@ class TensorRollout:
 
     def needs_bootstrap(self) -> Tensor:
         """Where (T, N) the value of the observation that the step reached is no other row's: at cuts and at the end."""
-        cut = self.truncated_TN.clone()
-        cut[-1].fill_(True)
-        return self.valid_TN & ~self.terminated_TN & cut
+        return _needs_bootstrap(self.valid_TN, self.terminated_TN, self.truncated_TN)
 
     def outcomes(self) -> Outcomes:
         """The small columns on the host, in one copy."""
@@ -88,8 +86,8 @@ def tensors_of(rollout: Rollout, policy: ImagePolicy) -> TensorRollout:
         return torch.from_numpy(np.ascontiguousarray(array)).to(policy.device)
 
     steps, num_envs = rollout.valid_TN.shape
-    cut = rollout.truncated_TN | (np.arange(steps)[:, None] == steps - 1)
-    needed = np.flatnonzero(rollout.valid_TN & ~rollout.terminated_TN & cut)
+    flags = (torch.from_numpy(flag) for flag in (rollout.valid_TN, rollout.terminated_TN, rollout.truncated_TN))
+    needed = np.flatnonzero(_needs_bootstrap(*flags).numpy())  # on the host, which need not ask the device
     images, reached = (i.reshape(-1, *i.shape[2:]) for i in (rollout.images_TN, rollout.next_images_TN))
     features = policy.features(images)
     following = torch.zeros_like(features)
@@ -101,3 +99,9 @@ def tensors_of(rollout: Rollout, policy: ImagePolicy) -> TensorRollout:
         tensor(rollout.rewards_TN), tensor(rollout.terminated_TN), tensor(rollout.truncated_TN),
         tensor(rollout.valid_TN), rollout.policy_version,
     )
+
+
+def _needs_bootstrap(valid_TN: Tensor, terminated_TN: Tensor, truncated_TN: Tensor) -> Tensor:
+    cut = truncated_TN.clone()
+    cut[-1].fill_(True)
+    return valid_TN & ~terminated_TN & cut

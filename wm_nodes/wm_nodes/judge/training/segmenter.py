@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from tqdm import trange
 
+from wm_nodes.core.device import CPU_DEVICE
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
@@ -24,7 +25,6 @@ from wm_nodes.judge.training.data import SetClip
 FRAMES_PER_CLIP = 4
 BATCH = 16
 LEARNING_RATE = 3e-3
-CPU = torch.device("cpu")
 CLASS_WEIGHTS = (1.0, 1.5, 5.0, 4.0)
 """Of scene, robot, object, clutter in the loss: small things count more."""
 WHOLE_PICTURE = frozenset({
@@ -58,7 +58,7 @@ def segmentation_data(clips: Iterable[SetClip], seed: int) -> tuple[UInt8Array, 
 
 def train_segmenter(
     images: UInt8Array, masks: UInt8Array, *, num_steps: int, seed: int, progress: bool = True,
-    device: torch.device = CPU,
+    device: torch.device = CPU_DEVICE,
 ) -> Segmenter:
     """Minimise weighted cross-entropy with AdamW; equal arguments give equal weights on one machine."""
     with torch.random.fork_rng([]):

@@ -18,6 +18,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 from tqdm import tqdm
 
+from wm_nodes.core.device import CPU_DEVICE
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.types import FloatArray
@@ -27,7 +28,6 @@ from wm_nodes.judge.evidence.sequence import READS, RIGHTWARD, ObjectSequence, T
 from wm_nodes.judge.training.heads import LAST_FAIL, UNKNOWN, Levels, true_levels
 from wm_nodes.world_model.precision import compute_context
 
-CPU = torch.device("cpu")
 FOLDS = 2
 BATCH = 64
 LEARNING_RATE, WEIGHT_DECAY = 1.5e-3, 0.05
@@ -62,7 +62,7 @@ def _answers(question: str, rows: Sequence[ManifestRow]) -> Levels:
 
 def cross_fit(
     folder: Path, data: TemporalData, *, count: int, epochs: int, seed: int, progress: bool = True,
-    device: torch.device = CPU,
+    device: torch.device = CPU_DEVICE,
 ) -> tuple[tuple[TemporalNetwork, ...], FloatArray]:
     """`count` readers per fold, and log-odds (N, K) of every clip, the mean of those that have not seen its recording.
 
@@ -109,7 +109,7 @@ def _key(data: TemporalData, chosen: Levels, epochs: int, seed: int) -> str:
 
 def train_temporal_network(
     data: TemporalData, chosen: Levels, *, epochs: int, seed: int, progress: bool = True,
-    device: torch.device = CPU,
+    device: torch.device = CPU_DEVICE,
 ) -> TemporalNetwork:
     """Minimise the weighted logistic loss of the known answers with AdamW; batches are of clips of one length."""
     with torch.random.fork_rng([]):

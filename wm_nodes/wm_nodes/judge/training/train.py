@@ -19,6 +19,7 @@ from safetensors.torch import load_file, save
 from tqdm import tqdm
 
 import wm_nodes.judge.evidence
+from wm_nodes.core.device import CPU_DEVICE
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import FloatArray
 from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC
@@ -33,7 +34,7 @@ from wm_nodes.judge.evidence.trees import TreeSettings
 from wm_nodes.judge.evidence.window import Window
 from wm_nodes.judge.training.data import load_sets, rows_of, set_clips
 from wm_nodes.judge.training.heads import TARGETS, Examples, conformal_limits, fit_all, fit_familiarity, measure_target
-from wm_nodes.judge.training.segmenter import CPU, overlaps, segmentation_data, train_segmenter
+from wm_nodes.judge.training.segmenter import overlaps, segmentation_data, train_segmenter
 from wm_nodes.judge.training.temporal_networks import cross_fit, temporal_data
 
 SEGMENTER = "segmenter.safetensors"
@@ -58,7 +59,7 @@ class JudgePlan:
 
 
 def make_judge(
-    folder: Path, plan: JudgePlan, *, progress: bool = True, device: torch.device = CPU
+    folder: Path, plan: JudgePlan, *, progress: bool = True, device: torch.device = CPU_DEVICE
 ) -> JudgeHead:
     """Train every part of a judge; the head's story holds the data, the seeds and the metrics on the validation part.
 
