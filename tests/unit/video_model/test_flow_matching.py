@@ -8,7 +8,6 @@ from torch import Tensor
 from video_toys import ACTION_DIM, randn, times, tiny_network
 
 from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import FlowMatchingConfig
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork, guided_velocity
@@ -19,6 +18,7 @@ from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest
 
 SHAPE = (2, 3, 4, 4)
+SETTINGS = load_video_config("base").model.training
 
 
 class Watched:
@@ -42,7 +42,7 @@ def loss_of(model: Watched, drop: float, iteration: int = 0, given: int = 1) -> 
     condition = Condition(
         model.latents[:, :, :given], torch.zeros(len(model.latents), SHAPE[1] - 1, ACTION_DIM), torch.zeros(16, 1, 0)
     )
-    return float(flow_matching_loss(model, model.latents, condition, drop, 0, iteration))  # type: ignore[arg-type]
+    return float(flow_matching_loss(model, model.latents, condition, SETTINGS.with_values(drop=drop), 0, iteration))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("given", [0, 1, 2])
@@ -88,7 +88,7 @@ def commanded(count: int, iteration: int) -> tuple[Tensor, Condition]:
 def test_a_trained_model_obeys_its_actions_and_without_them_knows_only_the_mean() -> None:
     torch.manual_seed(0)
     model = VideoNetwork(NetworkSettings(1, ACTION_DIM, width=16, depth=2))
-    settings = FlowMatchingConfig(num_iterations=400, learning_rate=3e-3, drop=0.2)
+    settings = SETTINGS.with_values(num_iterations=400, learning_rate=3e-3, drop=0.2)
     train_video_model(model, lambda i: commanded(16, i), settings, seed=0, run_dir=None)
     latents, condition = commanded(64, -1)
     noise = torch.randn(latents.shape, generator=torch_stream(0, "test_noise"))

@@ -79,7 +79,9 @@ class RecordedSource(RecordedContexts):
 def config_of(sampler: SamplerSetup, plan: LearningPlan, seed: int) -> VideoRlConfig:
     """The settings of loop 2 that a sampler and a plan stand for; held-out videos take the sampler's own steps."""
     base = load_video_config("base", {"task": TASK, "rewards": REWARDS})
-    groups = {"contexts": plan.contexts, "group_size": plan.group_size, "shared_noise": sampler.shared_noise}
+    groups = base.groups.with_values(
+        contexts=plan.contexts, group_size=plan.group_size, shared_noise=sampler.shared_noise
+    )
     return base.with_values(
         seed=seed, groups=groups, window=sampler.window, grpo=sampler.grpo,
         rollout=RolloutConfig.model_validate(sampler.rollout, from_attributes=True),

@@ -24,6 +24,13 @@ class FlowMatchingConfig(SettingsSection):
     learning_rate: PositiveFloat
     drop: Fraction
     """Share of videos whose actions and instruction are hidden, for classifier-free guidance."""
+    hide_actions: Fraction
+    """Share of videos whose actions alone are hidden: the model learns to choose the motion as well."""
+    given_frames: NonNegativeInt
+    """0: videos are whole episodes of which the first num_conditioning frames are given. Else they are cut out anywhere,
+    after 1 to this many given frames, drawn for each batch."""
+    new_frames: NonNegativeInt
+    """With given_frames: how many frames are learned after them."""
 
 
 class VideoModelConfig(SettingsSection):
@@ -55,6 +62,11 @@ class GroupConfig(SettingsSection):
     """Videos of each context."""
     shared_noise: bool
     """One initial noise for all videos of a context."""
+    hide_actions: bool
+    """Videos are made of first frame and instruction alone: the model chooses the motion."""
+    history: NonNegativeInt
+    """Closed loop: clips that the model makes one after the other, each from its own last frames, before those of a
+    group, which share them. 0: videos start at the recordings' first frames."""
 
 
 class VideoEvaluationConfig(SettingsSection):
@@ -260,3 +272,18 @@ class VideoRlConfig(SettingsSection):
     window: WindowConfig
     rollout: RolloutConfig
     grpo: GrpoConfig
+
+    @model_validator(mode="after")
+    def _knows_its_conditions(self) -> Self:
+        """What a model is asked for is what it was trained on."""
+        if self.groups.hide_actions and not self.model.training.hide_actions:
+            raise ValueError(
+                "groups.hide_actions needs a video model that was trained without actions, too: set "
+                "model.training.hide_actions, e.g. 0.5, or take the preset outcome"
+            )
+        if self.groups.history and not self.model.training.given_frames:
+            raise ValueError(
+                "groups.history needs a video model that can go on from its own frames: set "
+                "model.training.given_frames and new_frames, or take the preset closed_loop"
+            )
+        return self

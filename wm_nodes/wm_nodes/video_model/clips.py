@@ -4,7 +4,7 @@ Shapes: E episodes, F frames, H W 3 image, C h w latents, A action, P simulator 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,8 @@ from wm_nodes.video_model.tokenizer_codec import Codec
 @dataclass(frozen=True)
 class Clips:
     """frames: uint8 (E, F, H, W, 3). actions: (E, F - 1, stride A), the recorded actions between two frames, one after
-    the other. ground_truth: (E, F, P) simulator state of `task`. instructions: one each.
+    the other. ground_truth: (E, F, P) simulator state of `task`. instructions: one each. seeds: of the simulator's
+    reset, one each; () where unknown.
     """
 
     frames: Tensor
@@ -30,6 +31,7 @@ class Clips:
     ground_truth: FloatArray
     instructions: tuple[str, ...]
     task: str
+    seeds: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -38,6 +40,7 @@ class Clips:
         return Clips(
             self.frames[index], self.actions[index], self.ground_truth[index.numpy()],
             tuple(self.instructions[int(i)] for i in index), self.task,
+            tuple(self.seeds[int(i)] for i in index) if self.seeds else (),
         )
 
     def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:
@@ -53,7 +56,8 @@ def load_clips(bags: Sequence[Path], stride: int) -> Clips:
         BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, or of different sizes.
     """
     episodes = [episode for bag in bags for episode in read_episodes(bag)]
-    return cut_clips(stack_episodes(episodes, [episode.task for episode in episodes[:1]]), stride)
+    clips = cut_clips(stack_episodes(episodes, [episode.task for episode in episodes[:1]]), stride)
+    return replace(clips, seeds=tuple(episode.seed for episode in episodes))
 
 
 def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:

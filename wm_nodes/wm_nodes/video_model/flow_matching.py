@@ -37,13 +37,13 @@ def train_video_model(
     def loss(iteration: int) -> dict[str, Tensor]:
         latents, condition = batches(iteration)
         latents, condition = latents.to(device), condition.to(device)
-        return {"loss": flow_matching_loss(model, latents, condition, settings.drop, seed, iteration)}
+        return {"loss": flow_matching_loss(model, latents, condition, settings, seed, iteration)}
 
     return loop.run(loss)
 
 
 def flow_matching_loss(
-    model: VideoNetwork, latents: Tensor, condition: Condition, drop: float, seed: int, iteration: int
+    model: VideoNetwork, latents: Tensor, condition: Condition, settings: FlowMatchingConfig, seed: int, iteration: int
 ) -> Tensor:
     """Return the flow-matching loss of one batch; times, noise and drops come from streams of the iteration."""
     B, K = len(latents), condition.num_conditioning
@@ -52,9 +52,11 @@ def flow_matching_loss(
     shifted = SHIFT * t / (1 + (SHIFT - 1) * t)
     t = torch.where(torch.arange(B) % 2 == 0, t, shifted).to(latents.device)
     noise = torch.randn(latents.shape, generator=generator).to(latents.device)
-    hidden = (torch.rand(B, generator=generator) < drop).to(latents.device)
+    hidden = torch.rand(B, generator=generator) < settings.drop
+    if settings.hide_actions:
+        hidden = torch.stack([hidden | (torch.rand(B, generator=generator) < settings.hide_actions), hidden], 1)
     share = t.to(latents.dtype).view(-1, 1, 1, 1, 1)
     x_t = with_conditioning((1 - share) * latents + share * noise, condition.frames)
-    error = model(x_t, t, condition, hidden) - (noise - latents)
+    error = model(x_t, t, condition, hidden.to(latents.device)) - (noise - latents)
     loss: Tensor = error[:, :, K:].square().mean()
     return loss

@@ -25,7 +25,7 @@ class VelocityModel(Protocol):
     """(x_t, t, condition, drop) -> v = dx/dt of x_t = (1 - t) x_0 + t eps, shape of x_t.
 
     t: float64 (B,). drop: bool (B,), rows that see neither actions nor instruction (the unconditional branch of
-    classifier-free guidance); None: no row. What is returned on conditioning frames is never used.
+    classifier-free guidance), or (B, 2), rows that do not see the actions, the instruction; None: no row. What is returned on conditioning frames is never used.
     """
 
     def __call__(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None = None) -> Tensor: ...
@@ -93,17 +93,23 @@ class VideoNetwork(nn.Module):
         B, frames, K = x.shape[0], x.shape[2], condition.num_conditioning
         times_BF = t.to(device=x.device, dtype=x.dtype).view(B, 1).expand(B, frames).clone()
         times_BF[:, :K] = 0
-        kept = x.new_ones(B, 1) if drop is None else (~drop).to(x.dtype).view(B, 1)
-        actions = F.pad(condition.actions.to(x.dtype), (0, 0, 1, 0))  # the first frame follows no action
-        steered = torch.cat([actions, actions.cumsum(1) / 4, torch.ones_like(actions[..., :1])], 2) * kept.unsqueeze(2)
-        film: Tensor = self.time(time_features(times_BF)) + self.action(steered)
+        kept = x.new_ones(B, 2) if drop is None else (~drop).to(x.dtype).view(B, -1).expand(B, 2)
+        film: Tensor = self.time(time_features(times_BF)) + self.action(self._steering(x, condition) * kept[:, :1, None])
         if self.settings.text_dim:
             text = condition.text.to(x.dtype).sum(1) / max(1, condition.text.shape[1])  # no token: zeros
-            film = film + (self.text(text) * kept).unsqueeze(1)
+            film = film + (self.text(text) * kept[:, 1:]).unsqueeze(1)
         return film
 
+    def _steering(self, x: Tensor, condition: Condition) -> Tensor:
+        """The action that led to each frame, their sum so far, and 1, (B, F, 2 A + 1); zeros where they are hidden."""
+        actions = F.pad(condition.actions.to(x.dtype), (0, 0, 1, 0))  # the first frame follows no action
+        if not actions.shape[2]:
+            return actions.new_zeros(*actions.shape[:2], 2 * self.settings.action_dim + 1)
+        return torch.cat([actions, actions.cumsum(1) / 4, torch.ones_like(actions[..., :1])], 2)
+
     def _check(self, x: Tensor, condition: Condition) -> None:
-        given = (x.shape[1], condition.actions.shape[2], condition.actions.shape[1] + 1)
+        values = condition.actions.shape[2] or self.settings.action_dim
+        given = (x.shape[1], values, condition.actions.shape[1] + 1)
         wanted = (self.settings.channels, self.settings.action_dim, x.shape[2])
         if given != wanted:
             raise ValueError(

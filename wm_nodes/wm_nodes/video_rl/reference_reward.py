@@ -15,16 +15,21 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from wm_nodes.config.tasks import get_task
 from wm_nodes.core.types import FloatArray
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.tokenizer import PROBE_NAMES
 from wm_nodes.world_model.training.tokenizer import probe_targets
 from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL
 
-TRACKING_SCALE_M = 0.03
-"""An error of this much takes the tracking score to 1 / e."""
+TRACKING_SCALE_M, OUTCOME_SCALE_M = 0.03, 0.05
+"""An error of this much takes the tracking score, or the outcome, to 1 / e."""
+THING_HEIGHT_M = 0.02
+"""Of the centre of a thing on the table; the probe does not read it."""
+GOAL = [PROBE_NAMES.index(name) for name in ("goal_x", "goal_y")]
 SEEN_MOTION = 12
 """A pixel counts as scenery while no recorded frame differs from the first one by more than this, of 255."""
 ERRORS = ("scenery", "object_cm", "tool_cm")
@@ -36,7 +41,8 @@ class ClipScores:
     """Per clip, float64 (N,), in the host's memory. tracking: mean exp(-error / 3 cm) of object and tool over generated
     frames, in (0, 1]. scenery: mean absolute error, [0, 1], where the recording stands still. psnr_db: of generated
     frames. object_cm, tool_cm: mean position errors. motion: object path length, share of the recorded one, at most 2;
-    1 where the recorded object stands still.
+    1 where the recorded object stands still. success: 1 where the task is done in the last frame. outcome:
+    exp(-d / 5 cm), d what is then left to the edge of the goal (DD-32).
     """
 
     tracking: Tensor
@@ -45,6 +51,8 @@ class ClipScores:
     object_cm: Tensor
     tool_cm: Tensor
     motion: Tensor
+    success: Tensor
+    outcome: Tensor
 
     def named(self) -> dict[str, Tensor]:
         return dict(vars(self))
@@ -68,6 +76,7 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
     changed = (recorded.int() - recorded[:, :1].int()).abs().amax((1, 4)) > SEEN_MOTION
     still = (~changed)[:, None, :, :, None].float()
     weight = still.sum((1, 2, 3, 4)).clamp_min(1) * error.shape[1] * error.shape[4]
+    left_m = distance_left(positions[:, -1], truth[:, -1], references.task)
     return ClipScores(
         tracking=torch.from_numpy(tracking.mean(1)).double(),
         scenery=((error.abs() * still).sum((1, 2, 3, 4)) / weight).double().cpu(),
@@ -75,7 +84,29 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
         object_cm=torch.from_numpy(100 * object_m.mean(1)).double(),
         tool_cm=torch.from_numpy(100 * tool_m.mean(1)).double(),
         motion=torch.from_numpy(_path_share(positions[..., OBJECT], truth[..., OBJECT])).double(),
+        success=torch.from_numpy(np.where(np.isfinite(left_m), left_m <= 0, left_m)).double(),
+        outcome=torch.from_numpy(np.exp(-np.maximum(left_m, 0) / OUTCOME_SCALE_M)).double(),
     )
+
+
+def distance_left(positions: FloatArray, truth: FloatArray, task: str) -> FloatArray:
+    """Return how far what the task moves is from the edge of its goal, m, below 0 within it, (N,); NaN for a task
+    without rules for clips.
+
+    Args:
+        positions: read off a frame, (N, P) of PROBE_NAMES. truth: of the scene that the goal is in, the same.
+    """
+    rules = get_task(task).clips
+    if rules is None:
+        return np.full(len(positions), np.nan, np.float32)
+    rule = rules.label
+    if rule.above_thing_m is None:
+        place, goal = positions[:, OBJECT if rule.mover == "object" else TOOL[:2]], truth[:, GOAL]
+    else:
+        height = np.full((len(truth), 1), THING_HEIGHT_M + rule.above_thing_m, np.float32)
+        place, goal = positions[:, TOOL], np.concatenate([truth[:, OBJECT], height], 1)
+    left: FloatArray = np.linalg.norm(place - goal, axis=-1) - rule.radius_m
+    return left
 
 
 def more_is_better(name: str, values: ArrayLike) -> NDArray[np.float64]:

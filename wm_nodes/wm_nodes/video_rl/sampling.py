@@ -67,7 +67,8 @@ def sample_buffer(
 
 
 class ClipGenerator:
-    """Samples clips of recorded contexts (first frames, actions, instruction) from the video model.
+    """Samples clips of recorded contexts (first frames, actions unless groups.hide_actions, instruction) from the video
+    model.
 
     Args:
         folder: codec and network; the network is used as it is, so loading newer weights into it is enough.
@@ -119,9 +120,10 @@ class ClipGenerator:
         return self.contexts.select(torch.tensor(request.contexts).repeat_interleave(request.group_size))
 
     def _condition(self, rows: Tensor) -> Condition:
-        return self.contexts.select(rows).condition(
+        condition = self.contexts.select(rows).condition(
             self.folder.codec, self.folder.clip["num_conditioning"], self.folder.network.settings.text_dim
         )
+        return condition.without_actions() if self.config.groups.hide_actions else condition
 
     def _shape(self) -> tuple[int, ...]:
         _, F, H, W, _ = self.contexts.frames.shape
