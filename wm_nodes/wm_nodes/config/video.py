@@ -30,7 +30,7 @@ class FlowMatchingConfig(SettingsSection):
     """0: videos are whole episodes of which the first num_conditioning frames are given. Else they are cut out anywhere,
     after 1 to this many given frames, drawn for each batch."""
     new_frames: NonNegativeInt
-    """With given_frames: how many frames are learned after them."""
+    """With given_frames: how many frames at most are learned after them; drawn as well."""
 
 
 class VideoModelConfig(SettingsSection):
@@ -53,6 +53,12 @@ class VideoModelConfig(SettingsSection):
     batch_size: PositiveInt
     """Clips per training step."""
     training: FlowMatchingConfig
+
+    @model_validator(mode="after")
+    def _cuts_something(self) -> Self:
+        if bool(self.training.given_frames) != bool(self.training.new_frames):
+            raise ValueError("training.given_frames and new_frames go together; both are 0, or none")
+        return self
 
 
 class GroupConfig(SettingsSection):

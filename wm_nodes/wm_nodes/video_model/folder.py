@@ -16,6 +16,7 @@ from wm_nodes.core.model_folder import MANIFEST, ModelFolderError, read_manifest
 from wm_nodes.training.weights import WeightsError, load_weights, pack_weights
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.codec import PatchCodec
+from wm_nodes.video_model.continuation import ClipLengths
 from wm_nodes.video_model.tokenizer_codec import Codec, TokenizerCodec, codec_of_world_model
 
 CODEC, NETWORK = "codec.safetensors", "network.safetensors"
@@ -25,12 +26,20 @@ KINDS = {PatchCodec: "patch", TokenizerCodec: "tokenizer"}
 
 @dataclass(frozen=True)
 class VideoFolder:
-    """clip: how episodes are cut, {"stride": recorded steps between frames, "num_conditioning": given frames}."""
+    """clip: how episodes are cut, {"stride": recorded steps between frames, "num_conditioning": given frames}, and of a
+    model that goes on from its own frames {"given_frames", "new_frames": at most}.
+    """
 
     codec: Codec
     network: VideoNetwork
     clip: Mapping[str, int]
     manifest: Mapping[str, Any]
+
+    @property
+    def lengths(self) -> ClipLengths | None:
+        """What a clip goes on from and how much it makes; None where a clip is a whole episode."""
+        given = self.clip.get("given_frames", 0)
+        return ClipLengths(given, self.clip["new_frames"]) if given else None
 
 
 def save_video_folder(

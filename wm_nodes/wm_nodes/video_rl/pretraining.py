@@ -4,11 +4,12 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.config.video import FlowMatchingConfig, VideoRlConfig
 from wm_nodes.core.device import compute_device, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import numpy_stream, stream_seed
@@ -81,7 +82,7 @@ def _train(config: VideoRlConfig, clips: Clips, run_dir: Path) -> tuple[VideoFol
     latents, condition = codec.encode(clips.frames), clips.condition(codec, K, settings.text_dim)
     sizes = NetworkSettings(
         codec.channels, clips.actions.shape[2], settings.text_dim, settings.width, settings.depth,
-        patch=CELLS[settings.codec], change_std=change_std(latents, K),
+        patch=CELLS[settings.codec], change_std=change_std(latents, K, settings.training.new_frames),
     )
     torch.manual_seed(stream_seed(config.seed, "video_network") % 2**32)
     network = VideoNetwork(sizes).to(device)
@@ -89,11 +90,43 @@ def _train(config: VideoRlConfig, clips: Clips, run_dir: Path) -> tuple[VideoFol
     def batch(iteration: int) -> tuple[Tensor, Condition]:
         drawn = numpy_stream(config.seed, "video_batches", iteration).choice(len(clips), settings.batch_size)
         rows = torch.from_numpy(drawn).to(device)
-        return latents[rows], condition.rows(rows)
+        videos, of = latents[rows], condition.rows(rows)
+        if not settings.training.given_frames:
+            return videos, of
+        return cut_windows(videos, of, settings.training, numpy_stream(config.seed, "video_windows", iteration))
 
     with explain_memory(device, model__batch_size=settings.batch_size):
         losses = train_video_model(network, batch, settings.training, seed=config.seed, run_dir=run_dir)
-    return VideoFolder(codec, network, {"stride": settings.stride, "num_conditioning": K}, {}), losses
+    clip = {"stride": settings.stride, "num_conditioning": K}
+    if settings.training.given_frames:
+        clip |= {"given_frames": settings.training.given_frames, "new_frames": settings.training.new_frames}
+    return VideoFolder(codec, network, clip, {}), losses
+
+
+def cut_windows(
+    videos: Tensor, condition: Condition, settings: FlowMatchingConfig, rng: np.random.Generator
+) -> tuple[Tensor, Condition]:
+    """Cut K + n frames out of each of B videos (B, C, F, h, w), of which the first K are given.
+
+    K of 1 to given_frames and n of 1 to new_frames are drawn for the batch, the place for each video. condition: of the
+    whole videos.
+
+    Raises:
+        ValueError: the videos are shorter than the longest cut.
+    """
+    B, _, count = videos.shape[:3]
+    if count < settings.given_frames + settings.new_frames:
+        raise ValueError(
+            f"videos of {count} frames have no {settings.given_frames} + {settings.new_frames} to be cut out; lower "
+            "model.training.given_frames or new_frames"
+        )
+    K, n = (int(rng.integers(1, most + 1)) for most in (settings.given_frames, settings.new_frames))
+    starts = torch.from_numpy(rng.integers(0, count - K - n + 1, B)).to(videos.device)
+    places = starts.unsqueeze(1) + torch.arange(K + n, device=videos.device)
+    index = torch.arange(B, device=videos.device).unsqueeze(1)
+    cut = videos.transpose(1, 2)[index, places].transpose(1, 2).contiguous()
+    actions = condition.actions[index, places[:, :-1]]
+    return cut, Condition(cut[:, :, :K].contiguous(), actions, condition.text)
 
 
 def _score_baselines(
@@ -119,9 +152,15 @@ def _make_codec(config: VideoRlConfig, clips: Clips) -> Codec:
     return codec
 
 
-def change_std(latents: Tensor, num_conditioning: int) -> float:
-    """Root mean square of what changes after the last given frame of clips (B, C, F, h, w); without one, of all."""
+def change_std(latents: Tensor, num_conditioning: int, new_frames: int = 0) -> float:
+    """Root mean square of what changes after the last given frame of clips (B, C, F, h, w); without one, of all.
+
+    new_frames: with it, of what changes within up to so many frames, anywhere.
+    """
     if num_conditioning == 0:
         return float(latents.square().mean().sqrt())
+    if new_frames:
+        later = [latents[:, :, lag:] - latents[:, :, :-lag] for lag in range(1, new_frames + 1)]
+        return float(torch.stack([change.square().mean() for change in later]).mean().sqrt())
     given = latents[:, :, num_conditioning - 1 : num_conditioning]
     return float((latents[:, :, num_conditioning:] - given).square().mean().sqrt())

@@ -20,6 +20,7 @@ from wm_nodes.video_model import (
     stochastic_steps,
 )
 from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.continuation import ClipLengths, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.reference_reward import attach_rewards, mix_rewards, score_clips
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -106,14 +107,22 @@ class ClipGenerator:
         )
 
     def evaluate(self, contexts: Clips, num_steps: int) -> Tensor:
-        """Sample one clip of each context by ODE and decode it: uint8 (E, F, H, W, 3)."""
+        """Sample one clip of each context by ODE and decode it: uint8 (E, F, H, W, 3).
+
+        A model that goes on from its own frames makes it clip after clip.
+        """
         generator = ClipGenerator(self.folder, contexts, self.config)
-        rows = torch.arange(len(contexts))
-        seeds = _seeds(self.config.seed, "clip_evaluation", 0, rows, torch.zeros_like(rows))
+        rows, network = torch.arange(len(contexts)), self.folder.network
         settings = RolloutSettings(num_steps, self.config.rollout.shift, self.config.rollout.cfg)
-        noise = initial_noise(generator._shape(), seeds).to(device_of(self.folder.network))
-        rollout = sample_videos(self.folder.network, generator._condition(rows), noise, seeds, settings, [])
-        return self.folder.codec.decode(rollout.latents)
+        condition, shape = generator._condition(rows), generator._shape()
+
+        def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
+            seeds = _seeds(self.config.seed, "clip_evaluation", clip, rows, torch.zeros_like(rows))
+            return initial_noise(shape, seeds).to(device_of(network))
+
+        lengths = self.folder.lengths or ClipLengths(condition.num_conditioning, shape[1] - condition.num_conditioning)
+        given = condition.frames, condition.actions, condition.text
+        return self.folder.codec.decode(continue_videos(network, *given, lengths, shape[1], noise, settings))
 
     def references(self, request: GroupRequest) -> Clips:
         """Return the recordings that the request's clips are scored against, one row per clip."""

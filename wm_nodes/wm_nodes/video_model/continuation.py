@@ -1,0 +1,63 @@
+"""Videos made clip after clip: each one goes on from the last frames of the one before.
+
+Shapes: N videos, C channels, K given frames, n new frames of a clip, F frames, h w latent grid, A action values.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from wm_nodes.video_model.conditions import Condition
+from wm_nodes.video_model.network import VelocityModel
+from wm_nodes.video_model.sampling import RolloutSettings, sample_videos
+
+ClipNoise = Callable[[int, tuple[int, ...]], Tensor]
+"""(number of the clip, shape (C, K + n, h, w)) -> its initial noise (N, C, K + n, h, w)."""
+
+
+@dataclass(frozen=True)
+class ClipLengths:
+    """given: frames that a clip goes on from, at most. new: frames that it makes."""
+
+    given: int
+    new: int
+
+
+def clip_condition(videos: Tensor, actions: Tensor, text: Tensor, lengths: ClipLengths) -> Condition:
+    """Return the condition of the clip that goes on after `videos`: its last frames, and the actions from there.
+
+    Args:
+        videos: the frames so far (N, C, F, h, w). actions: (N, F - 1 + n or more, A), from the first frame on; A = 0
+            where they are hidden.
+
+    Raises:
+        ValueError: too few actions.
+    """
+    F, K = videos.shape[2], min(lengths.given, videos.shape[2])
+    wanted = actions[:, F - K : F - 1 + lengths.new]
+    if wanted.shape[1] != K - 1 + lengths.new:
+        raise ValueError(f"{lengths.new} frames after {F} need {F - 1 + lengths.new} actions, got {actions.shape[1]}")
+    return Condition(videos[:, :, F - K :].contiguous(), wanted.contiguous(), text)
+
+
+@torch.no_grad()
+def continue_videos(
+    model: VelocityModel, videos: Tensor, actions: Tensor, text: Tensor, lengths: ClipLengths, frames: int,
+    noise: ClipNoise, settings: RolloutSettings,
+) -> Tensor:
+    """Return `videos` (N, C, F, h, w) continued to `frames` frames, clip after clip by ODE; the last may be shorter.
+
+    Everything is where the model is; actions and text as in clip_condition. Raises ValueError as that.
+    """
+    seeds = torch.zeros(len(videos), dtype=torch.int64)  # of step noise, of which an ODE has none
+    clip = 0
+    while videos.shape[2] < frames:
+        new = min(lengths.new, frames - videos.shape[2])
+        condition = clip_condition(videos, actions, text, ClipLengths(lengths.given, new))
+        shape = (videos.shape[1], condition.num_conditioning + new, *videos.shape[3:])
+        rollout = sample_videos(model, condition, noise(clip, shape).to(videos.device), seeds, settings, [])
+        videos = torch.cat([videos, rollout.latents[:, :, -new:]], 2)
+        clip += 1
+    return videos
