@@ -27,8 +27,8 @@ class FlowMatchingConfig(SettingsSection):
     hide_actions: Fraction
     """Share of videos whose actions alone are hidden: the model learns to choose the motion as well."""
     given_frames: NonNegativeInt
-    """0: videos are whole episodes of which the first num_conditioning frames are given. Else they are cut out anywhere,
-    after 1 to this many given frames, drawn for each batch."""
+    """0: videos are whole episodes of which the first num_conditioning frames are given. Else they are cut out
+    anywhere, after 1 to this many given frames, drawn for each batch."""
     new_frames: NonNegativeInt
     """With given_frames: how many frames at most are learned after them; drawn as well."""
 

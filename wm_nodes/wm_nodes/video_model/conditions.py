@@ -15,7 +15,8 @@ from wm_nodes.core.seeding import torch_stream
 @dataclass(frozen=True)
 class Condition:
     """frames: clean latents of the first K >= 0 frames (B, C, K, H, W). actions: (B, F - 1, A), action f leads from
-    frame f to frame f + 1; A = 0 where they are hidden and the model chooses the motion. text: (B, L, E) embedded instruction; E and L may be 0.
+    frame f to frame f + 1; A = 0 where they are hidden and the model chooses the motion. text: (B, L, E) embedded
+    instruction; E and L may be 0.
     """
 
     frames: Tensor

@@ -25,7 +25,8 @@ class VelocityModel(Protocol):
     """(x_t, t, condition, drop) -> v = dx/dt of x_t = (1 - t) x_0 + t eps, shape of x_t.
 
     t: float64 (B,). drop: bool (B,), rows that see neither actions nor instruction (the unconditional branch of
-    classifier-free guidance), or (B, 2), rows that do not see the actions, the instruction; None: no row. What is returned on conditioning frames is never used.
+    classifier-free guidance), or (B, 2), rows that do not see the actions, the instruction; None: no row. What is
+    returned on conditioning frames is never used.
     """
 
     def __call__(self, x: Tensor, t: Tensor, condition: Condition, drop: Tensor | None = None) -> Tensor: ...
@@ -94,7 +95,8 @@ class VideoNetwork(nn.Module):
         times_BF = t.to(device=x.device, dtype=x.dtype).view(B, 1).expand(B, frames).clone()
         times_BF[:, :K] = 0
         kept = x.new_ones(B, 2) if drop is None else (~drop).to(x.dtype).view(B, -1).expand(B, 2)
-        film: Tensor = self.time(time_features(times_BF)) + self.action(self._steering(x, condition) * kept[:, :1, None])
+        steered = self._steering(x, condition) * kept[:, :1, None]
+        film: Tensor = self.time(time_features(times_BF)) + self.action(steered)
         if self.settings.text_dim:
             text = condition.text.to(x.dtype).sum(1) / max(1, condition.text.shape[1])  # no token: zeros
             film = film + (self.text(text) * kept[:, 1:]).unsqueeze(1)
