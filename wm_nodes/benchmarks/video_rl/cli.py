@@ -6,27 +6,26 @@ picture is drawn beside it (of ablations from two seeds on).
 """
 
 import argparse
-import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
-from pydantic import TypeAdapter
 from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
-from benchmarks.video_rl import diversity, plots, samplers, tables
+from benchmarks.video_rl import diversity, outcome, plots, samplers, tables
 from benchmarks.video_rl.clip_resolution import sample_clips, size_rows
-from benchmarks.video_rl.comparison import CLIP_MEASURES, MEASURES, SamplerComparison, compare_samplers
+from benchmarks.video_rl.comparison import CLIP_MEASURES
 from benchmarks.video_rl.cost import measure_anchors, pushcube_buffer, pushcube_rollout, toy_buffer, toy_rollout
 from benchmarks.video_rl.learning import train_on_discs, train_sampler
 from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup, diversity_samplers, learning_samplers
 from benchmarks.video_rl.sources import TASK, RecordedSource
-from benchmarks.video_rl.trials import Plan, SamplerTrial, ablation_trials, hacking_trials
+from benchmarks.video_rl.trainings import against_cps, compare, draw, select, settings_of, train_all
+from benchmarks.video_rl.trials import SamplerTrial, ablation_trials, hacking_trials
 from wm_nodes.apps.options import add_device, add_json, add_seed, positive, prepare_torch
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
@@ -51,7 +50,6 @@ NEW_SEEDS = 250_000
 LEARNER = load_video_config("base").grpo.with_values(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
 LOG_COLUMNS = 180  # of tables that go to a file or a pipe
-T = TypeVar("T")
 console = Console()
 
 
@@ -71,6 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     cost = experiments.add_parser("cost", help="seconds and bytes of the KL anchors, and of the mask")
     cost.add_argument("--repeats", type=positive, default=7)
     clips = experiments.add_parser("clips", help="diversity on a video model of recorded episodes")
+    outcome.add_options(experiments.add_parser("outcome", help="a video model that chooses the motion, by its outcome"))
     training = experiments.add_parser("clip-learning", help="learning on a video model of recorded episodes")
     training.add_argument("--iterations", type=positive, default=LearningPlan.iterations)
     training.add_argument("--eval-contexts", type=positive, default=LearningPlan.eval_contexts)
@@ -106,8 +105,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         experiment.add_argument("--samplers", "--arms", nargs="+", metavar="NAME")
     for experiment in (spread, learning, ablations, hacking, cost):
         experiment.add_argument("--base", type=Path, help="weights of another base model than the shipped experiment")
-    for experiment in experiments.choices.values():
-        add_device(experiment)
+    for name, experiment in experiments.choices.items():
+        if name != "outcome":
+            add_device(experiment)
     for experiment in (spread, learning, ablations, hacking, cost, clips, training, resolution):
         add_json(experiment, "write every row here; trainings go on where the file stops")
 
@@ -121,6 +121,7 @@ def run(arguments: argparse.Namespace) -> None:
     experiments = {
         "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,
         "cost": _cost, "clips": _clips, "clip-learning": _clip_learning, "resolution": _resolution,
+        "outcome": outcome.run,
     }
     experiments[arguments.experiment](arguments)
 
@@ -147,10 +148,10 @@ def _diversity(arguments: argparse.Namespace) -> None:
         diversity.measure_discs(model, setup, **plan, seed=arguments.seed)
         for setup in tqdm(_with_both_noises(chosen), desc="diversity", unit="sampler")
     ]
-    of = {"plan": plan, "seed": arguments.seed, "features": diversity.FEATURES, **_settings(chosen)}
+    of = {"plan": plan, "seed": arguments.seed, "features": diversity.FEATURES, **settings_of(chosen)}
     comparisons = diversity.disc_comparisons(rows, arguments.seed)
     write_results(arguments, {**of, **_base_of(arguments), "rows": rows, "comparisons": comparisons})
-    _draw(arguments, plots.plot_diversity, rows, arguments.seed)
+    draw(arguments, plots.plot_diversity, rows, arguments.seed)
     console.print(tables.diversity_table(rows, arguments.seed))
 
 
@@ -175,9 +176,9 @@ def _clips(arguments: argparse.Namespace) -> None:
             rows.append(diversity.measure_clips(source, setup, features, arguments.group_size, bar.update))
     compared = diversity.clip_comparisons(rows, arguments.seed)
     size = {"contexts": len(contexts), "group_size": arguments.group_size, "features": features.name}
-    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **_settings(chosen)}
+    of = {"rewards": config.rewards, "sha256": folder.manifest["sha256"], **settings_of(chosen)}
     write_results(arguments, {**size, "seed": arguments.seed, **of, "rows": rows, "comparisons": compared})
-    _draw(arguments, plots.plot_diversity, rows, arguments.seed)
+    draw(arguments, plots.plot_diversity, rows, arguments.seed)
     console.print(tables.clip_table(rows, arguments.seed), tables.clip_comparison_table(compared))
 
 
@@ -227,9 +228,9 @@ def _clip_learning(arguments: argparse.Namespace) -> None:
         source = RecordedSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed)
         return train_sampler(source, trial.sampler, trial.plan, seed, on_iteration)
 
-    rows = _train(arguments, trials, train, of)
-    comparisons = _compare(arguments, trials, rows, _against_cps(rows), of, CLIP_MEASURES)
-    _draw(arguments, plots.plot_comparisons, comparisons)
+    rows = train_all(arguments, trials, train, of)
+    comparisons = compare(arguments, trials, rows, against_cps(rows), of, CLIP_MEASURES)
+    draw(arguments, plots.plot_comparisons, comparisons)
     console.print(tables.clip_training_table(rows), tables.comparison_table(comparisons))
 
 
@@ -237,22 +238,22 @@ def _learning(arguments: argparse.Namespace) -> None:
     plan = _plan(arguments, eval_every=5)
     trials = [SamplerTrial(sampler, plan) for sampler in learning_samplers(LEARNER)]
     rows = _train_discs(arguments, trials)
-    comparisons = _compare(arguments, trials, rows, _against_cps(rows), _base_of(arguments))
-    _draw(arguments, plots.plot_learning, rows)
+    comparisons = compare(arguments, trials, rows, against_cps(rows), _base_of(arguments))
+    draw(arguments, plots.plot_learning, rows)
     console.print(tables.training_table(rows), tables.comparison_table(comparisons))
 
 
 def _ablations(arguments: argparse.Namespace) -> None:
     trials, pairs = ablation_trials(LEARNER, _plan(arguments, eval_every=4))
     rows = _train_discs(arguments, trials)
-    comparisons = _compare(arguments, trials, rows, pairs, _base_of(arguments))
-    _draw(arguments, plots.plot_comparisons, comparisons)
+    comparisons = compare(arguments, trials, rows, pairs, _base_of(arguments))
+    draw(arguments, plots.plot_comparisons, comparisons)
     console.print(tables.training_table(rows), tables.comparison_table(comparisons))
 
 
 def _hacking(arguments: argparse.Namespace) -> None:
     rows = _train_discs(arguments, hacking_trials(LEARNER, _plan(arguments, eval_every=3)))
-    _draw(arguments, plots.plot_hacking, rows)
+    draw(arguments, plots.plot_hacking, rows)
     console.print(tables.hacking_table(rows))
 
 
@@ -265,58 +266,7 @@ def _train_discs(arguments: argparse.Namespace, trials: list[SamplerTrial[DiscPl
         base = load_base(arguments.base, arguments.device)
         return train_on_discs(base, trial.sampler, trial.plan, seed, on_iteration)
 
-    return _train(arguments, trials, train, _base_of(arguments))
-
-
-def _train(
-    arguments: argparse.Namespace, trials: list[SamplerTrial[Plan]],
-    train: Callable[[SamplerTrial[Plan], int, Callable[[], object]], dict[str, Any]], of: dict[str, Any],
-) -> list[dict[str, Any]]:
-    """The trials named by --samplers, at every seed, but what --json holds already; it is written after each training.
-
-    train: returns the row of a trial at a seed. of: what the file says beside the rows.
-    """
-    rows = _finished(arguments.json, trials)
-    done = {(row["sampler"], row["seed"]) for row in rows}
-    wanted = _select({trial.sampler.name: trial for trial in trials}, arguments.samplers)
-    todo = [(trial, seed) for seed in arguments.seeds for trial in wanted if (trial.sampler.name, seed) not in done]
-    with tqdm(total=sum(trial.plan.iterations for trial, _ in todo), desc=arguments.experiment, unit="buffer") as bar:
-        for trial, seed in todo:
-            bar.set_postfix_str(f"{trial.sampler.name}, seed {seed}")
-            rows.append(train(trial, seed, bar.update))
-            _write_trainings(arguments, trials, rows, [], of)
-    return rows
-
-
-def _against_cps(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Every sampler with every CPS sampler."""
-    names = sorted({row["sampler"] for row in rows})
-    return [(name, base) for name in names for base in names if base.startswith("CPS") and name != base]
-
-
-def _compare(
-    arguments: argparse.Namespace, trials: Sequence[SamplerTrial[Any]], rows: list[dict[str, Any]],
-    pairs: list[tuple[str, str]], of: dict[str, Any], measures: Sequence[str] = MEASURES,
-) -> list[SamplerComparison]:
-    """Compare each pair that has seeds in common, and write that beside the rows."""
-    compared = (compare_samplers(rows, sampler, base, measures) for sampler, base in pairs)
-    comparisons = [comparison for comparison in compared if comparison is not None]
-    _write_trainings(arguments, trials, rows, comparisons, of)
-    return comparisons
-
-
-def _write_trainings(
-    arguments: argparse.Namespace, trials: Sequence[SamplerTrial[Any]], rows: list[dict[str, Any]],
-    comparisons: list[SamplerComparison], of: dict[str, Any],
-) -> None:
-    """The rows, the resolved settings of their samplers, and the comparisons."""
-    names = {row["sampler"] for row in rows}
-    samplers = _settings([trial.sampler for trial in trials if trial.sampler.name in names])
-    write_results(arguments, {**of, **samplers, "comparisons": list(map(asdict, comparisons)), "rows": rows})
-
-
-def _settings(samplers: list[SamplerSetup]) -> dict[str, Any]:
-    return {"samplers": TypeAdapter(list[SamplerSetup]).dump_python(samplers)}
+    return train_all(arguments, trials, train, _base_of(arguments))
 
 
 def _base_of(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -334,38 +284,10 @@ def _cost(arguments: argparse.Namespace) -> None:
     ]
     of = {"seed": seed, "learner": LEARNER.model_dump(), **_base_of(arguments)}
     write_results(arguments, {**of, "rollouts": rollouts, "rows": rows})
-    _draw(arguments, plots.plot_cost, rows)
+    draw(arguments, plots.plot_cost, rows)
     console.print(tables.rollout_table(rollouts, repeats), tables.cost_table(rows, repeats))
 
 
 def _choose_samplers(arguments: argparse.Namespace) -> list[SamplerSetup]:
     """The samplers of the diversity experiments that --samplers names."""
-    return _select({sampler.name: sampler for sampler in diversity_samplers()}, arguments.samplers)
-
-
-def _select(known: dict[str, T], names: list[str] | None) -> list[T]:
-    unknown = [name for name in names or [] if name not in known]
-    if unknown:
-        raise ValueError(f"unknown samplers {', '.join(unknown)}; choose among: {'; '.join(known)}")
-    return [known[name] for name in names or known]
-
-
-def _finished(path: Path | None, trials: Sequence[SamplerTrial[Any]]) -> list[dict[str, Any]]:
-    """The rows of an earlier call; a trial of this one that it ran by another plan is refused."""
-    if path is None or not path.is_file():
-        return []
-    rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
-    if any("sampler" not in row for row in rows):
-        raise ValueError(f"{path} is of an earlier version of this benchmark; take another file")
-    plans = {trial.sampler.name: asdict(trial.plan) for trial in trials}
-    for row in rows:
-        plan, name = row["plan"], row["sampler"]
-        if plan != plans.get(name, plan):
-            raise ValueError(f"{path} holds {name} by plan {plan}, this call has {plans[name]}; take another file")
-    return rows
-
-
-def _draw(arguments: argparse.Namespace, plot: Callable[..., None], what: Sequence[Any], *more: Any) -> None:
-    """The picture beside the --json file, where there is one and something to draw."""
-    if arguments.json is not None and what:
-        plot(what, arguments.json.with_suffix(".png"), *more)
+    return select({sampler.name: sampler for sampler in diversity_samplers()}, arguments.samplers)

@@ -127,6 +127,21 @@ def clip_learning_samplers() -> list[SamplerSetup]:
     ]
 
 
-def _in_window(sampler: SamplerSetup) -> SamplerSetup:
-    window = WindowConfig(strategy="progressive", size=4, period=7)
+def outcome_samplers() -> list[SamplerSetup]:
+    """Of the outcome task: CPS, DynDiff at the noise that CPS 0.4 spends, both in a window, DynDiff as written."""
+    learner = load_video_config("outcome").grpo
+    samplers = {
+        "CPS 0.4": SamplerSettings("cps", 0.4), "DynDiff 0.6 gated, rms": dyndiff(0.6, "gated", "rms"),
+        "DynDiff 0.6 gated": dyndiff(0.6),
+    }
+    plain = [
+        SamplerSetup(name, RolloutSettings(CLIP_STEPS, SHIFT, sampler=sampler), learner, shared_noise=True)
+        for name, sampler in samplers.items()
+    ]
+    windows = [replace(_in_window(sampler, size=2, period=1), name=f"{sampler.name}, window") for sampler in plain[:2]]
+    return [*plain, *windows]
+
+
+def _in_window(sampler: SamplerSetup, size: int = 4, period: int = 7) -> SamplerSetup:
+    window = WindowConfig(strategy="progressive", size=size, period=period)
     return replace(sampler, grpo=sampler.grpo.with_values(step_fraction=1.0), window=window, shared_noise=True)

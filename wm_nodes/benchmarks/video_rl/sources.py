@@ -76,9 +76,11 @@ class RecordedSource(RecordedContexts):
         return {name: values.tolist() for name, values in found.items()}
 
 
-def config_of(sampler: SamplerSetup, plan: LearningPlan, seed: int) -> VideoRlConfig:
+def config_of(
+    sampler: SamplerSetup, plan: LearningPlan, seed: int, preset: str = "base", rewards: Mapping[str, float] = REWARDS
+) -> VideoRlConfig:
     """The settings of loop 2 that a sampler and a plan stand for; held-out videos take the sampler's own steps."""
-    base = load_video_config("base", {"task": TASK, "rewards": REWARDS})
+    base = load_video_config(preset, {"task": TASK, "rewards": dict(rewards)})
     groups = base.groups.with_values(
         contexts=plan.contexts, group_size=plan.group_size, shared_noise=sampler.shared_noise
     )

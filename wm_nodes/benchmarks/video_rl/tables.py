@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.video_rl.comparison import Difference, SamplerComparison
+from benchmarks.video_rl.comparison import Difference, SamplerComparison, paired_interval
 from benchmarks.video_rl.learning import alarms
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.reports.console_table import estimate, make_table
@@ -95,6 +95,24 @@ def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
     return _table(
         "held-out contexts by ODE, after - before, 95 % bootstrap interval over the contexts", ("sampler",),
         ("seed", "noise rms/s", "tracking before", *SCORES, "seconds"), cells,
+    )
+
+
+def gain_table(rows: Sequence[dict[str, Any]], scores: Sequence[str]) -> Table:
+    """Per sampler and score: mean over seeds before, and what the training added, with its 95 % t interval."""
+    cells = []
+    for sampler in dict.fromkeys(row["sampler"] for row in rows):
+        mine = [row["evaluations"] for row in rows if row["sampler"] == sampler]
+        gains = ([points[-1][name] - points[0][name] for points in mine] for name in scores)
+        befores = (np.mean([points[0][name] for points in mine]) for name in scores)
+        texts = (
+            f"{before:.3f} {_difference_text(paired_interval(gain)) if len(gain) > 1 else f'{gain[0]:+.3f}'}"
+            for before, gain in zip(befores, gains, strict=True)
+        )
+        cells.append((sampler, len(mine), *texts))
+    return _table(
+        "held-out scores before, and gain over the training: mean, 95 % t interval over seeds", ("sampler",),
+        ("seeds", *scores), cells,
     )
 
 
