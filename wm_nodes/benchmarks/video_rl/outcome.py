@@ -38,9 +38,10 @@ console = Console()
 class OutcomePlan(LearningPlan):
     """rewards: weight by name."""
 
-    iterations: int = 12
+    iterations: int = 20
     contexts: int = 8
-    eval_every: int = 3
+    eval_contexts: int = 200
+    eval_every: int = 4
     rewards: tuple[tuple[str, float], ...] = (("outcome", 1.0),)
 
 
@@ -52,7 +53,7 @@ class OutcomeSource(RecordedContexts):
         plan: OutcomePlan, seed: int,
     ) -> None:
         super().__init__(folder, contexts, config_of(sampler, plan, seed, "outcome", dict(plan.rewards)), probe)
-        self.network, self._heldout = folder.network, heldout.select(torch.arange(plan.eval_contexts))
+        self.network, self._heldout = folder.network, heldout.select(torch.arange(min(plan.eval_contexts, len(heldout))))
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
         spread = buffer.rewards["total"].view(-1, self.config.groups.group_size).std(1, correction=0)
