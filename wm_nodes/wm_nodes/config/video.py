@@ -200,9 +200,28 @@ class KlConfig(SettingsSection):
     dual_every: PositiveInt
 
 
+class NftConfig(SettingsSection):
+    """DiffusionNFT: the update from final clips alone, by the forward process; see video_rl/nft.py."""
+
+    beta: PositiveFloat
+    """How far the two implied velocities lie from the old one, in differences of the current and the old one."""
+    times: PositiveInt
+    """Forward times of each clip in one optimizer step."""
+    old_decay: Annotated[float, Field(ge=0, lt=1)]
+    """How much of the old weights stays after each buffer; 0: they are those that sample the next one."""
+    old_ramp: PositiveFloat
+    """The decay rises to old_decay by this much per optimizer step; from 1 on it is constant."""
+    adaptive: bool
+    """Divide each squared error by its mean absolute error."""
+
+
 class GrpoConfig(SettingsSection):
     """The update of the video model's weights."""
 
+    objective: Literal["ratio", "nft"]
+    """ratio: GRPO, by the likelihoods of sampled steps. nft: DiffusionNFT, by noise added to the final clips, from any
+    sampler; what is said of ratios, clips and steps below then has no effect."""
+    nft: NftConfig
     advantage: AdvantageConfig
     kl: KlConfig
     trains: Literal["all", "condition"]
@@ -237,6 +256,23 @@ class GrpoConfig(SettingsSection):
     """Decay of the average of the weights that is evaluated; 0: none."""
     max_staleness: NonNegativeInt
     """Optimizer steps between sampling and training that are still accepted."""
+
+    @model_validator(mode="after")
+    def _nft_has_no_transition(self) -> Self:
+        """DiffusionNFT knows clips and velocities alone: no buffer of step noise, no likelihood."""
+        kl = self.kl
+        if self.objective == "nft" and kl.mode != "none" and (
+            kl.mode != "velocity" or kl.anchor in ("buffer", "dual")
+        ):
+            raise ValueError(
+                f"objective nft has no transitions, got kl.mode {kl.mode} with kl.anchor {kl.anchor}; take kl.mode "
+                "none, or velocity with kl.anchor frozen, moving or lora_off"
+            )
+        ablations = {"mask_source recompute": self.mask_source == "recompute", "ratio_norm": self.ratio_norm}
+        given = [name for name, on in {**ablations, "equalise": self.equalise}.items() if on]
+        if self.objective == "nft" and given:
+            raise ValueError(f"objective nft has no ratio, got {', '.join(given)}; switch it off, or take ratio")
+        return self
 
     @model_validator(mode="after")
     def _one_ratio(self) -> Self:

@@ -1,9 +1,11 @@
-"""GRPO of a flow-matching video model on a rollout buffer (DD-13 to DD-18, DD-20; averaged weights: DD-30).
+"""RL of a flow-matching video model on a rollout buffer: GRPO (DD-13 to DD-18, DD-20), or with grpo.objective nft
+DiffusionNFT (DD-31); averaged weights: DD-30.
 
 Shapes: N videos, S stochastic steps, M transitions (video, step) of one network call, U generated elements.
 
 One buffer serves `updates_per_buffer` optimizer steps. Each one accumulates over every kept (video, step) pair, divided
-by their number, so that micro-batches and ranks do not change it. On the first one the ratio is 1 and DD-20 is 0.
+by their number, so that micro-batches and ranks do not change it. On the first one the ratio is 1 and DD-20 is 0. With
+objective nft forward times stand in for the steps.
 
 Everything is computed where the model is; a buffer may lie there or in the host's memory, from where it is moved by
 micro-batches.
@@ -33,7 +35,6 @@ from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_model.sampling import RolloutSettings
-from wm_nodes.video_model.step_window import select_steps
 from wm_nodes.video_rl.group_advantages import (
     GroupAdvantages,
     RunningStd,
@@ -43,7 +44,7 @@ from wm_nodes.video_rl.group_advantages import (
     trainable,
     win_rates,
 )
-from wm_nodes.video_rl.grpo_math import clip_tails, clipped_objective
+from wm_nodes.video_rl.nft import NftTerms
 from wm_nodes.video_rl.ratio_and_kl import GrpoTerms, Rows
 
 SUMS = ("objective", "kl", "ratio", "low", "high", "forward_s", "kl_s", "backward_s")
@@ -55,6 +56,7 @@ MAX_SKIPPED = 5
 class UpdateReport:
     """One optimizer step; see docs/metrics.md. clip_low_share, clip_high_share: of transitions, by tail.
 
+    With objective nft there is no ratio: it and the clips are NaN, as is the KL without an anchor.
     *_seconds: forward of the weights that train; the anchor's forward and the KL; backward of both.
     """
 
@@ -98,7 +100,7 @@ class GrpoLearner:
     """Trains `model` in place; with settings.trains condition its other parameters no longer ask for a gradient.
 
     Args:
-        seed: of the step selection (stream `step_selection`).
+        seed: of the step selection (stream `step_selection`), and of noise and times (objective nft: stream `nft`).
         reward_weights: of the buffer's raw rewards, for advantage.mix advantage; their `total` is then only reported.
         ranks: this process's place among the learner's processes; all hold the whole buffer.
     """
@@ -107,8 +109,11 @@ class GrpoLearner:
         self, model: nn.Module, settings: GrpoConfig, rollout: RolloutSettings, *, seed: int,
         ranks: Ranks | None = None, reward_weights: Mapping[str, float] | None = None,
     ) -> None:
-        if rollout.sampler.arm == "ode" or rollout.sampler.eta == 0:
-            raise ValueError("an ODE rollout has no likelihood to train on; choose a stochastic arm and eta > 0")
+        if settings.objective == "ratio" and (rollout.sampler.arm == "ode" or rollout.sampler.eta == 0):
+            raise ValueError(
+                "an ODE rollout has no likelihood to train on; choose a stochastic arm and eta > 0, or grpo.objective "
+                "nft"
+            )
         if settings.advantage.mix == "advantage" and settings.advantage.std_scope == "running":
             raise ValueError("advantage.std_scope running is of one reward; with advantage.mix advantage take group")
         if settings.mask_source == "recompute":
@@ -130,7 +135,7 @@ class GrpoLearner:
             self.parameters, lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
         self._running = RunningStd()
-        self._terms = GrpoTerms(model, settings, rollout)
+        self._terms = (NftTerms if settings.objective == "nft" else GrpoTerms)(model, settings, rollout, seed)
         trained = _trained_parameters(model) if settings.ema_decay > 0 else ()
         self.averaged = {name: p.detach().clone() for name, p in trained}
 
@@ -168,6 +173,8 @@ class GrpoLearner:
             )
         try:
             updates = tuple(self._update(buffer, rows, advantages) for rows in self._passes(buffer, kept))
+            if updates:
+                self._terms.move_old(self.version)
         except BaseException:
             self._restore(before)
             raise
@@ -195,28 +202,24 @@ class GrpoLearner:
         device, total, seconds = device_of(self.model), len(rows), [0.0, 0.0, 0.0]
         sums = torch.zeros(5, dtype=torch.float64, device=device)
         signals = advantages.advantages_N.to(device, torch.float32)
-        weights = self._terms.step_weights(buffer, rows.videos[:1]) if self.settings.equalise else None
-        limits = {"clip_low": self.settings.clip_low, "clip_high": self.settings.clip_high}
+        weights = self._terms.step_weights(buffer, rows)
         own = self.ranks.share(torch.arange(total))
         for index in torch.split(own, self.settings.micro_batch):  # type: ignore[no-untyped-call]
             clock, part = [self._now(device)], rows.part(index)
-            terms = self._terms.ratio(buffer, part)
-            ratio, signal = terms.log_ratio, signals[part.videos.to(device)]
-            objective = clipped_objective(ratio, signal, **limits)
+            current: Any = self._terms.objective(buffer, part, signals[part.videos.to(device)], self.version)
+            objective = current.objective
             if weights is not None:
                 objective = objective * weights[part.positions].to(device)
             clock.append(self._now(device))
-            kl = self._terms.kl(terms, buffer, part, self.version)
+            kl = self._terms.kl(current, buffer, part, self.version)
             clock.append(self._now(device))
             loss = (self.settings.kl.beta * kl - objective).sum() / total
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             clock.append(self._now(device))
             seconds = [spent + end - start for spent, (start, end) in zip(seconds, pairwise(clock), strict=True)]
             if len(index):  # a share of none is not a number
-                ratio = ratio.detach()
-                tails = [share * len(index) for share in clip_tails(ratio, **limits)]
-                means = (objective.detach().sum(), kl.detach().sum(), ratio.exp().sum())
-                sums += torch.stack([*(value.double() for value in means), *tails])
+                sums[0] += objective.detach().sum().double()
+                sums[1:] += self._terms.sums(current, kl)
         values = torch.cat([sums.cpu(), torch.tensor(seconds, dtype=torch.float64)])  # the only wait for the device
         self.ranks.sum_(values)
         return dict(zip(SUMS, values.tolist(), strict=True))
@@ -247,11 +250,7 @@ class GrpoLearner:
         return time.perf_counter()
 
     def _passes(self, buffer: RolloutBuffer, kept: Tensor) -> Iterator[Rows]:
-        chosen = select_steps(
-            self.rollout.times, list(buffer.rollout.steps), len(buffer), fraction=self.settings.step_fraction,
-            select=self.settings.step_select, min_s=self.settings.min_s, seed=self.seed, iteration=buffer.iteration,
-        )
-        chosen &= kept.unsqueeze(1)
+        chosen = self._terms.choose(buffer) & kept.unsqueeze(1)
         count = self.settings.updates_per_buffer
         for update in range(count):
             rows = chosen
@@ -294,7 +293,7 @@ class GrpoLearner:
             "model": {name: p.detach().clone() for name, p in _trained_parameters(self.model)},
             "optimizer": {k: v.detach().clone() for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
             "averaged": {name: value.clone() for name, value in self.averaged.items()},
-            "anchor": self._terms.anchor,  # replaced, never changed
+            "anchor": self._terms.anchor, "old": self._terms.old,  # replaced, never changed
             "running": copy.copy(self._running),
             "version": self.version,
         }
@@ -304,15 +303,17 @@ class GrpoLearner:
         checkpoint.restore_optimizer(self._optimizer, before["optimizer"])
         for name, value in before["averaged"].items():
             self.averaged[name].copy_(value)
-        self._terms.anchor, self.version, self._running = before["anchor"], before["version"], before["running"]
+        self._terms.anchor, self._terms.old = before["anchor"], before["old"]
+        self.version, self._running = before["version"], before["running"]
 
     # checkpoints
 
     def save(self, path: Path, *, iteration: int) -> None:
-        """Write everything that train() depends on, atomically: trained weights, EMA, anchor, optimizer, counters."""
+        """Write everything that train() depends on, atomically: trained, averaged, anchor's and old weights, optimizer,
+        counters."""
         sections = {
             "model": dict(_trained_parameters(self.model)), "averaged": self.averaged, "anchor": self._terms.anchor,
-            "optimizer": checkpoint.optimizer_tensors(self._optimizer),
+            "old": self._terms.old, "optimizer": checkpoint.optimizer_tensors(self._optimizer),
         }
         header = {"version": self.version, "seed": self.seed, "iteration": iteration, "skipped": self.skipped}
         header |= {f.name: getattr(self._running, f.name) for f in fields(self._running)}
@@ -322,7 +323,7 @@ class GrpoLearner:
         """Continue exactly from save(); return its iteration.
 
         Raises:
-            ValueError: the file is damaged, or of another architecture, seed, KL anchor or EMA.
+            ValueError: the file is damaged, or of another architecture, seed, objective, KL anchor or EMA.
         """
         try:
             tensors, metadata = checkpoint.read_checkpoint(path)
@@ -333,13 +334,16 @@ class GrpoLearner:
             raise ValueError(f"{path} has seed {header['seed']}, this run has {self.seed}; use a new run folder")
         weights = checkpoint.section(tensors, "model.")
         check_same_layout(dict(_trained_parameters(self.model)), weights, what=str(path))
-        own = {"averaged.": (self.averaged, "ema_decay"), "anchor.": (self._terms.anchor, "kl.anchor")}
+        own = {
+            "averaged.": (self.averaged, "ema_decay"), "anchor.": (self._terms.anchor, "kl.anchor"),
+            "old.": (self._terms.old, "objective"),
+        }
         for prefix, (values, setting) in own.items():
             if bool(values) != bool(checkpoint.section(tensors, prefix)):
                 raise ValueError(f"{path} was made with another grpo.{setting}; resume with its settings")
         _set_trained(self.model, weights)
         device = device_of(self.model)
-        self.averaged, self._terms.anchor = (
+        self.averaged, self._terms.anchor, self._terms.old = (
             {name: value.to(device) for name, value in checkpoint.section(tensors, prefix).items()} for prefix in own
         )
         checkpoint.restore_optimizer(self._optimizer, checkpoint.section(tensors, "optimizer."))

@@ -1,11 +1,13 @@
-"""The two terms of GRPO's loss on stored transitions: the ratio of likelihoods (DD-14b to DD-15b) and the KL to
-an anchor (DD-17, DD-20).
+"""The two terms of GRPO's loss on stored transitions: the objective of the ratio of likelihoods (DD-14b to DD-16) and
+the KL to an anchor (DD-17, DD-20).
 
 Shapes: M transitions (video, step) of one network call, U generated elements, S stochastic steps.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -17,8 +19,11 @@ from wm_nodes.core.device import device_of
 from wm_nodes.video_model.buffer import RolloutBuffer
 from wm_nodes.video_model.kernels import masked_deviation
 from wm_nodes.video_model.sampling import RolloutSettings, step_noise
+from wm_nodes.video_model.step_window import select_steps
 from wm_nodes.video_model.transitions import GaussianTransition, transition
 from wm_nodes.video_rl.grpo_math import (
+    clip_tails,
+    clipped_objective,
     gaussian_logprob,
     log_ratio,
     log_space_kl,
@@ -31,7 +36,8 @@ from wm_nodes.video_rl.grpo_math import (
 
 @dataclass(frozen=True)
 class Rows:
-    """Transitions of a buffer: videos, and positions among its stochastic steps, int64 (M,), in the host's memory."""
+    """What one optimizer step trains on: videos of a buffer, and positions among its stochastic steps (objective nft:
+    among the times of a video), int64 (M,), in the host's memory."""
 
     videos: Tensor
     positions: Tensor
@@ -50,45 +56,81 @@ class Rows:
 
 
 class Pass(NamedTuple):
-    """One pass of the current weights. new: with gradient. old_zeta: of the rollout, (M, U). log_ratio: (M,)."""
+    """One pass of the current weights. objective, log_ratio: (M,). new: with gradient. old_zeta: of the rollout,
+    (M, U)."""
 
+    objective: Tensor
     new: GaussianTransition
     old_zeta: Tensor
     log_ratio: Tensor
 
 
-class GrpoTerms:
-    """Ratio and KL of transitions under `model`, and the weights of the anchor where it has its own.
+class Anchored:
+    """A loss on `model` with weights beside it: an anchor's, and with objective nft those of v_old.
 
-    The anchor is a copy of the parameters that train, nothing else: with LoRA it is as small as the adapter.
+    They are copies of the parameters that train, nothing else: with LoRA as small as the adapter.
 
     Raises:
         ValueError: the anchor is a model without its adapter, and there is none.
     """
 
-    def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutSettings) -> None:
+    def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutSettings, seed: int) -> None:
         if settings.kl.anchor == "lora_off" and not hasattr(model, "disable_adapter"):
             raise ValueError(
                 "kl.anchor lora_off needs a model with a LoRA adapter; add one (video_model.adapters.add_lora), or "
                 "take kl.anchor frozen"
             )
-        self.model, self.settings, self.rollout = model, settings, rollout
+        self.model, self.settings, self.rollout, self.seed = model, settings, rollout, seed
         self.anchor: dict[str, Tensor] = {}
         """Parameters of a frozen or moving anchor by name; empty where the buffer or the bare model is the anchor."""
+        self.old: dict[str, Tensor] = {}
+        """Parameters of v_old (DD-31) by name; empty with objective ratio."""
         if settings.kl.anchor in ("frozen", "moving", "dual"):
             self.move_anchor()
 
     def move_anchor(self) -> None:
         """Make the model's current parameters the anchor."""
-        named = self.model.named_parameters()
-        self.anchor = {name: p.detach().clone() for name, p in named if p.requires_grad}
+        self.anchor = self.trained()
 
-    def ratio(self, buffer: RolloutBuffer, rows: Rows) -> Pass:
-        """Run the current weights and take the logarithm of DD-15, or of DD-15b with ratio_norm."""
+    def move_old(self, version: int) -> None:
+        """Move the old weights after a buffer. version: optimizer steps made."""
+
+    def trained(self) -> dict[str, Tensor]:
+        """Copy the model's parameters that train."""
+        return {name: p.detach().clone() for name, p in self.model.named_parameters() if p.requires_grad}
+
+    def call(self, weights: dict[str, Tensor], *arguments: Any) -> Any:
+        """Call the model with other weights, while the current ones keep their graph."""
+        return functional_call(self.model, weights, arguments)
+
+    @contextmanager
+    def anchored(self) -> Iterator[Callable[..., Any]]:
+        """Give the model as it is at the anchor."""
+        if self.settings.kl.anchor != "lora_off":
+            yield partial(self.call, self.anchor)
+            return
+        disable: Any = self.model.disable_adapter
+        with disable():
+            yield self.model
+
+
+class GrpoTerms(Anchored):
+    """Objective and KL of transitions by the ratio of their likelihoods under `model`."""
+
+    def choose(self, buffer: RolloutBuffer) -> Tensor:
+        """Return which transitions train, bool (N, S)."""
+        return select_steps(
+            self.rollout.times, list(buffer.rollout.steps), len(buffer), fraction=self.settings.step_fraction,
+            select=self.settings.step_select, min_s=self.settings.min_s, seed=self.seed, iteration=buffer.iteration,
+        )
+
+    def objective(self, buffer: RolloutBuffer, rows: Rows, signals_M: Tensor, version: int) -> Pass:
+        """Run the current weights; return DD-16 of DD-15, or of DD-15b with ratio_norm. signals_M: the advantages."""
         cached = self.settings.mask_source == "cached"
         new = self._transition(self.model, buffer, rows, self._mask(buffer, rows) if cached else None)
         old_zeta = _stored_zeta(buffer, rows).to(new.zeta.device)
-        return Pass(new, old_zeta, self._log_ratio(new, old_zeta, buffer, rows))
+        ratio = self._log_ratio(new, old_zeta, buffer, rows)
+        return Pass(clipped_objective(ratio, signals_M, **self._limits), new, old_zeta, ratio)
 
     def kl(self, current: Pass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
         """Return DD-17 or DD-20 per transition, (M,). version: optimizer steps made, for the dual anchor."""
@@ -102,15 +144,28 @@ class GrpoTerms:
             kl = kl + self._distance(current.new, self._anchor_zeta(buffer, rows), buffer, rows)
         return kl
 
+    def sums(self, current: Pass, kl: Tensor) -> Tensor:
+        """Return the sums of kl and ratio, and the counts of ratios beyond either clip, float64 (4,)."""
+        ratio = current.log_ratio.detach()
+        tails = [share * len(ratio) for share in clip_tails(ratio, **self._limits)]
+        return torch.stack([kl.detach().sum().double(), ratio.exp().sum().double(), *tails])
+
     @torch.no_grad()
-    def step_weights(self, buffer: RolloutBuffer, video: Tensor) -> Tensor:
-        """Return SAGE's equaliser, (S,), from the sensitivity rms_u |d mean / d v| / std of one video (1,)."""
+    def step_weights(self, buffer: RolloutBuffer, rows: Rows) -> Tensor | None:
+        """Return SAGE's equaliser, (S,), from the sensitivity rms_u |d mean / d v| / std of the first video that trains;
+        None without equalise."""
+        if not self.settings.equalise:
+            return None
         S = len(buffer.rollout.steps)
-        rows = Rows(video.expand(S), torch.arange(S))
+        rows = Rows(rows.videos[:1].expand(S), torch.arange(S))
         law = self._transition(self.model, buffer, rows, self._mask(buffer, rows))
         return step_equaliser((law.slope / law.std).square().mean(1).sqrt().cpu())
 
     # internals
+
+    @property
+    def _limits(self) -> dict[str, float]:
+        return {"clip_low": self.settings.clip_low, "clip_high": self.settings.clip_high}
 
     def _transition(
         self, model: Callable[..., Any], buffer: RolloutBuffer, rows: Rows, mask: Tensor | None
@@ -170,16 +225,8 @@ class GrpoTerms:
 
     @torch.no_grad()
     def _anchor_zeta(self, buffer: RolloutBuffer, rows: Rows) -> Tensor:
-        mask = self._mask(buffer, rows)
-        if self.settings.kl.anchor != "lora_off":
-            return self._transition(self._call_anchor, buffer, rows, mask).zeta
-        disable: Any = self.model.disable_adapter
-        with disable():
-            return self._transition(self.model, buffer, rows, mask).zeta
-
-    def _call_anchor(self, *arguments: Any) -> Any:
-        """Call the model with the anchor's parameters, while the current ones keep their graph."""
-        return functional_call(self.model, self.anchor, arguments)
+        with self.anchored() as model:
+            return self._transition(model, buffer, rows, self._mask(buffer, rows)).zeta
 
 
 def _stored_zeta(buffer: RolloutBuffer, rows: Rows) -> Tensor:

@@ -1,0 +1,133 @@
+"""Negative-aware fine-tuning on the forward process (DiffusionNFT, DD-31): final clips and their advantages are enough,
+from any sampler.
+
+Shapes: M rows (video, forward time) of one network call, U generated elements.
+
+v_old is the velocity of the old weights, a copy of the parameters that train. With nft.old_decay 0 it is theirs at the
+buffer's first update: unless the buffer is stale, those that sampled it. With nft.old_decay > 0 it lags behind, while
+the current weights go on sampling; the authors let the old ones sample.
+
+Times are those of the sampler in density: uniform, one in each of nft.times equal parts of (0, 1), then shifted by
+rollout.shift. Theirs are the sampler's own times, all of them, each with a noise of its own.
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from wm_nodes.config.video import GrpoConfig
+from wm_nodes.core.device import device_of
+from wm_nodes.core.seeding import torch_stream
+from wm_nodes.video_model.buffer import RolloutBuffer
+from wm_nodes.video_model.conditions import Condition
+from wm_nodes.video_model.kernels import with_conditioning
+from wm_nodes.video_model.network import guided_velocity
+from wm_nodes.video_model.sampling import RolloutSettings
+from wm_nodes.video_rl.ratio_and_kl import Anchored, Rows
+
+LEAST_ERROR = 1e-5
+"""Below this mean absolute error the adaptive weight no longer grows."""
+
+
+class ForwardPass(NamedTuple):
+    """One pass of the current weights at x_t. objective: (M,), with gradient. v: (M, U), with gradient. x_t, t,
+    condition: what the network was asked, for the anchor."""
+
+    objective: Tensor
+    v: Tensor
+    x_t: Tensor
+    t: Tensor
+    condition: Condition
+
+
+class NftTerms(Anchored):
+    """Objective and KL of noised clips under `model`."""
+
+    def __init__(self, model: nn.Module, settings: GrpoConfig, rollout: RolloutSettings, seed: int) -> None:
+        super().__init__(model, settings, rollout, seed)
+        self.old = self.trained()
+
+    def move_old(self, version: int) -> None:
+        """Move the old weights towards the current ones after a buffer."""
+        decay = min(self.settings.nft.old_ramp * version, self.settings.nft.old_decay)
+        current = self.trained()
+        self.old = {name: value.lerp(self.old[name], decay) for name, value in current.items()} if decay else current
+
+    def choose(self, buffer: RolloutBuffer) -> Tensor:
+        """Return which forward times train, bool (N, times): all."""
+        return torch.ones(len(buffer), self.settings.nft.times, dtype=torch.bool)
+
+    def objective(self, buffer: RolloutBuffer, rows: Rows, signals_M: Tensor, version: int) -> ForwardPass:
+        """Noise the clips, run the current and the old weights, and return minus the loss of DD-31.
+
+        signals_M: the advantages. version: optimizer steps made; with the numbers of a row it decides time and noise.
+        """
+        device, K = device_of(self.model), buffer.condition.num_conditioning
+        videos = rows.videos.to(buffer.rollout.latents.device)
+        x_0 = buffer.rollout.latents[videos].to(device)
+        condition = buffer.condition.rows(rows.videos.to(buffer.condition.frames.device)).to(device)
+        t, noise = self._draw(buffer, rows, version)
+        t, noise = t.to(device), noise.to(device)
+        share = t.float().view(-1, 1, 1, 1, 1)
+        x_t = with_conditioning((1 - share) * x_0 + share * noise, condition.frames.float())
+        v = self._velocity(self.model, x_t, t, condition)
+        with torch.no_grad():
+            old = self._velocity(self._call_old, x_t, t, condition)
+        clean, noisy = (x[:, :, K:].flatten(1) for x in (x_0, x_t))
+        nft, clip, share = self.settings.nft, self.settings.advantage.clip, share.flatten(1)
+        change = nft.beta * (v - old)  # exactly 0 while the weights have not moved
+        errors = (noisy - share * (old + sign * change) - clean for sign in (1, -1))
+        good, bad = (squared_error(error, adaptive=nft.adaptive) for error in errors)
+        share_good = (signals_M / (2 * clip) + 0.5).clamp(0, 1)
+        loss = clip * (share_good * good + (1 - share_good) * bad) / nft.beta
+        return ForwardPass(-loss, v, x_t, t, condition)
+
+    def kl(self, current: ForwardPass, buffer: RolloutBuffer, rows: Rows, version: int) -> Tensor:
+        """Return mean over elements of |v - v_anchor|^2 (DD-17a), (M,); 0 without an anchor."""
+        if not self._has_kl:
+            return torch.zeros_like(current.objective)
+        with torch.no_grad(), self.anchored() as model:
+            anchor = self._velocity(model, current.x_t, current.t, current.condition)
+        return (current.v - anchor).square().mean(1)
+
+    def sums(self, current: ForwardPass, kl: Tensor) -> Tensor:
+        """Return the sum of kl, NaN without an anchor, and NaN for ratio and clips, float64 (4,)."""
+        missing = kl.new_full((4,), torch.nan, dtype=torch.float64)
+        if self._has_kl:
+            missing[0] = kl.detach().sum()
+        return missing
+
+    def step_weights(self, buffer: RolloutBuffer, rows: Rows) -> None:
+        """There are no steps to weigh."""
+
+    # internals
+
+    @property
+    def _has_kl(self) -> bool:
+        return self.settings.kl.mode != "none" and self.settings.kl.beta > 0
+
+    def _velocity(self, model: Any, x: Tensor, t: Tensor, condition: Condition) -> Tensor:
+        v = guided_velocity(model, x, t, condition, self.settings.cfg).float()
+        return v[:, :, condition.num_conditioning :].flatten(1)
+
+    def _call_old(self, *arguments: Any) -> Any:
+        return self.call(self.old, *arguments)
+
+    def _draw(self, buffer: RolloutBuffer, rows: Rows, version: int) -> tuple[Tensor, Tensor]:
+        """Return times, float64 (M,), and noise (M, C, F, H, W) of the rows, each from its own stream."""
+        uniform = torch.empty(len(rows), dtype=torch.float64)
+        noise = torch.empty(len(rows), *buffer.rollout.latents.shape[1:])
+        groups, samples = buffer.group_ids[rows.videos].tolist(), buffer.sample_ids[rows.videos].tolist()
+        for i, place in enumerate(zip(groups, samples, rows.positions.tolist(), strict=True)):
+            generator = torch_stream(self.seed, "nft", version, *place)
+            uniform[i] = torch.rand((), generator=generator, dtype=torch.float64)
+            torch.randn(noise.shape[1:], generator=generator, out=noise[i])
+        r, shift = (rows.positions + uniform) / self.settings.nft.times, self.rollout.shift
+        return shift * r / (1 + (shift - 1) * r), noise
+
+
+def squared_error(error_MU: Tensor, *, adaptive: bool) -> Tensor:
+    """Return each row's mean squared error, (M,); adaptive: divided by its mean absolute error, without gradient."""
+    square = error_MU.square().mean(1)
+    return square / error_MU.detach().abs().mean(1).clamp_min(LEAST_ERROR) if adaptive else square
