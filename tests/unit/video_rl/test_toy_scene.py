@@ -14,6 +14,7 @@ from wm_nodes.video_rl.toy_scene import (
     DIRECTIONS,
     FRAMES,
     NUM_ACTIONS,
+    RADIUS,
     SIDE,
     Scenes,
     draw_scenes,
@@ -148,6 +149,20 @@ def test_a_disc_of_half_the_opacity_has_less_mass_and_one_that_is_gone_none() ->
     assert 0.3 < float(score(faint, commanded).mass) < 0.55
     lost = score(gone, commanded)
     assert float(lost.mass) == 0 and float(lost.obeyed) == 0 and float(lost.task) == pytest.approx(math.exp(-8))
+
+
+def test_a_disc_that_grows_has_more_mass_than_one_and_is_paid_for_one() -> None:
+    commanded = scene(0)
+    alpha = opacity_at(commanded.path(commanded.action), 1.2 * RADIUS)[:, None]
+    grown = COLOUR.view(1, 2, 1, 1, 1) * alpha
+    grown[:, :, 0] = commanded.videos(commanded.action)[:, :, 0]
+    found = score(grown, commanded)
+    assert float(found.mass) > 1.2
+    assert float(found.reward) == float(found.task + 0.3 - 10 * found.background)
+    grown[:, :, 1:] *= 0.5
+    faint = score(grown, commanded)
+    assert float(faint.mass) < 1
+    assert float(faint.reward) == float(faint.task + 0.3 * faint.mass - 10 * faint.background)
 
 
 def test_a_changed_background_costs_its_mean_square_and_nothing_else() -> None:

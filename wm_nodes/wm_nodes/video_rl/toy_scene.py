@@ -107,8 +107,8 @@ class Scores:
 
     @property
     def reward(self) -> Tensor:
-        """The training reward: task + 0.3 mass - 10 background."""
-        return self.task + 0.3 * self.mass - 10 * self.background
+        """The training reward: task + 0.3 min(mass, 1) - 10 background. More opacity than the disc has pays nothing."""
+        return self.task + 0.3 * self.mass.clamp(max=1) - 10 * self.background
 
     def named(self) -> dict[str, Tensor]:
         return {"reward": self.reward, **vars(self)}
