@@ -38,10 +38,10 @@ console = Console()
 class OutcomePlan(LearningPlan):
     """rewards: weight by name."""
 
-    iterations: int = 20
+    iterations: int = 15
     contexts: int = 8
     eval_contexts: int = 200
-    eval_every: int = 4
+    eval_every: int = 3
     rewards: tuple[tuple[str, float], ...] = (("outcome", 1.0),)
 
 
@@ -53,7 +53,8 @@ class OutcomeSource(RecordedContexts):
         plan: OutcomePlan, seed: int,
     ) -> None:
         super().__init__(folder, contexts, config_of(sampler, plan, seed, "outcome", dict(plan.rewards)), probe)
-        self.network, self._heldout = folder.network, heldout.select(torch.arange(min(plan.eval_contexts, len(heldout))))
+        self.network = folder.network
+        self._heldout = heldout.select(torch.arange(min(plan.eval_contexts, len(heldout))))
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
         spread = buffer.rewards["total"].view(-1, self.config.groups.group_size).std(1, correction=0)

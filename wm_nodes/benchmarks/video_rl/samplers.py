@@ -128,10 +128,11 @@ def clip_learning_samplers() -> list[SamplerSetup]:
 
 
 def outcome_samplers() -> list[SamplerSetup]:
-    """Of the outcome task: CPS, DynDiff at the noise that CPS 0.4 spends, both in a window, DynDiff as written."""
+    """Of the outcome task: CPS, DynDiff at the noise that CPS 0.4 spends, both in a window, DynDiff as written, and NFT
+    by ODE, whose clips differ in their initial noise."""
     learner = load_video_config("outcome").grpo
     samplers = {
-        "CPS 0.4": SamplerSettings("cps", 0.4), "DynDiff 0.6 gated, rms": dyndiff(0.6, "gated", "rms"),
+        "CPS 0.4": SamplerSettings("cps", 0.4), "DynDiff 0.54 gated, rms": dyndiff(0.54, "gated", "rms"),
         "DynDiff 0.6 gated": dyndiff(0.6),
     }
     plain = [
@@ -139,7 +140,9 @@ def outcome_samplers() -> list[SamplerSetup]:
         for name, sampler in samplers.items()
     ]
     windows = [replace(_in_window(sampler, size=2, period=1), name=f"{sampler.name}, window") for sampler in plain[:2]]
-    return [*plain, *windows]
+    ode = RolloutSettings(CLIP_STEPS, SHIFT, sampler=SamplerSettings("ode", 0.0))
+    nft = learner.with_values(objective="nft", nft=learner.nft.with_values(times=CLIP_STEPS - 1))
+    return [*plain, *windows, SamplerSetup("NFT, ODE", ode, nft)]
 
 
 def _in_window(sampler: SamplerSetup, size: int = 4, period: int = 7) -> SamplerSetup:

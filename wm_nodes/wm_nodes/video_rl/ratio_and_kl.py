@@ -152,8 +152,8 @@ class GrpoTerms(Anchored):
 
     @torch.no_grad()
     def step_weights(self, buffer: RolloutBuffer, rows: Rows) -> Tensor | None:
-        """Return SAGE's equaliser, (S,), from the sensitivity rms_u |d mean / d v| / std of the first video that trains;
-        None without equalise."""
+        """Return SAGE's equaliser, (S,), from the sensitivity rms_u |d mean / d v| / std of the first video that
+        trains; None without equalise."""
         if not self.settings.equalise:
             return None
         S = len(buffer.rollout.steps)
