@@ -1,5 +1,6 @@
 """From clips to a video model: codec, flow matching, held-out scores. Resumable; what is finished is kept."""
 
+import json
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -63,16 +64,16 @@ def make_video_model(
 
 
 def shipped_video_model(config: VideoRlConfig) -> VideoFolder | None:
-    """The video model that is shipped with the task's world model, on config.device; None where there is none of these
-    settings."""
+    """The video model of these settings that is shipped with the task's world model, on config.device; None where there
+    is none."""
     try:
-        folder = shipped_model(config.task) / "video_model"
+        folders = sorted(shipped_model(config.task).glob(f"video_model*/{MANIFEST}"))
     except FileNotFoundError:
         return None
-    if not (folder / MANIFEST).is_file():
-        return None
-    shipped = load_video_folder(folder, compute_device(config.device))
-    return shipped if shipped.manifest["model"] == config.model.model_dump() else None
+    for manifest in folders:
+        if json.loads(manifest.read_text())["model"] == config.model.model_dump():
+            return load_video_folder(manifest.parent, compute_device(config.device))
+    return None
 
 
 def _train(config: VideoRlConfig, clips: Clips, run_dir: Path) -> tuple[VideoFolder, dict[str, float]]:
