@@ -12,17 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
+from rich.console import Console
 
 from benchmarks.video_rl import cost
 from benchmarks.video_rl.cli import LEARNER
 from benchmarks.video_rl.clock import clocked
-from benchmarks.video_rl.comparison import compare_samplers, paired_interval, value
+from benchmarks.video_rl.comparison import GAINS, compare_samplers, gains, paired_interval, value
 from benchmarks.video_rl.cost import ANCHORS, toy_rollout
 from benchmarks.video_rl.learning import alarms, hacked, train_on_discs
-from benchmarks.video_rl.plots import family_of
+from benchmarks.video_rl.plots import family_of, plot_learning
 from benchmarks.video_rl.samplers import DiscPlan, SamplerSetup, dyndiff, learning_samplers, sampler_setup
 from benchmarks.video_rl.sources import DiscSource, group_spread, sample_scenes
-from benchmarks.video_rl.tables import _last
+from benchmarks.video_rl.tables import _last, gain_table
 from benchmarks.video_rl.trials import ablation_trials, hacking_trials
 from wm_nodes.apps.cli import main
 from wm_nodes.config.shipped import PRETRAINED
@@ -66,6 +68,40 @@ def test_arms_are_compared_on_their_common_seeds_over_the_path_and_at_the_end() 
     assert found.differences["reward_path"].mean == pytest.approx((0.15 + 0.15) / 2)
     assert value(rows[0], "reward_path") == pytest.approx(0.4), "what every sampler starts from does not count"
     assert compare_samplers(rows, "new", "other") is None
+
+
+def test_the_gain_of_a_training_is_its_end_less_its_start_with_the_interval_over_seeds() -> None:
+    """Gains 1, 2, 3 from three different starts: 2 -+ 4.303 / sqrt(3); of one seed there is no interval."""
+    rows = [
+        training("CPS", 0, 5, 5.5, 6), training("CPS", 1, 0, 9, 2), training("CPS", 2, 1, 1, 4),
+        training("one", 0, 1, 3),
+    ]
+    assert gains(rows[:2], "reward") == [[0, 0.5, 1], [0, 9, 2]]
+    for row in rows:
+        row["evaluations"] = [{**dict.fromkeys(GAINS, 0.0), **point} for point in row["evaluations"]]
+    console = Console(width=300)
+    with console.capture() as printed:
+        console.print(gain_table(rows))
+    three, one = (
+        [cell.strip() for cell in line.split("│")] for line in printed.get().splitlines() if line.startswith("│")
+    )
+    assert three[1:4] == ["CPS", "3", "2.000 +2.0000 (-0.4843, +4.4843)"] and one[1:4] == ["one", "1", "1.000 +2.0000"]
+    assert three[5] == "0.000 +0.0000 (+0.0000, +0.0000)", "obeyed never changed"
+
+
+def test_the_learning_curves_have_the_interval_of_their_gains_from_three_seeds_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr("benchmarks.video_rl.plots.save_figure", lambda figure, _: drawn.append(figure))
+    rows = [training("CPS", seed, 5, 5, 5 + gain) for seed, gain in enumerate((1, 2, 3))]
+    plot_learning([{**row, "buffers": {}} for row in (*rows, training("one", 0, 1, 1, 3))], tmp_path / "learning.png")
+    reward = drawn[0].axes[0]
+    curves = {str(line.get_label()): np.asarray(line.get_ydata()).tolist() for line in reward.lines}
+    assert curves["CPS (3)"] == curves["one (1)"] == [0, 0, 2]
+    (band,) = reward.collections
+    heights = band.get_paths()[0].vertices[:, 1]
+    assert (heights.min(), heights.max()) == pytest.approx((2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5))
 
 
 # plans

@@ -240,7 +240,7 @@ def _learning(arguments: argparse.Namespace) -> None:
     rows = _train_discs(arguments, trials)
     comparisons = compare(arguments, trials, rows, against_cps(rows), _base_of(arguments))
     draw(arguments, plots.plot_learning, rows)
-    console.print(tables.training_table(rows), tables.comparison_table(comparisons))
+    console.print(tables.training_table(rows), tables.gain_table(rows), tables.comparison_table(comparisons))
 
 
 def _ablations(arguments: argparse.Namespace) -> None:

@@ -12,12 +12,13 @@ from wm_nodes.video_rl.reward_hacking import T_975
 PATH = "_path"
 """Ending of a measure that is a mean over the evaluations of a training, its area per model call, and not the last."""
 MEASURES = ("reward_path", "reward", "obeyed", "background")
+GAINS = ("reward", "task", "obeyed", "mass", "background")
 CLIP_MEASURES = ("tracking_path", "tracking", "object_cm", "tool_cm", "psnr_db")
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean and 95 % interval of sampler - base over `seeds`, for one measure."""
+    """Mean and 95 % interval over seeds of one measure: sampler - base, or after - before."""
 
     mean: float
     low: float
@@ -52,6 +53,12 @@ def compare_samplers(
         for measure in measures
     }
     return SamplerComparison(sampler, base, tuple(seeds), differences)
+
+
+def gains(rows: Sequence[dict[str, Any]], measure: str) -> list[list[float]]:
+    """Of each training, every evaluation of one measure less the first, the one before training."""
+    courses = ([point[measure] for point in row["evaluations"]] for row in rows)
+    return [[reached - course[0] for reached in course] for course in courses]
 
 
 def value(row: dict[str, Any], measure: str) -> float:

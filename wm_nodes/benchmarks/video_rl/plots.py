@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.video_rl.comparison import SamplerComparison, value
+from benchmarks.video_rl.comparison import SamplerComparison, gains, paired_interval
 from benchmarks.video_rl.learning import alarms
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figure, style_axes
 
 FAMILIES = {"CPS": "o", "DynDiff literal": "v", "DynDiff gated, rms": "s", "DynDiff sparse, rms": "D"}
 """Samplers that share a colour, with the marker of their points."""
-CURVE_SEEDS = 5
-"""Arms with fewer seeds get a dot each, no curve."""
+BAND_SEEDS = 3
+"""A curve of fewer has no interval: that of two seeds is twelve times their standard error."""
+DIVERSITY = "rollout_diversity"
 SAID = {
     "reward_path": "reward over the training", "reward": "reward after", "tracking_path": "tracking over the training",
     "tracking": "tracking after", "object_cm": "object error after, cm", "tool_cm": "tool error after, cm",
@@ -53,41 +54,44 @@ def plot_diversity(rows: Sequence[dict[str, Any]], path: Path, seed: int) -> Non
 
 
 def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Held-out reward above the base model's over the buffers, mean with standard error over seeds; every sampler's
-    mean over its training, by seed; and the diversity of its rollouts over the buffers, where the rows have it."""
-    spread = [row for row in rows if "rollout_diversity" in row["buffers"]]
-    figure = make_figure(17.0 if spread else 12.0, 4.8)
-    left, right, *more = figure.subplots(1, 3 if spread else 2, width_ratios=(1.15, 1, 1)[: 3 if spread else 2])
-    samplers = sorted({row["sampler"] for row in rows}, key=lambda sampler: np.mean(_gains(rows, sampler)))
-    style_axes(left, f"samplers with {CURVE_SEEDS} seeds or more", "buffers", "held-out reward above the base model's")
-    shown = [sampler for sampler in samplers if len(_gains(rows, sampler)) >= CURVE_SEEDS]
-    colours = dict(zip(shown, (*COLOURS, *MORE_COLOURS), strict=False))
-    for sampler in shown:
-        trained = [row["evaluations"] for row in rows if row["sampler"] == sampler]
-        curves = np.array([[point["reward"] for point in evaluations] for evaluations in trained])
-        curves -= curves[:, :1]
-        x = [point["iteration"] for point in trained[0]]
-        mean, error = curves.mean(0), curves.std(0, ddof=1) / len(curves) ** 0.5
-        colour = colours.get(sampler, "gray")
-        left.plot(x, mean, color=colour, linewidth=1.6, label=f"{sampler} ({len(curves)})")
-        left.fill_between(x, mean - error, mean + error, color=colour, alpha=0.12, linewidth=0)
-    if shown:
-        add_legend(left, "upper left", fontsize=7.5)
-    style_axes(right, "mean over a training; a dot per seed", "held-out reward above the base model's", "")
-    for place, sampler in enumerate(samplers):
-        values = _gains(rows, sampler)
-        right.plot(values, [place] * len(values), ".", color=colours.get(sampler, "gray"), alpha=0.5, markersize=7)
-        right.plot(np.mean(values), place, "|", color="black", markersize=13, markeredgewidth=1.8)
-    right.set_yticks(range(len(samplers)), samplers, fontsize=8)
-    for axes in more:
+    """Gain of held-out reward and obedience over the buffers, mean over seeds with its 95 % t interval; every sampler's
+    gain at the end, a dot per seed; and the diversity of its rollouts over the buffers, where the rows have it."""
+    trained = {name: [row for row in rows if row["sampler"] == name] for name in dict.fromkeys(map(_sampler, rows))}
+    trained = dict(sorted(trained.items(), key=lambda item: np.mean(_last_gains(item[1]))))
+    colours = dict(zip(reversed(trained), (*COLOURS, *MORE_COLOURS), strict=False))
+    spread = {name: mine for name, mine in trained.items() if all(DIVERSITY in row["buffers"] for row in mine)}
+    figure = make_figure(22.0 if spread else 17.0, 4.8)
+    *courses, ends = figure.subplots(1, 3) if not spread else figure.subplots(1, 4)[[0, 1, 3, 2]]
+    for axes, measure in zip(courses, ("reward", "obeyed"), strict=False):
+        style_axes(axes, f"{measure}: mean over seeds, 95 % t interval", "buffers", "held-out scenes, less before")
+        axes.axhline(0, color="gray", linewidth=1)
+        for name in reversed(trained):
+            _draw_course(axes, trained[name], measure, f"{name} ({len(trained[name])})", colours.get(name, "gray"))
+    add_legend(courses[0], "upper left", fontsize=7.5)
+    style_axes(ends, "reward after the training; a dot per seed", "held-out scenes, less before", "")
+    for place, (name, mine) in enumerate(trained.items()):
+        values = _last_gains(mine)
+        ends.plot(values, [place] * len(values), ".", color=colours.get(name, "gray"), alpha=0.5, markersize=7)
+        ends.plot(np.mean(values), place, "|", color="black", markersize=13, markeredgewidth=1.8)
+    ends.set_yticks(range(len(trained)), list(trained), fontsize=8)
+    for axes in courses[2:]:
         style_axes(axes, f"rollouts, mean of {SMOOTHED} buffers and over seeds", "buffers", "diversity (DD-19)")
-        for place, sampler in enumerate(dict.fromkeys(row["sampler"] for row in spread)):
-            mean = np.mean([row["buffers"]["rollout_diversity"] for row in spread if row["sampler"] == sampler], 0)
+        for name, mine in spread.items():
+            mean = np.mean([row["buffers"][DIVERSITY] for row in mine], 0)
             size = min(SMOOTHED, len(mean))
             smooth = np.convolve(mean, np.full(size, 1 / size), "valid")
-            axes.plot(np.arange(size, len(mean) + 1), smooth, color=COLOURS[place % len(COLOURS)], label=sampler)
-        add_legend(axes, fontsize=7.5)
+            axes.plot(np.arange(size, len(mean) + 1), smooth, color=colours.get(name, "gray"))
     save_figure(figure, path)
+
+
+def _draw_course(axes: Any, rows: Sequence[dict[str, Any]], measure: str, label: str, colour: str) -> None:
+    """The mean gain at every evaluation and, from BAND_SEEDS seeds on, its interval."""
+    x = [point["iteration"] for point in rows[0]["evaluations"]]
+    courses = np.array(gains(rows, measure))
+    axes.plot(x, courses.mean(0), color=colour, linewidth=1.6, label=label)
+    if len(rows) >= BAND_SEEDS:
+        found = [paired_interval(values) for values in courses.T.tolist()]
+        axes.fill_between(x, [one.low for one in found], [one.high for one in found], color=colour, alpha=0.12, lw=0)
 
 
 def plot_comparisons(comparisons: Sequence[SamplerComparison], path: Path) -> None:
@@ -156,6 +160,9 @@ def family_of(sampler: str) -> str:
     return f"DynDiff {sampler.split()[2]} rms" if sampler.endswith("rms") else "DynDiff literal"
 
 
-def _gains(rows: Sequence[dict[str, Any]], sampler: str) -> list[float]:
-    """Mean reward over each training of the sampler, less that of its start."""
-    return [value(row, "reward_path") - row["evaluations"][0]["reward"] for row in rows if row["sampler"] == sampler]
+def _sampler(row: dict[str, Any]) -> str:
+    return str(row["sampler"])
+
+
+def _last_gains(rows: Sequence[dict[str, Any]]) -> list[float]:
+    return [course[-1] for course in gains(rows, "reward")]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from benchmarks.video_rl.comparison import Difference, SamplerComparison, paired_interval
+from benchmarks.video_rl.comparison import GAINS, Difference, SamplerComparison, gains, paired_interval
 from benchmarks.video_rl.learning import alarms
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.reports.console_table import estimate, make_table
@@ -98,21 +98,17 @@ def clip_training_table(rows: Sequence[dict[str, Any]]) -> Table:
     )
 
 
-def gain_table(rows: Sequence[dict[str, Any]], scores: Sequence[str]) -> Table:
-    """Per sampler and score: mean over seeds before, and what the training added, with its 95 % t interval."""
+def gain_table(rows: Sequence[dict[str, Any]], scores: Sequence[str] = GAINS) -> Table:
+    """One line per sampler: held-out scores before, and what its training changed; of one seed the change alone."""
     cells = []
     for sampler in dict.fromkeys(row["sampler"] for row in rows):
-        mine = [row["evaluations"] for row in rows if row["sampler"] == sampler]
-        gains = ([points[-1][name] - points[0][name] for points in mine] for name in scores)
-        befores = (np.mean([points[0][name] for points in mine]) for name in scores)
-        texts = (
-            f"{before:.3f} {_difference_text(paired_interval(gain)) if len(gain) > 1 else f'{gain[0]:+.3f}'}"
-            for before, gain in zip(befores, gains, strict=True)
-        )
-        cells.append((sampler, len(mine), *texts))
+        mine = [row for row in rows if row["sampler"] == sampler]
+        befores = (np.mean([row["evaluations"][0][name] for row in mine]) for name in scores)
+        changes = (_change_text([course[-1] for course in gains(mine, name)]) for name in scores)
+        cells.append((sampler, len(mine), *(f"{old:.3f} {new}" for old, new in zip(befores, changes, strict=True))))
     return _table(
-        "held-out scores before, and gain over the training: mean, 95 % t interval over seeds", ("sampler",),
-        ("seeds", *scores), cells,
+        "held out: mean before, and after - before on the same seed with its 95 % t interval over seeds, * if beside 0",
+        ("sampler",), ("seeds", *scores), cells,
     )
 
 
@@ -187,6 +183,10 @@ def _over_buffers(rows: Sequence[dict[str, Any]], name: str) -> str:
     """Mean over seeds and buffers; nothing where a file of an earlier version lacks it."""
     means = [np.mean(row["buffers"][name]) for row in rows if name in row["buffers"]]
     return f"{np.mean(means):.3f}" if len(means) == len(rows) else ""
+
+
+def _change_text(changes: Sequence[float]) -> str:
+    return _difference_text(paired_interval(changes)) if len(changes) > 1 else f"{changes[0]:+.4f}"
 
 
 def _difference_text(difference: Difference) -> str:
