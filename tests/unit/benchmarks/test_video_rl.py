@@ -86,7 +86,7 @@ def test_the_gain_of_a_training_is_its_end_less_its_start_with_the_interval_over
         [cell.strip() for cell in line.split("│")] for line in printed.get().splitlines() if line.startswith("│")
     )
     assert three[1:4] == ["CPS", "3", "2.000 +2.0000 (-0.4843, +4.4843)"] and one[1:4] == ["one", "1", "1.000 +2.0000"]
-    assert three[5] == "0.000 +0.0000 (+0.0000, +0.0000)", "obeyed never changed"
+    assert three[5] == "0.500 +0.0000 (+0.0000, +0.0000)", "obeyed never changed"
 
 
 def test_the_learning_curves_have_the_interval_of_their_gains_from_three_seeds_on(
