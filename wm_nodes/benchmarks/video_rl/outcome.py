@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
     of = {"sha256": base.manifest["sha256"]}
     rows = train_all(arguments, trials, partial(_train, arguments), of, arguments.workers)
     comparisons = compare(arguments, trials, rows, against_cps(rows), of, MEASURES)
-    draw(arguments, plots.plot_comparisons, comparisons)
+    draw(arguments, plots.plot_courses, rows, SCORES)
     console.print(tables.gain_table(rows, SCORES), tables.comparison_table(comparisons))
 
 

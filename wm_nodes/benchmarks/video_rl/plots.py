@@ -84,6 +84,22 @@ def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
     save_figure(figure, path)
 
 
+def plot_courses(rows: Sequence[dict[str, Any]], path: Path, measures: Sequence[str]) -> None:
+    """A panel per held-out score: its course over the buffers, mean over seeds with its 95 % t interval."""
+    names = list(dict.fromkeys(map(_sampler, rows)))
+    colours = dict(zip(names, (*COLOURS, *MORE_COLOURS), strict=False))
+    figure = make_figure(5.2 * len(measures), 4.2)
+    panels = np.atleast_1d(figure.subplots(1, len(measures)))
+    for axes, measure in zip(panels, measures, strict=True):
+        style_axes(axes, SAID.get(measure, measure), "buffers", "held out, less before")
+        axes.axhline(0, color="gray", linewidth=1)
+        for name in names:
+            mine = [row for row in rows if row["sampler"] == name]
+            _draw_course(axes, mine, measure, f"{name} ({len(mine)})", colours.get(name, "gray"))
+    add_legend(panels[0], "upper left", fontsize=7.5)
+    save_figure(figure, path)
+
+
 def _draw_course(axes: Any, rows: Sequence[dict[str, Any]], measure: str, label: str, colour: str) -> None:
     """The mean gain at every evaluation and, from BAND_SEEDS seeds on, its interval."""
     x = [point["iteration"] for point in rows[0]["evaluations"]]
