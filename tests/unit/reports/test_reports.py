@@ -238,16 +238,18 @@ def test_scores_that_got_better_and_worse_are_named_apart() -> None:
     assert none.startswith("No difference that chance does not explain")
 
 
-def test_a_series_of_a_section_leaves_out_the_others_and_an_odd_panel_is_drawn(tmp_path: Path) -> None:
+def test_a_series_of_a_section_leaves_out_the_others_and_panels_without_numbers_are_not_drawn(tmp_path: Path) -> None:
     path = metrics_file(tmp_path, [
         {"section": "grpo", "step": 1, "reward": 3.0}, {"section": "heldout", "step": 1, "reward": 0.2},
         {"section": "heldout", "step": 2, "reward": None},
     ])
     assert read_series(path, "grpo/reward") == [(1, 3.0)]
     assert [step for step, _ in read_series(path, "heldout/reward")] == [1, 2]
-    panels = (Panel("reward", {"grpo/reward": "a", "heldout/reward": "b"}), *clip_panels(2)[:2])
-    drawn = curves(path, tmp_path / "curves.png", panels, step="buffers")
-    assert drawn is not None and cv2.imread(str(drawn)).shape[0] > 500
+    reward = Panel("reward", {"grpo/reward": "a", "heldout/reward": "b"})
+    for known, rows in ((1, 1), (3, 2)):
+        panels = (*[reward] * known, *clip_panels(2)[4:])
+        drawn = curves(path, tmp_path / "curves.png", panels, step="buffers")
+        assert drawn is not None and cv2.imread(str(drawn)).shape[0] == 297 * rows, "panels without a number are left out"
     assert curves(path, tmp_path / "none.png", clip_panels(2)[4:]) is None
 
 

@@ -52,8 +52,10 @@ def conclude(
     watched = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []
     summary = ClipSummary(
         task=config.task, preset=preset, seed=config.seed, iterations=iterations, version=version,
-        weights="averaged" if config.grpo.ema_decay > 0 else "last", contexts=len(before["tracking"]),
-        scores={name: score_change(name, before[name], after[name], config.seed) for name in TITLES},
+        weights="averaged" if config.grpo.ema_decay > 0 else "last", contexts=len(before["success"]),
+        scores={
+            name: score_change(name, before[name], after[name], config.seed) for name in TITLES if name in before
+        },
         evaluations=len(watched),
         hacked=[
             {"step": line["step"], "reward_slope": alarms[0].proxy_slope,
@@ -91,15 +93,15 @@ def _strips(config: VideoRlConfig, run_dir: Path, heldout: Clips, generators: Se
     shown = heldout.select(torch.arange(min(STRIPS, len(heldout))))
     frames = [generator.evaluate(shown, config.evaluation.num_steps).cpu() for generator in generators]
     rows = dict(zip(("recorded", "before", "after"), [shown.frames, *frames], strict=True))
-    pictures = []
+    pictures, given = [], "first frame" if config.groups.hide_actions else "first frame and actions"
     for index, instruction in enumerate(shown.instructions):
         path = run_dir / "pictures" / f"film_strip_{index}.png"
         film_strip({label: np.ascontiguousarray(clips[index].numpy()) for label, clips in rows.items()}, path)
         pictures.append(
             Picture(
                 f"Held-out context {index + 1}",
-                f"“{instruction}”. The recording, then what the model makes of its first frame and actions, before and "
-                "after, from the same noise.", path,
+                f"“{instruction}”. The recording, then what the model makes of its {given}, before and after, from the "
+                "same noise.", path,
             )
         )
     return pictures

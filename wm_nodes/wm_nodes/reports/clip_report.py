@@ -63,7 +63,7 @@ def clip_verdict(summary: ClipSummary) -> str:
     """One sentence: which scores changed by more than chance explains."""
     parts = []
     for verdict in ("better", "worse"):
-        names = [TITLES[name] for name in TITLES if summary.scores[name].verdict == verdict]
+        names = [TITLES[name] for name, change in summary.scores.items() if change.verdict == verdict]
         if names:
             parts.append(f"{verdict.capitalize()}: {'; '.join(names)}")
     sentence = ". ".join(parts) or "No difference that chance does not explain"
@@ -84,6 +84,7 @@ def clip_panels(updates: int) -> tuple[Panel, ...]:
     return (
         Panel("reward", {"grpo/reward_mean": "of the clips trained on", "heldout/reward": "held out, ODE"}),
         Panel("held-out tracking score, (0, 1]", {"heldout/tracking": ""}),
+        Panel("held-out clips that end with the task done (share)", {"heldout/success": ""}, (0.0, 1.0)),
         Panel("held-out position errors, cm", {"heldout/object_cm": "object", "heldout/tool_cm": "tool"}),
         Panel("held-out scenery error, of [0, 1]", {"heldout/scenery": ""}),
         Panel("KL to the anchor", {f"grpo/kl_{k}": f"update {k}" for k in range(1, updates + 1)}),
@@ -116,8 +117,8 @@ def write_clip_report(
 
 
 def _rows(summary: ClipSummary) -> Iterable[tuple[str, ScoreChange, tuple[str, str, str]]]:
-    for name, title in TITLES.items():
-        change = summary.scores[name]
+    for name, change in summary.scores.items():
+        title = TITLES[name]
         interval = estimate((change.difference, change.low, change.high))
         yield title, change, (f"{change.before:.4f}", f"{change.after:.4f}", interval)
 

@@ -34,17 +34,19 @@ def curves(
     """Draw the panels over the steps of the metrics, two in a row; returns the PNG.
 
     Returns None, and draws nothing, where no line of the file carries any of them. Values that were written as null
-    leave a gap; a metric without any number is neither drawn nor in the legend. step: said under each panel.
+    leave a gap; a metric without any number is neither drawn nor in the legend, nor a panel without any. step: said
+    under each panel.
     """
-    series = [{name: read_series(metrics_file, name) for name in panel.lines} for panel in panels]
-    if not any(points for lines in series for points in lines.values()):
+    read = [(panel, {name: read_series(metrics_file, name) for name in panel.lines}) for panel in panels]
+    drawn = [(panel, lines) for panel, lines in read if any(lines.values())]
+    if not drawn:
         return None
-    rows = -(-len(panels) // 2)
+    rows = -(-len(drawn) // 2)
     figure = make_figure(10.5, 2.7 * rows, dpi=110)
     diagrams = list(figure.subplots(rows, 2, squeeze=False).flat)
-    for unused in diagrams[len(panels) :]:
+    for unused in diagrams[len(drawn) :]:
         unused.set_axis_off()
-    for index, (axes, panel, lines) in enumerate(zip(diagrams, panels, series, strict=False)):
+    for index, (axes, (panel, lines)) in enumerate(zip(diagrams, drawn, strict=False)):
         _panel(axes, panel, lines, step, index)
     save_figure(figure, path)
     return path
