@@ -249,7 +249,7 @@ def test_a_series_of_a_section_leaves_out_the_others_and_panels_without_numbers_
     for known, rows in ((1, 1), (3, 2)):
         panels = (*[reward] * known, *clip_panels(2)[4:])
         drawn = curves(path, tmp_path / "curves.png", panels, step="buffers")
-        assert drawn is not None and cv2.imread(str(drawn)).shape[0] == 297 * rows, "panels without a number are left out"
+        assert drawn is not None and cv2.imread(str(drawn)).shape[0] == 297 * rows, "panels without a number"
     assert curves(path, tmp_path / "none.png", clip_panels(2)[4:]) is None
 
 
