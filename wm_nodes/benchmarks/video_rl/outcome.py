@@ -4,33 +4,46 @@ on held-out first frames, with scores that nothing was trained on.
 
 import argparse
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
+from tqdm import tqdm
 
 from benchmarks.video_rl import plots, tables
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
 from benchmarks.video_rl.sources import TASK, config_of
-from benchmarks.video_rl.trainings import against_cps, compare, draw, train_all
+from benchmarks.video_rl.trainings import against_cps, compare, draw, train_all, write_trainings
 from benchmarks.video_rl.trials import SamplerTrial
-from wm_nodes.apps.options import add_device, add_json, positive
+from wm_nodes.apps.options import add_device, add_json, positive, prepare_torch
+from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.files import write_atomic
-from wm_nodes.training.weights import pack_weights
+from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
+from wm_nodes.video_rl.clip_faults import measure_fault_limits
+from wm_nodes.video_rl.heldout_metrics import fit_tool_correction, measure_clips, measure_executability
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
-from wm_nodes.video_rl.sampling import RecordedContexts
+from wm_nodes.video_rl.sampling import ClipGenerator, RecordedContexts
+from wm_nodes.video_rl.success_reader import load_success_reader
 from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.training.tokenizer import probe_targets
 
 MEASURES = ("success_path", "success", "outcome", "scenery")
 SCORES = ("success", "outcome", "scenery")
+METRICS = (
+    "success", "reader_success", "executed_success", "executed_object_cm", "object_permanence", "ghost_motion",
+    "impossible_tool_steps", "scenery_change",
+)
+MEASURED = 100
 console = Console()
 
 
@@ -83,7 +96,7 @@ def add_options(outcome: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Train every arm at every seed; compare."""
+    """Train every arm at every seed; compare; measure what was kept in --weights."""
     base = load_video_folder(arguments.video_model, arguments.device)
     plan = OutcomePlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
     arms = outcome_samplers()
@@ -92,21 +105,84 @@ def run(arguments: argparse.Namespace) -> None:
     trials = [SamplerTrial(arm, plan) for arm in arms]
     of = {"sha256": base.manifest["sha256"]}
     rows = train_all(arguments, trials, partial(_train, arguments), of, arguments.workers)
+    if arguments.weights:
+        _measure_all(arguments, trials, rows, of)
     comparisons = compare(arguments, trials, rows, against_cps(rows), of, MEASURES)
     draw(arguments, plots.plot_courses, rows, SCORES)
     console.print(tables.gain_table(rows, SCORES), tables.comparison_table(comparisons))
+    if arguments.weights:
+        console.print(tables.measured_table(rows))
 
 
 def _train(
     arguments: argparse.Namespace, trial: SamplerTrial[OutcomePlan], seed: int, on_iteration: Callable[[], object]
 ) -> dict[str, Any]:
     folder = load_video_folder(arguments.video_model, arguments.device)
-    bags = arguments.context_bags, arguments.heldout_bags
-    contexts, heldout = (load_clips(some, folder.clip["stride"]) for some in bags)
+    contexts, heldout = _recordings(arguments, folder)
     probe = load_probe(shipped_model(TASK), arguments.device)
     source = OutcomeSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed)
     row = train_sampler(source, trial.sampler, trial.plan, seed, on_iteration)
     if arguments.weights:
-        name = f"{trial.sampler.name.replace(' ', '_').replace(',', '')}_{seed}.safetensors"
-        write_atomic(arguments.weights / name, pack_weights(folder.network).data)
+        write_atomic(_weights(arguments, row), pack_weights(folder.network).data)
     return {name: value for name, value in row.items() if name not in ("before", "after")}
+
+
+def _recordings(arguments: argparse.Namespace, folder: VideoFolder) -> tuple[Clips, Clips]:
+    """Clips to train on, and held-out ones."""
+    stride = folder.clip["stride"]
+    return load_clips(arguments.context_bags, stride), load_clips(arguments.heldout_bags, stride)
+
+
+def _weights(arguments: argparse.Namespace, row: Mapping[str, Any]) -> Path:
+    """Where the weights of a training are kept."""
+    name = row["sampler"].replace(",", "").replace(" ", "_")
+    return Path(arguments.weights / f"{name}_{row['seed']}.safetensors")
+
+
+def _measure_all(
+    arguments: argparse.Namespace, trials: list[SamplerTrial[OutcomePlan]], rows: list[dict[str, Any]],
+    of: dict[str, Any],
+) -> None:
+    """Add to each row what measure_weights finds, `measured_before` and `measured_after`, where it is missing."""
+    todo = [row for row in rows if "measured_after" not in row]
+    before = {row["seed"]: row["measured_before"] for row in rows if "measured_before" in row}
+    with (
+        ProcessPoolExecutor(arguments.workers, mp_context=get_context("spawn"), initializer=prepare_torch) as pool,
+        tqdm(total=len(todo), desc="held-out metrics", unit="training") as bar,
+    ):
+        bases = {
+            seed: pool.submit(measure_weights, arguments, None, seed)
+            for seed in dict.fromkeys(row["seed"] for row in todo) if seed not in before
+        }
+        trained = {pool.submit(measure_weights, arguments, _weights(arguments, row), row["seed"]): row for row in todo}
+        for future in as_completed(trained):
+            row = trained[future]
+            seed = row["seed"]
+            row["measured_before"] = before[seed] if seed in before else bases[seed].result()
+            row["measured_after"] = future.result()
+            bar.update()
+            write_trainings(arguments, trials, rows, [], of)
+
+
+def measure_weights(arguments: argparse.Namespace, weights: Path | None, seed: int) -> dict[str, float]:
+    """Return means over the first MEASURED held-out first frames of metrics that were never trained on, of one ODE clip
+    each from the noise of `seed`: success by two readers and in the simulator, faults. weights: None: the base's.
+
+    Raises:
+        OSError: no weights are kept.
+    """
+    folder = load_video_folder(arguments.video_model, arguments.device)
+    if weights is not None:
+        load_weights(folder.network, weights.read_bytes())
+    probe, reader = load_probe(shipped_model(TASK), arguments.device), load_success_reader(arguments.video_model, TASK)
+    config, simulation = load_video_config("outcome", {"seed": seed}), load_config("cpu", {"task": TASK}).simulation
+    recordings = _recordings(arguments, folder)[1]
+    decoded = folder.codec.decode(folder.codec.encode(recordings.frames))
+    seen = probe.read(decoded)
+    limits = measure_fault_limits(decoded, seen, simulation)
+    correction = fit_tool_correction(seen, probe_targets(recordings.ground_truth, TASK))
+    heldout = recordings.select(torch.arange(min(MEASURED, len(recordings))))
+    frames = ClipGenerator(folder, heldout, config).evaluate(heldout, config.evaluation.num_steps)
+    metrics = measure_clips(frames, heldout, probe, reader, limits, simulation, folder.clip["num_conditioning"])
+    metrics |= measure_executability(probe.read(frames), heldout, correction, simulation, folder.clip["stride"])
+    return {name: float(metrics[name].mean()) for name in METRICS}

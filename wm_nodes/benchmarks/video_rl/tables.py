@@ -112,6 +112,23 @@ def gain_table(rows: Sequence[dict[str, Any]], scores: Sequence[str] = GAINS) ->
     )
 
 
+def measured_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """One line per sampler: metrics that nothing trained on, before and after; mean over seeds, change with interval."""
+    known = [row for row in rows if "measured_after" in row]
+    names, cells = tuple(known[0]["measured_after"]) if known else (), []
+    for sampler in dict.fromkeys(row["sampler"] for row in known):
+        mine = [(row["measured_before"], row["measured_after"]) for row in known if row["sampler"] == sampler]
+        texts = (
+            f"{np.mean([before[name] for before, _ in mine]):.3f} "
+            f"{_change_text([after[name] - before[name] for before, after in mine])}" for name in names
+        )
+        cells.append((sampler, len(mine), *texts))
+    return _table(
+        "metrics that nothing trained on: mean before, and change with its 95 % t interval over seeds", ("sampler",),
+        ("seeds", *names), cells,
+    )
+
+
 def comparison_table(comparisons: Sequence[SamplerComparison]) -> Table:
     measures = tuple(comparisons[0].differences) if comparisons else ()
     cells = (
