@@ -113,7 +113,7 @@ def gain_table(rows: Sequence[dict[str, Any]], scores: Sequence[str] = GAINS) ->
 
 
 def measured_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per sampler: metrics that nothing trained on, before and after; mean over seeds, change with interval."""
+    """One line per sampler: metrics that nothing trained on, mean over seeds before, and change with its interval."""
     known = [row for row in rows if "measured_after" in row]
     names, cells = tuple(known[0]["measured_after"]) if known else (), []
     for sampler in dict.fromkeys(row["sampler"] for row in known):
