@@ -1,6 +1,7 @@
 """From clips to a video model: codec, flow matching, held-out scores. Resumable; what is finished is kept."""
 
 import json
+from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import success
 from wm_nodes.config.video import FlowMatchingConfig, VideoRlConfig
 from wm_nodes.core.device import compute_device, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
@@ -21,10 +23,11 @@ from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
 from wm_nodes.video_model.tokenizer_codec import Codec, codec_of_world_model
 from wm_nodes.video_rl.reference_reward import score_clips
+from wm_nodes.video_rl.success_reader import save_success_reader, score_reader, train_success_reader
 from wm_nodes.video_rl.validation import evaluated_contexts, load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
-CODEC_FRAMES = 2000
+CODEC_FRAMES, READER_ITERATIONS = 2000, 500
 CELLS = {"patch": 2, "tokenizer": 1}
 """Side of the square of latent cells that the network works on at a time."""
 BEFORE = Path("evaluations") / "before.json"
@@ -34,7 +37,8 @@ def make_video_model(
     config: VideoRlConfig, clips: Clips, heldout: Clips, probe: PositionProbe, run_dir: Path, *,
     shipped: VideoFolder | None = None, command: str = "",
 ) -> VideoFolder:
-    """The shipped video model, or without one a model trained on the clips, with its held-out scores.
+    """The shipped video model, or without one a model trained on the clips, with its held-out scores; with a success
+    reader where it chooses the motion or can be stepped.
 
     Kept in run_dir/video_model, and loaded from there; the scores of each held-out context are kept in
     run_dir/evaluations/before.json.
@@ -59,6 +63,11 @@ def make_video_model(
     story["model"] = config.model.model_dump()
     means = {name: sum(values) / len(values) for name, values in scores.items()}
     story["heldout"] = means | _score_baselines(model, heldout, probe, config)
+    if shipped is None and (config.model.training.hide_actions or config.model.training.given_frames):
+        reader = train_success_reader(clips, model.codec, READER_ITERATIONS, config.seed, run_dir)
+        found = score_reader(reader, heldout.frames, success(heldout.task, heldout.ground_truth))
+        told = {"seed": config.seed, "command": command, "heldout": asdict(found)}
+        save_success_reader(folder, reader, clips.task, told)
     save_video_folder(folder, model.codec, model.network, model.clip, story)
     return load_video_folder(folder, device)
 
