@@ -4,13 +4,13 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from statistics import mean
+from statistics import mean, median
 from typing import Any
 
 import pytest
 
 import wm_nodes
-from benchmarks.video_rl.comparison import paired_interval
+from benchmarks.video_rl.comparison import gains, paired_interval
 from wm_nodes.core.statistics import bootstrap_mean, paired_difference, wilson_interval
 
 ROOT = Path(wm_nodes.__file__).parents[1]
@@ -18,6 +18,8 @@ DOCS, FILES = ROOT / "docs", ROOT / "benchmarks" / "results"
 GUIDES = ("README", "audit", "embedded_judge", "model_refresh", "public_video_models")
 SHIPPED = Path(wm_nodes.__file__).parent / "pretrained"
 LINK = re.compile(r"\]\(([^)\s]+)\)")
+ABLATIONS = ("KL of log-probabilities", "no KL", "clip 5 against 2.5", "guidance", "pictures of 20 cells")
+"""The comparisons of the file, in its order, as the page calls them."""
 Run = dict[str, Any]
 Rows = Iterator[str]
 
@@ -110,10 +112,16 @@ def diversity_rows() -> Rows:
         )
 
 
-def compared(comparisons: list[Run], arm: str, base: str, **more: object) -> Run:
-    wanted = {"arm": arm, "base": base, **more}
-    (found,) = [one for one in comparisons if all(one[key] == value for key, value in wanted.items())]
+def compared(comparisons: list[Run], sampler: str, base: str, **more: object) -> Run:
+    wanted = {"base": base, **more}
+    of = [one for one in comparisons if sampler_of(one) == sampler]
+    (found,) = [one for one in of if all(one[key] == value for key, value in wanted.items())]
     return found
+
+
+def sampler_of(row: Run) -> str:
+    """Which sampler a row is about; files of before 2026-11-24 call it arm."""
+    return str(row["sampler"] if "sampler" in row else row["arm"])
 
 
 def clip_rows() -> Rows:
@@ -121,27 +129,38 @@ def clip_rows() -> Rows:
     for arm, base in (("DynDiff 0.2 sparse, rms", "CPS 0.2"), ("DynDiff 0.4 gated, rms", "CPS 0.4")):
         for shared in (True, False):
             found = [compared(run["comparisons"], arm, base, shared_noise=shared) for run in seeds]
+            first, *others = (one["diversity"] for one in found)
+            assert all(high < 0 for _, _, high in others)
             yield row(
-                f"{arm} - {base}", "shared" if shared else "own",
-                *(interval(*one["diversity"], digits=3) for one in found),
+                f"{arm} - {base}", "shared" if shared else "own", interval(*first, digits=3),
+                ", ".join(f"{value:+.3f}" for value, _, _ in others),
             )
 
 
 def learning_rows() -> Rows:
-    found = read("video_rl_learning.json")["comparisons"]
-    for arm, base in (
+    found = read("video_rl_learning.json")
+    measures = (("reward", 3), ("obeyed", 3), ("mass", 2), ("background", 4))
+    for name in (
+        "CPS 0.46, shared", "CPS 0.6, shared", "DynDiff 0.6 gated, rms, cps, shared", "CPS 0.6, window",
+        "DynDiff 0.6 gated, rms, cps, window",
+    ):
+        trained = [one for one in found["rows"] if sampler_of(one) == name]
+        gained = (paired_interval([course[-1] for course in gains(trained, key)]) for key, _ in measures)
+        yield row(
+            short(name), len(trained),
+            *(interval(one.mean, one.low, one.high, digits) for one, (_, digits) in zip(gained, measures)),
+        )
+    for name, base in (
         ("DynDiff 0.6 gated, rms, cps, shared", "CPS 0.46, shared"),
-        ("DynDiff 0.2 sparse, rms, cps, shared", "CPS 0.2, shared"),
         ("DynDiff 0.6 gated, rms, cps, shared", "CPS 0.6, shared"),
         ("DynDiff 0.6 gated, rms, cps, window", "CPS 0.6, window"),
-        ("DynDiff 0.6 gated", "CPS 0.6"),
-        ("Flow-GRPO 0.7", "CPS 0.6"),
-        ("CPS 0.6, window", "CPS 0.6, shared"),
-        ("Mix-GRPO 0.7", "CPS 0.6, window"),
     ):
-        one = compared(found, arm, base)
-        differences = (difference(one, "reward", 3), difference(one, "background", 4))
-        yield row(f"{arm} - {base}", len(one["seeds"]), *differences)
+        one = compared(found["comparisons"], name, base)
+        yield row(f"{short(name)} - {base}", *(difference(one, *measure) for measure in measures[:2]))
+
+
+def short(sampler: str) -> str:
+    return sampler.replace("DynDiff 0.6 gated, rms, cps", "DynDiff")
 
 
 def difference(comparison: Run, name: str, digits: int) -> str:
@@ -165,31 +184,36 @@ def change(trained: list[Run], name: str, digits: int) -> str:
 
 
 def cost_rows() -> Rows:
-    three = runs("video_rl_cost.jsonl").values()
-    for same in zip(*(run["rows"] for run in three)):
-        shares = (one["kl_s"] / (one["forward_s"] + one["kl_s"] + one["backward_s"]) for one in same)
-        kept = f"{same[-1]['bytes'] / 2**20:.2f}"
-        yield row(same[0]["model"], same[0]["anchor"], ", ".join(map(percent, shares)), kept)
-
-
-def rollout_rows() -> Rows:
-    three = runs("video_rl_cost.jsonl").values()
-    for same in zip(*(run["rollouts"] for run in three)):
-        shares = (f"{100 * (one['mask_share'] + one['cache_share']):.2f}" for one in same)
-        yield f"{same[0]['model']}: {', '.join(shares)}"
+    """One line per model: medians over the runs of the three anchors' share and memory, and of the mask's share."""
+    three = list(runs("video_rl_cost.jsonl").values())
+    for model in ("moving disc", "PushCube"):
+        anchors = [same for same in zip(*(run["rows"] for run in three)) if same[0]["model"] == model]
+        shares = (
+            median(one["kl_s"] / (one["forward_s"] + one["kl_s"] + one["backward_s"]) for one in same)
+            for same in anchors
+        )
+        kept = (f"{same[-1]['bytes'] / 2**20:.2f}" for same in anchors)
+        rollouts = [one for run in three for one in run["rollouts"] if one["model"] == model]
+        masked = median(one["mask_share"] + one["cache_share"] for one in rollouts)
+        assert [same[0]["anchor"] for same in anchors] == ["buffer", "frozen", "dual"]
+        yield row(model, ", ".join(map(percent, shares)), ", ".join(kept), f"{100 * masked:.2f}")
 
 
 def ablation_rows() -> Rows:
-    for one in read("video_rl_ablations.json")["comparisons"]:
-        values = (difference(one, name, digits) for name, digits in (("reward", 3), ("obeyed", 2), ("background", 4)))
-        yield row(f"{one['arm']} - {one['base']}", *values)
+    compared = read("video_rl_ablations.json")["comparisons"]
+    for one, text in zip(compared, ABLATIONS, strict=True):
+        found = one["differences"]["obeyed"]
+        beside_0 = not found["low"] <= 0 <= found["high"]
+        yield f"Guidance 2 - 1: obeyed {difference(one, 'obeyed', 2)}" if beside_0 else text
 
 
 def resolution_rows() -> Rows:
     rows = read("video_rl_resolution.json")["rows"]
-    for shown in ("model", "the model's own size, enlarged", "codec alone", "first frame repeated"):
+    for shown in ("model", "codec alone", "first frame repeated"):
         sizes = [one for one in rows if one["shown"] == shown]
         yield row(shown, *("{:.3f} [{:.3f}, {:.3f}]".format(*bootstrap_mean(one["tracking"], seed=0)) for one in sizes))
+    (enlarged,) = {f"{mean(one['tracking']):.3f}" for one in rows if one["shown"] == "the model's own size, enlarged"}
+    yield f"keep {enlarged} at every size"
 
 
 def hacking_rows() -> Rows:
@@ -353,7 +377,7 @@ def judge_rows() -> Rows:
 TABLES: dict[str, list[Callable[[], Rows]]] = {
     "policy_rl": [study_rows, refresh_rows],
     "video_rl": [
-        diversity_rows, clip_rows, learning_rows, clip_learning_rows, cost_rows, rollout_rows, ablation_rows,
+        diversity_rows, clip_rows, learning_rows, clip_learning_rows, cost_rows, ablation_rows,
         resolution_rows, hacking_rows,
     ],
     "judge": [
