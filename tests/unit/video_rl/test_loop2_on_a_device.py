@@ -236,7 +236,7 @@ def test_clips_of_the_tokenizer_are_scored_shown_and_judged_from_the_device(devi
         buffer = source.score(request, source.sample(request))
         frames, references = codec.decode(buffer.rollout.latents), source.references(request)
         strip = film_strip(frames)
-        jobs = buffer_jobs(frames, references, "0" * 64, given=1, fps=5.0, task="push_cube", robot="a robot")
+        jobs = buffer_jobs(frames, references, "0" * 64, config, given=1, fps=5.0)
         assert all(value.device.type == "cpu" for value in buffer.rewards.values())
         return {
             **{name: value.cpu() for name, value in buffer.rewards.items()},

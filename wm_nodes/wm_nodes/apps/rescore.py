@@ -155,8 +155,7 @@ def _clip_judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: floa
 
     def verdicts(recorded: RecordedClips, frames: Tensor, references: Clips) -> JudgedBuffer:
         jobs = buffer_jobs(
-            frames, references, recorded.sha256, given=config.model.num_conditioning, fps=fps, task=config.task,
-            robot=config.judge.robot,
+            frames, references, recorded.sha256, config, given=config.model.num_conditioning, fps=fps
         )
         found = judge.judge(jobs, by=recorded.judge_id if recorded.judge_id in judge.judge_ids else "")
         return JudgedBuffer(agent_scores(found), tuple(verdict_row(verdict) for verdict in found))

@@ -77,7 +77,7 @@ def _level_recall(labels: Sequence[int], right: Sequence[bool]) -> float:
 def row_names(rubric: Rubric) -> list[str]:
     """Planning, each stage with its components below it, overall: the order of the table."""
     names = [PLANNING]
-    for stage in STAGES:
+    for stage in (stage for stage in STAGES if stage in rubric.stages):
         names += [str(stage), *rubric.stages[stage].components]
     return [*names, *rubric.stages[Stage.TC].components, OVERALL]
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import AGENT, JudgeConfig
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import CPU
 from wm_nodes.core.named_files import RUBRIC, NamedFiles
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
@@ -340,11 +341,12 @@ def _late_verdict(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) ->
 
 
 def buffer_jobs(
-    frames: Tensor, references: Clips, sha256: str, *, given: int, fps: float, task: str, robot: str
+    frames: Tensor, references: Clips, sha256: str, config: VideoRlConfig, *, given: int, fps: float
 ) -> list[ClipJob]:
     """One job per clip of a buffer.
 
-    The conditioning frames are shown as they were recorded, not as the video model's codec decodes them.
+    The conditioning frames are shown as they were recorded, not as the video model's codec decodes them. With
+    groups.hide_actions the jobs have no actions, because the recorded ones are not what the clips should show.
 
     Args:
         frames: decoded clips, uint8 (N, F, H, W, 3). references: the recordings of their contexts, a row per clip.
@@ -352,11 +354,11 @@ def buffer_jobs(
     """
     shown = torch.cat([references.frames[:, :given], frames[:, given:].cpu()], 1).numpy()
     first = references.frames[:, 0].numpy()
-    actions = references.actions.numpy().astype(np.float32)
+    actions = [None] * len(shown) if config.groups.hide_actions else references.actions.numpy().astype(np.float32)
     return [
         ClipJob(
             clip_ref(f"{sha256[:12]}/{row}", shown[row], fps),
-            TaskSpec(references.instructions[row], task, robot, first[row], actions=actions[row]),
+            TaskSpec(references.instructions[row], config.task, config.judge.robot, first[row], actions=actions[row]),
         )
         for row in range(len(shown))
     ]

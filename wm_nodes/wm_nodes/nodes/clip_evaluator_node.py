@@ -109,8 +109,7 @@ class ClipEvaluatorNode(ManagedNode):
         goal: EvaluateClips.Goal = work.request
         references = self._generator.references(self._generator.request(buffer.iteration, buffer.policy_version))
         jobs = buffer_jobs(
-            frames, references, goal.sha256, given=self._config.model.num_conditioning, fps=self._fps,
-            task=self._config.task, robot=self._config.judge.robot,
+            frames, references, goal.sha256, self._config, given=self._config.model.num_conditioning, fps=self._fps
         )
         verdicts, messages = agent.judge_round(
             work, jobs, EvaluateClips.Feedback(stages_passed=[0] * len(GATED)), of=len(jobs), sha256=goal.sha256,

@@ -147,7 +147,7 @@ class _Run:
         if self.rubric.reflection.enabled:
             await self._reflect(plan)
             await self._read_stages(plan)
-        if self.rubric.hack.enabled and all(stage.status is not Status.SKIPPED for stage in self._stages_in_order()):
+        if self.rubric.hack.enabled and all(self.stages[s].status is not Status.SKIPPED for s in self.rubric.gated):
             await self._read_patterns()
             confirmed = [flag.pattern for flag in self.flags if flag.confirmed]
             self.stages = {s.stage: s for s in scoring.apply_caps(self._stages_in_order(), confirmed, self.rubric)}
@@ -165,7 +165,7 @@ class _Run:
 
     async def _read_stages(self, plan: PlanResult) -> None:
         """Read the stages not read yet, up to the first closed gate in reward mode."""
-        for stage in GATED:
+        for stage in self.rubric.gated:
             if self.stages[stage].status is Status.SKIPPED:
                 self.stages[stage] = score = await self._read_stage(stage, plan)
                 reasons = [part.reason for part in score.components if part.status is score.status]
@@ -309,7 +309,7 @@ class _Run:
 
     def _spare_reads(self, stage: Stage) -> int:
         """Reads that may be spent on votes now: what is left after one read of everything behind `stage`."""
-        behind = GATED[GATED.index(stage) + 1 :]
+        behind = self.rubric.gated[self.rubric.gated.index(stage) + 1 :]
         reserved = sum(len(self.rubric.stages[later].components) for later in behind)
         reserved += 2 * len(self.rubric.hack.patterns) if self.rubric.hack.enabled else 0
         return max(0, self.agent.max_reads - self.num_reads - reserved)

@@ -1,7 +1,8 @@
 """Rubric packs: components, level descriptions, weights and thresholds as versioned data (RA-4 to RA-14).
 
 A pack is a YAML file in rubrics/, or anywhere. `extends` lays it over another pack: mappings are merged name by name,
-so a new domain adds components, patterns or evidence without code. Its version names the resolved content.
+so a new domain adds components, patterns or evidence without code, and `null` takes what it names away. Its version
+names the resolved content.
 """
 
 import hashlib
@@ -140,8 +141,8 @@ class ReflectionRubric(RubricSection):
 
 
 class RewardRubric(RubricSection):
-    gate: Literal["hard", "soft", "lexicographic"]
-    """hard: prod 1[S >= theta]. soft: logistic. lexicographic: one quarter of [0, 1] per stage."""
+    gate: Literal["hard", "soft", "lexicographic", "open"]
+    """hard: prod 1[S >= theta]. soft: logistic. lexicographic: one quarter of [0, 1] per stage. open: none closes."""
     temperature: Annotated[float, Field(gt=0)]
     """Of the soft gate, in units of S."""
     mean_share: Share
@@ -161,8 +162,11 @@ class Rubric(RubricSection):
 
     @model_validator(mode="after")
     def _check_names(self) -> "Rubric":
-        if set(self.stages) != set(GATED):
-            raise ValueError(f"stages must be VQ, IF, TC, PC, got {', '.join(self.stages)}")
+        if not self.gated or len(self.gated) < len(self.stages):
+            raise ValueError(f"stages must be among VQ, IF, TC, PC, got {', '.join(self.stages)}")
+        for column, stage in enumerate(GATED):
+            if stage not in self.stages and any(row[column] for row in self.planning.weights):
+                raise ValueError(f"planning.weights pay {stage}, which is none of the stages; set its column to 0")
         known = self.component_names
         if len(set(known)) != len(known):
             raise ValueError(f"a component is in two stages: {', '.join(known)}")
@@ -174,9 +178,14 @@ class Rubric(RubricSection):
         return self
 
     @property
+    def gated(self) -> tuple[Stage, ...]:
+        """The stages that are read, in the order of GATED; the reward agent skips the others."""
+        return tuple(stage for stage in GATED if stage in self.stages)
+
+    @property
     def component_names(self) -> tuple[Component, ...]:
         """Of the gated stages, in the order of the pack."""
-        return tuple(name for stage in GATED for name in self.stages[stage].components)
+        return tuple(name for stage in self.gated for name in self.stages[stage].components)
 
     @property
     def version(self) -> str:
@@ -185,7 +194,7 @@ class Rubric(RubricSection):
         return f"{self.name}-{self.revision}-{digest[:12]}"
 
     def stage_of(self, component: Component) -> Stage:
-        return next(stage for stage in GATED if component in self.stages[stage].components)
+        return next(stage for stage in self.gated if component in self.stages[stage].components)
 
 
 def load_rubric(
@@ -237,4 +246,4 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in top.items():
         both = isinstance(value, Mapping) and isinstance(merged.get(name), Mapping)
         merged[name] = _merge(merged[name], value) if both else value
-    return merged
+    return {name: value for name, value in merged.items() if value is not None}

@@ -55,10 +55,13 @@ def plan_weights(p_level: Sequence[float], planning: PlanningRubric) -> dict[Sta
 
 
 def gate(score: StageScore, rubric: Rubric) -> float:
-    """What of the later stages counts, [0, 1]: 1 or 0, or with soft gates sigma((S - theta) / t), 1 at S = 1."""
-    if score.status is not Status.OK or score.vetoed_by:
+    """What of the later stages counts, [0, 1]: 1 or 0; soft: sigma((S - theta) / t), 1 at S = 1; open: always 1."""
+    kind = rubric.reward.gate
+    if score.status is not Status.OK or (score.vetoed_by and kind != "open"):
         return 0.0
-    if rubric.reward.gate != "soft":
+    if kind == "open":
+        return 1.0
+    if kind != "soft":
         return float(score.passed)
     theta, t = rubric.stages[score.stage].threshold, rubric.reward.temperature
     value = (1 + math.exp((theta - 1) / t)) / (1 + math.exp((theta - score.s) / t))
@@ -69,6 +72,7 @@ def reward(weights: Mapping[Stage, float], stages: Sequence[StageScore], rubric:
     """R in [0, 1] of VQ, IF, TC, PC, in this order; NaN where a stage that was looked at has no number.
 
     lexicographic: (number of gates passed before the last stage + S of the next stage) / 4, times the planning ceiling.
+    Stages that the rubric does not have count for nothing.
 
     Raises:
         ValueError: stages in another order, or one skipped behind an open gate.
@@ -81,10 +85,12 @@ def reward(weights: Mapping[Stage, float], stages: Sequence[StageScore], rubric:
     for score in stages:
         if open_share == 0:
             break
+        if score.stage not in rubric.stages:
+            continue
         if score.status is Status.SKIPPED:
             raise ValueError(f"{score.stage} was skipped though every gate before it is open")
         if rubric.reward.gate == "lexicographic":
-            total = math.fsum(weights.values()) * (num_passed + score.s) / len(GATED)
+            total = math.fsum(weights.values()) * (num_passed + score.s) / len(rubric.gated)
             num_passed += 1
         else:
             total += weights[score.stage] * score.s * open_share

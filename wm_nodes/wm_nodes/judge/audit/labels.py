@@ -77,7 +77,7 @@ def known_answers(label: ClipLabel, rubric: Rubric) -> dict[str, Answer]:
             if row.level is None or row.level >= NUM_PLAN_LEVELS:
                 raise AuditError(f"evaluation {label.evaluation}: planning needs a level 0 to 3, got {row.level}")
             known[name] = row.level
-    for stage in STAGES:
+    for stage in (stage for stage in STAGES if stage in rubric.stages):
         parts = [known.get(name) for name in rubric.stages[stage].components]
         if any(name in known for name in rubric.stages[stage].components):
             known[str(stage)] = False if False in parts else None if None in parts else True

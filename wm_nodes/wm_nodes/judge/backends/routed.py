@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from wm_nodes.judge.agent.judge import Capabilities, Health, Judge, Read, ReadRequest
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import GATED, PLANNING, Component, Stage
+from wm_nodes.judge.agent.types import PLANNING, Component, Stage
 
 TRANSPORT = "routed"
 OPEN_BREAKERS = "open_breakers"
@@ -34,7 +34,7 @@ class RoutedJudge:
             named = ", ".join(stage for stage, _ in routed)
             raise ValueError(f"each stage has one route and {Stage.REFLECT} follows its components; got {named}")
         needed: dict[Stage, set[Component]] = {Stage.PLAN: {PLANNING}}
-        needed |= {stage: set(rubric.stages[stage].components) for stage in GATED}
+        needed |= {stage: set(rubric.stages[stage].components) for stage in rubric.gated}
         needed[Stage.HACK] = set(rubric.hack.patterns if rubric.hack.enabled else ())
         for stage, names in needed.items():
             able = self._judge_of(stage).capabilities

@@ -20,7 +20,7 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.judge import Read
 from wm_nodes.judge.agent.levels import settle
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import GATED, PLANNING
+from wm_nodes.judge.agent.types import PLANNING
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.labels import FORMAT, HACK
 from wm_nodes.judge.audit.log import AuditError
@@ -83,12 +83,12 @@ def _describe_rubric(rubric: Rubric) -> dict[str, Any]:
     """What each row means, in the order of the page."""
     entries: list[tuple[str, str, str, Sequence[str]]] = [
         (PLANNING, "PLAN", rubric.planning.question, rubric.planning.levels),
-        *((n, str(stage), e.question, e.levels) for stage in GATED for n, e in rubric.stages[stage].components.items()),
+        *((n, str(s), e.question, e.levels) for s in rubric.gated for n, e in rubric.stages[s].components.items()),
         *((HACK + name, "HACK", pattern.defect, pattern.levels) for name, pattern in rubric.hack.patterns.items()),
         (OVERALL, "ALL", "Would you take this clip for a success?", ()),
     ]
     rows = [{"name": name, "stage": stage, "question": q, "levels": list(levels)} for name, stage, q, levels in entries]
-    return {"rows": rows, "thresholds": {str(stage): rubric.stages[stage].threshold for stage in GATED}}
+    return {"rows": rows, "thresholds": {str(stage): rubric.stages[stage].threshold for stage in rubric.gated}}
 
 
 def _describe_clip(record: Record, evaluation: RecordedEvaluation, chosen: SampledClip | None) -> dict[str, Any]:
