@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.video import AdvantageConfig, GrpoConfig, KlConfig
+from wm_nodes.judge.backends.embedded import shipped_heads
+from wm_nodes.judge.evidence.head import load_head, save_head
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import (
     Condition,
@@ -155,3 +157,12 @@ def video_learner_rank(rank: int, size: int, folder: str, settings: GrpoConfig) 
     numbers = [[u.objective, u.kl, u.ratio_mean, u.clip_low_share, u.clip_high_share] for u in report.updates]
     torch.save({"weights": weights(learner.model), "numbers": torch.tensor(numbers)}, Path(folder) / f"rank{rank}.pt")
     dist.destroy_process_group()
+
+
+def far_sighted_judge(folder: Path) -> Path:
+    """The shipped judge of the loops' pictures, told that it was trained on clips as short as the tiny loop's, and that
+    none is foreign."""
+    folder.mkdir()
+    head = load_head(shipped_heads()[1])
+    known = replace(head.familiarity, limit=1e9)
+    return save_head(folder, replace(head, lengths=(2, 25), familiarity=known))

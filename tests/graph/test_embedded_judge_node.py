@@ -3,30 +3,24 @@
 import functools
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from graph.harness import Graph, Probe, own_domain, wait_until
-from graph.video_loop import VideoLoop, settings
+from graph.video_loop import MODEL_DIR, STRIDE, VideoLoop, settings
 from recording_samples import make_spec
+from video_toys import far_sighted_judge
 
+from benchmarks.video_rl.judged import JudgedContexts
 from wm_msgs.action import TrainVideo
 from wm_msgs.msg import ClipVerdict
 from wm_nodes.judge.audit.reading import read_record
-from wm_nodes.judge.backends.embedded import shipped_heads
-from wm_nodes.judge.evidence.head import load_head, save_head
+from wm_nodes.judge.service import clip_fps
+from wm_nodes.video_model.clips import load_clips
+from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_rl.reference_reward import load_probe
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
-
-
-def far_sighted_judge(folder: Path) -> Path:
-    """The shipped judge of the loops' pictures, told that it was trained on clips as short as the tiny loop's, and that
-    none is foreign."""
-    folder.mkdir()
-    head = load_head(shipped_heads()[1])
-    known = replace(head.familiarity, limit=1e9)
-    return save_head(folder, replace(head, lengths=(2, 25), familiarity=known))
 
 
 def test_a_round_is_judged_in_the_node_without_any_server_and_with_the_evidence_of_the_world_model(
@@ -68,6 +62,13 @@ def test_a_round_is_judged_in_the_node_without_any_server_and_with_the_evidence_
         evidence = [entry.evidence for entry in entries]
         assert len(evidence) == 6 and all(set(found) == set(bands) for found in evidence)
         assert all(math.isfinite(value) for found in evidence for value in found.values())
+        folder, contexts = load_video_folder(loop.model), load_clips([loop.bag], STRIDE)
+        with JudgedContexts(folder, contexts, config, load_probe(MODEL_DIR), clip_fps(loop.bag, STRIDE)) as source:
+            request = source.request(0, 0)
+            buffer = source.score(request, source.sample(request))
+        in_graph = {verdict.clip_id: (verdict.audit_id, verdict.reward) for verdict in verdicts}
+        assert in_graph == {verdict.clip_id: (verdict.audit_id, verdict.reward) for verdict in source.verdicts}
+        assert buffer.rewards["total"].tolist() == [verdict.reward for verdict in source.verdicts], "as in one process"
         assert any(len(score.votes) > 1 for entry in entries for score in scores_of(entry.verdict, "clarity"))
 
 

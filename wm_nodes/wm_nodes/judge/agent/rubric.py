@@ -167,6 +167,8 @@ class Rubric(RubricSection):
         for column, stage in enumerate(GATED):
             if stage not in self.stages and any(row[column] for row in self.planning.weights):
                 raise ValueError(f"planning.weights pay {stage}, which is none of the stages; set its column to 0")
+        if hanging := [n for n, p in self.hack.patterns.items() if p.cap.stage and p.cap.stage not in self.stages]:
+            raise ValueError(f"hack.patterns {', '.join(hanging)} cap a stage that is not there; set them to null")
         known = self.component_names
         if len(set(known)) != len(known):
             raise ValueError(f"a component is in two stages: {', '.join(known)}")

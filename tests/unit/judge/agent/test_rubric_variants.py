@@ -1,0 +1,126 @@
+"""The robot pack with a part taken away: what is still read and paid, and what a pack may leave out."""
+
+import asyncio
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from scripted_judge import (
+    BORDERLINE,
+    CLEAN,
+    FAIR,
+    GOOD,
+    POOR,
+    UNUSABLE,
+    ScriptedJudge,
+    clean_table,
+    make_clip,
+    make_task,
+)
+
+from wm_nodes.config.load import ConfigError
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import Stage, Status
+from wm_nodes.judge.agent.verdict import Verdict
+
+VARIANTS = [f"robot_{name}" for name in ("no_physics", "no_planning", "open_gates", "single_read", "soft_gates")]
+ROBOT = load_rubric()
+DOUBT = (0.0, 0.2, 0.1, 0.0, 0.7)
+UNPAID = {"planning": {"weights": [[0.2, 0.3, 0.5, 0]] * 4}}
+"""Of PC."""
+
+
+def judged(pack: str, mode: Any = "reward", **table: Any) -> tuple[Verdict, list[Stage]]:
+    """The verdict on one clip, and the stages that were asked for."""
+    judge, clip = ScriptedJudge(clean_table(ROBOT, **table)), make_clip()
+    agent = RewardAgent(judge, load_rubric(pack, {} if pack == "robot_single_read" else {"voting": {"audit_share": 0}}),
+                        mode=mode)
+    return asyncio.run(agent.evaluate(clip, make_task(clip))), [request.stage for request in judge.requests]
+
+
+@pytest.mark.parametrize("pack", VARIANTS)
+@pytest.mark.parametrize("plan", [GOOD, FAIR, POOR])
+def test_a_clean_clip_still_earns_one(pack: str, plan: tuple[float, ...]) -> None:
+    verdict, _ = judged(pack, planning=plan)
+    assert verdict.status is Status.OK and verdict.reward == pytest.approx(1)
+
+
+@pytest.mark.parametrize("mode", ["reward", "benchmark"])
+def test_without_physics_its_stage_and_pattern_are_neither_read_nor_paid(mode: str) -> None:
+    broken = {"interaction": UNUSABLE, "deformation": UNUSABLE, "geometry": UNUSABLE, "physics": UNUSABLE}
+    verdict, asked = judged("robot_no_physics", mode, **broken)
+    assert verdict.reward == pytest.approx(1) and judged("robot", mode, **broken)[0].reward == pytest.approx(0.6)
+    assert asked == [Stage.PLAN, Stage.VQ, Stage.IF, Stage.TC, Stage.HACK]
+    assert [stage.status for stage in verdict.stages] == [Status.OK] * 3 + [Status.SKIPPED]
+    assert [flag.pattern for flag in verdict.hack_flags] == ["occlusion", "motion", "background"]
+    half = judged("robot_no_physics", mode, task_completion=BORDERLINE)[0]
+    assert half.reward == pytest.approx((0.1 + 0.2 + 0.3 * 0.5) / 0.6), "what is left of level 3, renormalised"
+
+
+def test_without_physics_a_judge_need_not_read_it() -> None:
+    rubric = load_rubric("robot_no_physics")
+    judge = ScriptedJudge(clean_table(rubric))
+    assert not {"interaction", "deformation", "geometry", "physics"} & set(judge.table)
+    assert RewardAgent(judge, rubric).judge is judge
+    with pytest.raises(ValueError, match="does not read deformation, geometry, interaction, physics"):
+        RewardAgent(judge, ROBOT)
+
+
+def test_without_planning_every_level_is_paid_and_voted_on_alike() -> None:
+    rewards = {judged("robot_no_planning", planning=plan, clarity=DOUBT)[0].reward for plan in (GOOD, FAIR, POOR)}
+    reads = {judged("robot_no_planning", planning=plan)[0].num_reads for plan in (GOOD, FAIR, POOR)}
+    assert len(rewards) == len(reads) == 1
+    assert rewards == {judged("robot", planning=GOOD, clarity=DOUBT)[0].reward}
+    assert judged("robot", planning=POOR, clarity=DOUBT)[0].reward not in rewards
+
+
+def test_with_single_reads_the_first_answer_decides() -> None:
+    table = {"clarity": [DOUBT, CLEAN, CLEAN], "task_completion": [BORDERLINE, CLEAN, CLEAN], "planning": FAIR}
+    single, _ = judged("robot_single_read", **table)
+    voted, _ = judged("robot", **table)
+    assert single.num_reads == 1 + 12 + 4 < voted.num_reads and not single.reflections
+    assert [len(score.votes) for stage in single.stages for score in stage.components] == [1] * 12
+    assert single.reward < voted.reward
+
+
+@pytest.mark.parametrize("mode", ["reward", "benchmark"])
+def test_open_gates_pay_what_comes_after_a_failure_and_soft_ones_part_of_it(mode: str) -> None:
+    failed = {"robot": UNUSABLE, "clarity": BORDERLINE}
+    (hard, _), (soft, _), (opened, asked) = (
+        judged(pack, mode, **failed) for pack in ("robot", "robot_soft_gates", "robot_open_gates")
+    )
+    s_vq, s_if = 0.5 * 3.5 / 4 + 0.25, 0.5 * 0.75
+    assert hard.reward == pytest.approx(0.1 * s_vq + 0.2 * s_if)
+    assert opened.reward == pytest.approx(0.1 * s_vq + 0.2 * s_if + 0.7)
+    assert asked.count(Stage.PC) == 1, "read in every mode"
+    gate = (1 + math.exp(-0.4 / 0.05)) / (1 + math.exp((0.6 - s_vq) / 0.05))
+    assert soft.reward == pytest.approx(0.1 * s_vq + 0.2 * s_if * gate), "a veto closes a soft gate"
+
+
+def test_a_confirmed_pattern_takes_its_stage_away_behind_open_gates_too() -> None:
+    verdict, _ = judged("robot_open_gates", physics=UNUSABLE, robot=UNUSABLE)
+    assert verdict.stages[-1].s == 0 and verdict.reward == pytest.approx(0.1 + 0.2 * 0.5 * 0.75 + 0.3)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"stages": {"PC": None}}, "weights pay PC, which is none of the stages"),
+        ({"stages": {"PC": None}, **UNPAID}, "hack.patterns physics cap a stage that is not there"),
+        ({"stages": {"PC": None}, **UNPAID, "hack": {"patterns": {"physics": None}}}, "unknown components interaction"),
+        ({"stages": dict.fromkeys(("VQ", "IF", "TC", "PC"))}, "stages must be among VQ, IF, TC, PC"),
+        ({"stages": {"HACK": {"threshold": 0.5, "profile": "D", "components": {}}}}, "stages"),
+    ],
+)
+def test_a_stage_is_left_out_with_all_that_hangs_on_it(overrides: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load_rubric(overrides=overrides)
+
+
+def test_a_lexicographic_reward_of_three_stages_has_three_parts() -> None:
+    rubric = load_rubric("robot_no_physics", {"reward": {"gate": "lexicographic"}, "voting": {"audit_share": 0}})
+    judge, clip = ScriptedJudge(clean_table(rubric, task_completion=BORDERLINE)), make_clip()
+    verdict = asyncio.run(RewardAgent(judge, rubric).evaluate(clip, replace(make_task(clip), actions=None)))
+    assert verdict.reward == pytest.approx((2 + 0.5) / 3)
