@@ -1,6 +1,7 @@
 """Clips that the reward agent pays, in one process: the rewards of the reward_evaluator node, bit by bit."""
 
 import hashlib
+from typing import Self
 
 from wm_nodes.config.load import judge_or_embedded
 from wm_nodes.config.schema import AGENT
@@ -39,7 +40,7 @@ class JudgedContexts(RecordedContexts):
         self.fps, self.verdicts = fps, tuple[Verdict, ...]()
         self._judge = open_judge(config, contexts) if config.rewards.get(AGENT) else None
 
-    def __enter__(self) -> "JudgedContexts":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -16,15 +16,18 @@ from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks.video_rl import plots, tables
+from benchmarks.video_rl.judged import JudgedContexts
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
 from benchmarks.video_rl.sources import TASK, config_of
 from benchmarks.video_rl.trainings import against_cps, compare, draw, train_all, write_trainings
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.apps.options import add_device, add_json, positive, prepare_torch
-from wm_nodes.config.load import load_config, load_video_config
+from wm_nodes.config.load import judge_or_embedded, load_config, load_video_config
+from wm_nodes.config.schema import AGENT
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.files import write_atomic
+from wm_nodes.judge.service import clip_fps
 from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
@@ -32,7 +35,7 @@ from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_rl.clip_faults import measure_fault_limits
 from wm_nodes.video_rl.heldout_metrics import fit_tool_correction, measure_clips, measure_executability
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
-from wm_nodes.video_rl.sampling import ClipGenerator, RecordedContexts
+from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.video_rl.success_reader import load_success_reader
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.training.tokenizer import probe_targets
@@ -44,34 +47,41 @@ METRICS = (
     "impossible_tool_steps", "scenery_change",
 )
 MEASURED = 100
+RUBRICS = ("robot", "robot_no_physics", "robot_no_planning", "robot_single_read", "robot_open_gates")
 console = Console()
 
 
 @dataclass(frozen=True)
 class OutcomePlan(LearningPlan):
-    """rewards: weight by name."""
+    """rewards: weight by name. rubric: of the judge, where `agent` is among them."""
 
     iterations: int = 15
     contexts: int = 8
     eval_contexts: int = 200
     eval_every: int = 3
     rewards: tuple[tuple[str, float], ...] = (("outcome", 1.0),)
+    rubric: str = "robot"
 
 
-class OutcomeSource(RecordedContexts):
-    """First frames of recorded episodes; `heldout` are others."""
+class OutcomeSource(JudgedContexts):
+    """First frames of recorded episodes; `heldout` are others. fps: of the clips."""
 
     def __init__(
         self, folder: VideoFolder, contexts: Clips, heldout: Clips, probe: PositionProbe, sampler: SamplerSetup,
-        plan: OutcomePlan, seed: int,
+        plan: OutcomePlan, seed: int, fps: float,
     ) -> None:
-        super().__init__(folder, contexts, config_of(sampler, plan, seed, "outcome", dict(plan.rewards)), probe)
+        config = config_of(sampler, plan, seed, "outcome", dict(plan.rewards))
+        config = config.with_values(judge=judge_or_embedded(config.judge.with_values(rubric=plan.rubric)))
+        super().__init__(folder, contexts, config, probe, fps)
         self.network = folder.network
         self._heldout = heldout.select(torch.arange(min(plan.eval_contexts, len(heldout))))
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
-        spread = buffer.rewards["total"].view(-1, self.config.groups.group_size).std(1, correction=0)
-        return {"rollout_reward_std": float(spread.mean())}
+        """rollout_reward_std: within groups, of the clips that have a reward."""
+        groups = sorted(set(buffer.group_ids.tolist()))
+        values = (buffer.rewards["total"][buffer.valid & (buffer.group_ids == group)] for group in groups)
+        stds = [float(rewards.std(correction=0)) for rewards in values if len(rewards)]
+        return {"rollout_reward_std": sum(stds) / len(stds)}
 
     def validate(self) -> Mapping[str, list[float]]:
         self.folder.network.eval()
@@ -102,7 +112,7 @@ def run(arguments: argparse.Namespace) -> None:
     arms = outcome_samplers()
     if arguments.learning_rate:
         arms = [replace(arm, grpo=arm.grpo.with_values(learning_rate=arguments.learning_rate)) for arm in arms]
-    trials = [SamplerTrial(arm, plan) for arm in arms]
+    trials = [SamplerTrial(arm, plan) for arm in arms] + judge_trials(arms[0], plan)
     of = {"sha256": base.manifest["sha256"]}
     rows = train_all(arguments, trials, partial(_train, arguments), of, arguments.workers)
     if arguments.weights:
@@ -114,14 +124,24 @@ def run(arguments: argparse.Namespace) -> None:
         console.print(tables.measured_table(rows))
 
 
+def judge_trials(sampler: SamplerSetup, plan: OutcomePlan) -> list[SamplerTrial[OutcomePlan]]:
+    """The same sampler, paid by the embedded judge alone: as it is shipped, and without a part of it each."""
+    judged = replace(plan, rewards=((AGENT, 1.0),))
+    return [
+        SamplerTrial(replace(sampler, name=f"{sampler.name}, judge {rubric}"), replace(judged, rubric=rubric))
+        for rubric in RUBRICS
+    ]
+
+
 def _train(
     arguments: argparse.Namespace, trial: SamplerTrial[OutcomePlan], seed: int, on_iteration: Callable[[], object]
 ) -> dict[str, Any]:
     folder = load_video_folder(arguments.video_model, arguments.device)
     contexts, heldout = _recordings(arguments, folder)
     probe = load_probe(shipped_model(TASK), arguments.device)
-    source = OutcomeSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed)
-    row = train_sampler(source, trial.sampler, trial.plan, seed, on_iteration)
+    fps = clip_fps(arguments.context_bags[0], folder.clip["stride"])
+    with OutcomeSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, fps) as source:
+        row = train_sampler(source, trial.sampler, trial.plan, seed, on_iteration)
     if arguments.weights:
         write_atomic(_weights(arguments, row), pack_weights(folder.network).data)
     return {name: value for name, value in row.items() if name not in ("before", "after")}
