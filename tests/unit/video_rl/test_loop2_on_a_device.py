@@ -53,6 +53,10 @@ SMALL = {
     "rewards": {"psnr_db": 1.0, "tracking": 1.0},
 }
 """The preset gpu at a size for tests."""
+NFT = {
+    "grpo.objective": "nft", "grpo.kl.mode": "velocity", "grpo.kl.anchor": "frozen", "grpo.nft.old_decay": 0.5,
+    "grpo.nft.old_ramp": 1.0,
+}
 Found = dict[str, Tensor]
 
 
@@ -104,8 +108,10 @@ def test_flow_matching_learns_the_same_weights_and_goes_on_from_a_checkpoint(dev
         {"rollout.buffer_device": "cpu", "grpo.kl.anchor": "moving", "rollout.storage_dtype": "bfloat16"},
         {"rollout.noise_store": "seed", "rollout.sampler.arm": "flow", "rollout.cfg": 2.0, "grpo.cfg": 2.0},
         {"rollout.noise_store": "zeta_bfloat16", "rollout.sampler.arm": "sage", "rollout.buffer_device": "cpu"},
+        {**NFT, "rollout.sampler.arm": "ode"},
+        {**NFT, "rollout.buffer_device": "cpu", "grpo.kl.mode": "none"},
     ],
-    ids=["dual", "host", "seed", "sage"],
+    ids=["dual", "host", "seed", "sage", "nft", "nft, host"],
 )
 def test_the_toy_is_sampled_scored_trained_saved_and_evaluated_alike(
     device: Device, changes: dict[str, Any], tmp_path: Path

@@ -9,6 +9,8 @@ from wm_nodes.video_model import MaskSettings, RolloutSettings, SamplerSettings
 from wm_nodes.video_rl.toy_scene import SIDE
 
 NUM_STEPS, CLIP_STEPS, SHIFT = 10, 4, 3.0
+NFT_RATE = 2e-4
+"""Learning rate of the objective nft on the moving disc, the better one of 1e-4 and 2e-4 on seed 0."""
 BASE = load_video_config("base")
 CLIP_LEARNER = BASE.grpo.with_values(
     advantage=BASE.grpo.advantage.with_values(std_scope="global", best_of_n=4),
@@ -83,7 +85,13 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
     """Learning: every sampler on one learner; `learner` holds what they share.
 
     Mix-GRPO and the samplers "window" train all four steps of a window that moves, as many as the others of their nine.
+    NFT trains at three times: with a call of the old weights each they cost what the others' four steps do, a call with
+    its gradient counted as three.
     """
+    nft = learner.with_values(
+        objective="nft", nft=learner.nft.with_values(times=3), kl=learner.kl.with_values(mode="none"),
+        learning_rate=NFT_RATE,
+    )
     cps = learner.with_values(logprob_weight="cps")
     frozen = BASE.grpo.kl.with_values(beta=learner.kl.beta, anchor="frozen")
     plain = sampler_setup("CPS 0.6", SamplerSettings("cps", 0.6), cps)
@@ -111,6 +119,8 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
             for sampler in (plain, matched, sparse, gated, *quiet)
         ),
         *(replace(_in_window(sampler), name=f"{sampler.name}, window") for sampler in (plain, gated)),
+        sampler_setup("NFT, ODE", SamplerSettings("ode", 0.0), nft),
+        sampler_setup("NFT, CPS 0.6", SamplerSettings("cps", 0.6), nft),
     ]
 
 

@@ -161,9 +161,12 @@ def _limits(rollout: RolloutSettings) -> tuple[float, float]:
 def _without_updates(grpo: GrpoConfig, rollout: RolloutSettings) -> GrpoConfig:
     """Settings of one update that changes no weight; a transition beyond the ratio's limit counts as clipped."""
     limit, _ = _limits(rollout)
+    mode, anchor = "mean", grpo.kl.anchor
+    if grpo.objective == "nft":
+        mode, anchor = "velocity", "lora_off" if anchor == "lora_off" else "frozen"
     return grpo.with_values(
         updates_per_buffer=1, learning_rate=0.0, weight_decay=0.0, ema_decay=0.0, ratio_norm=False,
-        kl=grpo.kl.with_values(mode="mean", beta=1.0), clip_low=limit, clip_high=limit,
+        kl=grpo.kl.with_values(mode=mode, beta=1.0, anchor=anchor), clip_low=limit, clip_high=limit,
         advantage=load_video_config("base").grpo.advantage,
     )
 
@@ -172,9 +175,11 @@ def _check_first_update(learner: GrpoLearner, buffer: RolloutBuffer) -> tuple[Ch
     (update,) = learner.train(buffer.with_rewards({"total": torch.arange(len(buffer), dtype=torch.float64)})).updates
     ratio_limit, kl_limit = _limits(learner.rollout)
     error, outside = abs(update.ratio_mean - 1), update.clip_low_share + update.clip_high_share
+    has_ratio = learner.settings.objective == "ratio"
     return CheckResult(
-        "ratio is 1 on the first update", error < ratio_limit and outside == 0,
-        f"mean ratio differs from 1 by {error:.1e}, {outside:.0%} of the transitions by more than {ratio_limit:g}",
+        "ratio is 1 on the first update", not has_ratio or (error < ratio_limit and outside == 0),
+        f"mean ratio differs from 1 by {error:.1e}, {outside:.0%} of the transitions by more than {ratio_limit:g}"
+        if has_ratio else "objective nft has none",
         "make rollout and training pass alike: rollout.cfg and grpo.cfg, dtype, micro_batch, dropout off, attention "
         "kernels; noise_store zeta",
     ), CheckResult(

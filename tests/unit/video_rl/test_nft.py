@@ -1,0 +1,432 @@
+"""DiffusionNFT (DD-31) against its formula in numpy, its limits, and the learner's contracts with it."""
+
+import copy
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.multiprocessing as mp
+from torch import Tensor
+from torch.testing import assert_close
+from video_toys import (
+    SHAPE,
+    Analytic,
+    grpo_config,
+    kl_config,
+    tiny_network,
+    toy_buffer,
+    toy_rollout_settings,
+    train_rounds,
+    video_learner_rank,
+    weights,
+)
+
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import GrpoConfig, RolloutConfig
+from wm_nodes.reports.clip_report import clip_panels
+from wm_nodes.reports.curves import curves
+from wm_nodes.training.metrics import FILE_NAME, read_metrics
+from wm_nodes.training.ranks import Ranks
+from wm_nodes.video_model import RolloutBuffer
+from wm_nodes.video_rl.checks import examine
+from wm_nodes.video_rl.group_advantages import GroupAdvantages
+from wm_nodes.video_rl.grpo import GrpoLearner
+from wm_nodes.video_rl.nft import NftTerms
+from wm_nodes.video_rl.ratio_and_kl import Rows
+from wm_nodes.video_rl.training_run import VideoRun
+
+ODE = toy_rollout_settings(micro_batch=8, arm="ode", eta=0.0)
+NO_KL, FROZEN = kl_config("none"), kl_config("velocity", 0.5, "frozen")
+ADVANTAGES = [1.5, -0.5, 0.25, -1.0, 2.5, -2.5, 0.0, 0.7]
+
+
+def nft_config(beta: float = 1.0, *, adaptive: bool = True, times: int = 3, **changes: Any) -> GrpoConfig:
+    decay = {name: changes.pop(name) for name in ("old_decay", "old_ramp") if name in changes}
+    nft = grpo_config().nft.with_values(beta=beta, adaptive=adaptive, times=times, **decay)
+    return grpo_config(**{
+        "objective": "nft", "nft": nft, "kl": NO_KL, "learning_rate": 1e-3, "micro_batch": 8, **changes
+    })
+
+
+def make(network: torch.nn.Module | None = None, *, seed: int = 0, ranks: Ranks | None = None,
+         rollout: Any = ODE, **changes: Any) -> GrpoLearner:
+    return GrpoLearner(network or tiny_network(), nft_config(**changes), rollout, seed=seed, ranks=ranks)
+
+
+def buffer_of(learner: GrpoLearner, **changes: Any) -> RolloutBuffer:
+    return toy_buffer(learner.model, learner.rollout, version=learner.version, **changes)
+
+
+def signal(values: list[float]) -> GroupAdvantages:
+    return GroupAdvantages(torch.tensor(values, dtype=torch.float64), torch.ones(len(values)).bool(), 1, 0)
+
+
+def all_rows(count: int, times: int = 3) -> Rows:
+    return Rows(torch.arange(count).repeat_interleave(times), torch.arange(times).repeat(count))
+
+
+def gradient(learner: GrpoLearner, buffer: RolloutBuffer, values: list[float], rows: Rows | None = None) -> Tensor:
+    """Of the learner's loss, all parameters in one row."""
+    learner.model.zero_grad(set_to_none=True)
+    rows = rows or all_rows(len(buffer), learner.settings.nft.times)
+    learner.gradients(buffer, rows, signal(values))
+    return torch.cat([p.grad.flatten() for p in learner.parameters if p.grad is not None])
+
+
+class Line(torch.nn.Module):
+    """v = slope x + offset; the condition says nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.slope, self.offset = (torch.nn.Parameter(torch.tensor(value)) for value in (0.3, -0.2))
+
+    def forward(self, x: Tensor, t: Tensor, condition: Any, drop: Tensor | None = None) -> Tensor:
+        return self.slope * x + self.offset
+
+
+def drawn(learner: GrpoLearner, buffer: RolloutBuffer, rows: Rows) -> tuple[np.ndarray, ...]:
+    """x_0, eps and x_t of the rows, (M, C, F, H, W) without the given frame, and t, float64."""
+    assert isinstance(learner._terms, NftTerms)
+    t, noise = learner._terms._draw(buffer, rows, learner.version)
+    x_0 = buffer.rollout.latents[rows.videos].double().numpy()[:, :, 1:]
+    eps, times = noise.double().numpy()[:, :, 1:], t.numpy().reshape(-1, 1, 1, 1, 1)
+    return x_0, eps, (1 - times) * x_0 + times * eps, times
+
+
+# the formula
+
+
+@pytest.mark.parametrize("adaptive", [True, False])
+@pytest.mark.parametrize("beta", [1.0, 0.1, 2.5])
+def test_loss_and_gradient_of_a_linear_velocity_are_those_worked_out_by_hand(beta: float, adaptive: bool) -> None:
+    """v = a x + b now at a = 0.5, b = 0.1, old at a = 0.3, b = -0.2; c = 2.5."""
+    learner = make(Line(), beta=beta, adaptive=adaptive, micro_batch=5)
+    buffer, rows = buffer_of(learner), all_rows(8)
+    with torch.no_grad():
+        learner.model.slope.fill_(0.5)
+        learner.model.offset.fill_(0.1)
+    x_0, _, x_t, t = drawn(learner, buffer, rows)
+    new, old, c = 0.5 * x_t + 0.1, 0.3 * x_t - 0.2, 2.5
+    r = np.clip(np.array(ADVANTAGES)[rows.videos] / c / 2 + 0.5, 0, 1)
+    axes, loss, slope, offset = (1, 2, 3, 4), 0.0, 0.0, 0.0
+    for share, sign in ((r, 1), (1 - r, -1)):
+        v = beta * new + (1 - beta) * old if sign == 1 else (1 + beta) * old - beta * new
+        error = x_t - t * v - x_0
+        scale = np.maximum(np.abs(error).mean(axes), 1e-5) if adaptive else np.ones(24)
+        loss = loss + c * share * (error**2).mean(axes) / scale / beta
+        down = -2 * sign * t * error * beta  # d error^2 / d v, by the chain rule through v+ or v-
+        slope = slope + c * share * (down * x_t).mean(axes) / scale / beta
+        offset = offset + c * share * down.mean(axes) / scale / beta
+    learner.model.zero_grad(set_to_none=True)
+    sums = learner.gradients(buffer, rows, signal(ADVANTAGES))
+    assert -sums["objective"] / 24 == pytest.approx(np.mean(loss), rel=1e-5)
+    assert float(learner.model.slope.grad) == pytest.approx(np.mean(slope), rel=1e-4)
+    assert float(learner.model.offset.grad) == pytest.approx(np.mean(offset), rel=1e-4)
+
+
+@pytest.mark.parametrize("adaptive", [True, False])
+@pytest.mark.parametrize("beta", [1.0, 0.1])
+def test_clips_without_an_advantage_have_no_gradient_while_the_weights_are_the_old_ones(
+    beta: float, adaptive: bool
+) -> None:
+    learner = make(beta=beta, adaptive=adaptive)
+    buffer = buffer_of(learner)
+    assert not gradient(learner, buffer, [0.0] * 8).any()
+    assert gradient(learner, buffer, ADVANTAGES).norm() > 0.1
+    with torch.no_grad():
+        for parameter in learner.parameters:
+            parameter.add_(0.01)
+    assert gradient(learner, buffer, [0.0] * 8).any(), "then it draws back to them"
+
+
+def test_the_best_clips_with_beta_1_are_learned_by_plain_flow_matching_in_the_space_of_clean_clips() -> None:
+    """A = c: r = 1, v+ = v; the error x^_0 - x_0 is t times that of the velocity."""
+    learner = make(adaptive=False)
+    buffer, rows = buffer_of(learner), all_rows(8)
+    found = gradient(learner, buffer, [2.5] * 8)
+    _, noise = learner._terms._draw(buffer, rows, 0)
+    t, x_0 = torch.from_numpy(drawn(learner, buffer, rows)[3]).float(), buffer.rollout.latents[rows.videos]
+    condition = buffer.condition.rows(rows.videos)
+    x_t = torch.cat([condition.frames, ((1 - t) * x_0 + t * noise)[:, :, 1:]], 2)
+    error = (learner.model(x_t, t.flatten().double(), condition) - (noise - x_0))[:, :, 1:]
+    loss = 2.5 * (t * error).square().mean()
+    wanted = torch.autograd.grad(loss, learner.parameters, allow_unused=True)  # the text layer, without a text
+    wanted = torch.cat([g.flatten() for g in wanted if g is not None])
+    assert float((found - wanted).norm() / wanted.norm()) < 1e-5
+
+
+@pytest.mark.parametrize("good", [0, 1])
+@pytest.mark.parametrize("adaptive", [True, False])
+def test_a_step_moves_the_velocity_towards_that_of_the_good_clip_and_away_from_that_of_the_bad_one(
+    good: int, adaptive: bool
+) -> None:
+    """Clips of ones and of minus ones; v is a constant. The velocity eps - x_0 to the clip of ones is the lower one."""
+    model = Analytic(lambda x, t: torch.zeros_like(x))
+    learner = GrpoLearner(model, nft_config(adaptive=adaptive), ODE, seed=0)
+    buffer = buffer_of(learner, groups=1, size=2)
+    values = torch.tensor([1.0, -1.0]).view(2, 1, 1, 1, 1).expand_as(buffer.rollout.latents)
+    buffer = replace(buffer, rollout=replace(buffer.rollout, latents=values.contiguous()))
+    for advantages, both in (([2.5, -2.5], True), ([2.5, 0.0], False), ([0.0, -2.5], False)):
+        found = float(gradient(learner, buffer, advantages if good == 0 else advantages[::-1]))
+        assert math.copysign(1, found) == (1 if good == 0 else -1) and abs(found) > (1.0 if both else 0.5)
+
+
+def test_updates_move_new_videos_towards_what_is_rewarded() -> None:
+    """One parameter is added to the velocity: a brighter video needs less of it."""
+    for sign in (1, -1):
+        model = Analytic(lambda x, t: x)
+        learner, seen = GrpoLearner(model, nft_config(learning_rate=0.02), ODE, seed=0), []
+        for iteration in range(6):
+            buffer = buffer_of(learner, iteration=iteration, size=16)
+            learner.train(buffer.with_rewards({"total": sign * buffer.rollout.latents.mean((1, 2, 3, 4))}))
+            seen.append(-sign * model.offset.item())
+        assert seen == sorted(seen) and seen[0] > 0.01 and seen[-1] > 0.05
+
+
+def test_given_frames_stay_clean_and_count_nothing() -> None:
+    """Other latents where frames are given change no bit."""
+    learner = make()
+    buffer = buffer_of(learner)
+    latents = buffer.rollout.latents.clone()
+    latents[:, :, 0] += 100
+    other = replace(buffer, rollout=replace(buffer.rollout, latents=latents))
+    assert torch.equal(gradient(learner, buffer, ADVANTAGES), gradient(learner, other, ADVANTAGES))
+
+
+def test_times_lie_one_in_each_part_of_the_sampler_s_range_and_every_update_draws_anew() -> None:
+    learner = make(times=4)
+    buffer, rows = buffer_of(learner), all_rows(8, 4)
+    times, noise = learner._terms._draw(buffer, rows, 0)
+    uniform = times / (3 - 2 * times)  # the inverse of shift 3
+    assert (uniform * 4).floor().int().tolist() == [0, 1, 2, 3] * 8 and len(set(times.tolist())) == 32
+    assert float(times.mean()) > 0.6, "shifted towards the noise"
+    again, later = learner._terms._draw(buffer, rows, 0), learner._terms._draw(buffer, rows, 1)
+    assert torch.equal(again[1], noise) and torch.equal(again[0], times)
+    assert not (later[1] == noise).any() and not (later[0] == times).any()
+    part = rows.part(torch.tensor([17, 3]))
+    assert torch.equal(learner._terms._draw(buffer, part, 0)[1], noise[[17, 3]])
+
+
+# the learner's contracts
+
+
+@pytest.mark.parametrize("rollout", [ODE, toy_rollout_settings(micro_batch=8, arm="cps", noise_store="seed")])
+def test_clips_of_any_sampler_train_and_what_does_not_exist_is_not_a_number(rollout: Any) -> None:
+    learner = make(rollout=rollout)
+    before = weights(learner.model)
+    report = learner.train(buffer_of(learner))
+    assert [update.transitions for update in report.updates] == [24, 24] and report.kept == 8
+    for update in report.updates:
+        missing = (update.kl, update.ratio_mean, update.clip_low_share, update.clip_high_share)
+        assert all(map(math.isnan, missing)) and update.objective < 0 < update.grad_norm
+    assert any(not torch.equal(value, before[name]) for name, value in weights(learner.model).items())
+    if rollout is ODE:
+        assert (report.noise_share, report.step_noise) == (0.0, {})
+
+
+def test_every_update_trains_the_kept_videos_alone() -> None:
+    learner = make(passes="parts")
+    buffer = buffer_of(learner)
+    rewards = torch.tensor([0.0, 1, math.nan, 3, 5, 5, 5, 5])
+    report = learner.train(buffer.with_rewards({"total": rewards}))
+    assert report.kept == 3 and [update.transitions for update in report.updates] == [3, 6]
+
+
+@pytest.mark.parametrize("changes", [{}, {"kl": FROZEN}])
+def test_the_size_of_a_micro_batch_does_not_change_the_gradient(changes: dict[str, Any]) -> None:
+    whole = make(micro_batch=1000, **changes)
+    buffer = buffer_of(whole)
+    wanted = gradient(whole, buffer, ADVANTAGES)
+    for size in (1, 5):
+        parts = gradient(make(micro_batch=size, **changes), buffer, ADVANTAGES)
+        assert float((parts - wanted).norm() / wanted.norm()) < 1e-5
+
+
+class OneOfTwo(Ranks):
+    """A rank that is told nothing by the other one."""
+
+    def sum_(self, *tensors: Tensor) -> None:
+        pass
+
+
+def test_the_gradients_of_two_ranks_add_up_to_that_of_one_and_a_rank_without_rows_gives_zeros() -> None:
+    one = make()
+    buffer, rows = buffer_of(one), Rows(torch.tensor([0, 3, 3, 5, 7]), torch.tensor([1, 0, 2, 2, 2]))
+    halves = [gradient(make(ranks=OneOfTwo(rank, 2)), buffer, ADVANTAGES, rows) for rank in (0, 1)]
+    wanted = gradient(one, buffer, ADVANTAGES, rows)
+    assert float((halves[0] + halves[1] - wanted).norm() / wanted.norm()) < 1e-5
+    idle = gradient(make(ranks=OneOfTwo(1, 2)), buffer, ADVANTAGES, rows.part(torch.tensor([0])))
+    assert idle.shape == wanted.shape and not idle.any()
+
+
+@pytest.mark.slow
+def test_two_gloo_ranks_give_the_update_of_one(tmp_path: Path) -> None:
+    settings = nft_config(micro_batch=3, updates_per_buffer=3, learning_rate=1e-4, kl=FROZEN, old_decay=0.5)
+    one = GrpoLearner(tiny_network(), settings, toy_rollout_settings(), seed=5)
+    report = one.train(toy_buffer(one.model, one.rollout))
+    mp.spawn(video_learner_rank, args=(2, str(tmp_path), settings), nprocs=2)
+    ranks = [torch.load(tmp_path / f"rank{rank}.pt", weights_only=True) for rank in (0, 1)]
+    for name, tensor in weights(one.model).items():
+        assert torch.equal(ranks[0]["weights"][name], ranks[1]["weights"][name])
+        assert_close(ranks[0]["weights"][name], tensor, rtol=1e-4, atol=1e-6)
+    numbers = [[u.objective, u.kl, u.ratio_mean, u.clip_low_share, u.clip_high_share] for u in report.updates]
+    assert_close(ranks[0]["numbers"], torch.tensor(numbers), rtol=1e-3, atol=1e-6, equal_nan=True)
+
+
+# old weights
+
+
+@pytest.mark.parametrize(("decay", "ramp", "kept"), [(0.0, 1.0, 0.0), (0.5, 0.1, 0.2), (0.5, 1.0, 0.5)])
+def test_the_old_weights_follow_after_each_buffer(decay: float, ramp: float, kept: float) -> None:
+    """Two optimizer steps: d = min(2 ramp, decay)."""
+    learner = make(old_decay=decay, old_ramp=ramp)
+    start = weights(learner.model)
+    assert all(torch.equal(value, start[name]) for name, value in learner._terms.old.items())
+    learner.train(buffer_of(learner))
+    for name, value in weights(learner.model).items():
+        assert_close(learner._terms.old[name], kept * start[name] + (1 - kept) * value)
+
+
+STATEFUL = [{}, {"old_decay": 0.5, "old_ramp": 0.1}, {"kl": FROZEN, "ema_decay": 0.9, "passes": "parts"}]
+
+
+@pytest.mark.parametrize("changes", STATEFUL)
+def test_three_rounds_equal_two_a_resume_and_one_bit_for_bit(tmp_path: Path, changes: dict[str, Any]) -> None:
+    straight, stopped, other = make(**changes), make(**changes), make(seed=1, **changes)
+    train_rounds(straight, range(3))
+    train_rounds(other, range(3))
+    train_rounds(stopped, range(2))
+    stopped.save(tmp_path / "state", iteration=2)
+    resumed = make(tiny_network(seed=9), **changes)
+    assert resumed.load(tmp_path / "state") == 2 and resumed.version == 4
+    train_rounds(resumed, range(2, 3))
+    for name, value in weights(straight.model).items():
+        assert torch.equal(value, weights(resumed.model)[name]), name
+        assert torch.equal(straight._terms.old[name], resumed._terms.old[name]), name
+    assert any(not torch.equal(value, weights(other.model)[name]) for name, value in weights(straight.model).items())
+
+
+def test_a_checkpoint_of_the_other_objective_is_refused(tmp_path: Path) -> None:
+    rollout = toy_rollout_settings()
+    ratio = GrpoLearner(tiny_network(), grpo_config(), rollout, seed=0)
+    nft = make(rollout=rollout)
+    for one, other in ((ratio, nft), (nft, ratio)):
+        one.save(tmp_path / "state", iteration=0)
+        with pytest.raises(ValueError, match=r"another grpo\.objective; resume with its settings"):
+            other.load(tmp_path / "state")
+
+
+@pytest.mark.parametrize("changes", STATEFUL)
+def test_a_gradient_that_is_not_finite_undoes_the_whole_buffer(changes: dict[str, Any]) -> None:
+    """In the second update of the second buffer."""
+    learner, undisturbed = make(**changes), make(**changes)
+    for one in (learner, undisturbed):
+        train_rounds(one, range(1))
+    buffer, before, old = buffer_of(learner, iteration=7), weights(learner.model), copy.deepcopy(learner._terms.old)
+    calls = iter(range(1000))
+    first = len(next(learner._passes(buffer, torch.ones(8).bool()))) // 8 + 1
+    handle = learner.parameters[0].register_hook(lambda g: g * (math.nan if next(calls) >= first else 1.0))
+    with pytest.raises(FloatingPointError, match="gradient is not finite"):
+        learner.train(buffer)
+    handle.remove()
+    assert learner.version == 2
+    assert all(torch.equal(value, before[name]) for name, value in weights(learner.model).items())
+    assert all(torch.equal(value, old[name]) for name, value in learner._terms.old.items())
+    for one in (learner, undisturbed):
+        one.train(buffer)
+        one.train(buffer_of(one, iteration=8))
+    for name, value in weights(learner.model).items():
+        assert torch.equal(value, weights(undisturbed.model)[name]), name
+
+
+# anchors and refusals
+
+
+def test_the_kl_is_the_squared_distance_of_the_velocities_from_the_anchor_s() -> None:
+    """v is 0 at the anchor and 0.5 now."""
+    model = Analytic(lambda x, t: torch.zeros_like(x))
+    learner = GrpoLearner(model, nft_config(kl=kl_config("velocity", 2.0, "frozen")), ODE, seed=0)
+    buffer = buffer_of(learner)
+    assert learner.gradients(buffer, all_rows(8), signal([0.0] * 8))["kl"] == 0.0
+    with torch.no_grad():
+        model.offset.fill_(0.5)
+    plain = GrpoLearner(model, nft_config(), ODE, seed=0)
+    plain._terms.old = {"offset": torch.zeros(())}
+    assert learner.gradients(buffer, all_rows(8), signal(ADVANTAGES))["kl"] / 24 == pytest.approx(0.25)
+    found = gradient(learner, buffer, ADVANTAGES) - gradient(plain, buffer, ADVANTAGES)
+    assert float(found) == pytest.approx(2.0 * 2 * 0.5, rel=1e-5), "beta d v^2 / d v"
+
+
+@pytest.mark.parametrize("anchor", ["frozen", "moving"])
+def test_each_anchor_is_where_it_says(anchor: str) -> None:
+    learner, found = make(kl=kl_config("velocity", 0.5, anchor, 3)), []
+    for iteration in range(3):
+        found += [update.kl for update in learner.train(buffer_of(learner, iteration=iteration)).updates]
+    assert [kl == 0.0 for kl in found] == [True, False, False, anchor == "moving", False, False]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"kl": kl_config("mean", 0.5, "frozen")}, "no transitions, got kl.mode mean with kl.anchor frozen; take"),
+        ({"kl": kl_config("logk3", 0.5, "frozen")}, "got kl.mode logk3"),
+        ({"kl": kl_config("velocity", 0.5, "buffer")}, "got kl.mode velocity with kl.anchor buffer"),
+        ({"kl": kl_config("velocity", 0.5, "dual")}, "with kl.anchor dual; .* frozen, moving or lora_off"),
+        ({"equalise": True, "ratio_norm": True}, "has no ratio, got ratio_norm, equalise; switch it off"),
+        ({"mask_source": "recompute"}, "got mask_source recompute"),
+    ],
+)
+def test_what_needs_a_transition_is_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        nft_config(**changes)
+
+
+def test_the_ratio_still_needs_a_sampler_with_noise_and_names_this_objective() -> None:
+    with pytest.raises(ValueError, match=r"no likelihood to train on; .* or grpo\.objective nft"):
+        GrpoLearner(tiny_network(), grpo_config(), ODE, seed=0)
+
+
+# around the learner
+
+
+def test_a_run_folder_of_ode_clips_resumes_and_writes_null_for_what_does_not_exist(tmp_path: Path) -> None:
+    plain = load_video_config("smoke")
+    config = plain.with_values(
+        rollout=RolloutConfig.model_validate(ODE, from_attributes=True), grpo=nft_config(old_decay=0.3, old_ramp=1.0)
+    )
+
+    def train(run: VideoRun, rounds: int) -> VideoRun:
+        for _ in range(rounds):
+            buffer = buffer_of(run.learner, iteration=run.iterations)
+            again = RolloutBuffer.from_bytes(buffer.to_bytes())
+            assert again.to_bytes() == buffer.to_bytes() and again.rollout.steps == ()
+            run.train(again)
+        run.close()
+        return run
+
+    straight = train(VideoRun(tiny_network(), config, tmp_path / "straight"), 3)
+    train(VideoRun(tiny_network(), config, tmp_path / "stopped"), 2)
+    resumed = train(VideoRun(tiny_network(seed=3), config, tmp_path / "stopped"), 1)
+    assert (resumed.version, resumed.iterations) == (straight.version, straight.iterations) == (6, 3)
+    for name, value in weights(straight.network).items():
+        assert torch.equal(value, weights(resumed.network)[name]), name
+    first, *_ = read_metrics(tmp_path / "stopped", "grpo")
+    assert {name for name, value in first.items() if value is None} == {
+        f"{name}_{k}" for name in ("kl", "ratio_mean", "clip_low_share", "clip_high_share") for k in (1, 2)
+    }
+    assert curves(tmp_path / "stopped" / FILE_NAME, tmp_path / "curves.png", clip_panels(2)) is not None
+
+
+def test_the_check_of_a_video_model_finds_no_ratio_and_equal_calls() -> None:
+    config, network = nft_config(), tiny_network()
+    buffer = toy_buffer(network, ODE)
+    found = {f.name: f for f in examine(network, buffer.condition, SHAPE, ODE, config)}
+    assert all(finding.passed for finding in found.values())
+    assert found["ratio is 1 on the first update"].value == "objective nft has none"
+    restless = Analytic(lambda x, t: x + 0.3 * torch.randn_like(x))  # other noise on every call, as dropout would give
+    found = {f.name: f for f in examine(restless, buffer.condition, SHAPE, ODE, config)}
+    assert not found["KL is 0 at the anchor"].passed
