@@ -200,8 +200,8 @@ def cost_rows() -> Rows:
 
 
 def ablation_rows() -> Rows:
-    compared = read("video_rl_ablations.json")["comparisons"]
-    for one, text in zip(compared, ABLATIONS, strict=True):
+    comparisons = read("video_rl_ablations.json")["comparisons"]
+    for one, text in zip(comparisons, ABLATIONS, strict=True):
         found = one["differences"]["obeyed"]
         beside_0 = not found["low"] <= 0 <= found["high"]
         yield f"Guidance 2 - 1: obeyed {difference(one, 'obeyed', 2)}" if beside_0 else text
