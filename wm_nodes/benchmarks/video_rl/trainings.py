@@ -100,7 +100,7 @@ def finished(path: Path | None, trials: Sequence[SamplerTrial[Any]]) -> list[dic
     rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
     if any("sampler" not in row for row in rows):
         raise ValueError(f"{path} is of an earlier version of this benchmark; take another file")
-    plans = {trial.sampler.name: asdict(trial.plan) for trial in trials}
+    plans = {trial.sampler.name: json.loads(json.dumps(asdict(trial.plan))) for trial in trials}
     for row in rows:
         plan, name = row["plan"], row["sampler"]
         if plan != plans.get(name, plan):
