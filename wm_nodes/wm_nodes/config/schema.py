@@ -110,6 +110,15 @@ class WorldModelConfig(SettingsSection):
     """Weight of the losses on predicted frames after decoding, and after encoding them again (0: off)."""
 
 
+class VideoEnvironmentConfig(SettingsSection):
+    """How the video model makes a frame where it is the environment."""
+
+    num_steps: PositiveInt
+    """Sampler steps, each a call of the network."""
+    shift: PositiveFloat
+    """Of the flow times towards the noise; 1: none."""
+
+
 class RewardConfig(SettingsSection):
     mode: Literal["delta", "abs", "progress"]
     """Dense reward (RS-5): change of the goal distance, its level, or progress along the golden trajectory."""
@@ -290,6 +299,7 @@ class RunConfig(SettingsSection):
     data: DataConfig
     tokenizer: TokenizerConfig
     world_model: WorldModelConfig
+    video_environment: VideoEnvironmentConfig
     reward: RewardConfig
     judge: JudgeConfig
     policy: PolicyConfig

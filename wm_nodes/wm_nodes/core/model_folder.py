@@ -46,6 +46,11 @@ def read_manifest(folder: Path, kind: str, version: int | str, manifest_name: st
     return manifest
 
 
+def files_sha256(manifest: Mapping[str, Any]) -> str:
+    """Of a manifest's file hashes: the identity of the model."""
+    return hashlib.sha256(json.dumps(manifest["sha256"], sort_keys=True).encode()).hexdigest()
+
+
 def read_model_file(path: Path, sha256: str) -> bytes:
     """Read a file of a model folder. Raises ModelFolderError where it is not the one of the manifest's sha256."""
     if not path.is_file():

@@ -23,7 +23,7 @@ from wm_nodes.policy_rl.rollouts import action_noise, collect_rollout, reset_see
 from wm_nodes.policy_rl.tensor_rollout import TensorRollout
 from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel
 from wm_nodes.world_model.device_environment import DeviceEnvironment
-from wm_nodes.world_model.imagined_environment import start_of
+from wm_nodes.world_model.imagined_episodes import start_of
 
 MOST_HASHED_STARTS = 1024
 WARM_UP_STEPS = 3

@@ -12,7 +12,15 @@ import torch
 from torch import nn
 
 from wm_nodes.config.schema import TokenizerConfig
-from wm_nodes.core.model_folder import MANIFEST, ModelFolderError, read_manifest, read_model_file, write_model_folder
+from wm_nodes.core.device import device_of
+from wm_nodes.core.model_folder import (
+    MANIFEST,
+    ModelFolderError,
+    files_sha256,
+    read_manifest,
+    read_model_file,
+    write_model_folder,
+)
 from wm_nodes.training.weights import WeightsError, load_weights, pack_weights
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.codec import PatchCodec
@@ -40,6 +48,14 @@ class VideoFolder:
         """What a clip goes on from and how much it makes; None where a clip is a whole episode."""
         given = self.clip.get("given_frames", 0)
         return ClipLengths(given, self.clip["new_frames"]) if given else None
+
+    @property
+    def device(self) -> torch.device:
+        return device_of(self.network)
+
+    @property
+    def sha256(self) -> str:
+        return files_sha256(self.manifest)
 
 
 def save_video_folder(

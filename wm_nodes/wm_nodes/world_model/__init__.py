@@ -3,11 +3,12 @@
 from wm_nodes.world_model.device_environment import DeviceEnvironment
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.folder import WorldModels, load_model_folder, save_model_folder, save_refreshed_folder
-from wm_nodes.world_model.imagined_environment import ImaginedEnvironment, load_starts
+from wm_nodes.world_model.imagined_environment import ImaginedEnvironment
+from wm_nodes.world_model.imagined_episodes import ImaginedEpisodes, load_starts
 from wm_nodes.world_model.text import TextModel, imagine_goals
 from wm_nodes.world_model.tokenizer import Tokenizer
 
 __all__ = [
-    "ActionModel", "DeviceEnvironment", "ImaginedEnvironment", "TextModel", "Tokenizer", "WorldModels", "imagine_goals",
-    "load_model_folder", "load_starts", "save_model_folder", "save_refreshed_folder",
+    "ActionModel", "DeviceEnvironment", "ImaginedEnvironment", "ImaginedEpisodes", "TextModel", "Tokenizer",
+    "WorldModels", "imagine_goals", "load_model_folder", "load_starts", "save_model_folder", "save_refreshed_folder",
 ]

@@ -23,8 +23,8 @@ from wm_nodes.world_model.imagined_environment import (
     ImaginedEnvironment,
     encode_starts,
     imagine_start_goals,
-    imagined_spec,
     models_to_infer,
+    world_model_spec,
 )
 from wm_nodes.world_model.precision import has_fast_bfloat16
 
@@ -60,7 +60,7 @@ class DeviceEnvironment:
         self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
         *, num_envs: int, with_goals: bool = True, exact: bool = False, fixed: bool | None = None,
     ) -> None:
-        self.spec, self.device = imagined_spec(models, spec, num_envs), models.tokenizer.device
+        self.spec, self.device = world_model_spec(models, spec, num_envs), models.tokenizer.device
         self.tokenizer_sha256 = models.tokenizer_sha256
         self._reward, self._task = reward, models.task_index(spec.task)
         images, states = starts

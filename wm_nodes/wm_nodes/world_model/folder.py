@@ -1,7 +1,6 @@
 """World models on disk: one folder with safetensors files and a manifest that says how they were made."""
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,13 @@ from safetensors.torch import load, save
 from torch import nn
 
 from wm_nodes.config.schema import RunConfig, SimulationConfig, TokenizerConfig, WorldModelConfig
-from wm_nodes.core.model_folder import ModelFolderError, read_manifest, read_model_file, write_model_folder
+from wm_nodes.core.model_folder import (
+    ModelFolderError,
+    files_sha256,
+    read_manifest,
+    read_model_file,
+    write_model_folder,
+)
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -45,8 +50,7 @@ class WorldModels:
 
     @property
     def sha256(self) -> str:
-        """Of the manifest's file hashes: the identity of the world model."""
-        return hashlib.sha256(json.dumps(self.manifest["sha256"], sort_keys=True).encode()).hexdigest()
+        return files_sha256(self.manifest)
 
     @property
     def tokenizer_sha256(self) -> str:

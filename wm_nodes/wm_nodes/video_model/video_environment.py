@@ -1,0 +1,137 @@
+"""The video model behind the Environment interface: the next frame of each environment, from its own last ones.
+
+Shapes: N environments, M starts, R rows of one call, C channels, G frames given at most, K given frames, h w latent
+grid, H W 3 image, A action.
+"""
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wm_nodes.config.schema import RewardConfig, VideoEnvironmentConfig
+from wm_nodes.core.seeding import stream_seed
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
+from wm_nodes.video_model.conditions import Condition, hashed_words
+from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_model.sampling import RolloutSettings, initial_noise, sample_videos
+from wm_nodes.world_model.imagined_episodes import ImaginedEpisodes, imagined_spec
+from wm_nodes.world_model.parts import in_parallel
+
+ROWS = 16
+"""Of each call of the models on a CPU, the last one filled up: with one batch size a row has the same bits beside any
+others. Fewer rows cost more each, more rows hardly less."""
+
+
+class DoneSignal(Protocol):
+    """Tells from uint8 frames (R, H, W, 3) with what probability the task is done in each, (R,); see success_reader."""
+
+    def read(self, frames: Tensor) -> FloatArray: ...
+
+
+class VideoEnvironment(ImaginedEpisodes):
+    """N imagined environments in lock-step, one sampled frame per step.
+
+    The initial noise of a frame comes from the stream (seed of the reset, `video_step`, step), so an episode is the
+    same in any batch; on a CPU bit for bit. The done signal is that of `reader`; nothing estimates its uncertainty,
+    which is 0, and no goals are imagined.
+
+    Args:
+        spec, starts, reward: as ImaginedEpisodes's; the spec is that of the simulator the model was learned from.
+        settings: of the sampler, an ODE.
+
+    Raises:
+        ValueError: a model that cannot be stepped, or of another task or robot; starts of another picture size.
+    """
+
+    def __init__(
+        self, folder: VideoFolder, reader: DoneSignal, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray],
+        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, seed: int = 0,
+    ) -> None:
+        check_steppable(folder, spec)
+        assert folder.lengths is not None  # checked
+        device = folder.device
+        super().__init__(
+            imagined_spec(spec, f"video/{spec.task}", folder.sha256, num_envs), starts, reward, seed=seed, device=device
+        )
+        self.folder, self._reader = folder, reader
+        self._rows = ROWS if device.type == "cpu" else num_envs
+        self._sampler = RolloutSettings(settings.num_steps, settings.shift, micro_batch=self._rows)
+        self._start_latents = folder.codec.encode(torch.from_numpy(starts[0]).unsqueeze(1)).to(device)
+        self._text = hashed_words((spec.instruction,), folder.network.settings.text_dim).to(device)
+        most = folder.lengths.given
+        # newest last; of the oldest, only the newest _num_given are of the present episode
+        self._given = self._start_latents[:1].repeat(num_envs, 1, most, 1, 1)
+        self._acted = torch.zeros(num_envs, most, spec.action_dim, device=device)
+        self._num_given = np.ones(num_envs, np.int64)
+
+    def _begin(self, mask: BoolArray) -> None:
+        rows = self._tensor(np.flatnonzero(mask))
+        self._given[rows, :, -1:] = self._start_latents[self._tensor(self._starts[mask])]
+        self._num_given[mask] = 1
+
+    def _predict(
+        self, actions: FloatArray, moved: FloatArray, valid: BoolArray
+    ) -> tuple[UInt8Array, FloatArray, FloatArray]:
+        acted = torch.cat([self._acted[:, 1:], self._tensor(actions).unsqueeze(1)], 1)
+        noise = self._noise(valid)
+        calls = self._calls(valid)
+
+        def sample(rows: Tensor) -> tuple[Tensor, Tensor, FloatArray]:
+            K = int(self._num_given[int(rows[0])])
+            frames = self._given[rows, :, -K:]
+            condition = Condition(frames, acted[rows, -K:], self._text.expand(len(rows), -1, -1))
+            x = torch.cat([torch.zeros_like(frames), noise[rows]], 2)
+            none = torch.zeros(len(rows), dtype=torch.int64)  # an ODE has no step noise
+            made = sample_videos(self.folder.network, condition, x, none, self._sampler, []).latents[:, :, -1:]
+            pictures = self.folder.codec.decode(made).squeeze(1)
+            return made, pictures, self._reader.read(pictures)
+
+        shown, signal = self._shown.copy(), np.zeros(len(valid), np.float32)
+        latents = self._given[:, :, -1:].clone()
+        for rows, (made, pictures, done) in zip(calls, in_parallel(sample, calls), strict=True):
+            latents[rows] = made  # rows that fill up a call are written twice, with the same
+            shown[rows.cpu().numpy()], signal[rows.cpu().numpy()] = pictures.cpu().numpy(), done
+        if not torch.isfinite(latents).all():
+            raise FloatingPointError("the video model predicted NaN; its weights are damaged or were trained too hot")
+        stepped = self._tensor(valid)
+        given = torch.cat([self._given[:, :, 1:], latents], 2)
+        self._given = torch.where(stepped[:, None, None, None, None], given, self._given)
+        self._acted = torch.where(stepped[:, None, None], acted, self._acted)
+        most = self._given.shape[2]
+        self._num_given = np.where(valid, np.minimum(self._num_given + 1, most), self._num_given)
+        return shown, signal, np.zeros_like(signal)
+
+    def _calls(self, valid: BoolArray) -> list[Tensor]:
+        """The rows of each call of the models: of as many given frames; on a CPU always ROWS of them."""
+        calls = list[Tensor]()
+        for K in np.unique(self._num_given[valid]):
+            rows = np.flatnonzero(valid & (self._num_given == K))
+            if self.device.type == "cpu":
+                rows = np.concatenate([rows, np.full(-len(rows) % self._rows, rows[0])])
+            calls += torch.split(self._tensor(rows), self._rows)  # type: ignore[no-untyped-call]
+        return calls
+
+    def _noise(self, valid: BoolArray) -> Tensor:
+        """Initial noise (N, C, 1, h, w) of the next frames; where not `valid`, any."""
+        seeds = [
+            stream_seed(int(seed), "video_step", int(step)) if needed else 0
+            for seed, step, needed in zip(self._seeds, self._steps, valid, strict=True)
+        ]
+        return initial_noise(tuple(self._start_latents.shape[1:]), torch.tensor(seeds)).to(self.device)
+
+
+def check_steppable(folder: VideoFolder, spec: EnvironmentSpec) -> None:
+    """Raise ValueError unless the model can be stepped, as the robot and for the task of `spec`."""
+    stride, actions, task = folder.clip["stride"], folder.network.settings.action_dim, folder.manifest.get("task")
+    if folder.lengths is None or stride != 1:
+        raise ValueError(
+            f"this video model makes clips of whole episodes, {stride} steps between two frames, and cannot be "
+            "stepped; train one with the preset closed_loop"
+        )
+    if task not in (None, spec.task):
+        raise ValueError(f"this video model was trained for the task {task}, not for {spec.task}; train one for it")
+    if actions != spec.action_dim:
+        raise ValueError(f"this video model takes {actions} action values, the robot {spec.action_dim}; train it anew")

@@ -1,0 +1,141 @@
+"""What every imagined environment shares: real starts, exact tool positions, step limits, ends by a done signal.
+
+Shapes: N environments, M starts, H W 3 image, A action, P state.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file
+from torch import Tensor
+
+from wm_nodes.config.schema import RewardConfig
+from wm_nodes.core.cameras import CameraModel
+from wm_nodes.core.device import explain_memory
+from wm_nodes.core.seeding import numpy_stream, stream_seed
+from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
+from wm_nodes.core.tool_control import check_actions, next_state
+from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+
+
+def load_starts(path: Path) -> tuple[UInt8Array, FloatArray]:
+    """Real first frames uint8 (M, H, W, 3) and states float32 (M, P) to imagine from."""
+    tensors = load_file(path)
+    missing = {"images", "states"} - tensors.keys()
+    if missing or not len(tensors["images"]):
+        raise ValueError(f"{path} is no starts file: it must hold images and states of at least one first frame")
+    return tensors["images"].numpy(), tensors["states"].numpy()
+
+
+def imagined_spec(spec: EnvironmentSpec, env_id: str, sha256: str, num_envs: int) -> EnvironmentSpec:
+    """The spec of a simulator as that of a model, of files with this sha256, which stands in for it."""
+    return replace(
+        spec, env_id=env_id, source=SOURCE_IMAGINED, num_envs=num_envs, ground_truth_names=(),
+        world_model_sha256=sha256,
+    )
+
+
+def start_of(seed: int, num_starts: int) -> int:
+    """The start at which a reset with `seed` begins."""
+    return int(numpy_stream(seed, "start").integers(num_starts))
+
+
+class ImaginedEpisodes(ABC):
+    """N imagined environments in lock-step, without the model that imagines. An episode terminates when the done signal
+    exceeds reward.success_threshold (RS-7), and is truncated at the step limit or above reward.uncertainty_limit.
+
+    Args:
+        spec: what imagined_spec gives.
+        starts: first frames and states; a reset with seed s begins at start hash(s) mod M.
+        seed: root of the stream `reset`, of which resets without seeds take theirs.
+        device: where the model is.
+    """
+
+    cameras: Sequence[CameraModel] = ()
+    """Those whose pictures it imagines, where somebody has said so."""
+
+    def __init__(
+        self, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig, *, seed: int,
+        device: torch.device,
+    ) -> None:
+        self.spec, self.starts, self.reward, self.device = spec, starts, reward, device
+        images, states = starts
+        self._seed, self._num_resets = seed, 0
+        self._starts = np.zeros(spec.num_envs, np.int64)
+        self._seeds = np.zeros(spec.num_envs, np.uint64)
+        self._shown = np.repeat(images[:1], spec.num_envs, 0)
+        self._states = np.repeat(states[:1], spec.num_envs, 0).astype(np.float32)
+        self._steps = np.zeros(spec.num_envs, np.uint32)
+        self._episode_ids = np.zeros(spec.num_envs, np.uint64)
+        self._ended = np.ones(spec.num_envs, np.bool_)
+
+    @torch.inference_mode()
+    def reset(self, mask: BoolArray | None = None, seeds: UInt64Array | None = None) -> Observation:
+        mask = np.ones(self.spec.num_envs, np.bool_) if mask is None else mask
+        images, states = self.starts
+        for i in np.flatnonzero(mask):
+            self._num_resets += 1
+            self._seeds[i] = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else seeds[i]
+            self._starts[i] = start_of(int(self._seeds[i]), len(images))
+            self._episode_ids[i] = self._num_resets
+        chosen = self._starts[mask]
+        self._shown[mask] = images[chosen]
+        self._states[mask] = states[chosen]
+        self._begin(mask)
+        self._steps[mask] = 0
+        self._ended[mask] = False
+        return self.current()
+
+    @torch.inference_mode()
+    def step(self, actions: FloatArray) -> StepResult:
+        check_actions(actions, self.spec)
+        valid = ~self._ended
+        moved = next_state(self._states, actions, self.spec)
+        with explain_memory(self.device, ppo__num_envs=self.spec.num_envs):
+            frames, signal, spread = self._predict(actions, moved, valid)
+        self._states = np.where(valid[:, None], moved, self._states)
+        self._steps += valid.astype(np.uint32)
+        self._shown = np.where(valid[:, None, None, None], frames, self._shown)
+        terminated = valid & (signal > self.reward.success_threshold)
+        too_long = self._steps >= self.spec.max_episode_steps
+        unsure = (self.reward.uncertainty_limit > 0) & (spread > self.reward.uncertainty_limit)
+        truncated = valid & ~terminated & (too_long | unsure)
+        self._ended = self._ended | terminated | truncated
+        return StepResult(
+            observation=self.current(),
+            terminated=terminated,
+            truncated=truncated,
+            success_probability=signal,
+            uncertainty=spread,
+            ground_truth=np.zeros((self.spec.num_envs, 0), np.float32),
+            valid=valid,
+        )
+
+    def current(self) -> Observation:
+        return Observation(self._shown.copy(), self._states.copy(), self._episode_ids.copy(), self._steps.copy())
+
+    def goals(self) -> tuple[UInt8Array, BoolArray] | None:
+        return None
+
+    def close(self) -> None:
+        return None
+
+    @abstractmethod
+    def _begin(self, mask: BoolArray) -> None:
+        """Let the environments of `mask` imagine from their start, self._starts."""
+
+    @abstractmethod
+    def _predict(
+        self, actions: FloatArray, moved: FloatArray, valid: BoolArray
+    ) -> tuple[UInt8Array, FloatArray, FloatArray]:
+        """Take the step where `valid`; return frames (N, H, W, 3), done signal (N,) and disagreement (N,)."""
+
+    def _tensor(self, array: NDArray[Any]) -> Tensor:
+        """The array on the model's device."""
+        return torch.from_numpy(array).to(self.device)
