@@ -6,9 +6,9 @@ import torch
 from wm_nodes.config.load import load_config
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.success_reader import SuccessReader
 from wm_nodes.video_rl.clip_faults import FaultLimits
 from wm_nodes.video_rl.heldout_metrics import fit_tool_correction, measure_clips
-from wm_nodes.video_rl.success_reader import SuccessReader
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
 from wm_nodes.world_model.validation.open_loop import TOOL

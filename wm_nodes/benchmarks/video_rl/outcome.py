@@ -32,11 +32,11 @@ from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
+from wm_nodes.video_model.success_reader import load_success_reader
 from wm_nodes.video_rl.clip_faults import measure_fault_limits
 from wm_nodes.video_rl.heldout_metrics import fit_tool_correction, measure_clips, measure_executability
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
-from wm_nodes.video_rl.success_reader import load_success_reader
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.training.tokenizer import probe_targets
 

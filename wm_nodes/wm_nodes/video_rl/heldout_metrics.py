@@ -9,9 +9,9 @@ from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.maniskill.replay import execute_paths
 from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.success_reader import SuccessReader
 from wm_nodes.video_rl.clip_faults import FaultLimits, find_faults
 from wm_nodes.video_rl.reference_reward import score_clips
-from wm_nodes.video_rl.success_reader import SuccessReader
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL
 

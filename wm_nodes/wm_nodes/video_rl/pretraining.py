@@ -21,9 +21,9 @@ from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.flow_matching import train_video_model
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
+from wm_nodes.video_model.success_reader import save_success_reader, score_reader, train_success_reader
 from wm_nodes.video_model.tokenizer_codec import Codec, codec_of_world_model
 from wm_nodes.video_rl.reference_reward import score_clips
-from wm_nodes.video_rl.success_reader import save_success_reader, score_reader, train_success_reader
 from wm_nodes.video_rl.validation import evaluated_contexts, load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 

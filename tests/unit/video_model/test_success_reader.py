@@ -10,7 +10,7 @@ from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.codec import PatchCodec
-from wm_nodes.video_rl.success_reader import (
+from wm_nodes.video_model.success_reader import (
     SUCCESS_MANIFEST,
     WEIGHTS,
     load_success_reader,
