@@ -2,12 +2,18 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
+from safetensors.torch import save_file
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import model_tasks
 from wm_nodes.policy_rl.factories import ACTION_DIM, STATE_DIM
+from wm_nodes.video_model import NetworkSettings, VideoNetwork
+from wm_nodes.video_model.codec import PatchCodec
+from wm_nodes.video_model.folder import save_video_folder
+from wm_nodes.video_model.success_reader import SuccessReader, save_success_reader
 from wm_nodes.world_model import Tokenizer, save_model_folder
 from wm_nodes.world_model.folder import action_model_class
 
@@ -24,3 +30,31 @@ def make_model_folder(folder: Path, config: RunConfig | None = None) -> Path:
             action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),
         )
     return save_model_folder(folder, tokenizer, action, None, config, tasks=tasks, story={"made": {"seed": 0}})
+
+
+def make_stepped_folder(folder: Path, task: str = "push_cube", **clip: int) -> Path:
+    """A video model that goes on from its own frames, of pictures of 64 x 128, and its success reader, untrained."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        network = VideoNetwork(NetworkSettings(6, ACTION_DIM, text_dim=4, width=16, depth=2, patch=1, change_std=0.5))
+        for parameter in network.parameters():  # what starts at zero makes the network say nothing
+            if not parameter.any():
+                torch.nn.init.normal_(parameter, std=0.1)
+        reader = SuccessReader(64, 128)
+        frames = PatchCodec(16, 6).decode(torch.randn(64, 6, 1, 4, 8)).squeeze(1).permute(0, 3, 1, 2) / 255
+    with torch.no_grad():  # so that some frames are read as success
+        logits = reader(frames)
+        last = reader.layers[-1]
+        last.weight *= 4 / logits.std()
+        last.bias.copy_(last.bias * 4 / logits.std() - 4 * logits.mean() / logits.std())
+    cut = {"stride": 1, "num_conditioning": 1, "given_frames": 4, "new_frames": 2, **clip}
+    save_video_folder(folder, PatchCodec(16, 6), network, cut, {"task": task})
+    return save_success_reader(folder, reader, task, {})
+
+
+def write_starts(path: Path) -> Path:
+    """Five first frames of 64 x 128 noise and their states."""
+    rng = np.random.default_rng(0)
+    images, states = rng.integers(0, 256, (5, 64, 128, 3), dtype=np.uint8), rng.uniform(0.5, 0.7, (5, 3))
+    save_file({"images": torch.from_numpy(images), "states": torch.from_numpy(states).float()}, path)
+    return path

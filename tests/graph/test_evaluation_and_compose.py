@@ -8,18 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from graph import toy
 from graph.harness import Graph, Probe, wait_until
-from model_folders import make_model_folder
-from safetensors.torch import save_file
+from model_folders import make_model_folder, make_stepped_folder, write_starts
 
 from wm_msgs.action import Evaluate, Rollout, Train
 from wm_nodes.config.load import load_config
 from wm_nodes.nodes.compose import make_nodes
 from wm_nodes.policy_rl.evaluation import evaluate
-from wm_nodes.policy_rl.factories import make_endogenous_reward, make_imagined_environment, make_policy
+from wm_nodes.policy_rl.factories import (
+    make_endogenous_reward,
+    make_imagined_environment,
+    make_policy,
+    make_video_environment,
+)
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.training.weights import pack_weights, save_weights, unpack_weights
@@ -99,10 +102,8 @@ def test_a_composed_process_steps_by_direct_call_and_trains_to_the_same_weights(
 @pytest.fixture
 def imagined(tmp_path: Path) -> dict[str, dict[str, Any]]:
     """Parameters of nodes that train in an untrained world model of 8 environments."""
-    model, rng = make_model_folder(tmp_path / "model"), np.random.default_rng(0)
-    images, states = rng.integers(0, 256, (5, 64, 128, 3), dtype=np.uint8), rng.uniform(0.5, 0.7, (5, 3))
-    starts = model / STARTS
-    save_file({"images": torch.from_numpy(images), "states": torch.from_numpy(states).float()}, starts)
+    model = make_model_folder(tmp_path / "model")
+    starts = write_starts(model / STARTS)
     params = {
         "environment": {"backend": "world_model", "starts_file": str(starts), "num_envs": 8}, "policy": {},
         "reward_evaluator": {"reward": "endogenous"}, "learner": {},
@@ -131,6 +132,29 @@ def test_device_rollouts_give_the_weights_of_policy_rl_train_and_leave_the_topic
 
     rollout = probe.finish(probe.send(probe.action(Rollout, "rollout"), Rollout.Goal(steps=3, reset=True)))
     wait_until("steps for whoever asks", lambda: transitions and transitions[-1].step_id == rollout.last_step_id)
+
+
+def test_a_policy_trains_in_a_video_model_to_the_weights_of_one_process(
+    graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    """Environment, policy, reward and learner in four processes; environments end at different steps."""
+    folder, model = make_stepped_folder(tmp_path / "video_model"), Path(imagined["learner"]["model_dir"])
+    imagined["environment"] |= {"backend": "video_model", "video_model_dir": str(folder)}
+    imagined["policy"]["await_nodes"] = ["environment", "reward_evaluator", "learner"]
+    for node, params in imagined.items():
+        graph.start(node, **params)
+    result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=2)))
+    assert (result.termination_reason, result.policy_version) == (Train.Result.FINISHED, 3), result.message
+
+    config = load_config("smoke")
+    policy, reward = make_policy(config, model), make_endogenous_reward(config, model)
+    env = make_video_environment(config, folder, model / STARTS, num_envs=8, seed=0)
+    rollouts = [rollout for rollout, _ in train_policy(policy, env, reward, config)]
+    ended = rollouts[0].terminated_TN
+    assert ended.any() and not ended.all(), "the reader is to end some episodes"
+    found, _ = unpack_weights((graph.folder / "policies" / "policy_000003.safetensors").read_bytes())
+    for name, tensor in unpack_weights(pack_weights(policy).data)[0].items():
+        np.testing.assert_array_equal(found[name].numpy(), tensor.numpy(), err_msg=name)
 
 
 def test_device_rollouts_refuse_a_reward_that_is_not_theirs_and_name_it(

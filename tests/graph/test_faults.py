@@ -138,7 +138,7 @@ def test_a_consumer_without_credit_holds_the_environment_up_until_it_is_dropped(
 @pytest.mark.parametrize(
     ("params", "words"),
     [
-        ({"backend": "gazebo"}, "backend must be one of world_model, maniskill, factory; got 'gazebo'"),
+        ({"backend": "gazebo"}, "backend must be one of world_model, video_model, maniskill, factory; got 'gazebo'"),
         ({"num_env": 3}, "unknown parameter 'num_env'; did you mean 'num_envs'?"),
         (
             {"qos_overrides./wm/env/image.publisher.depth": 2},

@@ -166,7 +166,7 @@ def test_graph_of_the_run_is_kept_as_json(given: dict[str, str]) -> None:
     ("wrong", "message"),
     [
         ({"colour": "red"}, "unknown argument 'colour'"),
-        ({"backend": "gazebo"}, "backend must be one of world_model, maniskill, factory; got 'gazebo'"),
+        ({"backend": "gazebo"}, "backend must be one of world_model, video_model, maniskill, factory; got 'gazebo'"),
         ({"num_envs": "many"}, "num_envs must be a whole number, got 'many'"),
         ({"domain_id": "102"}, "domain_id must be 0 to 101, got 102"),
         ({"model_dir": "/nowhere"}, "holds no manifest.json"),

@@ -67,6 +67,18 @@ def test_both_recording_scenarios_record_the_episodes_of_the_simulator(given: di
     assert graph.node("recorder").parameters["topics"] == list(GRAPH_TOPICS)
 
 
+def test_a_video_model_is_stepped_where_it_is_named_as_the_backend(given: dict[str, str], tmp_path: Path) -> None:
+    chosen = {**given, "backend": "video_model", "video_model_dir": str(tmp_path)}
+    for scenario in ("online_training", "rollout_record"):
+        graph, values = launch_arguments.prepare(scenario, chosen)
+        parameters = graph.node("wm/environment").parameters
+        assert (parameters["backend"], parameters["video_model_dir"]) == ("video_model", str(tmp_path))
+        assert parameters["starts_file"] == values["starts_file"] and "model_dir" not in parameters
+        assert graph.node("reward_evaluator").parameters["reward"] == "endogenous"
+        with pytest.raises(GraphError, match="backend:=video_model needs video_model_dir:=<folder"):
+            launch_arguments.prepare(scenario, {**chosen, "video_model_dir": ""})
+
+
 def test_plug_ins_and_a_parameter_file_reach_the_nodes(given: dict[str, str], tmp_path: Path) -> None:
     file = tmp_path / "more.yaml"
     file.write_text("/**:\n  ros__parameters:\n    peer_timeout_s: 9.0\n")

@@ -28,10 +28,11 @@ from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph_client import GraphClient
 from wm_nodes.launching.runner import Runner
 from wm_nodes.policy_rl.evaluation import evaluate
-from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, models_of
+from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, make_video_environment, models_of
 from wm_nodes.policy_rl.initial_policy import num_starts
 from wm_nodes.policy_rl.training_run import POLICY_FILES
 from wm_nodes.reports.summary import SuccessRate
+from wm_nodes.video_model.folder import load_video_folder
 
 READY_S = 120.0
 TRAINED = "trained.json"
@@ -56,7 +57,8 @@ class Stages:
 
 @dataclass(frozen=True)
 class RunContext:
-    """What all trainings of a run share. starts: first frames to imagine from. reward: as the launch argument."""
+    """What all trainings of a run share. starts: first frames to imagine from. reward: as the launch argument.
+    video_model: folder of the video model to train in; empty: the world model."""
 
     config: RunConfig
     run_dir: Path
@@ -66,6 +68,16 @@ class RunContext:
     compose: bool = False
     verbose: bool = False
     reward: str = "endogenous"
+    video_model: str = ""
+
+    @property
+    def trained_in(self) -> str:
+        return "video model" if self.video_model else "world model"
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """The launch arguments of what the policy is trained in."""
+        return {"backend": "video_model", "video_model_dir": self.video_model} if self.video_model else {}
 
 
 @dataclass(frozen=True)
@@ -113,7 +125,7 @@ def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
         "config_file": str(config_file), "reward": job.reward, "run_dir": str(start.folder),
         "model_dir": str(start.model_dir), "starts_file": str(job.starts), "initial_policy": str(start.policy),
         "seed": str(start.config.seed), "bag_uri": str(bag), "domain_id": job.domain_id,
-        "compose": "true" if job.compose else "false", "autostart": "false",
+        "compose": "true" if job.compose else "false", "autostart": "false", **job.environment,
     })
     job.stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))
     runner = Runner(graph, log_dir=start.folder / "logs", log=sys.stdout if job.verbose else None)
@@ -147,7 +159,7 @@ def train_round(
                 judge(_real(operator, job, start, "before", start.policy))
             before, began = _progress(start.folder), time.monotonic()
             remaining = max(0, start.config.ppo.updates - int(before["updates"]))
-            job.stage(f"training the policy in the world model: {remaining} updates")
+            job.stage(f"training the policy in the {job.trained_in}: {remaining} updates")
             if remaining:
                 _train(operator, remaining)
             after, seconds = _progress(start.folder), time.monotonic() - began
@@ -166,15 +178,18 @@ def read_success(folder: Path, name: str) -> BoolArray:
 
 
 def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path, policy: Path) -> BoolArray:
-    """Success in the world model, without action noise, on num_starts() episodes, (E,)."""
+    """Success in the model that is trained in, without action noise, on num_starts() episodes, (E,)."""
     episodes = num_starts(job.config)
+    make = make_video_environment if job.video_model else make_imagined_environment
+    model = Path(job.video_model or model_dir)
+    sha256 = load_video_folder(model).sha256 if job.video_model else models_of(model, job.config.device).sha256
 
     def measure() -> BoolArray:
-        env = make_imagined_environment(job.config, model_dir, job.starts, num_envs=64, seed=job.config.seed)
+        env = make(job.config, model, job.starts, num_envs=64, seed=job.config.seed)
         weights = load_policy(job.config, model_dir, policy)
         return evaluate(weights, env, episodes, job.config.evaluation.first_seed).success
 
-    identity = {"policy_sha256": file_sha256(policy), "model_sha256": models_of(model_dir, job.config.device).sha256}
+    identity = {"policy_sha256": file_sha256(policy), "model_sha256": sha256}
     success = cached_success(folder / "evaluations" / f"imagined_{label}.json", identity, measure)
     job.stage(f"imagined success of {policy.stem}: {int(success.sum())}/{len(success)}")
     return success
@@ -224,7 +239,7 @@ def _real(operator: GraphClient, job: RunContext, start: TrainingStart, label: s
 
 
 def _train(operator: GraphClient, updates: int) -> None:
-    with tqdm(total=updates, desc="PPO in the world model", unit="update") as bar:
+    with tqdm(total=updates, desc="PPO in the model", unit="update") as bar:
 
         def show(feedback: Any) -> None:
             bar.update(feedback.update - bar.n)

@@ -29,7 +29,8 @@ from wm_nodes.core.types import BoolArray
 from wm_nodes.environments.record import HELDOUT_SEEDS, acceptance_plan, collect_plan
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
-from wm_nodes.policy_rl.factories import check_scene, load_policy
+from wm_nodes.launching.scenarios import IMAGINED
+from wm_nodes.policy_rl.factories import check_scene, load_policy, load_steppable
 from wm_nodes.policy_rl.initial_policy import prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import load_arrays, make_model
 from wm_nodes.reports.html import write_report
@@ -38,13 +39,17 @@ from wm_nodes.reports.summary import Summary, write_summary
 from wm_nodes.reports.tables import results_table, rounds_table
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.folder import read_world_manifest
-from wm_nodes.world_model.validation.acceptance import accept_world_model
+from wm_nodes.world_model.validation.acceptance import accept_success_agreement, accept_world_model
 
 ENDOGENOUS = "endogenous"
 ACCEPTANCE, FORMER_ACCEPTANCE = "acceptance.json", "gate.json"
 """Report of accept_world_model in the run folder, and its name in older ones."""
-FIXED, FREE = ("preset", "model_dir", "from_scratch", "reward"), ("force", "compose")
-DEFAULTS = {"preset": "cpu", "from_scratch": False, "reward": ENDOGENOUS, "force": False, "compose": False}
+FIXED = ("preset", "model_dir", "from_scratch", "reward", "environment", "video_model")
+FREE = ("force", "compose")
+DEFAULTS = {
+    "preset": "cpu", "from_scratch": False, "reward": ENDOGENOUS, "environment": IMAGINED[0], "force": False,
+    "compose": False,
+}
 """Options that a run keeps, see run_options.open_run."""
 
 
@@ -54,6 +59,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_seed(parser, None)
     options.add_run_dir(parser)
     parser.add_argument("--model-dir", type=Path, help="world model to use instead of the shipped one")
+    parser.add_argument(
+        "--environment", choices=IMAGINED,
+        help=f"what the policy is trained in; default: {IMAGINED[0]}, which also gives the policy its encoder",
+    )
+    parser.add_argument("--video-model", type=Path, metavar="DIR", help="folder of the video model to train in")
     parser.add_argument("--from-scratch", action="store_true", help="collect data and train the world model too")
     parser.add_argument("--force", action="store_true", help="train even in a model that does not pass acceptance")
     parser.add_argument(
@@ -93,7 +103,8 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     model_dir = _model(arguments, config, run_dir, stage)
     starts, weak = start_files(run_dir)
     job = RunContext(
-        config, run_dir, starts, stage, arguments.domain_id, arguments.compose, arguments.verbose, arguments.reward
+        config, run_dir, starts, stage, arguments.domain_id, arguments.compose, arguments.verbose, arguments.reward,
+        str(arguments.video_model or ""),
     )
     with ExitStack() as stack:
         first, waiting = round_start(job, 1, model_dir, weak), None
@@ -144,11 +155,21 @@ def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
         model_dir = Path(arguments.model_dir or shipped_model(config.task))
         made_in = SimulationConfig.model_validate(read_world_manifest(model_dir)["simulation"])
         check_scene(config, model_dir, made_in)
+    _check_environment(arguments, config)
     judge = options.judge_settings(arguments)
     if judge and arguments.reward != AGENT:
         raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")
     if arguments.reward == AGENT:
         check_agent(config)
+
+
+def _check_environment(arguments: argparse.Namespace, config: RunConfig) -> None:
+    if (arguments.environment == "video_model") != bool(arguments.video_model):
+        raise ConfigError("--environment video_model and --video-model DIR go together; give both, or none")
+    if arguments.video_model:
+        load_steppable(config, Path(arguments.video_model))
+        if (rounds := config.model_refresh.num_rounds) > 1:
+            raise ConfigError(f"--rounds {rounds} refreshes a world model, and a video model is trained in; give 1")
 
 
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: Stages) -> Path:
@@ -163,11 +184,13 @@ def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stag
 def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, real: BoolArray) -> None:
     """Write acceptance.json and print it; raise ModelNotAcceptedError where the model failed and `force` is not set."""
     config = job.config
-    bags = collect_plan(acceptance_plan(config), config, job.run_dir / "bags" / "heldout")
-    report = accept_world_model(
-        load_model_folder(model_dir, compute_device(config.device)), load_arrays(bags, config), config,
-        (int(imagined.sum()), len(imagined)), (int(real.sum()), len(real)),
-    )
+    successes = (int(imagined.sum()), len(imagined)), (int(real.sum()), len(real))
+    if job.video_model:
+        report = accept_success_agreement(config.task, *successes)
+    else:
+        bags = collect_plan(acceptance_plan(config), config, job.run_dir / "bags" / "heldout")
+        models, heldout = load_model_folder(model_dir, compute_device(config.device)), load_arrays(bags, config)
+        report = accept_world_model(models, heldout, config, *successes)
     path = job.run_dir / ACCEPTANCE
     path.write_text(json.dumps(report.to_dict(), indent=1))
     console.print(report.table())

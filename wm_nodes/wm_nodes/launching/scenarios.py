@@ -16,6 +16,8 @@ from wm_nodes.config.tasks import task_names
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
 
 TRUTHS = ("true", "false")
+IMAGINED = ("world_model", "video_model")
+"""Environments that a model imagines, which is also where reward `endogenous` comes from."""
 ENVIRONMENT_TOPICS = ("env/spec", "env/image", "env/transition", "env/goal", "episode")
 GRAPH_TOPICS = (
     *ENVIRONMENT_TOPICS, "reward", "action", "policy/version", "reward/summary", "learner/metrics", "run/state",
@@ -55,7 +57,7 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("starts_file", "", "First frames to imagine from; empty: starts.safetensors in model_dir"),
     LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
     LaunchArgument("backend", "world_model", "What the environment node steps",
-                   ("world_model", "maniskill", "factory")),
+                   (*IMAGINED, "maniskill", "factory")),
     LaunchArgument("backend_factory", "", "module:callable(config, num_envs, seed) -> Environment (backend factory)"),
     LaunchArgument("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir"),
     LaunchArgument("reward_factory", "", "module:callable(config) -> RewardModel instead of `reward`"),
@@ -180,8 +182,11 @@ def _environment(arguments: Mapping[str, str], backend: str, *, count: str = "nu
         if not arguments["backend_factory"]:
             raise GraphError("backend:=factory needs backend_factory:=module:callable")
         parameters["backend_factory"] = arguments["backend_factory"]
-    if backend == "world_model":
-        parameters |= {"model_dir": arguments["model_dir"], "starts_file": arguments["starts_file"]}
+    if backend in IMAGINED:
+        folder = f"{backend.removeprefix('world_')}_dir"
+        if not arguments[folder]:
+            raise GraphError(f"backend:={backend} needs {folder}:=<folder of a trained one>")
+        parameters |= {folder: arguments[folder], "starts_file": arguments["starts_file"]}
     return _node(arguments, "environment", parameters, below=below)
 
 
@@ -209,7 +214,7 @@ def _weights(arguments: Mapping[str, str]) -> dict[str, ParameterValue]:
 
 def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[str, ...] = ()) -> list[NodeSpec]:
     """consumers: further nodes that must not miss the first messages of a rollout."""
-    reward = arguments["reward"] or ("endogenous" if backend == "world_model" else "rule")
+    reward = arguments["reward"] or ("endogenous" if backend in IMAGINED else "rule")
     recorder = _recorder(arguments, simulator=arguments.get("simulator") == "true")
     policy = {**_weights(arguments), "mode": arguments.get("mode", "lockstep")}
     awaited = ["environment", "reward_evaluator", *(node.name for node in recorder), *consumers]
@@ -229,7 +234,8 @@ def _online_training(arguments: Mapping[str, str]) -> Graph:
     learner = _weights(arguments)
     if arguments["reward"] == "agent":
         learner["join_timeout_s"] = AGENT_JOIN_S
-    nodes = [*_rollout_nodes(arguments, "world_model", ("learner",)), _node(arguments, "learner", learner, ranks=ranks)]
+    rollouts = _rollout_nodes(arguments, arguments["backend"], ("learner",))
+    nodes = [*rollouts, _node(arguments, "learner", learner, ranks=ranks)]
     if arguments["simulator"] == "true":
         nodes += _simulator_and_evaluation(arguments)
     return Graph("online_training", tuple(nodes))
@@ -292,19 +298,20 @@ class Scenario:
 
 _JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
 _TRAINING = (
-    *_COMMON, "model_dir", "starts_file", "initial_policy", "reward", "num_envs", "simulator_envs", "simulator", "seed",
-    "learner_ranks", "record", "bag_uri", "policy_factory", "reward_factory", *_JUDGE,
+    *_COMMON, "model_dir", "starts_file", "initial_policy", "backend", "video_model_dir", "reward", "num_envs",
+    "simulator_envs", "simulator", "seed", "learner_ranks", "record", "bag_uri", "backend_factory", "policy_factory",
+    "reward_factory", *_JUDGE,
 )
 _ROLLOUT = (
-    "model_dir", "starts_file", "initial_policy", "backend", "mode", "reward", "num_envs", "seed", "record", "bag_uri",
-    "backend_factory", "policy_factory", "reward_factory", *_JUDGE,
+    "model_dir", "starts_file", "initial_policy", "backend", "video_model_dir", "mode", "reward", "num_envs", "seed",
+    "record", "bag_uri", "backend_factory", "policy_factory", "reward_factory", *_JUDGE,
 )
 _EVALUATE = (*_COMMON, "model_dir", "initial_policy", "policy_factory", "simulator_envs", "seed", "record", "bag_uri")
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
-        Scenario("online_training", "Train a policy in the world model; evaluate it in the simulator", _TRAINING,
+        Scenario("online_training", "Train a policy in an environment; evaluate it in the simulator", _TRAINING,
                  _online_training),
         Scenario("rollout_record", "Let a policy act and record it", (*_COMMON, *_ROLLOUT), _rollout_record),
         Scenario("replay_offline", "Play a bag; the learner trains from what is played",

@@ -43,7 +43,8 @@ PARAMS = (
     Param("backend_factory", "", "module:callable(config, num_envs, seed) -> Environment, for backend factory; the "
           "plug-in point for real robots", read_only=True),
     Param("model_dir", "", "World-model folder, for backend world_model", read_only=True),
-    Param("starts_file", "", "starts.safetensors: real first frames, for backend world_model", read_only=True),
+    Param("video_model_dir", "", "Folder of a video model that is stepped, for backend video_model", read_only=True),
+    Param("starts_file", "", "starts.safetensors: real first frames, for an imagining backend", read_only=True),
     Param("num_envs", 1, "Environments stepped together (N)", read_only=True, minimum=1, maximum=4096),
     Param("seed", 0, "Root seed of resets without a given seed", read_only=True, minimum=0),
     Param("mode", "lockstep", "Stepped by requests on env/step, or by the node's clock with the newest of `action`",
@@ -77,6 +78,7 @@ class EnvironmentNode(ManagedNode):
             str(self.param("backend")), self.run_config(), num_envs=int(self.param("num_envs")),
             seed=int(self.param("seed")), model_dir=str(self.param("model_dir")),
             starts_file=str(self.param("starts_file")), factory=str(self.param("backend_factory")),
+            video_model_dir=str(self.param("video_model_dir")),
         )
         if (size := mosaic_bytes(environment.spec)) > MAX_MOSAIC_BYTES:
             environment.close()

@@ -18,7 +18,7 @@ from wm_nodes.reward import RewardModel
 from wm_nodes.ros.wire import WireError
 from wm_nodes.training.ranks import Ranks
 
-BACKENDS = ("world_model", "maniskill", "factory")
+BACKENDS = ("world_model", "video_model", "maniskill", "factory")
 REWARDS = ("endogenous", "rule", AGENT)
 """The agent judges whole episodes (judge/episode_reward.py), so it is no RewardModel of make_reward."""
 
@@ -42,7 +42,8 @@ def load_factory(path: str) -> Any:
 
 
 def make_environment(
-    backend: str, config: RunConfig, *, num_envs: int, seed: int, model_dir: str, starts_file: str, factory: str
+    backend: str, config: RunConfig, *, num_envs: int, seed: int, model_dir: str, starts_file: str, factory: str,
+    video_model_dir: str = "",
 ) -> Environment:
     """Build the environment that a node serves.
 
@@ -56,10 +57,12 @@ def make_environment(
     if backend == "factory":
         environment: Environment = load_factory(factory)(config, num_envs, seed)
         return environment
-    model, starts = existing(model_dir, "model_dir"), existing(starts_file, "starts_file")
-    from wm_nodes.policy_rl.factories import make_imagined_environment
+    from wm_nodes.policy_rl.factories import make_imagined_environment, make_video_environment
 
-    return make_imagined_environment(config, model, starts, num_envs=num_envs, seed=seed)
+    name, folder = ("model_dir", model_dir) if backend == "world_model" else ("video_model_dir", video_model_dir)
+    model, starts = existing(folder, name), existing(starts_file, "starts_file")
+    make = make_imagined_environment if backend == "world_model" else make_video_environment
+    return make(config, model, starts, num_envs=num_envs, seed=seed)
 
 
 def make_reward(kind: str, config: RunConfig, model_dir: str, factory: str = "") -> RewardModel:

@@ -1,7 +1,7 @@
 """Builds what needs more than one sibling package: policies, rewards and environments from a model folder."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import RunConfig, SimulationConfig
+from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import CPU, compute_device, explain_memory
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import simulation_spec
@@ -19,9 +20,13 @@ from wm_nodes.environments.maniskill.cameras import hand_over, table_top_cameras
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.reward import EncoderDistance, EndogenousReward
 from wm_nodes.training.weights import load_weights
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder
+from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader
+from wm_nodes.video_model.video_environment import VideoEnvironment, check_steppable
 from wm_nodes.world_model import (
     DeviceEnvironment,
     ImaginedEnvironment,
+    ImaginedEpisodes,
     WorldModels,
     load_model_folder,
     load_starts,
@@ -105,8 +110,38 @@ def make_imagined_environment(
         ValueError: the folder was trained for another scene than the configuration describes.
     """
     environment = _imagine(partial(ImaginedEnvironment, seed=seed), config, model_dir, starts_file, num_envs)
-    environment.cameras = table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
+    environment.cameras = _cameras(config, environment)
     return environment
+
+
+def make_video_environment(
+    config: RunConfig, video_model_dir: Path, starts_file: Path, *, num_envs: int, seed: int
+) -> VideoEnvironment:
+    """Return a video model as an environment for config.task. Raises as load_steppable."""
+    folder, reader = load_steppable(config, video_model_dir)
+    spec = simulation_spec(config.task, config.simulation, num_envs)
+    with explain_memory(folder.device, ppo__num_envs=num_envs):
+        environment = VideoEnvironment(
+            folder, reader, spec, load_starts(Path(starts_file)), config.reward, config.video_environment,
+            num_envs=num_envs, seed=seed,
+        )
+    environment.cameras = _cameras(config, environment)
+    return environment
+
+
+def load_steppable(config: RunConfig, video_model_dir: Path) -> tuple[VideoFolder, SuccessReader]:
+    """Return a video model that can be stepped for config.task, and its done signal.
+
+    Raises:
+        ValueError: a model that cannot be stepped, or settings that ask for what it does not give; names the remedy.
+    """
+    for name, missing in (("dense_weight", "goals"), ("uncertainty_limit", "uncertainty")):
+        if value := getattr(config.reward, name):
+            raise ValueError(f"reward.{name} is {value}, and a video model gives no {missing}; set it to 0")
+    device = compute_device(config.device)
+    folder = load_video_folder(video_model_dir, device)
+    check_steppable(folder, simulation_spec(config.task, config.simulation, 1))
+    return folder, load_success_reader(video_model_dir, config.task, device)
 
 
 def make_device_environment(
@@ -115,6 +150,10 @@ def make_device_environment(
     """Return the world model as a device program for config.task, for DeviceCollector. Raises as
     make_imagined_environment."""
     return _imagine(DeviceEnvironment, config, model_dir, starts_file, num_envs)
+
+
+def _cameras(config: RunConfig, environment: ImaginedEpisodes) -> Sequence[CameraModel]:
+    return table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
 
 
 def _imagine(

@@ -19,6 +19,7 @@ from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_model.sampling import RolloutSettings, initial_noise, sample_videos
 from wm_nodes.world_model.imagined_episodes import ImaginedEpisodes, imagined_spec
 from wm_nodes.world_model.parts import in_parallel
+from wm_nodes.world_model.precision import compute_context
 
 ROWS = 16
 """Of each call of the models on a CPU, the last one filled up: with one batch size a row has the same bits beside any
@@ -41,6 +42,7 @@ class VideoEnvironment(ImaginedEpisodes):
     Args:
         spec, starts, reward: as ImaginedEpisodes's; the spec is that of the simulator the model was learned from.
         settings: of the sampler, an ODE.
+        exact: compute in float32 even where bfloat16 is faster.
 
     Raises:
         ValueError: a model that cannot be stepped, or of another task or robot; starts of another picture size.
@@ -48,7 +50,7 @@ class VideoEnvironment(ImaginedEpisodes):
 
     def __init__(
         self, folder: VideoFolder, reader: DoneSignal, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray],
-        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, seed: int = 0,
+        reward: RewardConfig, settings: VideoEnvironmentConfig, *, num_envs: int, seed: int = 0, exact: bool = False,
     ) -> None:
         check_steppable(folder, spec)
         assert folder.lengths is not None  # checked
@@ -56,7 +58,7 @@ class VideoEnvironment(ImaginedEpisodes):
         super().__init__(
             imagined_spec(spec, f"video/{spec.task}", folder.sha256, num_envs), starts, reward, seed=seed, device=device
         )
-        self.folder, self._reader = folder, reader
+        self.folder, self._reader, self._exact = folder, reader, exact
         self._rows = ROWS if device.type == "cpu" else num_envs
         self._sampler = RolloutSettings(settings.num_steps, settings.shift, micro_batch=self._rows)
         self._start_latents = folder.codec.encode(torch.from_numpy(starts[0]).unsqueeze(1)).to(device)
@@ -85,7 +87,8 @@ class VideoEnvironment(ImaginedEpisodes):
             condition = Condition(frames, acted[rows, -K:], self._text.expand(len(rows), -1, -1))
             x = torch.cat([torch.zeros_like(frames), noise[rows]], 2)
             none = torch.zeros(len(rows), dtype=torch.int64)  # an ODE has no step noise
-            made = sample_videos(self.folder.network, condition, x, none, self._sampler, []).latents[:, :, -1:]
+            with compute_context(self.device, exact=self._exact):
+                made = sample_videos(self.folder.network, condition, x, none, self._sampler, []).latents[:, :, -1:]
             pictures = self.folder.codec.decode(made).squeeze(1)
             return made, pictures, self._reader.read(pictures)
 

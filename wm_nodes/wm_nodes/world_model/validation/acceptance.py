@@ -142,6 +142,12 @@ def apply_criteria(
     return tuple(criteria), tuple(notes)
 
 
+def accept_success_agreement(task: str, imagined: tuple[int, int], real: tuple[int, int]) -> AcceptanceReport:
+    """Judge a model that cannot be rolled out as accept_world_model does, by (successes, episodes) in both alone."""
+    notes = ("Errors of the frames were not judged: the model is no world model.",)
+    return AcceptanceReport(task, 0, (_agreement(imagined, real),), {}, notes)
+
+
 def _agreement(imagined: tuple[int, int], real: tuple[int, int]) -> Criterion:
     low, high = newcombe_difference(*imagined, *real)
     gap = imagined[0] / imagined[1] - real[0] / real[1]
