@@ -46,6 +46,7 @@ GROUPS = {
     },
     "benchmarks, where the repository is": {
         "benchmark speed": "how fast graph, world model and simulator are; or a GPU (--device)",
+        "benchmark environments": "what models are worth as the environment of a policy",
         "benchmark video-rl": "DynDiff-GRPO against its rivals",
         "benchmark judge": "the reward agent against labels, and its speed",
     },

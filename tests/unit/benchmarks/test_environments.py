@@ -1,0 +1,55 @@
+"""Models as environments: rank correlation by hand, what is kept, and a ranking of real policies."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model_folders import make_model_folder, make_stepped_folder, write_starts
+
+from benchmarks.environments.policies import WORLD_MODEL, Workplace, measure_speed, rank_policies, spearman
+from wm_nodes.config.load import load_config
+from wm_nodes.policy_rl.factories import make_policy
+from wm_nodes.policy_rl.initial_policy import start_files
+from wm_nodes.training.weights import save_weights
+
+
+def test_the_rank_correlation_is_that_of_a_number_worked_by_hand() -> None:
+    """Spearman's 1 - 6 sum d^2 / (n (n^2 - 1)) with d = (0, 1, -1, 0, 0), n = 5: 0.9; monotone maps change nothing."""
+    x, y = np.array([1, 2, 3, 4, 5]), np.array([0.1, 30, 2, 400, 5000])
+    correlation, low, high = spearman(x, y, seed=0)
+    assert correlation == pytest.approx(0.9)
+    assert -1 <= low < correlation <= high <= 1
+    assert spearman(x, np.exp(-y / 1000), seed=0)[0] == pytest.approx(-0.9)
+    assert spearman([1, 1, 2, 2], [1, 1, 2, 2], seed=0)[0] == pytest.approx(1)
+
+
+def test_without_spread_there_is_no_correlation_and_pairs_must_match() -> None:
+    assert all(math.isnan(value) for value in spearman([0.5, 0.5, 0.5], [1, 2, 3], seed=0))
+    with pytest.raises(ValueError, match="needs pairs"):
+        spearman([1, 2], [1, 2, 3], seed=0)
+
+
+def test_each_model_is_ranked_against_the_simulator() -> None:
+    rows = [
+        {"real": {"rate": real}, "imagined": {"a": {"rate": real / 2}, "b": {"rate": 1 - real}}}
+        for real in np.linspace(0, 1, 8)
+    ]
+    found = rank_policies(rows, ["a", "b"], seed=0)
+    assert (found["a"]["correlation"], found["b"]["correlation"]) == (pytest.approx(1), pytest.approx(-1))
+
+
+def test_speed_and_imagined_success_are_measured_in_each_model(tmp_path: Path) -> None:
+    config = load_config("smoke")
+    work = Workplace(config, make_model_folder(tmp_path / "model"), tmp_path / "push_cube_0")
+    starts, weak = start_files(work.folder)
+    weak.parent.mkdir(parents=True)
+    vars(work)["start"] = (write_starts(starts), weak)
+    save_weights(make_policy(config, work.model_dir), weak)
+    models = [WORLD_MODEL, str(make_stepped_folder(tmp_path / "video_model"))]
+    rows = measure_speed(work, models, num_steps=2)
+    assert [(row["model"], row["envs"]) for row in rows] == [(model, config.ppo.num_envs) for model in models]
+    assert rows[0]["of_world_model"] == 1 and rows[1]["of_world_model"] > 0
+    imagined = [work.imagined(work.policy(), work.environment(model)) for model in models]
+    assert [result.episodes for result in imagined] == [8 * config.evaluation.episodes] * 2
+    assert imagined[1].successes > 0

@@ -1,0 +1,1 @@
+"""What models are worth as the environment of a policy."""

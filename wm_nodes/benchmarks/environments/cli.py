@@ -1,0 +1,115 @@
+"""Models as the environment of a policy: what a policy that is trained in each is worth in the simulator, how each
+ranks policies, and how fast it steps. The task's world model is always the first of them.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from tqdm import tqdm
+
+from benchmarks.environments.policies import (
+    WORLD_MODEL,
+    Workplace,
+    measure_policy,
+    measure_speed,
+    rank_policies,
+    train_in,
+)
+from benchmarks.speed.results import write_results
+from wm_nodes.apps.options import add_json, add_preset, positive, prepare_torch, settings
+from wm_nodes.config.load import load_config, preset_names
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.device import compute_device
+from wm_nodes.reports.console_table import make_table
+
+console = Console()
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    experiments = parser.add_subparsers(dest="experiment", required=True, metavar="EXPERIMENT")
+    trained = experiments.add_parser("trained-in", help="train a policy in each model, measure it in the simulator")
+    ranking = experiments.add_parser("ranking", help="imagined success of policies against their real success")
+    speed = experiments.add_parser("speed", help="environment steps/s")
+    ranking.add_argument("--policies", type=Path, nargs="+", required=True, metavar="FILE", help="weights, 8 or more")
+    speed.add_argument("--steps", type=positive, default=16, help="lock-steps of the rollout (default: 16)")
+    for experiment in (trained, ranking, speed):
+        experiment.add_argument("--video-models", type=Path, nargs="*", default=[], metavar="DIR",
+                                help="folders of video models that can be stepped")
+        add_preset(experiment, "cpu", preset_names())
+        experiment.add_argument("--task", default="push_cube")
+        experiment.add_argument("--work", type=Path, default=Path("runs/environments"), metavar="DIR",
+                                help="folder of first frames and policies; what is there is kept")
+        add_json(experiment, "write every row here; what it holds is not measured again")
+    trained.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    for experiment in (ranking, speed):
+        experiment.add_argument("--seed", type=int, default=0)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    prepare_torch()
+    models = [WORLD_MODEL, *(str(folder) for folder in arguments.video_models)]
+    {"trained-in": _trained_in, "ranking": _ranking, "speed": _speed}[arguments.experiment](arguments, models)
+
+
+def _workplace(arguments: argparse.Namespace, seed: int) -> Workplace:
+    config = load_config(arguments.preset, {"task": arguments.task, **settings(arguments), "seed": seed})
+    compute_device(config.device)
+    return Workplace(config, shipped_model(config.task), arguments.work.absolute() / f"{config.task}_{seed}")
+
+
+def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
+    rows = _kept_rows(arguments)
+    for seed in arguments.seeds:
+        workplace = _workplace(arguments, seed)
+        updates = workplace.config.ppo.updates
+        for model in models:
+            if any((row["model"], row["seed"], row["updates"]) == (model, seed, updates) for row in rows):
+                continue
+            with tqdm(total=updates, desc=f"{Path(model).name}, seed {seed}", unit="update") as bar:
+                rows.append(train_in(workplace, model, bar.update))
+            write_results(arguments, {"rows": rows})
+    console.print(make_table(
+        "policies trained in each model", ("trained in", "seed", "real before", "real after", "gain", "imagined"),
+        [(row["model"], str(row["seed"]), _percent(row["real_before"]), _percent(row["real_after"]),
+          "{difference:+.3f} ({low:+.3f} to {high:+.3f})".format(**row["real_gain"]),
+          f"{_percent(row['imagined_before'])} -> {_percent(row['imagined_after'])}") for row in rows],
+    ))
+
+
+def _ranking(arguments: argparse.Namespace, models: list[str]) -> None:
+    rows, workplace = _kept_rows(arguments), _workplace(arguments, arguments.seed)
+    for path in tqdm(arguments.policies, desc="policies", unit="policy"):
+        if not any(row["policy"] == str(path) and set(models) <= row["imagined"].keys() for row in rows):
+            rows.append(measure_policy(workplace, path, models))
+            write_results(arguments, {"rows": rows})
+    correlations = rank_policies(rows, models, arguments.seed)
+    write_results(arguments, {"rows": rows, "correlations": correlations})
+    console.print(make_table(
+        f"imagined against real success of {len(rows)} policies", ("model", "rank correlation", "95 %"),
+        [(model, f"{found['correlation']:+.2f}", f"{found['low']:+.2f} to {found['high']:+.2f}")
+         for model, found in correlations.items()],
+    ))
+
+
+def _speed(arguments: argparse.Namespace, models: list[str]) -> None:
+    rows = measure_speed(_workplace(arguments, arguments.seed), models, arguments.steps)
+    write_results(arguments, {"rows": rows})
+    console.print(make_table(
+        "environment steps", ("model", "environments", "steps/s", "steps per second of CPU", "of the world model's"),
+        [(row["model"], str(row["envs"]), f"{row['steps_per_s']:.0f}", f"{row['steps_per_cpu_s']:.0f}",
+          f"{row['of_world_model']:.3f}") for row in rows],
+    ))
+
+
+def _kept_rows(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    if arguments.json is None or not arguments.json.is_file():
+        return []
+    rows: list[dict[str, Any]] = json.loads(arguments.json.read_text())["rows"]
+    return rows
+
+
+def _percent(rate: dict[str, float]) -> str:
+    return f"{100 * rate['rate']:.1f} % of {rate['episodes']:.0f}"

@@ -1,0 +1,180 @@
+"""Policies trained in a model and measured in the simulator, and how a model ranks policies.
+
+A model is the task's world model, or a video model that can be stepped, given by its folder.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.files import file_sha256
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.statistics import paired_difference, wilson_interval
+from wm_nodes.core.types import Environment
+from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
+from wm_nodes.policy_rl.factories import (
+    load_policy,
+    make_endogenous_reward,
+    make_imagined_environment,
+    make_video_environment,
+)
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.initial_policy import prepare_start
+from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics
+from wm_nodes.policy_rl.train import train_policy
+from wm_nodes.training.weights import save_weights
+from wm_nodes.world_model import ImaginedEpisodes
+
+WORLD_MODEL = "world_model"
+SIMULATOR_ENVS, IMAGINED_EPISODES = 8, 256
+KEPT_EVERY = 6
+"""Updates between two versions of a training that are kept to be ranked."""
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """One seed of the main job. folder: of its starts and of the policy that training begins with; made there once."""
+
+    config: RunConfig
+    model_dir: Path
+    folder: Path
+
+    @cached_property
+    def start(self) -> tuple[Path, Path]:
+        """First frames and weak policy, see prepare_start."""
+        return prepare_start(self.config, self.folder, self.model_dir)
+
+    def policy(self, weights: Path | None = None) -> ImagePolicy:
+        """The policy of a file; None: the one that training begins with."""
+        return load_policy(self.config, self.model_dir, weights or self.start[1])
+
+    def environment(self, model: str, num_envs: int = 0) -> ImaginedEpisodes:
+        """model: WORLD_MODEL, or a video model's folder. num_envs: 0 for the configuration's."""
+        make = make_imagined_environment if model == WORLD_MODEL else make_video_environment
+        folder = self.model_dir if model == WORLD_MODEL else Path(model)
+        count = num_envs or self.config.ppo.num_envs
+        return make(self.config, folder, self.start[0], num_envs=count, seed=self.config.seed)
+
+    def real(self, policy: ImagePolicy) -> EvaluationResult:
+        """Success in the simulator, on the seeds of the configuration."""
+        from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
+
+        config, how = self.config, self.config.evaluation
+        env = ManiSkillEnvironment(config.task, config.simulation, SIMULATOR_ENVS, seed=config.seed)
+        try:
+            return evaluate(policy, env, how.episodes, how.first_seed, how.deterministic)
+        finally:
+            env.close()
+
+    def imagined(self, policy: ImagePolicy, env: Environment) -> EvaluationResult:
+        return evaluate(policy, env, min(IMAGINED_EPISODES, 8 * self.config.evaluation.episodes),
+                        self.config.evaluation.first_seed)
+
+
+def train_in(workplace: Workplace, model: str, on_update: Callable[[], object] = lambda: None) -> dict[str, Any]:
+    """Train the weak policy of a seed in a model; return the row of the table.
+
+    Every KEPT_EVERY-th version lies in workplace.folder / name of the model.
+    """
+    config, began = workplace.config, time.monotonic()
+    policy, env = workplace.policy(), workplace.environment(model)
+    reward = make_endogenous_reward(config, workplace.model_dir)
+    before = workplace.real(policy), workplace.imagined(policy, env)
+    course, kept, seconds = list[float](), list[str](), time.monotonic()
+    for update, (rollout, _) in enumerate(train_policy(policy, env, reward, config), 1):
+        course.append(rollout_statistics(rollout).success_rate)
+        if update % KEPT_EVERY == 0 or update == config.ppo.updates:
+            path = workplace.folder / Path(model).name / f"policy_{update:06d}.safetensors"
+            save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
+            kept.append(str(path))
+        on_update()
+    seconds = time.monotonic() - seconds
+    after = workplace.real(policy), workplace.imagined(policy, env)
+    pair = paired_difference(before[0].success.tolist(), after[0].success.tolist())
+    return {
+        "model": model, "model_sha256": env.spec.world_model_sha256, "task": config.task, "seed": config.seed,
+        "updates": config.ppo.updates, "course": course, "policies": kept,
+        "real_before": _rate(before[0]), "real_after": _rate(after[0]),
+        "imagined_before": _rate(before[1]), "imagined_after": _rate(after[1]),
+        "real_gain": {"difference": pair.difference, "low": pair.low, "high": pair.high},
+        "success_after": after[0].success.astype(int).tolist(),
+        "seconds_per_update": seconds / max(1, len(course)), "minutes": (time.monotonic() - began) / 60,
+    }
+
+
+def measure_policy(workplace: Workplace, weights: Path, models: Sequence[str]) -> dict[str, Any]:
+    """Success of a policy in the simulator and in each model, its row of the ranking."""
+    policy = workplace.policy(weights)
+    imagined = {model: _rate(workplace.imagined(policy, workplace.environment(model))) for model in models}
+    return {
+        "policy": str(weights), "sha256": file_sha256(weights), "real": _rate(workplace.real(policy)),
+        "imagined": imagined,
+    }
+
+
+def rank_policies(rows: Sequence[dict[str, Any]], models: Sequence[str], seed: int) -> dict[str, dict[str, float]]:
+    """For each model: the Spearman correlation of imagined with real success over the policies, and its interval."""
+    real = [row["real"]["rate"] for row in rows]
+    found = {model: spearman(real, [row["imagined"][model]["rate"] for row in rows], seed=seed) for model in models}
+    return {model: dict(zip(("correlation", "low", "high"), values, strict=True)) for model, values in found.items()}
+
+
+def spearman(x: ArrayLike, y: ArrayLike, *, seed: int, draws: int = 10_000) -> tuple[float, float, float]:
+    """Return Spearman's rank correlation, ties by their mean rank, and its 95 % percentile bootstrap interval over the
+    pairs; draws without spread are left out, and NaN is where there is none.
+
+    Raises:
+        ValueError: lengths differ.
+    """
+    first, second = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    if first.shape != second.shape or first.ndim != 1:
+        raise ValueError(f"a correlation needs pairs, got {first.shape} and {second.shape}")
+    rng = numpy_stream(seed, "spearman", len(first))
+    index = rng.integers(len(first), size=(draws, len(first)))
+    drawn = np.array([_correlation(first[rows], second[rows]) for rows in index])
+    drawn = drawn[np.isfinite(drawn)]
+    low, high = np.quantile(drawn, (0.025, 0.975)) if len(drawn) else (np.nan, np.nan)
+    return _correlation(first, second), float(low), float(high)
+
+
+def measure_speed(workplace: Workplace, models: Sequence[str], num_steps: int) -> list[dict[str, Any]]:
+    """Environment steps/s of a rollout in each model, one after the other, with those of the world model beside."""
+    policy, rows = workplace.policy(), list[dict[str, Any]]()
+    reward = make_endogenous_reward(workplace.config, workplace.model_dir)
+    for model in models:
+        env = workplace.environment(model)
+        collect_rollout(env, policy, reward, 1, workplace.config.seed, 0)
+        wall, used = time.perf_counter(), time.process_time()
+        rollout = collect_rollout(env, policy, reward, num_steps, workplace.config.seed, 1)
+        wall, used = time.perf_counter() - wall, time.process_time() - used
+        steps = rollout.valid_TN.size
+        rows.append({"model": model, "envs": env.spec.num_envs, "steps_per_s": steps / wall,
+                     "steps_per_cpu_s": steps / used})
+    for row in rows:
+        row["of_world_model"] = row["steps_per_cpu_s"] / rows[0]["steps_per_cpu_s"]
+    return rows
+
+
+def _correlation(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    if (x == x[0]).all() or (y == y[0]).all():
+        return float("nan")
+    return float(np.corrcoef(_ranks(x), _ranks(y))[0, 1])
+
+
+def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    _, index, counts = np.unique(values, return_inverse=True, return_counts=True)
+    ranks: NDArray[np.float64] = (np.cumsum(counts) - (counts - 1) / 2)[index]
+    return ranks
+
+
+def _rate(result: EvaluationResult) -> dict[str, float]:
+    low, high = wilson_interval(result.successes, result.episodes)
+    return {"rate": result.success_rate, "successes": result.successes, "episodes": result.episodes, "low": low,
+            "high": high}
