@@ -17,7 +17,7 @@ from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
-from benchmarks.video_rl import diversity, outcome, plots, samplers, tables
+from benchmarks.video_rl import closed_loop, diversity, outcome, plots, samplers, tables
 from benchmarks.video_rl.clip_resolution import sample_clips, size_rows
 from benchmarks.video_rl.comparison import CLIP_MEASURES
 from benchmarks.video_rl.cost import measure_anchors, pushcube_buffer, pushcube_rollout, toy_buffer, toy_rollout
@@ -110,6 +110,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
             add_device(experiment)
     for experiment in (spread, learning, ablations, hacking, cost, clips, training, resolution):
         add_json(experiment, "write every row here; trainings go on where the file stops")
+    closed_loop.add_options(experiments.add_parser("closed-loop", help="going on from own frames, with controls"))
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -121,7 +122,7 @@ def run(arguments: argparse.Namespace) -> None:
     experiments = {
         "base": _base, "diversity": _diversity, "learning": _learning, "ablations": _ablations, "hacking": _hacking,
         "cost": _cost, "clips": _clips, "clip-learning": _clip_learning, "resolution": _resolution,
-        "outcome": outcome.run,
+        "outcome": outcome.run, "closed-loop": closed_loop.run,
     }
     experiments[arguments.experiment](arguments)
 

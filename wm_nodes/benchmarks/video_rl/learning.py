@@ -13,7 +13,7 @@ from wm_nodes.core.device import device_of
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.reward_hacking import find_hacked_metrics
-from wm_nodes.video_rl.train import Request, post_train
+from wm_nodes.video_rl.train import Request, VideoLearner, post_train
 from wm_nodes.video_rl.training_run import flatten_metrics
 
 MIN_EVALUATIONS = 4
@@ -23,11 +23,14 @@ DRIFTS = "background"
 
 def train_sampler(
     source: TrainingSource[Request], sampler: SamplerSetup, plan: LearningPlan, seed: int,
-    on_iteration: Callable[[], object] = lambda: None,
+    on_iteration: Callable[[], object] = lambda: None, learner: VideoLearner | None = None,
 ) -> dict[str, Any]:
     """Post-train source.network in place; return what that gave: scores of each held-out context before and after,
-    means over them (before, every eval_every buffers, and after), a list per quantity of the buffers, and seconds."""
-    learner = GrpoLearner(source.network, sampler.grpo, sampler.rollout, seed=seed)
+    means over them (before, every eval_every buffers, and after), a list per quantity of the buffers, and seconds.
+
+    learner: None: a GrpoLearner of the sampler's settings.
+    """
+    learner = learner or GrpoLearner(source.network, sampler.grpo, sampler.rollout, seed=seed)
     before = after = source.validate()
     evaluations, buffers = [{"iteration": 0, **_means(before)}], list[dict[str, float]]()
     device = device_of(source.network)

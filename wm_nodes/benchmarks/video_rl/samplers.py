@@ -137,10 +137,10 @@ def clip_learning_samplers() -> list[SamplerSetup]:
     ]
 
 
-def outcome_samplers() -> list[SamplerSetup]:
-    """Of the outcome task: CPS, DynDiff at the noise that CPS 0.4 spends, both in a window, DynDiff as written, and NFT
-    by ODE, whose clips differ in their initial noise."""
-    learner = load_video_config("outcome").grpo
+def outcome_samplers(preset: str = "outcome") -> list[SamplerSetup]:
+    """Of the outcome task, or of another preset: CPS, DynDiff at the noise that CPS 0.4 spends, both in a window,
+    DynDiff as written, and NFT by ODE, whose clips differ in their initial noise."""
+    learner = load_video_config(preset).grpo
     samplers = {
         "CPS 0.4": SamplerSettings("cps", 0.4), "DynDiff 0.54 gated, rms": dyndiff(0.54, "gated", "rms"),
         "DynDiff 0.6 gated": dyndiff(0.6),

@@ -1,4 +1,5 @@
-"""Check a video model before GRPO trains it: ratio, KL, ODE step, mask, buffer and memory, a line each.
+"""Check a video model before GRPO trains it: ratio, KL, ODE step, mask, buffer and memory, a line each; of an embedded
+one what the best clip of a group is better by than the others, clip after clip on its own frames.
 
     wm check-video-model [--video-model FOLDER --context-bags BAG ... | --public FOLDER]
 """
@@ -14,16 +15,19 @@ import torch
 from rich.console import Console
 from torch import nn
 
-from wm_nodes.apps.options import add_preset, settings
+from wm_nodes.apps.options import add_preset, positive, settings
 from wm_nodes.config.load import VIDEO, load_video_config, preset_names
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
-from wm_nodes.reports.console_table import make_table
+from wm_nodes.reports.console_table import estimate, make_table
 from wm_nodes.video_model import Condition
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.checks import examine
-from wm_nodes.video_rl.sampling import rollout_settings
+from wm_nodes.video_rl.horizons import DRIFT, horizon_scores, measure_headroom
+from wm_nodes.video_rl.reference_reward import load_probe
+from wm_nodes.video_rl.sampling import ClipGenerator, rollout_settings
 from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
 
 VIDEOS = 4
@@ -43,6 +47,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dtype", choices=("float32", "bfloat16", "float16"), default="float32")
     parser.add_argument("--offload", action="store_true", help="VAE and text encoder rest on the CPU")
     parser.add_argument("--lora-rank", type=int, default=0, help="check with a LoRA adapter of this rank")
+    parser.add_argument("--contexts", type=positive, default=32, help="contexts whose groups show the head-room")
     add_preset(parser, "recommended", preset_names(VIDEO))
 
 
@@ -58,8 +63,38 @@ def run(arguments: argparse.Namespace) -> int:
     columns = ("check", "", "found", "where it failed")
     marks = {True: "[green]passed", False: "[red]FAILED"}
     rows = ((f.name, marks[f.passed], f.value, "" if f.passed else f.remedy) for f in findings)
-    Console().print(make_table(title, columns, rows, left=columns))
+    console = Console()
+    console.print(make_table(title, columns, rows, left=columns))
+    if arguments.video_model is not None and not arguments.public:
+        _print_headroom(console, arguments, config)
     return int(not all(finding.passed for finding in findings))
+
+
+def _print_headroom(console: Console, arguments: argparse.Namespace, config: VideoRlConfig) -> None:
+    """Groups and whole rollouts of the first contexts, per clip, and in words whether groups can teach anything."""
+    device = compute_device(config.device)
+    folder, probe = load_video_folder(arguments.video_model, device), load_probe(shipped_model(config.task), device)
+    clips = load_clips(arguments.context_bags, folder.clip["stride"])
+    clips = clips.select(torch.arange(min(arguments.contexts, len(clips))))
+    found = measure_headroom(folder, clips, config, probe)
+    frames = ClipGenerator(folder, clips, config).evaluate(clips, config.rollout.num_steps)
+    drift = {name: float(values.mean()) for name, values in horizon_scores(frames, clips, probe, folder).items()}
+    columns = (
+        "clip", "reward", "best of n", "gain", "object, cm less", "tool, cm less", "std in a group", "codec",
+        *(f"rollout {name}" for name in DRIFT),
+    )
+    rows = (
+        (
+            str(h.clips), f"{h.reward:.3f}", f"{h.best:.3f}", estimate(h.gain, ".3f"), estimate(h.object_cm, ".2f"),
+            estimate(h.tool_cm, ".2f"), f"{h.spread:.3f}", f"{h.codec:.3f}",
+            *(f"{drift[f'{name}_{h.clips}']:.2f}" for name in DRIFT),
+        )
+        for h in found
+    )
+    n = config.groups.group_size
+    title = f"best of {n} clips against the mean, {len(clips)} contexts, 95 % bootstrap interval over them"
+    console.print(make_table(title, columns, rows, left=()))
+    console.print(*(h.text() for h in found), sep="\n", highlight=False)
 
 
 def _model_to_check(arguments: argparse.Namespace, config: VideoRlConfig) -> ModelToCheck:

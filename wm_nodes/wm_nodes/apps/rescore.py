@@ -44,6 +44,7 @@ from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_rl import recorded_buffers
 from wm_nodes.video_rl.recorded_buffers import BufferJudge, JudgedBuffer, RecordedClips, Rescored
 from wm_nodes.video_rl.reference_reward import load_probe
+from wm_nodes.video_rl.sampling import recorded_place
 
 RESCORED = "rescored.json"
 SHOWN = 10
@@ -129,10 +130,10 @@ def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any],
     with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
         recordings = recorded_buffers.recorded_bags(run_dir)
         clips = chain.from_iterable(recorded_buffers.read_clips(recording, pictures=True) for recording in recordings)
-        rows = [
-            recorded_buffers.rescore(recorded, contexts, probe, config.rewards, config.model.num_conditioning, judge)
-            for recorded in tqdm(clips, desc="rescoring", unit="buffer")
-        ]
+        rows = list[Rescored]()
+        for recorded in tqdm(clips, desc="rescoring", unit="buffer"):
+            first, given = recorded_place(config, recorded.iteration)
+            rows.append(recorded_buffers.rescore(recorded, contexts, probe, config.rewards, given, judge, first))
     equal = all(not row.different for row in rows)
     path = arguments.json or run_dir / RESCORED
     console.print(_table(rows))

@@ -5,6 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from wm_nodes.config.schema import (
+    AGENT,
     DeviceName,
     Fraction,
     JudgeConfig,
@@ -327,5 +328,10 @@ class VideoRlConfig(SettingsSection):
             raise ValueError(
                 "groups.history needs a video model that can go on from its own frames: set "
                 "model.training.given_frames and new_frames, or take the preset closed_loop"
+            )
+        if self.groups.history and self.rewards.get(AGENT):
+            raise ValueError(
+                "a judge sees whole episodes, and groups.history makes parts of them; set rewards.agent 0, or "
+                "groups.history 0"
             )
         return self

@@ -43,6 +43,20 @@ class Clips:
             tuple(self.seeds[int(i)] for i in index) if self.seeds else (),
         )
 
+    def window(self, first: int, frames: int) -> "Clips":
+        """The frames from `first` on.
+
+        Raises:
+            ValueError: the clips have no such frames.
+        """
+        last = first + frames
+        if last > self.frames.shape[1]:
+            raise ValueError(f"recordings of {self.frames.shape[1]} frames have no frames {first} to {last - 1}")
+        return replace(
+            self, frames=self.frames[:, first:last], actions=self.actions[:, first : last - 1],
+            ground_truth=self.ground_truth[:, first:last],
+        )
+
     def condition(self, codec: Codec, num_conditioning: int, text_dim: int) -> Condition:
         """Return the first frames, the actions and the instruction, where the codec is."""
         first = codec.encode(self.frames[:, :num_conditioning])

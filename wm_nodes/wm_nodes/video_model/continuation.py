@@ -24,6 +24,11 @@ class ClipLengths:
     given: int
     new: int
 
+    def place(self, frames: int) -> tuple[int, int]:
+        """Return the first frame and the number of given frames of the clip that goes on after `frames` frames."""
+        given = min(self.given, frames)
+        return frames - given, given
+
 
 def clip_condition(videos: Tensor, actions: Tensor, text: Tensor, lengths: ClipLengths) -> Condition:
     """Return the condition of the clip that goes on after `videos`: its last frames, and the actions from there.
@@ -35,11 +40,12 @@ def clip_condition(videos: Tensor, actions: Tensor, text: Tensor, lengths: ClipL
     Raises:
         ValueError: too few actions.
     """
-    F, K = videos.shape[2], min(lengths.given, videos.shape[2])
-    wanted = actions[:, F - K : F - 1 + lengths.new]
+    F = videos.shape[2]
+    first, K = lengths.place(F)
+    wanted = actions[:, first : F - 1 + lengths.new]
     if wanted.shape[1] != K - 1 + lengths.new:
         raise ValueError(f"{lengths.new} frames after {F} need {F - 1 + lengths.new} actions, got {actions.shape[1]}")
-    return Condition(videos[:, :, F - K :].contiguous(), wanted.contiguous(), text)
+    return Condition(videos[:, :, first:].contiguous(), wanted.contiguous(), text)
 
 
 @torch.no_grad()

@@ -165,13 +165,14 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
 
 def rescore(
     recorded: RecordedClips, contexts: Clips, probe: PositionProbe, rewards: Mapping[str, float], num_conditioning: int,
-    judge: BufferJudge | None = None,
+    judge: BufferJudge | None = None, first: int = 0,
 ) -> Rescored:
     """Score the pictures against the recordings of their contexts and compare with the recorded scores, bit for bit.
 
     Args:
         rewards: weights of the total; where other scores have a weight than were recorded, the total is not compared.
         judge: called where the agent is among the rewards.
+        first: frame of the recordings that the clips begin with.
 
     Raises:
         BagError: no picture, or scores that cannot be computed from pictures.
@@ -182,7 +183,7 @@ def rescore(
             f"iteration {recorded.iteration} is of context {int(recorded.contexts.max())}, the bags hold "
             f"{len(contexts)}; name the folder of the run that recorded it"
         )
-    references = contexts.select(recorded.contexts)
+    references = contexts.select(recorded.contexts).window(first, recorded.num_frames)
     frames = recorded.frames(*references.frames.shape[2:4]).to(device_of(probe))
     scores = score_clips(frames, references, probe, num_conditioning).named()
     unknown, verdicts = sorted(set(recorded.scores) - set(scores) - {AGENT}), tuple[Mapping[str, Any], ...]()

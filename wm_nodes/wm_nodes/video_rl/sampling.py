@@ -20,7 +20,7 @@ from wm_nodes.video_model import (
     stochastic_steps,
 )
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.continuation import ClipLengths, continue_videos
+from wm_nodes.video_model.continuation import ClipLengths, clip_condition, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_rl.reference_reward import attach_rewards, mix_rewards, score_clips
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -35,13 +35,33 @@ def rollout_settings(config: RolloutConfig) -> RolloutSettings:
 
 @dataclass(frozen=True)
 class GroupRequest:
-    """What to sample. contexts: rows of the generator's clips. iteration, policy_version: of the learner."""
+    """What to sample. contexts: rows of the generator's clips. iteration, policy_version: of the learner. history:
+    clips that the model makes one after the other before those of a group, which share them; None: the group's are of
+    whole recordings."""
 
     contexts: tuple[int, ...]
     group_size: int
     iteration: int
     policy_version: int
     shared_noise: bool = False
+    history: int | None = None
+
+
+def drawn_history(config: VideoRlConfig, iteration: int) -> int | None:
+    """Return how many clips come before those of an iteration, 1 to groups.history; None where that is 0."""
+    if not config.groups.history:
+        return None
+    return int(numpy_stream(config.seed, "history", iteration).integers(1, config.groups.history + 1))
+
+
+def recorded_place(config: VideoRlConfig, iteration: int) -> tuple[int, int]:
+    """Return where in the recordings the clips of an iteration begin, and how many of their frames are given."""
+    start, training = config.model.num_conditioning, config.model.training
+    history = drawn_history(config, iteration)
+    if history is None:
+        return 0, start
+    lengths = ClipLengths(training.given_frames, training.new_frames)
+    return lengths.place(start + history * lengths.new)
 
 
 def sample_buffer(
@@ -69,15 +89,22 @@ def sample_buffer(
 
 class ClipGenerator:
     """Samples clips of recorded contexts (first frames, actions unless groups.hide_actions, instruction) from the video
-    model.
+    model. With groups.history they are continuations: one clip each, from the last frames that the model itself made
+    of a context.
 
     Args:
         folder: codec and network; the network is used as it is, so loading newer weights into it is enough.
         contexts: the recorded clips to draw contexts from.
+
+    Raises:
+        ValueError: groups.history of a model that makes other clips than the settings say, or of recordings that end
+            before.
     """
 
     def __init__(self, folder: VideoFolder, contexts: Clips, config: VideoRlConfig) -> None:
         self.folder, self.contexts, self.config = folder, contexts, config
+        if config.groups.history:
+            self._check_lengths()
 
     def request(self, iteration: int, policy_version: int) -> GroupRequest:
         """Draw the contexts of an iteration without replacement from stream `contexts`."""
@@ -85,7 +112,8 @@ class ClipGenerator:
         count = min(groups.contexts, len(self.contexts))
         drawn = numpy_stream(self.config.seed, "contexts", iteration).choice(len(self.contexts), count, replace=False)
         return GroupRequest(
-            tuple(int(i) for i in drawn), groups.group_size, iteration, policy_version, groups.shared_noise
+            tuple(int(i) for i in drawn), groups.group_size, iteration, policy_version, groups.shared_noise,
+            drawn_history(self.config, iteration),
         )
 
     def sample(
@@ -97,14 +125,32 @@ class ClipGenerator:
         """
         group = torch.arange(len(request.contexts)).repeat_interleave(request.group_size)
         sample = torch.arange(request.group_size).repeat(len(request.contexts))
-        rows = torch.tensor(request.contexts)[group]
         seeds = _seeds(self.config.seed, "clip_steps", request.iteration, group, sample)
         noises = torch.zeros_like(sample) if request.shared_noise else sample
-        noise = initial_noise(self._shape(), _seeds(self.config.seed, "clip_noise", request.iteration, group, noises))
+        condition = self.condition(request)
+        shape = self._shape(condition.actions.shape[1] + 1)
+        noise = initial_noise(shape, _seeds(self.config.seed, "clip_noise", request.iteration, group, noises))
         return sample_buffer(
-            self.folder.network, self.config, self._condition(rows), noise, seeds, group, sample, request.iteration,
+            self.folder.network, self.config, condition, noise, seeds, group, sample, request.iteration,
             request.policy_version, on_progress,
         )
+
+    def condition(self, request: GroupRequest) -> Condition:
+        """Return what the request's clips are made of, a row per clip: recorded first frames, or the last frames of its
+        history, which the model makes here by ODE, once per context."""
+        start = self._condition(torch.tensor(request.contexts))
+        if request.history is None:
+            return start.repeat_interleave(request.group_size)
+        lengths, contexts = self._lengths(), torch.arange(len(request.contexts))
+
+        def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
+            of = torch.full_like(contexts, clip)
+            return initial_noise(shape, _seeds(self.config.seed, "history_noise", request.iteration, contexts, of))
+
+        frames, settings = self._made(request.history), self._ode(self.config.rollout.num_steps)
+        given = start.frames, start.actions, start.text
+        videos = continue_videos(self.folder.network, *given, lengths, frames, noise, settings)
+        return clip_condition(videos, start.actions, start.text, lengths).repeat_interleave(request.group_size)
 
     def evaluate(self, contexts: Clips, num_steps: int) -> Tensor:
         """Sample one clip of each context by ODE and decode it: uint8 (E, F, H, W, 3).
@@ -113,8 +159,8 @@ class ClipGenerator:
         """
         generator = ClipGenerator(self.folder, contexts, self.config)
         rows, network = torch.arange(len(contexts)), self.folder.network
-        settings = RolloutSettings(num_steps, self.config.rollout.shift, self.config.rollout.cfg)
-        condition, shape = generator._condition(rows), generator._shape()
+        condition, settings = generator._condition(rows), self._ode(num_steps)
+        shape = generator._shape(contexts.frames.shape[1])
 
         def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
             seeds = _seeds(self.config.seed, "clip_evaluation", clip, rows, torch.zeros_like(rows))
@@ -125,8 +171,13 @@ class ClipGenerator:
         return self.folder.codec.decode(continue_videos(network, *given, lengths, shape[1], noise, settings))
 
     def references(self, request: GroupRequest) -> Clips:
-        """Return the recordings that the request's clips are scored against, one row per clip."""
-        return self.contexts.select(torch.tensor(request.contexts).repeat_interleave(request.group_size))
+        """Return the recordings that the request's clips are scored against, one row per clip, of the same frames."""
+        recorded = self.contexts.select(torch.tensor(request.contexts).repeat_interleave(request.group_size))
+        if request.history is None:
+            return recorded
+        lengths = self._lengths()
+        first, given = lengths.place(self._made(request.history))
+        return recorded.window(first, given + lengths.new)
 
     def _condition(self, rows: Tensor) -> Condition:
         condition = self.contexts.select(rows).condition(
@@ -134,10 +185,38 @@ class ClipGenerator:
         )
         return condition.without_actions() if self.config.groups.hide_actions else condition
 
-    def _shape(self) -> tuple[int, ...]:
-        _, F, H, W, _ = self.contexts.frames.shape
+    def _shape(self, frames: int) -> tuple[int, ...]:
+        _, _, H, W, _ = self.contexts.frames.shape
         codec = self.folder.codec
-        return codec.channels, F, H // codec.patch, W // codec.patch
+        return codec.channels, frames, H // codec.patch, W // codec.patch
+
+    def _ode(self, num_steps: int) -> RolloutSettings:
+        return RolloutSettings(num_steps, self.config.rollout.shift, self.config.rollout.cfg)
+
+    def _made(self, history: int) -> int:
+        """Frames of so many clips, the recorded first ones among them."""
+        return self.folder.clip["num_conditioning"] + history * self._lengths().new
+
+    def _lengths(self) -> ClipLengths:
+        if self.folder.lengths is None:
+            raise ValueError(
+                "this video model makes whole episodes and cannot go on from its own frames; set groups.history 0, or "
+                "train a model of the preset closed_loop"
+            )
+        return self.folder.lengths
+
+    def _check_lengths(self) -> None:
+        lengths, training, history = self._lengths(), self.config.model.training, self.config.groups.history
+        if (lengths.given, lengths.new) != (training.given_frames, training.new_frames):
+            raise ValueError(
+                f"this video model goes on from {lengths.given} frames with {lengths.new} new ones, the settings say "
+                f"{training.given_frames} and {training.new_frames}; set model.training.given_frames and new_frames"
+            )
+        frames, wanted = self.contexts.frames.shape[1], self._made(history + 1)
+        if wanted > frames:
+            raise ValueError(
+                f"{history} clips and one more have {wanted} frames, the recordings {frames}; lower groups.history"
+            )
 
 
 class RecordedContexts(ClipGenerator):
@@ -154,7 +233,7 @@ class RecordedContexts(ClipGenerator):
     def score(self, request: GroupRequest, clips: RolloutBuffer) -> RolloutBuffer:
         """Return the buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
         frames = self.folder.codec.decode(clips.rollout.latents)
-        given = self.folder.clip["num_conditioning"]
+        given = clips.condition.num_conditioning
         scores = score_clips(frames, self.references(request), self.probe, given).named()
         return attach_rewards(clips, scores, mix_rewards(scores, self.config.rewards))
 

@@ -1,0 +1,159 @@
+"""Continuations of a video model's own frames: what a group shares, what it is scored against, and its head-room."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from video_toys import ACTION_DIM, randn, tiny_network
+
+from wm_nodes.config.load import load_video_config
+from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
+from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.codec import PatchCodec
+from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.horizons import LEAST_SHARE, Headroom, horizon_scores, measure_headroom
+from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest, RecordedContexts, drawn_history, recorded_place
+from wm_nodes.world_model.position_probe import PositionProbe
+
+GIVEN, NEW, FRAMES = 3, 2, 9
+CONFIG = load_video_config("smoke", {
+    "model.stride": 1, "model.training.given_frames": GIVEN, "model.training.new_frames": NEW, "groups.history": 3,
+    "rewards": {"psnr_db": 1.0}, "groups.shared_noise": True,
+})
+
+
+def recorded(frames: int = FRAMES) -> Clips:
+    """Two contexts whose frame f of context i is of grey value 10 i + f."""
+    values = torch.arange(frames).view(1, -1) + 10 * torch.arange(2).view(-1, 1)
+    pictures = values.view(2, frames, 1, 1, 1).expand(2, frames, 8, 12, 3).to(torch.uint8)
+    actions = randn(2, frames - 1, ACTION_DIM)
+    truth = np.full((2, frames, len(GROUND_TRUTH_NAMES)), 0.1, np.float32)
+    return Clips(pictures, actions, truth, ("push", "pull"), "push_cube")
+
+
+def make_folder(given: int = GIVEN, seed: int = 0) -> VideoFolder:
+    torch.manual_seed(0)
+    codec = PatchCodec(4, 6)
+    codec.fit(torch.randint(0, 256, (40, 8, 12, 3), dtype=torch.uint8))
+    clip = {"stride": 1, "num_conditioning": 1, "given_frames": given, "new_frames": NEW} if given else {
+        "stride": 1, "num_conditioning": 1
+    }
+    network = tiny_network(6)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * randn(*parameter.shape, seed=seed))
+    return VideoFolder(codec, network, clip, {})
+
+
+def make_source(config: VideoRlConfig = CONFIG, folder: VideoFolder | None = None) -> RecordedContexts:
+    return RecordedContexts(folder or make_folder(), recorded(), config, PositionProbe(8, 12))
+
+
+def test_a_group_goes_on_from_one_self_made_history_under_the_recorded_actions() -> None:
+    source = make_source()
+    request = GroupRequest((1, 0), 3, 5, 0, True, history=2)
+    buffer = source.sample(request)
+    assert buffer.rollout.latents.shape == (6, 6, GIVEN + NEW, 2, 3)
+    given = buffer.condition.frames.view(2, 3, 6, GIVEN, 2, 3)
+    assert torch.equal(given, given[:, :1].expand_as(given)), "not one history for a group"
+    assert torch.equal(buffer.rollout.latents[:, :, :GIVEN], buffer.condition.frames)
+    assert not torch.equal(buffer.rollout.latents[0], buffer.rollout.latents[1]), "a group of one clip"
+    codec, contexts = source.folder.codec, source.contexts
+    assert not torch.allclose(given[0, 0], codec.encode(contexts.frames)[1, :, 2:5]), "recorded frames, not its own"
+    first, clip = 2, GIVEN + NEW  # after frames 0 to 4 those are 2, 3, 4, and 5, 6 are new
+    assert torch.equal(buffer.condition.actions[0], contexts.actions[1, first : first + clip - 1])
+    references = source.references(request)
+    assert references.frames[::3, :, 0, 0, 0].tolist() == [[12, 13, 14, 15, 16], [2, 3, 4, 5, 6]]
+    assert references.actions.shape == (6, clip - 1, ACTION_DIM) and references.ground_truth.shape[1] == clip
+
+
+def test_the_history_is_of_the_weights_that_sample_and_equal_requests_give_equal_bytes() -> None:
+    request = GroupRequest((0, 1), 2, 1, 0, True, history=1)
+    first, again, other = (make_source(folder=make_folder(seed=seed)).sample(request) for seed in (0, 0, 1))
+    assert first.to_bytes() == again.to_bytes()
+    assert not torch.equal(first.condition.frames, other.condition.frames)
+    later = make_source().sample(replace(request, iteration=2))
+    assert not torch.equal(first.condition.frames, later.condition.frames), "each iteration has a history of its own"
+
+
+@pytest.mark.parametrize(("history", "first", "given"), [(0, 0, 1), (1, 0, 3), (2, 2, 3), (3, 4, 3)])
+def test_a_clip_begins_with_as_many_frames_as_there_are(history: int, first: int, given: int) -> None:
+    source, request = make_source(), GroupRequest((0,), 1, 0, 0, history=history)
+    buffer = source.sample(request)
+    assert buffer.condition.num_conditioning == given and buffer.rollout.latents.shape[2] == given + NEW
+    assert source.references(request).frames[0, 0, 0, 0, 0] == first
+
+
+def test_how_many_clips_come_before_is_drawn_for_each_iteration_from_the_seed_alone() -> None:
+    drawn = [drawn_history(CONFIG, iteration) for iteration in range(40)]
+    assert set(drawn) == {1, 2, 3} and drawn == [drawn_history(CONFIG, iteration) for iteration in range(40)]
+    source = make_source()
+    for iteration, history in enumerate(drawn[:6]):
+        request = source.request(iteration, 0)
+        assert request.history == history
+        first, given = recorded_place(CONFIG, iteration)
+        assert (first, given) == (2 * history + 1 - GIVEN, GIVEN)
+        assert source.references(request).frames[0, 0, 0, 0, 0] == first + 10 * request.contexts[0]
+    plain = CONFIG.with_values(groups=CONFIG.groups.with_values(history=0))
+    assert drawn_history(plain, 0) is None and recorded_place(plain, 0) == (0, 1)
+
+
+def test_a_continuation_is_scored_on_its_new_frames_alone() -> None:
+    source, request = make_source(), GroupRequest((0, 1), 2, 0, 0, history=1)
+    buffer = source.sample(request)
+    frames = source.folder.codec.decode(buffer.rollout.latents)[:, GIVEN:].float()
+    wanted = source.references(request).frames[:, GIVEN:].float()
+    psnr = -10 * ((frames - wanted) / 255).square().mean((1, 2, 3, 4)).log10()
+    torch.testing.assert_close(source.score(request, buffer).rewards["total"], psnr.double(), rtol=1e-5, atol=1e-5)
+
+
+def test_settings_that_a_model_or_its_recordings_cannot_have_are_refused() -> None:
+    with pytest.raises(ValueError, match="whole episodes"):
+        make_source(folder=make_folder(given=0))
+    with pytest.raises(ValueError, match="goes on from 2 frames with 2 new ones, the settings say 3 and 2"):
+        make_source(folder=make_folder(given=2))
+    with pytest.raises(ValueError, match="3 clips and one more have 9 frames, the recordings 8"):
+        ClipGenerator(make_folder(), recorded(8), CONFIG)
+    with pytest.raises(ValueError, match="a judge sees whole episodes"):
+        load_video_config("closed_loop", {"rewards.agent": 1.0})
+
+
+def test_a_group_of_equal_clips_has_no_head_room_and_one_of_different_clips_what_its_best_is_better_by() -> None:
+    silent = CONFIG.with_values(rollout=CONFIG.rollout.with_values(
+        sampler=CONFIG.rollout.sampler.with_values(eta=0.0)
+    ))
+    folder, probe = make_folder(), PositionProbe(8, 12)
+    found = measure_headroom(folder, recorded(), silent, probe)
+    assert [one.clips for one in found] == [1, 2, 3, 4]
+    for one in found:
+        assert one.gain == pytest.approx((0, 0, 0), abs=1e-9) and one.spread == pytest.approx(0, abs=1e-9)
+        assert not one.can_learn and "no group method can learn" in one.text() and one.codec > one.reward
+    source = make_source()
+    for one in measure_headroom(folder, recorded(), CONFIG, probe):
+        request = GroupRequest((0, 1), 3, one.clips - 1, 0, True, one.clips - 1)
+        rewards = source.score(request, source.sample(request)).rewards["total"].view(2, 3)
+        assert one.gain[0] == pytest.approx(float((rewards.amax(1) - rewards.mean(1)).mean())) and one.gain[0] > 0
+        assert one.best - one.reward == pytest.approx(one.gain[0])
+    whole = measure_headroom(make_folder(given=0), recorded(), CONFIG, probe)
+    assert [one.clips for one in whole] == [1]
+
+
+def test_a_gain_is_weighed_against_what_is_missing_to_the_codec() -> None:
+    one = Headroom(2, 0.5, 0.52, (0.02, 0.01, 0.03), 0.01, 0.7, (0, 0, 0), (0, 0, 0))
+    assert one.share == pytest.approx(0.15) and one.can_learn
+    assert not replace(one, gain=(0.02, 0.01, LEAST_SHARE * 0.2 - 1e-6)).can_learn
+    perfect = replace(one, codec=0.5)
+    assert not perfect.can_learn and "nothing is left to learn" in perfect.text()
+
+
+def test_each_clip_of_a_rollout_is_scored_by_itself() -> None:
+    clips, folder, probe = recorded(), make_folder(), PositionProbe(8, 12)
+    frames: Tensor = clips.frames.clone()
+    frames[:, 4] += 50  # the last frame of the second clip: frames 3 and 4
+    found = {name: float(values.mean()) for name, values in horizon_scores(frames, clips, probe, folder).items()}
+    assert [found[f"psnr_db_{clip}"] for clip in (1, 3, 4)] == pytest.approx([80.0] * 3)
+    assert found["psnr_db_2"] == pytest.approx(-10 * np.log10((50 / 255) ** 2 / 2), abs=1e-3)
+    assert {f"{name}_{clip}" for name in ("tool_cm", "object_cm", "psnr_db") for clip in (1, 2, 3, 4)} == found.keys()

@@ -1,0 +1,198 @@
+"""Closed loop: a video model that goes on from its own frames is post-trained on continuations of its own histories,
+by group methods and by controls of the same compute (controls.py), and rolled out whole over held-out episodes.
+
+Compute of a buffer, in forwards of one clip: contexts x history x steps for the histories, contexts x group_size x
+steps for the groups, TRAINING_CALLS for each (clip, step) or (clip, time) that trains, and one more with NFT.
+"""
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from rich.console import Console
+
+from benchmarks.video_rl import plots, tables
+from benchmarks.video_rl.controls import TRAINING_CALLS, FlowMatchingLearner, RecordedTargets
+from benchmarks.video_rl.learning import train_sampler
+from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
+from benchmarks.video_rl.sources import TASK, config_of
+from benchmarks.video_rl.trainings import compare, draw, train_all
+from benchmarks.video_rl.trials import SamplerTrial
+from wm_nodes.apps.options import add_device, add_json, positive
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.video_model import RolloutBuffer
+from wm_nodes.video_model.clips import Clips, load_clips
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder
+from wm_nodes.video_rl.grpo import GrpoLearner
+from wm_nodes.video_rl.horizons import horizon_scores
+from wm_nodes.video_rl.reference_reward import load_probe, score_clips
+from wm_nodes.video_rl.sampling import RecordedContexts
+from wm_nodes.world_model.position_probe import PositionProbe
+
+PRESET, REWARDS = "closed_loop", {"tracking": 1.0}
+BEST, RECORDINGS = "best of n", "recordings"
+DRAWS, UPDATES = 4, 4
+"""Of the controls: (time, noise) pairs per recorded clip; optimizer steps per buffer, which share the pairs."""
+MEASURES = ("error_cm", "error_cm_path", "win", "object_cm", "tool_cm", "psnr_db")
+SCORES = ("tracking", "object_cm", "tool_cm", "psnr_db", "scenery")
+SHOWN = ("error_cm", "win", "object_cm", "tool_cm", "psnr_db", "object_cm_4", "tool_cm_4")
+console = Console()
+
+
+@dataclass(frozen=True)
+class ClosedLoopPlan(LearningPlan):
+    """eval_contexts: held-out episodes, rolled out whole. history: clips at most before those of a group."""
+
+    iterations: int = 30
+    contexts: int = 8
+    eval_every: int = 10
+    history: int = 2
+
+
+def closed_loop_samplers() -> list[SamplerSetup]:
+    """Group methods that train the same number of (clip, step) pairs (in a window of 2 of the 3 steps that can train,
+    half as many clips again), and the two controls: flow matching on each group's best clip, and on recordings."""
+    group = [_fill_window(one) if one.name.endswith("window") else one for one in outcome_samplers(PRESET)]
+    controls = group[0].grpo.with_values(updates_per_buffer=UPDATES)
+    return [*group, *(replace(group[0], name=name, grpo=controls) for name in (BEST, RECORDINGS))]
+
+
+def calls_of_buffer(config: VideoRlConfig) -> dict[str, float]:
+    """Return the mean forwards of one clip that a buffer of a group method costs, see above."""
+    groups, grpo, steps = config.groups, config.grpo, config.rollout.num_steps
+    kept = min(grpo.advantage.best_of_n or groups.group_size, groups.group_size)
+    trained = steps - 1 if config.window.strategy == "all" else min(config.window.size, steps - 1)
+    each = trained * TRAINING_CALLS if grpo.objective == "ratio" else grpo.nft.times * (TRAINING_CALLS + 1)
+    return {
+        "history": groups.contexts * (1 + groups.history) / 2 * steps,
+        "sampling": float(groups.contexts * groups.group_size * steps),
+        "training": float(groups.contexts * kept * each),
+    }
+
+
+def equal_compute(config: VideoRlConfig, control: str) -> tuple[int, int]:
+    """Return contexts per buffer and (time, noise) pairs per clip that cost a control what a group method costs."""
+    calls, contexts = calls_of_buffer(config), config.groups.contexts
+    if control == BEST:
+        pairs = calls["training"] / (TRAINING_CALLS * contexts)
+        return contexts, max(1, round(pairs / UPDATES)) * UPDATES
+    each = calls["history"] / contexts + TRAINING_CALLS * DRAWS
+    return round(sum(calls.values()) / each), DRAWS
+
+
+class ClosedLoopSource(RecordedContexts):
+    """Continuations of the model's own histories; held-out contexts are rolled out whole, clip after clip."""
+
+    def __init__(
+        self, folder: VideoFolder, contexts: Clips, heldout: Clips, probe: PositionProbe, config: VideoRlConfig
+    ) -> None:
+        super().__init__(folder, contexts, config, probe)
+        self.network, self._heldout = folder.network, heldout
+        self._before: torch.Tensor | None = None
+
+    def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
+        """reward_spread: standard deviation of the reward within a group, mean over the groups."""
+        rewards = buffer.rewards["total"].view(int(buffer.group_ids.max()) + 1, -1)
+        return {"reward_spread": float(rewards.std(1, correction=0).mean())}
+
+    def validate(self) -> Mapping[str, list[float]]:
+        """Scores of whole rollouts and of each of their clips. error_cm: of tool and object together. win: 1 where that
+        is smaller than at the first call, 0.5 where it is the same."""
+        frames = self.evaluate(self._heldout, self.config.evaluation.num_steps)
+        found = score_clips(frames, self._heldout, self.probe, self.folder.clip["num_conditioning"])
+        scores = {name: getattr(found, name) for name in SCORES}
+        scores["error_cm"] = scores["object_cm"] + scores["tool_cm"]
+        if self._before is None:
+            self._before = scores["error_cm"]
+        scores["win"] = (torch.sign(self._before - scores["error_cm"]) + 1) / 2
+        scores |= horizon_scores(frames, self._heldout, self.probe, self.folder)
+        return {name: values.tolist() for name, values in scores.items()}
+
+
+class RecordedSource(RecordedTargets, ClosedLoopSource):
+    """Recordings in place of continuations, validated alike."""
+
+
+def train_arm(
+    folder: VideoFolder, contexts: Clips, heldout: Clips, probe: PositionProbe, sampler: SamplerSetup,
+    plan: ClosedLoopPlan, seed: int, on_iteration: Callable[[], object] = lambda: None,
+) -> dict[str, Any]:
+    """Post-train folder.network in place; return train_sampler's row with learning_rate and calls per buffer."""
+    config = config_of(sampler, plan, seed, PRESET, REWARDS)
+    config = config.with_values(groups=config.groups.with_values(history=plan.history))
+    learner: GrpoLearner | FlowMatchingLearner
+    calls, source = sum(calls_of_buffer(config).values()), ClosedLoopSource
+    if sampler.name in (BEST, RECORDINGS):
+        count, draws = equal_compute(config, sampler.name)
+        config = config.with_values(groups=config.groups.with_values(contexts=count))
+        keep: Literal["best", "all"] = "best" if sampler.name == BEST else "all"
+        source = ClosedLoopSource if sampler.name == BEST else RecordedSource
+        learner = FlowMatchingLearner(
+            folder.network, sampler.grpo, sampler.rollout, seed=seed, keep=keep, draws=draws
+        )
+    else:
+        learner = GrpoLearner(folder.network, sampler.grpo, sampler.rollout, seed=seed)
+    made = source(folder, contexts, heldout, probe, config)
+    row = train_sampler(made, sampler, plan, seed, on_iteration, learner)
+    return {**row, "learning_rate": sampler.grpo.learning_rate, "calls": calls}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model_closed_loop")
+    parser.add_argument("--context-bags", type=Path, nargs="+", required=True, metavar="BAG")
+    parser.add_argument("--heldout-bags", type=Path, nargs="+", required=True, metavar="BAG")
+    parser.add_argument("--iterations", type=positive, default=ClosedLoopPlan.iterations)
+    parser.add_argument("--contexts", type=positive, default=ClosedLoopPlan.contexts, help="per buffer, 8 clips each")
+    parser.add_argument("--eval-contexts", type=positive, default=ClosedLoopPlan.eval_contexts)
+    parser.add_argument("--eval-every", type=positive, default=ClosedLoopPlan.eval_every)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--samplers", "--arms", nargs="+", metavar="NAME")
+    parser.add_argument("--learning-rate", type=float, help="of every arm, to choose one; default: the chosen ones")
+    parser.add_argument("--workers", type=positive, default=1, help="trainings at the same time, a process each")
+    add_device(parser)
+    add_json(parser, "write every row here; trainings go on where the file stops")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Train every arm at every seed; compare each with the others."""
+    base = load_video_folder(arguments.video_model, arguments.device)
+    plan = ClosedLoopPlan(
+        arguments.iterations, arguments.contexts, eval_contexts=arguments.eval_contexts, eval_every=arguments.eval_every
+    )
+    arms = closed_loop_samplers()
+    if arguments.learning_rate:
+        arms = [replace(arm, grpo=arm.grpo.with_values(learning_rate=arguments.learning_rate)) for arm in arms]
+    trials, of = [SamplerTrial(arm, plan) for arm in arms], {"sha256": base.manifest["sha256"]}
+    rows = train_all(arguments, trials, partial(_train, arguments), of, arguments.workers)
+    comparisons = compare(arguments, trials, rows, _pairs(rows), of, MEASURES)
+    draw(arguments, plots.plot_comparisons, comparisons)
+    console.print(tables.gain_table(rows, SHOWN), tables.comparison_table(comparisons))
+
+
+def _train(
+    arguments: argparse.Namespace, trial: SamplerTrial[ClosedLoopPlan], seed: int, on_iteration: Callable[[], object]
+) -> dict[str, Any]:
+    folder = load_video_folder(arguments.video_model, arguments.device)
+    bags = arguments.context_bags, arguments.heldout_bags
+    contexts, heldout = (load_clips(some, folder.clip["stride"]) for some in bags)
+    heldout = heldout.select(torch.arange(min(trial.plan.eval_contexts, len(heldout))))
+    probe = load_probe(shipped_model(TASK), arguments.device)
+    return train_arm(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, on_iteration)
+
+
+def _pairs(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Every arm with each control, and with CPS."""
+    names = sorted({row["sampler"] for row in rows})
+    return [(name, base) for base in ("CPS 0.4", BEST, RECORDINGS) for name in names if base in names and name != base]
+
+
+def _fill_window(sampler: SamplerSetup) -> SamplerSetup:
+    """In a window of 2 of 3 steps half as many clips again are trained on."""
+    advantage = sampler.grpo.advantage
+    more = advantage.with_values(best_of_n=3 * advantage.best_of_n // 2)
+    return replace(sampler, grpo=sampler.grpo.with_values(advantage=more))

@@ -1,0 +1,122 @@
+"""How a video model does clip after clip on its own frames, and what the best clip of a group is better by.
+
+Shapes: E contexts, n clips of a group, F frames.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.statistics import bootstrap_mean
+from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.reference_reward import mix_rewards, score_clips
+from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest
+from wm_nodes.world_model.position_probe import PositionProbe
+
+LEAST_SHARE = 0.1
+"""A group whose best clip closes less than this share of the gap between a clip's reward and that of a recording seen
+through the codec has nothing to teach: the number is a judgement, not a theorem."""
+DRIFT = ("tool_cm", "object_cm", "psnr_db")
+Interval = tuple[float, float, float]
+"""Mean over contexts and its 95 % bootstrap interval."""
+
+
+@dataclass(frozen=True)
+class Headroom:
+    """Groups of continuations after `clips - 1` self-made clips.
+
+    reward: mean of a clip; best: of the best of n; gain: best - mean; spread: standard deviation within a group;
+    codec: of the recording, decoded from its latents. object_cm, tool_cm: how much smaller the errors of the clip of
+    best reward are than a clip's; below 0: larger.
+    """
+
+    clips: int
+    reward: float
+    best: float
+    gain: Interval
+    spread: float
+    codec: float
+    object_cm: Interval
+    tool_cm: Interval
+
+    @property
+    def share(self) -> float:
+        """The part of the gap to the codec that the best of a group closes, by the upper end of its interval."""
+        gap = self.codec - self.reward
+        return self.gain[2] / gap if gap > 0 else 0.0
+
+    @property
+    def can_learn(self) -> bool:
+        return self.share >= LEAST_SHARE
+
+    def text(self) -> str:
+        """One sentence."""
+        if self.codec <= self.reward:
+            return f"clip {self.clips}: as good as the codec allows; nothing is left to learn"
+        if self.can_learn:
+            return f"clip {self.clips}: the best of a group closes up to {self.share:.0%} of the gap to the codec"
+        return (
+            f"clip {self.clips}: no group method can learn here: the best of a group closes at most {self.share:.1%} "
+            f"of the gap to the codec (below {LEAST_SHARE:.0%}); add noise, or train on recordings"
+        )
+
+
+def measure_headroom(
+    folder: VideoFolder, contexts: Clips, config: VideoRlConfig, probe: PositionProbe,
+    on_horizon: Callable[[], object] = lambda: None,
+) -> list[Headroom]:
+    """Return the head-room of groups.group_size clips by the rewards of `config`, one per horizon, or only that of
+    whole clips where the model makes such.
+
+    Raises:
+        ValueError: a reward that is no score against the recording.
+    """
+    config = config.with_values(groups=config.groups.with_values(history=0), window=config.window.with_values(
+        strategy="all"
+    ))
+    generator, n, found = ClipGenerator(folder, contexts, config), config.groups.group_size, list[Headroom]()
+    plain = GroupRequest(tuple(range(len(contexts))), n, 0, 0, config.groups.shared_noise)
+    for history in _histories(folder, contexts):
+        request = replace(plain, history=history, iteration=history or 0)
+        buffer, recorded = generator.sample(request), generator.references(request)
+        K, one = buffer.condition.num_conditioning, recorded.select(torch.arange(0, len(recorded), n))
+        scores = score_clips(folder.codec.decode(buffer.rollout.latents), recorded, probe, K).named()
+        coded = folder.codec.decode(folder.codec.encode(one.frames))
+        ceiling = mix_rewards(score_clips(coded, one, probe, K).named(), config.rewards)
+        rewards = mix_rewards(scores, config.rewards).view(-1, n)
+        best = rewards.argmax(1, keepdim=True)
+
+        def gained(values: Tensor, sign: int, best: Tensor = best) -> Interval:
+            values = sign * values.view(-1, n)
+            return bootstrap_mean((values.gather(1, best)[:, 0] - values.mean(1)).numpy(), seed=config.seed)
+
+        found.append(Headroom(
+            (history or 0) + 1, float(rewards.mean()), float(rewards.amax(1).mean()), gained(rewards, 1),
+            float(rewards.std(1, correction=0).mean()), float(ceiling.mean()),
+            gained(scores["object_cm"], -1), gained(scores["tool_cm"], -1),
+        ))
+        on_horizon()
+    return found
+
+
+def horizon_scores(frames: Tensor, recorded: Clips, probe: PositionProbe, folder: VideoFolder) -> dict[str, Tensor]:
+    """Score each clip of whole rollouts, uint8 (E, F, H, W, 3), by itself: DRIFT scores ending in _<clip>, from 1."""
+    lengths, first, found, clip = folder.lengths, folder.clip["num_conditioning"], dict[str, Tensor](), 1
+    new = lengths.new if lengths else frames.shape[1] - first
+    while first < frames.shape[1]:
+        count = min(new, frames.shape[1] - first)
+        part = recorded.window(first - 1, count + 1)
+        scores = score_clips(frames[:, first - 1 : first + count], part, probe, 1).named()
+        found |= {f"{name}_{clip}": scores[name] for name in DRIFT}
+        first, clip = first + count, clip + 1
+    return found
+
+
+def _histories(folder: VideoFolder, contexts: Clips) -> Sequence[int | None]:
+    if folder.lengths is None:
+        return [None]
+    return range((contexts.frames.shape[1] - folder.clip["num_conditioning"]) // folder.lengths.new)
