@@ -59,7 +59,7 @@ def write_contexts(path: Path) -> Path:
     return path
 
 
-def make_video_folder(folder: Path, clips: Clips) -> Path:
+def make_video_folder(folder: Path, clips: Clips, config: VideoRlConfig | None = None) -> Path:
     """A fitted codec and a network that was not trained; the zeros that it starts with are replaced."""
     codec = PatchCodec(4, 6)
     codec.fit(clips.frames.flatten(0, 1))
@@ -68,7 +68,10 @@ def make_video_folder(folder: Path, clips: Clips) -> Path:
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
-    return save_video_folder(folder, codec, network, {"stride": STRIDE, "num_conditioning": 1}, {"seed": 0})
+    clip = {"stride": STRIDE, "num_conditioning": 1}
+    if config is not None and config.model.training.given_frames:
+        clip |= {name: getattr(config.model.training, name) for name in ("given_frames", "new_frames")}
+    return save_video_folder(folder, codec, network, clip, {"seed": 0})
 
 
 class LocalLoop:
@@ -133,7 +136,7 @@ class VideoLoop:
     def __init__(self, graph: Graph, probe: Probe, config: VideoRlConfig, lag: int = 0) -> None:
         self.graph, self.probe, self.config = graph, probe, config
         self.bag = write_contexts(graph.folder / "contexts")
-        self.model = make_video_folder(graph.folder / "video_model", load_clips([self.bag], STRIDE))
+        self.model = make_video_folder(graph.folder / "video_model", load_clips([self.bag], STRIDE), config)
         (graph.folder / "video_config.yaml").write_text(dump_config(config))
         self.local = LocalLoop(config, self.model, self.bag, lag)
         self.links = probe.links()
