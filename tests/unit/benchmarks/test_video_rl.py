@@ -98,7 +98,7 @@ def test_the_learning_curves_have_the_interval_of_their_gains_from_three_seeds_o
     plot_learning([{**row, "buffers": {}} for row in (*rows, training("one", 0, 1, 1, 3))], tmp_path / "learning.png")
     reward = drawn[0].axes[0]
     curves = {str(line.get_label()): np.asarray(line.get_ydata()).tolist() for line in reward.lines}
-    assert curves["CPS (3)"] == curves["one (1)"] == [0, 0, 2]
+    assert curves["CPS, n = 3"] == curves["one, n = 1"] == [0, 0, 2]
     (band,) = reward.collections
     heights = band.get_paths()[0].vertices[:, 1]
     assert (heights.min(), heights.max()) == pytest.approx((2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5))

@@ -66,7 +66,7 @@ def plot_learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
         style_axes(axes, f"{measure}: mean over seeds, 95 % t interval", "buffers", "held-out scenes, less before")
         axes.axhline(0, color="gray", linewidth=1)
         for name in reversed(trained):
-            _draw_course(axes, trained[name], measure, f"{name} ({len(trained[name])})", colours.get(name, "gray"))
+            _draw_course(axes, trained[name], measure, f"{name}, n = {len(trained[name])}", colours.get(name, "gray"))
     add_legend(courses[0], "upper left", fontsize=7.5)
     style_axes(ends, "reward after the training; a dot per seed", "held-out scenes, less before", "")
     for place, (name, mine) in enumerate(trained.items()):
@@ -95,7 +95,7 @@ def plot_courses(rows: Sequence[dict[str, Any]], path: Path, measures: Sequence[
         axes.axhline(0, color="gray", linewidth=1)
         for name in names:
             mine = [row for row in rows if row["sampler"] == name]
-            _draw_course(axes, mine, measure, f"{name} ({len(mine)})", colours.get(name, "gray"))
+            _draw_course(axes, mine, measure, f"{name}, n = {len(mine)}", colours.get(name, "gray"))
     add_legend(panels[0], "upper left", fontsize=7.5)
     save_figure(figure, path)
 
