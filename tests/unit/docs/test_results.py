@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import wm_nodes
-from benchmarks.video_rl.comparison import gains, paired_interval
+from benchmarks.video_rl.comparison import Difference, compare_samplers, gains, paired_interval
 from wm_nodes.core.statistics import bootstrap_mean, paired_difference, wilson_interval
 
 ROOT = Path(wm_nodes.__file__).parents[1]
@@ -166,6 +166,49 @@ def short(sampler: str) -> str:
 def difference(comparison: Run, name: str, digits: int) -> str:
     found = comparison["differences"][name]
     return interval(found["mean"], found["low"], found["high"], digits)
+
+
+# --- video_tasks.md ---------------------------------------------------------------------------------------------
+def outcome_rows() -> Rows:
+    """One line per arm: success at both ends, gain, and the mean over the training against CPS on the same seeds."""
+    truth, judged = read("video_rl_outcome.json")["rows"], read("video_rl_outcome_judge.json")["rows"]
+    for name, of in (*((name, truth) for name in OUTCOME_ARMS), *((name, judged) for name in JUDGE_ARMS)):
+        trained = [one for one in of if one["sampler"] == name]
+        ends = (percent(mean(one["evaluations"][place]["success"] for one in trained)) for place in (0, -1))
+        gained = paired_interval([course[-1] for course in gains(trained, "success")])
+        against = compare_samplers(truth, name, "CPS 0.4", ["success_path"]) if of is truth else None
+        yield row(
+            name, len(trained), " → ".join(ends), interval(gained.mean, gained.low, gained.high, 3),
+            "" if against is None else interval_of(against.differences["success_path"], 3),
+        )
+
+
+OUTCOME_ARMS = (
+    "CPS 0.4", "DynDiff 0.54 gated, rms", "CPS 0.4, window", "DynDiff 0.54 gated, rms, window", "DynDiff 0.6 gated",
+    "NFT, ODE",
+)
+JUDGE_ARMS = ("CPS 0.4, judge robot", "CPS 0.4, judge robot_no_physics")
+HELDOUT_METRICS = (
+    ("executed_success", 3), ("executed_object_cm", 1), ("reader_success", 3), ("object_permanence", 3),
+    ("impossible_tool_steps", 3),
+)
+
+
+def interval_of(found: Difference, digits: int) -> str:
+    return interval(found.mean, found.low, found.high, digits)
+
+
+def heldout_metric_rows() -> Rows:
+    """One line per arm: mean before, and change, of metrics that nothing was trained on."""
+    rows = read("video_rl_outcome.json")["rows"] + read("video_rl_outcome_judge.json")["rows"]
+    for name in ("CPS 0.4", "DynDiff 0.54 gated, rms", "NFT, ODE", *JUDGE_ARMS):
+        mine = [one for one in rows if one["sampler"] == name]
+        cells = []
+        for metric, digits in HELDOUT_METRICS:
+            before, after = ([one[f"measured_{when}"][metric] for one in mine] for when in ("before", "after"))
+            changed = paired_interval([later - first for first, later in zip(before, after, strict=True)])
+            cells.append(f"{mean(before):.{digits}f} {interval_of(changed, digits)}")
+        yield row(name, *cells)
 
 
 def clip_learning_rows() -> Rows:
@@ -380,6 +423,7 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         diversity_rows, clip_rows, learning_rows, clip_learning_rows, cost_rows, ablation_rows,
         resolution_rows, hacking_rows,
     ],
+    "video_tasks": [outcome_rows, heldout_metric_rows],
     "judge": [
         table_rows, pattern_rows, conformal_rows, stacked_rows, efficiency_rows, judge_hacking_rows, control_rows,
         imagined_rows, policy_camera_rows,

@@ -89,8 +89,8 @@ def sample_buffer(
 
 class ClipGenerator:
     """Samples clips of recorded contexts (first frames, actions unless groups.hide_actions, instruction) from the video
-    model. With groups.history they are continuations: one clip each, from the last frames that the model itself made
-    of a context.
+    model. With groups.history they are continuations (DD-33): one clip each, from the last frames that the model itself
+    made of a context.
 
     Args:
         folder: codec and network; the network is used as it is, so loading newer weights into it is enough.
