@@ -15,7 +15,7 @@ from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 
 OPTIONS = {
     "train-policy": "--preset --set --device --task --seed --run-dir --model-dir --from-scratch --force --rounds "
-    "--reward --judge --judge-model --judge-key-env --rubric --compose --domain-id --verbose",
+    "--environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose --domain-id --verbose",
     "train-video-model": "--preset --set --seed --run-dir --from-scratch --bags --heldout-bags --keep-buffers --reward "
     "--judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",
     "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset --set",
@@ -33,6 +33,7 @@ OPTIONS = {
     "--policy-view --measure",
     "normal-ranges": "model_dir bags --check --output --rubric --stride --tail --device",
     "benchmark speed": "--json --quick --preset --model-dir --untrained --seed",
+    "benchmark environments": "trained-in ranking speed",
     "benchmark video-rl": "base diversity learning ablations hacking cost clips clip-learning resolution",
     "benchmark judge": "table efficiency hacking comparisons imagined-vs-real speed fault-visibility pai-bench",
 }
@@ -66,7 +67,7 @@ def test_every_verb_explains_itself_and_names_its_options(verb: str, capsys: pyt
         assert re.search(rf"(^|[\s,{{|\[]){re.escape(option)}($|[\s,}}|\]])", text), f"{option} is not in\n{text}"
 
 
-@pytest.mark.parametrize("suite", ["video-rl", "judge"])
+@pytest.mark.parametrize("suite", ["environments", "video-rl", "judge"])
 def test_every_experiment_explains_itself(suite: str, capsys: pytest.CaptureFixture[str]) -> None:
     for name in OPTIONS[f"benchmark {suite}"].split():
         assert f"usage: wm benchmark {suite} {name}" in shown(["benchmark", suite, name], capsys)
@@ -83,6 +84,9 @@ def test_every_experiment_explains_itself(suite: str, capsys: pytest.CaptureFixt
         (["train-policy", "--set", "ppo.updates=many"], "ppo.updates"),
         (["train-policy", "--preset", "nosuch"], "nosuch"),
         (["train-policy", "--preset", "gpu", "--device", "cpu"], "image_size = 64, the configuration says 128"),
+        (["train-policy", "--environment", "video_model"], "--video-model DIR go together; give both, or none"),
+        (["train-policy", "--video-model", "nothing-here"], "--video-model DIR go together; give both, or none"),
+        (["train-policy", "--environment", "video_model", "--video-model", "nothing-here"], "nothing-here holds no man"),
         (["train-video-model", "--set", "width"], "section.key=value"),
     ],
 )
