@@ -15,7 +15,8 @@ from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 
 OPTIONS = {
     "train-policy": "--preset --set --device --task --seed --run-dir --model-dir --from-scratch --force --rounds "
-    "--environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose --domain-id --verbose",
+    "--environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose --domain-id "
+    "--verbose",
     "train-video-model": "--preset --set --seed --run-dir --from-scratch --bags --heldout-bags --keep-buffers --reward "
     "--judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",
     "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset --set",
@@ -86,7 +87,7 @@ def test_every_experiment_explains_itself(suite: str, capsys: pytest.CaptureFixt
         (["train-policy", "--preset", "gpu", "--device", "cpu"], "image_size = 64, the configuration says 128"),
         (["train-policy", "--environment", "video_model"], "--video-model DIR go together; give both, or none"),
         (["train-policy", "--video-model", "nothing-here"], "--video-model DIR go together; give both, or none"),
-        (["train-policy", "--environment", "video_model", "--video-model", "nothing-here"], "nothing-here holds no man"),
+        (["train-policy", "--environment", "video_model", "--video-model", "nowhere"], "nowhere holds no manifest"),
         (["train-video-model", "--set", "width"], "section.key=value"),
     ],
 )
