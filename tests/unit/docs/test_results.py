@@ -142,7 +142,7 @@ def learning_rows() -> Rows:
     measures = (("reward", 3), ("obeyed", 3), ("mass", 2), ("background", 4))
     for name in (
         "CPS 0.46, shared", "CPS 0.6, shared", "DynDiff 0.6 gated, rms, cps, shared", "CPS 0.6, window",
-        "DynDiff 0.6 gated, rms, cps, window",
+        "DynDiff 0.6 gated, rms, cps, window", "NFT, ODE",
     ):
         trained = [one for one in found["rows"] if sampler_of(one) == name]
         gained = (paired_interval([course[-1] for course in gains(trained, key)]) for key, _ in measures)
@@ -202,13 +202,23 @@ def heldout_metric_rows() -> Rows:
     """One line per arm: mean before, and change, of metrics that nothing was trained on."""
     rows = read("video_rl_outcome.json")["rows"] + read("video_rl_outcome_judge.json")["rows"]
     for name in ("CPS 0.4", "DynDiff 0.54 gated, rms", "NFT, ODE", *JUDGE_ARMS):
-        mine = [one for one in rows if one["sampler"] == name]
-        cells = []
+        mine = [one for one in rows if one["sampler"] == name and "measured_after" in one]
+        cells = [str(len(mine))]
         for metric, digits in HELDOUT_METRICS:
             before, after = ([one[f"measured_{when}"][metric] for one in mine] for when in ("before", "after"))
             changed = paired_interval([later - first for first, later in zip(before, after, strict=True)])
             cells.append(f"{mean(before):.{digits}f} {interval_of(changed, digits)}")
         yield row(name, *cells)
+
+
+def closed_loop_rows() -> Rows:
+    """One line per arm and learning rate of the pilots: error of whole rollouts, and how many got better."""
+    for run in runs("video_rl_closed_loop.jsonl").values():
+        for one in run["rows"]:
+            first, last = one["evaluations"][0], one["evaluations"][-1]
+            changed = (f"{last[name] - first[name]:+.2f}" for name in ("object_cm", "tool_cm", "psnr_db"))
+            share = f"{100 * last['win']:.0f}"
+            yield row(one["sampler"], f"{one['learning_rate']:g}", last["iteration"], *changed, share)
 
 
 def clip_learning_rows() -> Rows:
@@ -423,7 +433,7 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         diversity_rows, clip_rows, learning_rows, clip_learning_rows, cost_rows, ablation_rows,
         resolution_rows, hacking_rows,
     ],
-    "video_tasks": [outcome_rows, heldout_metric_rows],
+    "video_tasks": [outcome_rows, heldout_metric_rows, closed_loop_rows],
     "judge": [
         table_rows, pattern_rows, conformal_rows, stacked_rows, efficiency_rows, judge_hacking_rows, control_rows,
         imagined_rows, policy_camera_rows,
