@@ -187,7 +187,10 @@ OUTCOME_ARMS = (
     "CPS 0.4", "DynDiff 0.54 gated, rms", "CPS 0.4, window", "DynDiff 0.54 gated, rms, window", "DynDiff 0.6 gated",
     "NFT, ODE",
 )
-JUDGE_ARMS = ("CPS 0.4, judge robot", "CPS 0.4, judge robot_no_physics")
+JUDGE_ARMS = tuple(
+    f"CPS 0.4, judge {rubric}"
+    for rubric in ("robot", "robot_no_physics", "robot_no_planning", "robot_single_read", "robot_open_gates")
+)
 HELDOUT_METRICS = (
     ("executed_success", 3), ("executed_object_cm", 1), ("reader_success", 3), ("object_permanence", 3),
     ("impossible_tool_steps", 3),
@@ -201,7 +204,7 @@ def interval_of(found: Difference, digits: int) -> str:
 def heldout_metric_rows() -> Rows:
     """One line per arm: mean before, and change, of metrics that nothing was trained on."""
     rows = read("video_rl_outcome.json")["rows"] + read("video_rl_outcome_judge.json")["rows"]
-    for name in ("CPS 0.4", "DynDiff 0.54 gated, rms", "NFT, ODE", *JUDGE_ARMS):
+    for name in ("CPS 0.4", "DynDiff 0.54 gated, rms", "NFT, ODE", *JUDGE_ARMS[:2]):
         mine = [one for one in rows if one["sampler"] == name and "measured_after" in one]
         cells = [str(len(mine))]
         for metric, digits in HELDOUT_METRICS:
