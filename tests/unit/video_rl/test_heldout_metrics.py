@@ -29,7 +29,8 @@ def test_every_metric_of_a_clip_is_a_number_and_the_other_reader_looks_at_the_la
     reader = SuccessReader(64, 128)
     reader.threshold = float(np.median(reader.read(frames[:, -1])))
     simulation, limits = load_config("cpu").simulation, FaultLimits(0.15, 6)
-    found = measure_clips(frames, clips, PositionProbe(64, 128), reader, limits, simulation, 1)
+    probe = PositionProbe(64, 128)
+    found = measure_clips(frames, probe.read(frames), clips, probe, reader, limits, simulation, 1)
     assert {"success", "ghost_motion", "object_permanence", "reader_success"} <= found.keys()
     for values in found.values():
         assert values.shape == (3,) and values.dtype == torch.float64 and torch.isfinite(values).all()

@@ -9,7 +9,6 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -19,14 +18,14 @@ from benchmarks.video_rl import plots, tables
 from benchmarks.video_rl.controls import TRAINING_CALLS, FlowMatchingLearner, RecordedTargets
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
-from benchmarks.video_rl.sources import TASK, config_of
-from benchmarks.video_rl.trainings import compare, draw, train_all
+from benchmarks.video_rl.sources import TASK, config_of, reward_spread
+from benchmarks.video_rl.trainings import add_training_options, compare, draw, load_recordings, train_all, with_rate
 from benchmarks.video_rl.trials import SamplerTrial
-from wm_nodes.apps.options import add_device, add_json, positive
+from wm_nodes.apps.options import positive
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.video_model import RolloutBuffer
-from wm_nodes.video_model.clips import Clips, load_clips
+from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.horizons import horizon_scores
@@ -96,9 +95,7 @@ class ClosedLoopSource(RecordedContexts):
         self._before: torch.Tensor | None = None
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
-        """reward_spread: standard deviation of the reward within a group, mean over the groups."""
-        rewards = buffer.rewards["total"].view(int(buffer.group_ids.max()) + 1, -1)
-        return {"reward_spread": float(rewards.std(1, correction=0).mean())}
+        return {"reward_spread": reward_spread(buffer)}
 
     def validate(self) -> Mapping[str, list[float]]:
         """Scores of whole rollouts and of each of their clips. error_cm: of tool and object together. win: 1 where that
@@ -143,19 +140,9 @@ def train_arm(
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model_closed_loop")
-    parser.add_argument("--context-bags", type=Path, nargs="+", required=True, metavar="BAG")
-    parser.add_argument("--heldout-bags", type=Path, nargs="+", required=True, metavar="BAG")
-    parser.add_argument("--iterations", type=positive, default=ClosedLoopPlan.iterations)
+    add_training_options(parser, ClosedLoopPlan, "video_model_closed_loop", range(5))
     parser.add_argument("--contexts", type=positive, default=ClosedLoopPlan.contexts, help="per buffer, 8 clips each")
-    parser.add_argument("--eval-contexts", type=positive, default=ClosedLoopPlan.eval_contexts)
     parser.add_argument("--eval-every", type=positive, default=ClosedLoopPlan.eval_every)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--samplers", "--arms", nargs="+", metavar="NAME")
-    parser.add_argument("--learning-rate", type=float, help="of every arm, to choose one; default: the chosen ones")
-    parser.add_argument("--workers", type=positive, default=1, help="trainings at the same time, a process each")
-    add_device(parser)
-    add_json(parser, "write every row here; trainings go on where the file stops")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -164,9 +151,7 @@ def run(arguments: argparse.Namespace) -> None:
     plan = ClosedLoopPlan(
         arguments.iterations, arguments.contexts, eval_contexts=arguments.eval_contexts, eval_every=arguments.eval_every
     )
-    arms = closed_loop_samplers()
-    if arguments.learning_rate:
-        arms = [replace(arm, grpo=arm.grpo.with_values(learning_rate=arguments.learning_rate)) for arm in arms]
+    arms = with_rate(closed_loop_samplers(), arguments.learning_rate)
     trials, of = [SamplerTrial(arm, plan) for arm in arms], {"sha256": base.manifest["sha256"]}
     rows = train_all(arguments, trials, partial(_train, arguments), of, arguments.workers)
     comparisons = compare(arguments, trials, rows, _pairs(rows), of, MEASURES)
@@ -179,9 +164,7 @@ def _train(
     arguments: argparse.Namespace, trial: SamplerTrial[ClosedLoopPlan], seed: int, on_iteration: Callable[[], object]
 ) -> dict[str, Any]:
     folder = load_video_folder(arguments.video_model, arguments.device)
-    bags = arguments.context_bags, arguments.heldout_bags
-    contexts, heldout = (load_clips(some, folder.clip["stride"]) for some in bags)
-    heldout = heldout.select(torch.arange(min(trial.plan.eval_contexts, len(heldout))))
+    contexts, heldout = load_recordings(arguments, folder, trial.plan.eval_contexts)
     probe = load_probe(shipped_model(TASK), arguments.device)
     return train_arm(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, on_iteration)
 

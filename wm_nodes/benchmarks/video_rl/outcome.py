@@ -6,12 +6,14 @@ import argparse
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 from tqdm import tqdm
 
@@ -19,12 +21,21 @@ from benchmarks.video_rl import plots, tables
 from benchmarks.video_rl.judged import JudgedContexts
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
-from benchmarks.video_rl.sources import TASK, config_of
-from benchmarks.video_rl.trainings import against_cps, compare, draw, train_all, write_trainings
+from benchmarks.video_rl.sources import TASK, config_of, reward_spread
+from benchmarks.video_rl.trainings import (
+    add_training_options,
+    against_cps,
+    compare,
+    draw,
+    load_recordings,
+    train_all,
+    with_rate,
+    write_trainings,
+)
 from benchmarks.video_rl.trials import SamplerTrial
-from wm_nodes.apps.options import add_device, add_json, positive, prepare_torch
+from wm_nodes.apps.options import prepare_torch
 from wm_nodes.config.load import judge_or_embedded, load_config, load_video_config
-from wm_nodes.config.schema import AGENT
+from wm_nodes.config.schema import AGENT, SimulationConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.service import clip_fps
@@ -32,8 +43,8 @@ from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
-from wm_nodes.video_model.success_reader import load_success_reader
-from wm_nodes.video_rl.clip_faults import measure_fault_limits
+from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader
+from wm_nodes.video_rl.clip_faults import FaultLimits, measure_fault_limits
 from wm_nodes.video_rl.heldout_metrics import fit_tool_correction, measure_clips, measure_executability
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
@@ -73,15 +84,10 @@ class OutcomeSource(JudgedContexts):
         config = config_of(sampler, plan, seed, "outcome", dict(plan.rewards))
         config = config.with_values(judge=judge_or_embedded(config.judge.with_values(rubric=plan.rubric)))
         super().__init__(folder, contexts, config, probe, fps)
-        self.network = folder.network
-        self._heldout = heldout.select(torch.arange(min(plan.eval_contexts, len(heldout))))
+        self.network, self._heldout = folder.network, heldout
 
     def measure(self, buffer: RolloutBuffer) -> dict[str, float]:
-        """rollout_reward_std: within groups, of the clips that have a reward."""
-        groups = sorted(set(buffer.group_ids.tolist()))
-        values = (buffer.rewards["total"][buffer.valid & (buffer.group_ids == group)] for group in groups)
-        stds = [float(rewards.std(correction=0)) for rewards in values if len(rewards)]
-        return {"rollout_reward_std": sum(stds) / len(stds)}
+        return {"rollout_reward_std": reward_spread(buffer)}
 
     def validate(self) -> Mapping[str, list[float]]:
         self.folder.network.eval()
@@ -91,27 +97,15 @@ class OutcomeSource(JudgedContexts):
 
 
 def add_options(outcome: argparse.ArgumentParser) -> None:
-    outcome.add_argument("--iterations", type=positive, default=OutcomePlan.iterations)
-    outcome.add_argument("--eval-contexts", type=positive, default=OutcomePlan.eval_contexts)
-    outcome.add_argument("--video-model", type=Path, default=shipped_model(TASK) / "video_model_outcome")
-    outcome.add_argument("--context-bags", type=Path, nargs="+", required=True, metavar="BAG")
-    outcome.add_argument("--heldout-bags", type=Path, nargs="+", required=True, metavar="BAG")
-    outcome.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    outcome.add_argument("--samplers", "--arms", nargs="+", metavar="NAME")
-    outcome.add_argument("--learning-rate", type=float, help="of every arm, to choose one; default: the chosen ones")
-    outcome.add_argument("--workers", type=positive, default=1, help="trainings at the same time, a process each")
+    add_training_options(outcome, OutcomePlan, "video_model_outcome", range(3))
     outcome.add_argument("--weights", type=Path, metavar="FOLDER", help="keep the trained weights here")
-    add_device(outcome)
-    add_json(outcome, "write every row here; trainings go on where the file stops")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Train every arm at every seed; compare; measure what was kept in --weights."""
     base = load_video_folder(arguments.video_model, arguments.device)
     plan = OutcomePlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
-    arms = outcome_samplers()
-    if arguments.learning_rate:
-        arms = [replace(arm, grpo=arm.grpo.with_values(learning_rate=arguments.learning_rate)) for arm in arms]
+    arms = with_rate(outcome_samplers(), arguments.learning_rate)
     trials = [SamplerTrial(arm, plan) for arm in arms] + judge_trials(arms[0], plan)
     of = {"sha256": base.manifest["sha256"]}
     rows = train_all(arguments, trials, partial(_train, arguments), of, arguments.workers)
@@ -137,7 +131,7 @@ def _train(
     arguments: argparse.Namespace, trial: SamplerTrial[OutcomePlan], seed: int, on_iteration: Callable[[], object]
 ) -> dict[str, Any]:
     folder = load_video_folder(arguments.video_model, arguments.device)
-    contexts, heldout = _recordings(arguments, folder)
+    contexts, heldout = load_recordings(arguments, folder, trial.plan.eval_contexts)
     probe = load_probe(shipped_model(TASK), arguments.device)
     fps = clip_fps(arguments.context_bags[0], folder.clip["stride"])
     with OutcomeSource(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, fps) as source:
@@ -145,12 +139,6 @@ def _train(
     if arguments.weights:
         write_atomic(_weights(arguments, row), pack_weights(folder.network).data)
     return {name: value for name, value in row.items() if name not in ("before", "after")}
-
-
-def _recordings(arguments: argparse.Namespace, folder: VideoFolder) -> tuple[Clips, Clips]:
-    """Clips to train on, and held-out ones."""
-    stride = folder.clip["stride"]
-    return load_clips(arguments.context_bags, stride), load_clips(arguments.heldout_bags, stride)
 
 
 def _weights(arguments: argparse.Namespace, row: Mapping[str, Any]) -> Path:
@@ -184,6 +172,33 @@ def _measure_all(
             write_trainings(arguments, trials, rows, [], of)
 
 
+@dataclass(frozen=True)
+class Yardstick:
+    """What clips of the first MEASURED held-out first frames are measured with: readers, and what recordings that went
+    through the codec say of limits and of the tool's height."""
+
+    heldout: Clips
+    probe: PositionProbe
+    reader: SuccessReader
+    simulation: SimulationConfig
+    limits: FaultLimits
+    correction: NDArray[np.float64]
+
+
+@cache
+def _yardstick(video_model: Path, heldout_bags: tuple[Path, ...], device: torch.device) -> Yardstick:
+    folder, probe = load_video_folder(video_model, device), load_probe(shipped_model(TASK), device)
+    simulation = load_config("cpu", {"task": TASK}).simulation
+    recordings = load_clips(heldout_bags, folder.clip["stride"])
+    decoded = folder.codec.decode(folder.codec.encode(recordings.frames))
+    seen = probe.read(decoded)
+    return Yardstick(
+        recordings.select(torch.arange(len(recordings))[:MEASURED]), probe, load_success_reader(video_model, TASK),
+        simulation, measure_fault_limits(decoded, seen, simulation),
+        fit_tool_correction(seen, probe_targets(recordings.ground_truth, TASK)),
+    )
+
+
 def measure_weights(arguments: argparse.Namespace, weights: Path | None, seed: int) -> dict[str, float]:
     """Return means over the first MEASURED held-out first frames of metrics that were never trained on, of one ODE clip
     each from the noise of `seed`: success by two readers and in the simulator, faults. weights: None: the base's.
@@ -191,18 +206,13 @@ def measure_weights(arguments: argparse.Namespace, weights: Path | None, seed: i
     Raises:
         OSError: no weights are kept.
     """
+    by = _yardstick(arguments.video_model, tuple(arguments.heldout_bags), arguments.device)
     folder = load_video_folder(arguments.video_model, arguments.device)
+    config = load_video_config("outcome", {"seed": seed})
     if weights is not None:
         load_weights(folder.network, weights.read_bytes())
-    probe, reader = load_probe(shipped_model(TASK), arguments.device), load_success_reader(arguments.video_model, TASK)
-    config, simulation = load_video_config("outcome", {"seed": seed}), load_config("cpu", {"task": TASK}).simulation
-    recordings = _recordings(arguments, folder)[1]
-    decoded = folder.codec.decode(folder.codec.encode(recordings.frames))
-    seen = probe.read(decoded)
-    limits = measure_fault_limits(decoded, seen, simulation)
-    correction = fit_tool_correction(seen, probe_targets(recordings.ground_truth, TASK))
-    heldout = recordings.select(torch.arange(min(MEASURED, len(recordings))))
-    frames = ClipGenerator(folder, heldout, config).evaluate(heldout, config.evaluation.num_steps)
-    metrics = measure_clips(frames, heldout, probe, reader, limits, simulation, folder.clip["num_conditioning"])
-    metrics |= measure_executability(probe.read(frames), heldout, correction, simulation, folder.clip["stride"])
+    frames = ClipGenerator(folder, by.heldout, config).evaluate(by.heldout, config.evaluation.num_steps)
+    positions, given = by.probe.read(frames), folder.clip["num_conditioning"]
+    metrics = measure_clips(frames, positions, by.heldout, by.probe, by.reader, by.limits, by.simulation, given)
+    metrics |= measure_executability(positions, by.heldout, by.correction, by.simulation, folder.clip["stride"])
     return {name: float(metrics[name].mean()) for name in METRICS}

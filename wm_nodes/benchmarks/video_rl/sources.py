@@ -107,6 +107,12 @@ def group_spread(buffer: RolloutBuffer, group_size: int) -> dict[str, float]:
     """
     latents = buffer.rollout.latents
     groups = latents.view(-1, group_size, *latents.shape[1:])
-    stds = buffer.rewards["total"].view(-1, group_size).std(1, correction=0)
     diversity = sum(rollout_diversity(centred_pixels(videos)) for videos in groups) / len(groups)
-    return {"rollout_diversity": diversity, "rollout_reward_std": float(stds.mean())}
+    return {"rollout_diversity": diversity, "rollout_reward_std": reward_spread(buffer)}
+
+
+def reward_spread(buffer: RolloutBuffer) -> float:
+    """Standard deviation of the training reward within a group, mean over the groups; of the valid videos."""
+    groups = sorted(set(buffer.group_ids[buffer.valid].tolist()))
+    rewards = (buffer.rewards["total"][buffer.valid & (buffer.group_ids == group)] for group in groups)
+    return sum(float(values.std(correction=0)) for values in rewards) / max(1, len(groups))

@@ -4,21 +4,57 @@ import argparse
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
+import torch
 from pydantic import TypeAdapter
 from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
 from benchmarks.video_rl.comparison import MEASURES, SamplerComparison, compare_samplers
-from benchmarks.video_rl.samplers import SamplerSetup
+from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup
+from benchmarks.video_rl.sources import TASK
 from benchmarks.video_rl.trials import Plan, SamplerTrial
-from wm_nodes.apps.options import prepare_torch
+from wm_nodes.apps.options import add_device, add_json, positive, prepare_torch
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.video_model.clips import Clips, load_clips
+from wm_nodes.video_model.folder import VideoFolder
 
 T = TypeVar("T")
+
+
+def add_training_options(
+    parser: argparse.ArgumentParser, plan: type[LearningPlan], video_model: str, seeds: Sequence[int]
+) -> None:
+    """Of trainings on recordings. plan: its values are the defaults. video_model: folder beside the world model."""
+    parser.add_argument("--video-model", type=Path, default=shipped_model(TASK) / video_model)
+    parser.add_argument("--context-bags", type=Path, nargs="+", required=True, metavar="BAG")
+    parser.add_argument("--heldout-bags", type=Path, nargs="+", required=True, metavar="BAG")
+    parser.add_argument("--iterations", type=positive, default=plan.iterations)
+    parser.add_argument("--eval-contexts", type=positive, default=plan.eval_contexts)
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(seeds))
+    parser.add_argument("--samplers", "--arms", nargs="+", metavar="NAME")
+    parser.add_argument("--learning-rate", type=float, help="of every arm, to choose one; default: the chosen ones")
+    parser.add_argument("--workers", type=positive, default=1, help="trainings at the same time, a process each")
+    add_device(parser)
+    add_json(parser, "write every row here; trainings go on where the file stops")
+
+
+def with_rate(arms: list[SamplerSetup], learning_rate: float | None) -> list[SamplerSetup]:
+    """The arms with another learning rate; None: with their own."""
+    if not learning_rate:
+        return arms
+    return [replace(arm, grpo=arm.grpo.with_values(learning_rate=learning_rate)) for arm in arms]
+
+
+def load_recordings(arguments: argparse.Namespace, folder: VideoFolder, most: int | None = None) -> tuple[Clips, Clips]:
+    """Clips of the bags to train on, and the first `most` held-out ones; None: all."""
+    bags = arguments.context_bags, arguments.heldout_bags
+    contexts, heldout = (load_clips(some, folder.clip["stride"]) for some in bags)
+    return contexts, heldout.select(torch.arange(len(heldout))[:most])
 
 
 def train_all(

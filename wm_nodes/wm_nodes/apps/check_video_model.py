@@ -22,8 +22,8 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
 from wm_nodes.reports.console_table import estimate, make_table
 from wm_nodes.video_model import Condition
-from wm_nodes.video_model.clips import load_clips
-from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_model.clips import Clips, load_clips
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_rl.checks import examine
 from wm_nodes.video_rl.horizons import DRIFT, horizon_scores, measure_headroom
 from wm_nodes.video_rl.reference_reward import load_probe
@@ -54,7 +54,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print a line per check; return 1 where one failed."""
     config = load_video_config(arguments.preset, settings(arguments))
-    model, condition, shape, config = _model_to_check(arguments, config)
+    recorded = _recorded(arguments, config)
+    model, condition, shape, config = _model_to_check(arguments, config, recorded)
     videos = config.groups.contexts * config.groups.group_size
     findings = examine(
         model, condition, shape, rollout_settings(config.rollout), config.grpo, seed=config.seed, buffer_videos=videos
@@ -65,17 +66,17 @@ def run(arguments: argparse.Namespace) -> int:
     rows = ((f.name, marks[f.passed], f.value, "" if f.passed else f.remedy) for f in findings)
     console = Console()
     console.print(make_table(title, columns, rows, left=columns))
-    if arguments.video_model is not None and not arguments.public:
-        _print_headroom(console, arguments, config)
+    if recorded is not None:
+        _print_headroom(console, *recorded, arguments.contexts, config)
     return int(not all(finding.passed for finding in findings))
 
 
-def _print_headroom(console: Console, arguments: argparse.Namespace, config: VideoRlConfig) -> None:
+def _print_headroom(
+    console: Console, folder: VideoFolder, clips: Clips, contexts: int, config: VideoRlConfig
+) -> None:
     """Groups and whole rollouts of the first contexts, per clip, and in words whether groups can teach anything."""
-    device = compute_device(config.device)
-    folder, probe = load_video_folder(arguments.video_model, device), load_probe(shipped_model(config.task), device)
-    clips = load_clips(arguments.context_bags, folder.clip["stride"])
-    clips = clips.select(torch.arange(min(arguments.contexts, len(clips))))
+    probe = load_probe(shipped_model(config.task), folder.device)
+    clips = clips.select(torch.arange(min(contexts, len(clips))))
     found = measure_headroom(folder, clips, config, probe)
     frames = ClipGenerator(folder, clips, config).evaluate(clips, config.rollout.num_steps)
     drift = {name: float(values.mean()) for name, values in horizon_scores(frames, clips, probe, folder).items()}
@@ -97,17 +98,26 @@ def _print_headroom(console: Console, arguments: argparse.Namespace, config: Vid
     console.print(*(h.text() for h in found), sep="\n", highlight=False)
 
 
-def _model_to_check(arguments: argparse.Namespace, config: VideoRlConfig) -> ModelToCheck:
+def _recorded(arguments: argparse.Namespace, config: VideoRlConfig) -> tuple[VideoFolder, Clips] | None:
+    """The embedded model and the recordings to check it on; None for the toy and for a public model."""
+    if arguments.public or arguments.video_model is None:
+        return None
+    if not arguments.context_bags:
+        raise ValueError("--video-model needs --context-bags: recorded episodes to take first frames and actions from")
+    folder = load_video_folder(arguments.video_model, compute_device(config.device))
+    return folder, load_clips(arguments.context_bags, folder.clip["stride"])
+
+
+def _model_to_check(
+    arguments: argparse.Namespace, config: VideoRlConfig, recorded: tuple[VideoFolder, Clips] | None
+) -> ModelToCheck:
     device = compute_device(config.device)
     if arguments.public:
         return _public(arguments, config, str(device))
-    if arguments.video_model is None:
+    if recorded is None:
         toy = draw_scenes(VIDEOS, config.seed, "doctor").condition()
         return load_base(device=device), toy.to(device), (CHANNELS, FRAMES, SIDE, SIDE), config
-    if not arguments.context_bags:
-        raise ValueError("--video-model needs --context-bags: recorded episodes to take first frames and actions from")
-    folder = load_video_folder(arguments.video_model, device)
-    clips = load_clips(arguments.context_bags, folder.clip["stride"])
+    folder, clips = recorded
     clips = clips.select(torch.arange(min(VIDEOS, len(clips))))
     condition = clips.condition(folder.codec, folder.clip["num_conditioning"], folder.network.settings.text_dim)
     latents = folder.codec.encode(clips.frames)

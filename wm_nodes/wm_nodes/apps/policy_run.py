@@ -22,6 +22,7 @@ from wm_nodes.config.load import dump_config
 from wm_nodes.config.saved import with_device
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
+from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.statistics import wilson_interval
 from wm_nodes.core.types import BoolArray
 from wm_nodes.launching import arguments as launch_arguments
@@ -32,7 +33,7 @@ from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment,
 from wm_nodes.policy_rl.initial_policy import num_starts
 from wm_nodes.policy_rl.training_run import POLICY_FILES
 from wm_nodes.reports.summary import SuccessRate
-from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_model.folder import read_video_manifest
 
 READY_S = 120.0
 TRAINED = "trained.json"
@@ -182,7 +183,9 @@ def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path,
     episodes = num_starts(job.config)
     make = make_video_environment if job.video_model else make_imagined_environment
     model = Path(job.video_model or model_dir)
-    sha256 = load_video_folder(model).sha256 if job.video_model else models_of(model, job.config.device).sha256
+    sha256 = (
+        files_sha256(read_video_manifest(model)) if job.video_model else models_of(model, job.config.device).sha256
+    )
 
     def measure() -> BoolArray:
         env = make(job.config, model, job.starts, num_envs=64, seed=job.config.seed)

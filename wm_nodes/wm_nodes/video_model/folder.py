@@ -71,13 +71,18 @@ def save_video_folder(
     return write_model_folder(folder, {name: weights.data for name, weights in packed.items()}, manifest)
 
 
+def read_video_manifest(folder: Path) -> dict[str, Any]:
+    """Read the manifest alone. Raises ModelFolderError as load_video_folder."""
+    return read_manifest(folder, "video model", FORMAT)
+
+
 def load_video_folder(folder: Path, device: torch.device | str = "cpu") -> VideoFolder:
     """Load and verify a folder, onto `device`, in evaluation mode.
 
     Raises:
         ModelFolderError: names the file, what is wrong, and the remedy.
     """
-    manifest = read_manifest(folder, "video model", FORMAT)
+    manifest = read_video_manifest(folder)
     network = VideoNetwork(NetworkSettings(**manifest["network"]))
     _load(Path(folder) / NETWORK, network, manifest["sha256"][NETWORK])
     codec = _load_codec(Path(folder), manifest["sha256"][CODEC], **manifest["codec"])

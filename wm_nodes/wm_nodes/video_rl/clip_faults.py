@@ -15,7 +15,7 @@ from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 from wm_nodes.environments.maniskill.cameras import table_top_cameras
-from wm_nodes.video_rl.reference_reward import THING_HEIGHT_M
+from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M
 from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL
 
 GHOST_STEP_M, GHOST_DISTANCE_M = 0.02, 0.10
@@ -82,7 +82,7 @@ def find_faults(
     if num_conditioning < 1:
         raise ValueError(f"faults are changes since a given frame, got num_conditioning {num_conditioning}")
     images, generated = frames.cpu().numpy(), positions[:, num_conditioning - 1 :]
-    height = np.full((*generated.shape[:2], 1), THING_HEIGHT_M, np.float32)
+    height = np.full((*generated.shape[:2], 1), CUBE_HALF_SIZE_M, np.float32)
     away = np.linalg.norm(np.concatenate([generated[..., OBJECT], height], -1) - generated[..., TOOL], axis=-1)
     untouched = np.minimum(away[:, :-1], away[:, 1:]) > GHOST_DISTANCE_M
     pixels = _object_pixels(images, positions, simulation)
@@ -146,7 +146,7 @@ def _near_things(positions: FloatArray, camera: CameraModel) -> BoolArray:
 
 def _places(positions: FloatArray, camera: CameraModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return where a camera sees the object's centre and the tool, each (..., 2), px: column, row."""
-    height = np.full((*positions.shape[:-1], 1), THING_HEIGHT_M, np.float32)
+    height = np.full((*positions.shape[:-1], 1), CUBE_HALF_SIZE_M, np.float32)
     to_camera = np.linalg.inv(camera.pose_in())
     seen = []
     for world in (np.concatenate([positions[..., OBJECT], height], -1), positions[..., TOOL]):

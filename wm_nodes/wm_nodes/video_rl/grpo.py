@@ -136,8 +136,7 @@ class GrpoLearner:
         )
         self._running = RunningStd()
         self._terms = (NftTerms if settings.objective == "nft" else GrpoTerms)(model, settings, rollout, seed)
-        trained = _trained_parameters(model) if settings.ema_decay > 0 else ()
-        self.averaged = {name: p.detach().clone() for name, p in trained}
+        self.averaged = self._terms.trained() if settings.ema_decay > 0 else {}
 
     def train(self, buffer: RolloutBuffer) -> BufferReport:
         """Make `updates_per_buffer` optimizer steps; nothing has changed when it raises.
@@ -290,7 +289,7 @@ class GrpoLearner:
         """Copy what a failed train() puts back, where it is: on a GPU that is once more the memory of the weights that
         train, of their two moments and of their average, and nothing crosses to the host."""
         return {
-            "model": {name: p.detach().clone() for name, p in _trained_parameters(self.model)},
+            "model": self._terms.trained(),
             "optimizer": {k: v.detach().clone() for k, v in checkpoint.optimizer_tensors(self._optimizer).items()},
             "averaged": {name: value.clone() for name, value in self.averaged.items()},
             "anchor": self._terms.anchor, "old": self._terms.old,  # replaced, never changed

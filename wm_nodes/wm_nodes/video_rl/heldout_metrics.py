@@ -17,15 +17,17 @@ from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL
 
 
 def measure_clips(
-    frames: Tensor, references: Clips, probe: PositionProbe, reader: SuccessReader, limits: FaultLimits,
-    simulation: SimulationConfig, num_conditioning: int,
+    frames: Tensor, positions: FloatArray, references: Clips, probe: PositionProbe, reader: SuccessReader,
+    limits: FaultLimits, simulation: SimulationConfig, num_conditioning: int,
 ) -> dict[str, Tensor]:
     """Return by name, float64 (N,), all scores of ClipScores and ClipFaults of decoded clips, uint8 (N, F, H, W, 3),
     `reader_success`: 1 where the other reader sees the task done in the last frame, and `reader_probability` of it.
+
+    positions: what the probe reads in the clips, (N, F, P).
     """
     probability = reader.read(frames[:, -1])
     scores = score_clips(frames, references, probe, num_conditioning).named()
-    faults = find_faults(frames, probe.read(frames), limits, simulation, num_conditioning).named()
+    faults = find_faults(frames, positions, limits, simulation, num_conditioning).named()
     read = {"reader_success": probability >= reader.threshold, "reader_probability": probability}
     return {**scores, **faults, **{name: torch.from_numpy(value.astype(np.float64)) for name, value in read.items()}}
 

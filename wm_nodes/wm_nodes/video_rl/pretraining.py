@@ -1,6 +1,5 @@
 """From clips to a video model: codec, flow matching, held-out scores. Resumable; what is finished is kept."""
 
-import json
 from dataclasses import asdict
 from datetime import date
 from pathlib import Path
@@ -20,7 +19,7 @@ from wm_nodes.video_model import Condition, NetworkSettings, VideoNetwork
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.flow_matching import train_video_model
-from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder, read_video_manifest, save_video_folder
 from wm_nodes.video_model.success_reader import save_success_reader, score_reader, train_success_reader
 from wm_nodes.video_model.tokenizer_codec import Codec, codec_of_world_model
 from wm_nodes.video_rl.reference_reward import score_clips
@@ -80,7 +79,7 @@ def shipped_video_model(config: VideoRlConfig) -> VideoFolder | None:
     except FileNotFoundError:
         return None
     for manifest in folders:
-        if json.loads(manifest.read_text())["model"] == config.model.model_dump():
+        if read_video_manifest(manifest.parent)["model"] == config.model.model_dump():
             return load_video_folder(manifest.parent, compute_device(config.device))
     return None
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.types import FloatArray
+from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.world_model import load_model_folder
@@ -27,8 +28,6 @@ from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL
 
 TRACKING_SCALE_M, OUTCOME_SCALE_M = 0.03, 0.05
 """An error of this much takes the tracking score, or the outcome, to 1 / e."""
-THING_HEIGHT_M = 0.02
-"""Of the centre of a thing on the table; the probe does not read it."""
 GOAL = [PROBE_NAMES.index(name) for name in ("goal_x", "goal_y")]
 SEEN_MOTION = 12
 """A pixel counts as scenery while no recorded frame differs from the first one by more than this, of 255."""
@@ -103,7 +102,8 @@ def distance_left(positions: FloatArray, truth: FloatArray, task: str) -> FloatA
     if rule.above_thing_m is None:
         place, goal = positions[:, OBJECT if rule.mover == "object" else TOOL[:2]], truth[:, GOAL]
     else:
-        height = np.full((len(truth), 1), THING_HEIGHT_M + rule.above_thing_m, np.float32)
+        # the probe does not read how high the thing lies
+        height = np.full((len(truth), 1), CUBE_HALF_SIZE_M + rule.above_thing_m, np.float32)
         place, goal = positions[:, TOOL], np.concatenate([truth[:, OBJECT], height], 1)
     left: FloatArray = np.linalg.norm(place - goal, axis=-1) - rule.radius_m
     return left

@@ -164,7 +164,7 @@ class ClipGenerator:
 
         def noise(clip: int, shape: tuple[int, ...]) -> Tensor:
             seeds = _seeds(self.config.seed, "clip_evaluation", clip, rows, torch.zeros_like(rows))
-            return initial_noise(shape, seeds).to(device_of(network))
+            return initial_noise(shape, seeds).to(self.folder.device)
 
         lengths = self.folder.lengths or ClipLengths(condition.num_conditioning, shape[1] - condition.num_conditioning)
         given = condition.frames, condition.actions, condition.text

@@ -1,0 +1,46 @@
+"""The outcome benchmark on recorded simulator episodes, with the shipped model, its reader and the shipped judge."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks.video_rl.outcome import METRICS
+from wm_nodes.apps.cli import main
+from wm_nodes.config.load import load_config
+from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
+
+ARMS = ["CPS 0.4", "NFT, ODE", "CPS 0.4, judge robot"]
+
+
+def rows_of(path: Path) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
+    return rows
+
+
+def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file_stops(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = load_config("cpu", {"task": "push_cube", "data.num_workers": 1})
+    (bag,) = collect_plan(scripted_plan(scene, 3, HELDOUT_SEEDS), scene, tmp_path / "bags")
+    path, kept = tmp_path / "found.json", tmp_path / "weights"
+    call = [
+        "benchmark", "video-rl", "outcome", "--context-bags", str(bag), "--heldout-bags", str(bag), "--iterations", "1",
+        "--eval-contexts", "2", "--weights", str(kept), "--json", str(path), "--arms", *ARMS,
+    ]
+    assert main([*call, "--seeds", "0"]) == 0
+    first = rows_of(path)
+    assert [row["sampler"] for row in first] == ARMS
+    for row in first:
+        assert len(row["evaluations"]) == 2 and set(row["measured_before"]) == set(row["measured_after"]) == set(METRICS)
+        assert row["measured_before"] == first[0]["measured_before"], "all arms begin with the same model"
+    assert first[0]["plan"]["rewards"] == [["outcome", 1.0]] and first[2]["plan"]["rewards"] == [["agent", 1.0]]
+    assert {file.name for file in kept.iterdir()} == {
+        "CPS_0.4_0.safetensors", "NFT_ODE_0.safetensors", "CPS_0.4_judge_robot_0.safetensors"
+    }
+    assert len({file.read_bytes() for file in kept.iterdir()}) == 3, "two arms are the same training"
+    assert "executed_success" in METRICS and "metrics that nothing trained on" in capsys.readouterr().out
+    assert main([*call[:-len(ARMS)], ARMS[0], "--seeds", "0", "1"]) == 0
+    rows = rows_of(path)
+    assert rows[:3] == first and [(row["sampler"], row["seed"]) for row in rows[3:]] == [(ARMS[0], 1)]
