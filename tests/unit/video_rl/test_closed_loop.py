@@ -89,13 +89,13 @@ def test_a_clip_begins_with_as_many_frames_as_there_are(history: int, first: int
 
 def test_how_many_clips_come_before_is_drawn_for_each_iteration_from_the_seed_alone() -> None:
     drawn = [drawn_history(CONFIG, iteration) for iteration in range(40)]
-    assert set(drawn) == {1, 2, 3} and drawn == [drawn_history(CONFIG, iteration) for iteration in range(40)]
+    assert set(drawn) == {0, 1, 2, 3} and drawn == [drawn_history(CONFIG, iteration) for iteration in range(40)]
     source = make_source()
-    for iteration, history in enumerate(drawn[:6]):
+    for iteration, history in enumerate(drawn[:12]):
         request = source.request(iteration, 0)
         assert request.history == history
         first, given = recorded_place(CONFIG, iteration)
-        assert (first, given) == (2 * history + 1 - GIVEN, GIVEN)
+        assert (first, given) == ((2 * history + 1 - GIVEN, GIVEN) if history else (0, 1))
         assert source.references(request).frames[0, 0, 0, 0, 0] == first + 10 * request.contexts[0]
     plain = CONFIG.with_values(groups=CONFIG.groups.with_values(history=0))
     assert drawn_history(plain, 0) is None and recorded_place(plain, 0) == (0, 1)

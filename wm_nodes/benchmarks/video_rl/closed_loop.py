@@ -68,7 +68,7 @@ def calls_of_buffer(config: VideoRlConfig) -> dict[str, float]:
     trained = steps - 1 if config.window.strategy == "all" else min(config.window.size, steps - 1)
     each = trained * TRAINING_CALLS if grpo.objective == "ratio" else grpo.nft.times * (TRAINING_CALLS + 1)
     return {
-        "history": groups.contexts * (1 + groups.history) / 2 * steps,
+        "history": groups.contexts * groups.history / 2 * steps,
         "sampling": float(groups.contexts * groups.group_size * steps),
         "training": float(groups.contexts * kept * each),
     }

@@ -72,8 +72,8 @@ class GroupConfig(SettingsSection):
     hide_actions: bool
     """Videos are made of first frame and instruction alone: the model chooses the motion."""
     history: NonNegativeInt
-    """Closed loop: clips that the model makes one after the other, each from its own last frames, before those of a
-    group, which share them. 0: videos start at the recordings' first frames."""
+    """Closed loop: clips at most that the model makes one after the other, each from its own last frames, before those
+    of a group, which share them; drawn from 0 on for each iteration. 0: videos are whole recordings."""
 
 
 class VideoEvaluationConfig(SettingsSection):

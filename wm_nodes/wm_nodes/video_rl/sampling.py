@@ -48,10 +48,13 @@ class GroupRequest:
 
 
 def drawn_history(config: VideoRlConfig, iteration: int) -> int | None:
-    """Return how many clips come before those of an iteration, 1 to groups.history; None where that is 0."""
+    """Return how many clips come before those of an iteration, 0 to groups.history; None where that is 0.
+
+    Without the first clips, which go on from one recorded frame, a model forgets how to make them.
+    """
     if not config.groups.history:
         return None
-    return int(numpy_stream(config.seed, "history", iteration).integers(1, config.groups.history + 1))
+    return int(numpy_stream(config.seed, "history", iteration).integers(config.groups.history + 1))
 
 
 def recorded_place(config: VideoRlConfig, iteration: int) -> tuple[int, int]:
