@@ -30,7 +30,8 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.recording import EpisodeBagWriter
 from wm_nodes.video_model import NetworkSettings, RolloutBuffer, VideoNetwork
 from wm_nodes.video_model.clips import Clips, load_clips
-from wm_nodes.video_model.folder import VideoFolder, save_video_folder
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
+from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader, save_success_reader
 from wm_nodes.video_model.tokenizer_codec import codec_of_world_model
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts, rollout_settings
 from wm_nodes.world_model.position_probe import PositionProbe
@@ -137,11 +138,12 @@ def test_the_command_trains_every_arm_and_goes_on_where_its_file_stops(
     bag: Path, folder: VideoFolder, tmp_path: Path
 ) -> None:
     model = save_video_folder(tmp_path / "model", folder.codec, folder.network, folder.clip, {})
+    save_success_reader(model, SuccessReader(64, 128, 0.25), "push_cube", {})
     path, arms = tmp_path / "found.json", ["CPS 0.4", BEST, RECORDINGS]
     bags = ["--context-bags", str(bag), "--heldout-bags", str(bag), "--video-model", str(model)]
     size = ["--contexts", "2", "--eval-contexts", "2", "--iterations", "1"]
     more = ["--learning-rate", "3e-3", "--arms", *arms, "--json", str(path)]
-    call = ["benchmark", "video-rl", "closed-loop", *bags, *size, *more]
+    call = ["benchmark", "video-rl", "closed-loop", *bags, *size, *more, "--models", str(tmp_path / "kept")]
     assert main([*call, "--seeds", "0"]) == 0
     rows = json.loads(path.read_text())["rows"]
     assert [row["sampler"] for row in rows] == arms and {row["learning_rate"] for row in rows} == {3e-3}
@@ -154,6 +156,11 @@ def test_the_command_trains_every_arm_and_goes_on_where_its_file_stops(
         assert {"tool_cm_3", "psnr_db_1"} <= last.keys()
         assert row["before"] == rows[0]["before"] and row["after"] != row["before"]
     assert len({json.dumps(row["after"]) for row in rows}) == 3, "two arms are the same training"
+    for name in ("CPS_0.4_0", "best_of_n_0", "recordings_0"):
+        kept = load_video_folder(tmp_path / "kept" / name)
+        assert kept.lengths == folder.lengths and kept.manifest["base"] == load_video_folder(model).sha256
+        assert kept.manifest["post_training"]["seed"] == 0 and kept.sha256 != kept.manifest["base"]
+        assert load_success_reader(tmp_path / "kept" / name, "push_cube").threshold == 0.25
     assert main([*call, "--seeds", "0", "1"]) == 0
     found = json.loads(path.read_text())
     assert found["rows"][:3] == rows and len(found["rows"]) == 6

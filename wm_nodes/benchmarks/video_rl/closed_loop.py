@@ -6,9 +6,11 @@ steps for the groups, TRAINING_CALLS for each (clip, step) or (clip, time) that 
 """
 
 import argparse
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -19,14 +21,23 @@ from benchmarks.video_rl.controls import TRAINING_CALLS, FlowMatchingLearner, Re
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
 from benchmarks.video_rl.sources import TASK, config_of, reward_spread
-from benchmarks.video_rl.trainings import add_training_options, compare, draw, load_recordings, train_all, with_rate
+from benchmarks.video_rl.trainings import (
+    add_training_options,
+    compare,
+    draw,
+    load_recordings,
+    row_name,
+    train_all,
+    with_rate,
+)
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.apps.options import positive
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.folder import VideoFolder, load_video_folder
+from wm_nodes.video_model.folder import VideoFolder, load_video_folder, save_video_folder
+from wm_nodes.video_model.success_reader import SUCCESS_MANIFEST, WEIGHTS
 from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.horizons import horizon_scores
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
@@ -143,6 +154,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_training_options(parser, ClosedLoopPlan, "video_model_closed_loop", range(5))
     parser.add_argument("--contexts", type=positive, default=ClosedLoopPlan.contexts, help="per buffer, 8 clips each")
     parser.add_argument("--eval-every", type=positive, default=ClosedLoopPlan.eval_every)
+    parser.add_argument("--models", type=Path, metavar="FOLDER", help="keep the trained models here, a folder each")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -166,7 +178,19 @@ def _train(
     folder = load_video_folder(arguments.video_model, arguments.device)
     contexts, heldout = load_recordings(arguments, folder, trial.plan.eval_contexts)
     probe = load_probe(shipped_model(TASK), arguments.device)
-    return train_arm(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, on_iteration)
+    row = train_arm(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, on_iteration)
+    if arguments.models:
+        _keep_model(arguments.models / row_name(row), folder, arguments.video_model, row)
+    return row
+
+
+def _keep_model(place: Path, folder: VideoFolder, base: Path, row: Mapping[str, Any]) -> None:
+    """Save the trained model, with the success reader of its base, so that a policy can be trained in it."""
+    kept = ("sampler", "seed", "plan", "learning_rate")
+    story = {"task": TASK, "base": folder.sha256, "post_training": {name: row[name] for name in kept}}
+    save_video_folder(place, folder.codec, folder.network, folder.clip, story)
+    for name in (WEIGHTS, SUCCESS_MANIFEST):
+        shutil.copyfile(base / name, place / name)
 
 
 def _pairs(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:

@@ -28,6 +28,7 @@ from benchmarks.video_rl.trainings import (
     compare,
     draw,
     load_recordings,
+    row_name,
     train_all,
     with_rate,
     write_trainings,
@@ -143,8 +144,7 @@ def _train(
 
 def _weights(arguments: argparse.Namespace, row: Mapping[str, Any]) -> Path:
     """Where the weights of a training are kept."""
-    name = row["sampler"].replace(",", "").replace(" ", "_")
-    return Path(arguments.weights / f"{name}_{row['seed']}.safetensors")
+    return Path(arguments.weights / f"{row_name(row)}.safetensors")
 
 
 def _measure_all(

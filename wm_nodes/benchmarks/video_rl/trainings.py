@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from multiprocessing import get_context
@@ -89,6 +89,11 @@ def train_all(
 
 def _unseen() -> None:
     """Progress within a training of another process."""
+
+
+def row_name(row: Mapping[str, Any]) -> str:
+    """Arm and seed of a row, as a file's name."""
+    return f"{row['sampler'].replace(',', '').replace(' ', '_')}_{row['seed']}"
 
 
 def against_cps(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:
