@@ -41,6 +41,7 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
         "CPS_0.4_0.safetensors", "NFT_ODE_0.safetensors", "CPS_0.4_judge_robot_0.safetensors"
     }
     assert len({file.read_bytes() for file in kept.iterdir()}) == 3, "two arms are the same training"
+    assert (tmp_path / "found_proxy.png").is_file()
     assert "executed_success" in METRICS and "metrics that nothing trained on" in capsys.readouterr().out
     assert main([*call[:-len(ARMS)], ARMS[0], "--seeds", "0", "1"]) == 0
     rows = rows_of(path)

@@ -117,6 +117,8 @@ def run(arguments: argparse.Namespace) -> None:
     console.print(tables.gain_table(rows, SCORES), tables.comparison_table(comparisons))
     if arguments.weights:
         console.print(tables.measured_table(rows))
+        if arguments.json is not None:
+            plots.plot_proxy(rows, arguments.json.with_name(f"{arguments.json.stem}_proxy.png"))
 
 
 def judge_trials(sampler: SamplerSetup, plan: OutcomePlan) -> list[SamplerTrial[OutcomePlan]]:
