@@ -30,8 +30,10 @@ def toy_ppo(**changes: Any) -> PpoConfig:
     return load_config("base").ppo.model_copy(update=settings)
 
 
-def toy_rollout(policy: ImagePolicy, version: int = 1, *, steps: int = STEPS, seed: int = 0) -> Rollout:
-    return collect_rollout(ReachToy(NUM_ENVS, 0), policy, RuleReward(), steps, seed, version)
+def toy_rollout(
+    policy: ImagePolicy, version: int = 1, *, steps: int = STEPS, seed: int = 0, envs_per_start: int = 1
+) -> Rollout:
+    return collect_rollout(ReachToy(NUM_ENVS, 0), policy, RuleReward(), steps, seed, version, envs_per_start)
 
 
 def learner_rank(rank: int, size: int, folder: str, changes: dict[str, Any], updates: int) -> None:

@@ -14,7 +14,7 @@ from graph.harness import Graph, Probe, wait_until
 from model_folders import make_model_folder, make_stepped_folder, write_starts
 
 from wm_msgs.action import Evaluate, Rollout, Train
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.nodes.compose import make_nodes
 from wm_nodes.policy_rl.evaluation import evaluate
 from wm_nodes.policy_rl.factories import (
@@ -111,9 +111,15 @@ def imagined(tmp_path: Path) -> dict[str, dict[str, Any]]:
     return {node: {"model_dir": str(model), **values} for node, values in params.items()}
 
 
+@pytest.mark.parametrize("advantage", ["gae", "group"])
 def test_device_rollouts_give_the_weights_of_policy_rl_train_and_leave_the_topics_of_steps_silent(
-    graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]]
+    graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]], advantage: str
 ) -> None:
+    settings = {"ppo.advantage": advantage, "ppo.group_size": 4}
+    if advantage == "group":  # some episodes end and others follow, which do not count
+        settings["reward.success_threshold"] = 0.13
+    config = load_config("smoke", settings)
+    (graph.folder / "config.yaml").write_text(dump_config(config))
     transitions, versions, metrics = (probe.listen(t) for t in ("env/transition", "policy/version", "learner/metrics"))
     start_composed(graph, imagined, "--device-rollouts")
     result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=2)))
@@ -121,11 +127,13 @@ def test_device_rollouts_give_the_weights_of_policy_rl_train_and_leave_the_topic
     wait_until("versions and metrics", lambda: versions and versions[-1].version == 3 and len(metrics) == 2)
     assert not transitions
 
-    config, model = load_config("smoke"), Path(imagined["learner"]["model_dir"])
+    model = Path(imagined["learner"]["model_dir"])
     policy, reward = make_policy(config, model), make_endogenous_reward(config, model)
     env = make_imagined_environment(config, model, model / STARTS, num_envs=8, seed=0)
-    samples = sum(int(rollout.valid_TN.sum()) for rollout, _ in train_policy(policy, env, reward, config))
-    assert result.samples == samples
+    trained = list(train_policy(policy, env, reward, config))
+    assert result.samples == sum(metrics.samples for _, metrics in trained)
+    collected = sum(int(rollout.valid_TN.sum()) for rollout, _ in trained)
+    assert result.samples == collected if advantage == "gae" else result.samples < collected
     found, _ = unpack_weights((graph.folder / "policies" / "policy_000003.safetensors").read_bytes())
     for name, tensor in unpack_weights(pack_weights(policy).data)[0].items():
         np.testing.assert_array_equal(found[name].numpy(), tensor.numpy(), err_msg=name)

@@ -72,9 +72,13 @@ def test_a_late_joiner_gets_the_newest_version_inline_and_in_chunks(graph: Graph
     assert (graph.folder / "mine" / "best.json").is_file()
 
 
-def _run(folder: Path, updates: int, *, forks: bool = True) -> dict[str, str]:
+GROUPS = {"ppo.advantage": "group", "ppo.group_size": 2, "ppo.num_steps": 12, "policy.init_log_std": 0.0}
+"""GRPO, with noise so large that some episodes of a group reach and others do not."""
+
+
+def _run(folder: Path, updates: int, *, forks: bool = True, settings: dict[str, Any] | None = None) -> dict[str, str]:
     with own_domain() as domain:
-        graph, probe = Graph(domain, folder, forks=forks), Probe(domain)
+        graph, probe = Graph(domain, folder, load_config("smoke", settings), forks=forks), Probe(domain)
         try:
             graph.start_training_nodes()
             assert train(probe, updates=updates).termination_reason == Train.Result.FINISHED
@@ -92,10 +96,12 @@ def test_two_runs_with_one_seed_give_bit_equal_weights_and_a_resumed_run_the_sam
     assert _run(tmp_path / "c", 2) == first
 
 
-def test_the_graph_gives_the_weights_of_policy_rl_train_bit_for_bit(tmp_path: Path) -> None:
-    graph_weights = _run(tmp_path / "graph", 2)
+@pytest.mark.parametrize("settings", [{}, GROUPS], ids=["gae", "group"])
+def test_the_graph_gives_the_weights_of_policy_rl_train_bit_for_bit(settings: dict[str, Any], tmp_path: Path) -> None:
+    graph_weights = _run(tmp_path / "graph", 2, settings=settings)
     assert len(graph_weights) == 3
-    toy.assert_trained_in_one_process(tmp_path / "graph" / "policies" / "policy_000003.safetensors", updates=2)
+    file = tmp_path / "graph" / "policies" / "policy_000003.safetensors"
+    toy.assert_trained_in_one_process(file, updates=2, settings=settings)
 
 
 def recorded_training(graph: Graph, probe: Probe, updates: int) -> Path:

@@ -1,6 +1,7 @@
 """A tiny deterministic environment and policy: real objects for the graph, small enough for two cores."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -205,12 +206,17 @@ def make_policy(config: RunConfig) -> ImagePolicy:
     return ImagePolicy(encoder, 3, 3, small, seed=config.seed)
 
 
-def assert_trained_in_one_process(file: Path, updates: int, tolerance: float = 0.0) -> None:
-    """Assert that a weights file holds what policy_rl/train.py gives; bit for bit with tolerance 0."""
-    config = load_config("smoke", {"ppo.num_envs": 4, "ppo.updates": updates})
+def assert_trained_in_one_process(
+    file: Path, updates: int, tolerance: float = 0.0, settings: Mapping[str, Any] | None = None
+) -> None:
+    """Assert that a weights file holds what policy_rl/train.py gives; bit for bit with tolerance 0.
+
+    settings: changes of the preset smoke.
+    """
+    config = load_config("smoke", {"ppo.num_envs": 4, "ppo.updates": updates, **(settings or {})})
     policy, environment = make_policy(config), make_environment(config, num_envs=4, seed=0)
-    for _ in train_policy(policy, environment, RuleReward(config.reward.sparse_weight), config):
-        pass
+    trained = list(train_policy(policy, environment, RuleReward(config.reward.sparse_weight), config))
+    assert trained[-1][1].grad_norm > 1e-2, "the last update learned nothing"
     found, _ = unpack_weights(file.read_bytes())
     expected, _ = unpack_weights(pack_weights(policy).data)
     for name, tensor in expected.items():

@@ -1,4 +1,4 @@
-"""Advantages and losses against numbers worked by hand and a brute-force sum. RS-10a to RS-10c."""
+"""Advantages and losses against numbers worked by hand and a brute-force sum. RS-10a to RS-10c, RS-10e."""
 
 import math
 
@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from wm_nodes.policy_rl.advantages import explained_variance, gae, masked_normalise
+from wm_nodes.policy_rl.advantages import (
+    GroupAdvantages,
+    explained_variance,
+    gae,
+    group_advantages,
+    masked_normalise,
+)
 from wm_nodes.policy_rl.losses import approximate_kl, clip_fraction, clipped_policy_loss, value_loss
 
 
@@ -84,6 +90,60 @@ def test_recursion_equals_the_explicit_sum(seed: int) -> None:
     arrays = (torch.from_numpy(a) for a in (rewards, values, reached, terminated, truncated, valid))
     advantages, _ = gae(*arrays, gamma=gamma, lambda_=lambda_)
     np.testing.assert_allclose(advantages.numpy(), expected, atol=1e-12)
+
+
+def groups_of_three(
+    rewards: list[list[float]], ended: list[list[int]], valid: list[list[int]] | None = None, **how: bool
+) -> GroupAdvantages:
+    """Of rows (one per step) of two groups of three environments. ended: 1 terminated, 2 truncated."""
+    flags = torch.tensor(ended)
+    known = torch.ones_like(flags) if valid is None else torch.tensor(valid)
+    return group_advantages(torch.tensor(rewards), flags == 1, flags == 2, known.bool(), group_size=3, **how)
+
+
+def test_group_advantages_are_the_distance_from_the_groups_mean_in_its_deviations() -> None:
+    """Returns 1, 0, 0 | 3, 2, 1; the fourth environment pays twice; what follows an end is of later episodes."""
+    rewards = [[0.0, 0, 0, 2, 2, 0], [1, 0, 0, 1, 9, 1], [9, 0, 0, 0, 9, 9]]
+    ended = [[0, 0, 0, 0, 1, 0], [1, 0, 0, 0, 0, 1], [0, 2, 0, 1, 1, 0]]
+    found = groups_of_three(rewards, ended)
+    first, second = math.sqrt(2), math.sqrt(1.5)  # (1 - 1 / 3) / (sqrt(2) / 3); (3 - 2) / sqrt(2 / 3)
+    both = [first, -first / 2, -first / 2, second, 0, -second]
+    counted = torch.tensor([[1, 1, 1, 1, 1, 1], [1, 1, 1, 1, 0, 1], [0, 1, 1, 1, 0, 0]], dtype=torch.bool)
+    assert torch.equal(found.counted_TN, counted)
+    assert_close(found.advantages_TN, torch.tensor(both).expand(3, 6) * counted)
+    assert (found.groups_without_signal, found.episodes_without_return) == (0, 0)
+    plain = groups_of_three(rewards, ended, by_std=False).advantages_TN[0]
+    assert_close(plain, torch.tensor([2 / 3, -1 / 3, -1 / 3, 1.0, 0.0, -1.0]))
+    others = groups_of_three(rewards, ended, by_std=False, leave_one_out=True).advantages_TN[0]
+    assert_close(others, torch.tensor([1 - 0, 0 - 1 / 2, 0 - 1 / 2, 3 - 3 / 2, 2 - 2, 1 - 5 / 2]))
+
+
+def test_a_group_of_equal_returns_trains_nothing_and_is_counted() -> None:
+    """0.7 = 0.1 + 0.6 = 0.35 + 0.35 but for rounding."""
+    rewards = [[0.1, 0.6, 0.35, 0, 0, 0], [0.6, 0.1, 0.35, 0, 1, 0]]
+    for how in ({}, {"by_std": False}, {"leave_one_out": True}):
+        found = groups_of_three(rewards, [[0] * 6, [2] * 6], **how)
+        assert not found.advantages_TN[:, :3].any() and found.advantages_TN[:, 3:].all()
+        assert (found.groups_without_signal, found.episodes_without_return) == (1, 0)
+        assert found.counted_TN.all()
+
+
+def test_an_episode_with_a_missing_reward_is_left_out_and_its_group_is_the_others() -> None:
+    nan = math.nan
+    rewards = [[0.0, nan, 0, 0, nan, nan], [1, 5, 0, 1, 1, 0], [nan, 5, nan, nan, nan, nan]]
+    ended = [[0, 0, 0, 0, 0, 0], [1, 1, 1, 1, 1, 1], [0, 0, 0, 0, 0, 0]]
+    valid = [[1, 0, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1], [0, 1, 0, 0, 0, 0]]
+    found = groups_of_three(rewards, ended, valid)
+    assert_close(found.advantages_TN[:2], torch.tensor([[1.0, 0, -1, 0, 0, 0]] * 2))
+    assert torch.equal(found.counted_TN, torch.tensor([[1, 0, 1, 1, 0, 0]] * 2 + [[0] * 6], dtype=torch.bool))
+    assert (found.groups_without_signal, found.episodes_without_return) == (1, 3), "one alone has nothing to compare"
+    alone = groups_of_three(rewards, ended, valid, by_std=False, leave_one_out=True).advantages_TN
+    assert_close(alone[0], torch.tensor([1.0, 0, -1, 0, 0, 0]))
+
+
+def test_a_valid_reward_that_is_not_finite_is_an_error_that_names_the_environment() -> None:
+    with pytest.raises(ValueError, match=r"environment 4 are valid and sum to nan; mark the missing valid=False"):
+        groups_of_three([[0.0, 0, 0, 0, math.nan, 0]], [[1] * 6])
 
 
 def test_normalisation_uses_only_masked_entries() -> None:

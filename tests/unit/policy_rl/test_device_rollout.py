@@ -1,5 +1,6 @@
 """Rollouts that stay on the device: the numbers of collect_rollout, and a lock-step that a GPU can capture."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -103,8 +104,10 @@ def test_token_models_take_the_same_path(tmp_path: Path) -> None:
     assert_same(lockstep, found)
 
 
-def test_training_from_device_rollouts_gives_the_weights_of_the_lock_step_loop() -> None:
-    config = config_of(ppo__num_envs=32, ppo__num_steps=STEPS, ppo__updates=2, ppo__value_warmup_updates=0)
+@pytest.mark.parametrize("advantage", ["gae", "group"])
+def test_training_from_device_rollouts_gives_the_weights_of_the_lock_step_loop(advantage: str) -> None:
+    config = config_of(ppo__num_envs=32, ppo__num_steps=STEPS, ppo__updates=2, ppo__value_warmup_updates=0,
+                       ppo__advantage=advantage)
     reward, weights, metrics = make_endogenous_reward(config, MODEL), [], []
     for env in (
         make_imagined_environment(config, MODEL, MODEL / STARTS, num_envs=32, seed=0), device_environment(config, 32)
@@ -112,7 +115,8 @@ def test_training_from_device_rollouts_gives_the_weights_of_the_lock_step_loop()
         policy = make_policy(config, MODEL)
         metrics.append([m for _, m in train_policy(policy, env, reward, config)])
         weights.append(policy.state_dict())
-    assert metrics[0] == metrics[1]
+    np.testing.assert_equal([asdict(m) for m in metrics[0]], [asdict(m) for m in metrics[1]])
+    assert metrics[0][0].groups_without_signal in (None, 1, 2, 3)
     assert metrics[0][1].epochs > 0 and not torch.equal(
         weights[0]["actor.output.weight"], make_policy(config, MODEL).actor.output.weight
     )
@@ -158,6 +162,8 @@ def test_large_rollouts_draw_their_starts_at_once() -> None:
     assert many.shape == (2, MOST_HASHED_STARTS) and set(np.unique(many)) == set(range(64))
     np.testing.assert_array_equal(many, rollout_starts(0, 1, 2, MOST_HASHED_STARTS, 64))
     assert (many != rollout_starts(0, 2, 2, MOST_HASHED_STARTS, 64)).any()
+    groups = rollout_starts(0, 1, 2, MOST_HASHED_STARTS, 64, 2).reshape(2, -1, 2)
+    assert (groups == groups[..., :1]).all() and set(np.unique(groups)) == set(range(64))
 
 
 def test_given_starts_are_where_episodes_begin() -> None:

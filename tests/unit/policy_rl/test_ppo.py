@@ -1,18 +1,24 @@
 """PPO on a toy: it learns, resumes and cancels exactly, keeps to the reference, and several ranks equal one."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import torch.multiprocessing as mp
+from graph.toy import ReachToy
 from rl_toys import learner_rank, paying_for_the_first_axis, toy_policy, toy_ppo, toy_rollout
 
+from wm_nodes.config.schema import PpoConfig
+from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.rollouts import Canceled
+from wm_nodes.policy_rl.rollouts import Canceled, collect_rollout, rollout_statistics
+from wm_nodes.reward import RuleReward
 from wm_nodes.training.weights import load_weights, pack_weights, unpack_weights
 
 
@@ -32,6 +38,51 @@ def test_updates_move_the_actions_towards_the_reward() -> None:
     for version in range(1, 16):
         learner.update(paying_for_the_first_axis(toy_rollout(policy, version)))
     assert float(toy_rollout(policy, 99).actions_TN[..., 0].mean()) > before + 0.2
+
+
+def grouped(**changes: Any) -> PpoConfig:
+    """GRPO in groups of three."""
+    return toy_ppo(advantage="group", group_size=3, num_steps=12, **changes)
+
+
+def test_groups_learn_to_reach_without_a_critic() -> None:
+    policy, env = toy_policy(), ReachToy(36, 0)
+    learner = PpoLearner(policy, grouped(learning_rate=3e-3, kl_reference_weight=0.0, value_warmup_updates=9), seed=0)
+    before, rates = weights(policy), []
+    for version in range(1, 31):
+        rollout = collect_rollout(env, policy, RuleReward(), 12, 0, version, envs_per_start=3)
+        metrics = learner.update(rollout)
+        rates.append(rollout_statistics(rollout).success_rate)
+    assert np.mean(rates[-5:]) > np.mean(rates[:5]) + 0.3, rates
+    assert math.isnan(metrics.loss_value) and math.isnan(metrics.explained_variance)
+    for name, tensor in policy.named_parameters():
+        assert torch.equal(tensor, before[name]) == name.startswith("critic."), name
+
+
+def test_groups_that_began_at_different_starts_or_hold_several_episodes_are_refused() -> None:
+    policy = toy_policy()
+    learner = PpoLearner(policy, grouped(), seed=0)
+    with pytest.raises(ValueError, match="3 neighbouring environments began at different starts; collect with"):
+        learner.update(toy_rollout(policy))
+    rollout = collect_rollout(ReachToy(3, 0), policy, RuleReward(), 13, 0, 1, envs_per_start=3)
+    with pytest.raises(ValueError, match=r"of 13 lock-steps most .*; step ppo.num_envs \(64\) environments at a time"):
+        learner.update(rollout)
+    with pytest.raises(ValueError, match="3 environments are not whole groups of 2"):
+        PpoLearner(policy, toy_ppo(advantage="group", group_size=2), seed=0).update(rollout)
+
+
+def test_groups_leave_out_episodes_without_a_return_and_need_no_values() -> None:
+    policy = toy_policy()
+    rollout = collect_rollout(ReachToy(6, 0), policy, RuleReward(), 12, 0, 1, envs_per_start=3)
+    valid = rollout.valid_TN.copy()
+    valid[1, 2] = False
+    given = replace(rollout, valid_TN=valid, values_TN=np.full_like(rollout.values_TN, np.nan))
+    metrics = PpoLearner(policy, grouped(), seed=0).update(given)
+    ends = np.argmax(rollout.terminated_TN | rollout.truncated_TN, 0) + 1
+    assert (metrics.episodes_without_return, metrics.samples) == (1, ends.sum() - ends[2])
+    valid[1] = False
+    with pytest.raises(ValueError, match="no first episode with every reward"):
+        PpoLearner(policy, grouped(), seed=0).update(replace(given, valid_TN=valid))
 
 
 def test_a_large_reference_weight_holds_the_policy_near_the_reference() -> None:
@@ -149,16 +200,22 @@ def test_a_canceled_update_leaves_weights_and_optimiser_as_they_were(earlier_upd
     assert_equal(weights(policy), weights(straight))
 
 
-def test_four_updates_equal_two_a_resume_and_two_bit_for_bit(tmp_path: Path) -> None:
-    settings = toy_ppo(value_warmup_updates=1, kl_reference_weight=0.1)
+@pytest.mark.parametrize("make", [toy_ppo, grouped])
+def test_four_updates_equal_two_a_resume_and_two_bit_for_bit(make: Callable[..., PpoConfig], tmp_path: Path) -> None:
+    settings = make(value_warmup_updates=1, kl_reference_weight=0.1)
+
+    def collect(policy: ImagePolicy, version: int) -> Rollout:
+        rollout = toy_rollout(policy, version, envs_per_start=settings.envs_per_start)
+        return rollout if make is toy_ppo else paying_for_the_first_axis(rollout)
+
     straight = toy_policy()
     learner = PpoLearner(straight, settings, seed=3)
     for version in range(1, 5):
-        learner.update(toy_rollout(straight, version))
+        learner.update(collect(straight, version))
     stopped = toy_policy()
     learner = PpoLearner(stopped, settings, seed=3)
     for version in (1, 2):
-        learner.update(toy_rollout(stopped, version))
+        learner.update(collect(stopped, version))
     learner.save(tmp_path / "state")
     packed = pack_weights(stopped)
     resumed = toy_policy()
@@ -166,7 +223,7 @@ def test_four_updates_equal_two_a_resume_and_two_bit_for_bit(tmp_path: Path) -> 
     learner = PpoLearner(resumed, settings, seed=3)
     learner.load(tmp_path / "state")
     for version in (3, 4):
-        learner.update(toy_rollout(resumed, version))
+        learner.update(collect(resumed, version))
     assert_equal(weights(straight), weights(resumed))
 
 

@@ -84,6 +84,16 @@ def test_streams_differ_by_seed_version_and_step() -> None:
     np.testing.assert_array_equal(action_noise(0, 1, 2, 4, 3), action_noise(0, 1, 2, 4, 3))
 
 
+def test_environments_of_a_group_begin_at_one_start_and_act_with_noise_of_their_own() -> None:
+    rollout = collect_rollout(ReachToy(6, 0), toy_policy(), RuleReward(), 3, 0, 1, envs_per_start=3)
+    states = rollout.states_TN[0].reshape(2, 3, 3)
+    np.testing.assert_array_equal(states, states[:, :1].repeat(3, 1))
+    assert (states[0, 0] != states[1, 0]).any()
+    assert len(np.unique(rollout.actions_TN[0], axis=0)) == 6
+    with pytest.raises(ValueError, match="6 environments are not whole groups of 4; set"):
+        reset_seeds(0, 1, 0, 6, 4)
+
+
 def test_too_few_steps_are_refused() -> None:
     with pytest.raises(ValueError, match="steps must be >= 1, got 0"):
         collect_rollout(ReachToy(2, 0), toy_policy(), RuleReward(), 0, 0, 1)

@@ -231,6 +231,14 @@ class PpoConfig(SettingsSection):
     num_envs: PositiveInt
     num_steps: PositiveInt
     """Lock-steps per update."""
+    advantage: Literal["gae", "group"]
+    """gae: PPO, with a critic; group: GRPO, of each environment's first episode against those from the same start."""
+    group_size: Annotated[int, Field(ge=2)]
+    """group: environments that begin at the same start; must divide num_envs."""
+    group_std: bool
+    """group: divide by the standard deviation of the group's returns; false: Dr. GRPO."""
+    leave_one_out: bool
+    """group: compare an episode with the mean of the others only."""
     gamma: Fraction
     gae_lambda: Fraction
     clip: PositiveFloat
@@ -248,7 +256,12 @@ class PpoConfig(SettingsSection):
     target_kl: NonNegativeFloat
     """Stop the epochs of an update early beyond this approximate KL, nats; 0: never."""
     value_warmup_updates: NonNegativeInt
-    """First updates that train the critic only."""
+    """gae: first updates that train the critic only."""
+
+    @property
+    def envs_per_start(self) -> int:
+        """Environments that are reset with one seed."""
+        return self.group_size if self.advantage == "group" else 1
 
 
 class AcceptanceConfig(SettingsSection):

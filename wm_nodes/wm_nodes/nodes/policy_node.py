@@ -15,6 +15,7 @@ from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
 from wm_msgs.srv import InferAction, LoadPolicy
 from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.types import UInt64Array
 from wm_nodes.nodes.factories import existing, expected_spec, make_policy, refuse_other
 from wm_nodes.nodes.policy.asynchronous import AsynchronousPolicy
 from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
@@ -72,6 +73,7 @@ class PolicyNode(ManagedNode):
     def configure(self) -> None:
         given = self.run_config(), str(self.param("model_dir")), str(self.param("policy_factory"))
         self._holder, self._expected_spec = PolicyHolder(make_policy(*given)), expected_spec(*given)
+        self._envs_per_start = given[0].ppo.envs_per_start
         self._files = named_files(self, str(self.param("initial_policy")))
         if self.param("initial_policy"):
             path = existing(str(self.param("initial_policy")), "initial_policy")
@@ -172,7 +174,7 @@ class PolicyNode(ManagedNode):
                     session=reply.session, step_id=step_id, spec_hash=spec.spec_hash,
                     actions=output.actions.reshape(-1), policy_version=acting, logprobs=output.logprobs,
                     values=output.values, reset_mask=ended if ended.any() else None,
-                    reset_seeds=reset_seeds(goal.seed, version, step, spec.num_envs) if ended.any() else None,
+                    reset_seeds=self._reset_seeds(goal, version, step, spec) if ended.any() else None,
                 ),
                 work.check,
             )
@@ -193,8 +195,11 @@ class PolicyNode(ManagedNode):
         last = self._last_reply
         if not goal.reset and last is not None and last.session == self._environment.session:
             return last
-        seeds = reset_seeds(goal.seed, version, 0, spec.num_envs)
+        seeds = self._reset_seeds(goal, version, 0, spec)
         return self._environment.reset(ResetCommand(seeds=seeds, behaviour=goal.behaviour), work.check)
+
+    def _reset_seeds(self, goal: Rollout.Goal, version: int, step: int, spec: EnvironmentSpec) -> UInt64Array:
+        return reset_seeds(goal.seed, version, step, spec.num_envs, self._envs_per_start)
 
     def _check_spec(self, spec: EnvironmentSpec) -> None:
         dims, expected = (spec.state_dim, spec.action_dim), (self._holder.state_dim, self._holder.action_dim)

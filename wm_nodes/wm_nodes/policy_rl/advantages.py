@@ -1,4 +1,8 @@
-"""Advantages and value targets over rollouts of lock-steps. Shapes: T time, N environments. RS-10a."""
+"""Advantages and value targets over rollouts of lock-steps. Shapes: T time, N environments, K groups of G neighbouring
+environments, N = K G. RS-10a, RS-10e.
+"""
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -53,6 +57,63 @@ def gae(
         ahead_valid_N = valid_TN[t]
         advantages_TN[t] = ahead_N
     return advantages_TN, torch.where(valid_TN, advantages_TN + values_TN, zeros_TN)
+
+
+@dataclass(frozen=True)
+class GroupAdvantages:
+    """advantages_TN: float32. counted_TN: bool, the steps to train on; elsewhere advantages are 0.
+
+    groups_without_signal: groups of equal returns, or of a single one. episodes_without_return: left out.
+    """
+
+    advantages_TN: Tensor
+    counted_TN: Tensor
+    groups_without_signal: int
+    episodes_without_return: int
+
+
+def group_advantages(
+    rewards_TN: Tensor, terminated_TN: Tensor, truncated_TN: Tensor, valid_TN: Tensor, *, group_size: int,
+    by_std: bool = True, leave_one_out: bool = False,
+) -> GroupAdvantages:
+    """Compare each environment's first episode with those of its group, all begun at the same start (RS-10e).
+
+    R_i = sum of the rewards of episode i up to its end or the rollout's; A_i = (R_i - mean_g R) / std_g R, the same for
+    all steps of the episode. An episode with an invalid step has no return and is left out; its group is the others.
+    A group with std_g < 1e-6 max(1, |mean_g|) has advantages 0.
+
+    Args:
+        rewards_TN: as of gae. group_size: G; environments i G .. i G + G - 1 are a group.
+        by_std: False: do not divide by the standard deviation (population, float64).
+        leave_one_out: the mean is that of the group's other episodes.
+
+    Raises:
+        ValueError: shapes differ, or the rewards of an episode are valid and not finite.
+    """
+    _check_equal_shapes(rewards_TN, terminated_TN, truncated_TN, valid_TN)
+    ended_TN = (terminated_TN.bool() | truncated_TN.bool()).int()
+    first_TN = ended_TN.cumsum(0) - ended_TN == 0
+    known_N = (valid_TN.bool() | ~first_TN).all(0)
+    counted_TN = first_TN & known_N
+    returns_N = torch.where(counted_TN, rewards_TN, 0.0).double().sum(0)
+    if not bool(torch.isfinite(returns_N).all()):
+        n = int(torch.nonzero(~torch.isfinite(returns_N))[0])
+        raise ValueError(
+            f"the rewards of environment {n} are valid and sum to {float(returns_N[n])}; mark the missing valid=False"
+        )
+    returns_KG, known_KG = (column.view(-1, group_size) for column in (returns_N, known_N))
+    counts_K1 = known_KG.sum(1, keepdim=True)
+    means_K1 = returns_KG.sum(1, keepdim=True) / counts_K1.clamp(min=1)
+    deviations_KG = torch.where(known_KG, returns_KG - means_K1, 0.0)
+    stds_K1 = (deviations_KG.square().sum(1, keepdim=True) / counts_K1.clamp(min=1)).sqrt()
+    differs_K1 = stds_K1 >= 1e-6 * means_K1.abs().clamp(min=1)
+    if leave_one_out:  # R_i - (sum_g R - R_i) / (n - 1)
+        deviations_KG = deviations_KG * counts_K1 / (counts_K1 - 1).clamp(min=1)
+    scales_K1 = torch.where(differs_K1 & by_std, stds_K1, 1.0)
+    advantages_N = torch.where(differs_K1, deviations_KG / scales_K1, 0.0).flatten().float()
+    return GroupAdvantages(
+        torch.where(counted_TN, advantages_N, 0.0), counted_TN, int((~differs_K1).sum()), int((~known_N).sum())
+    )
 
 
 def masked_normalise(values: Tensor, mask: Tensor, *, epsilon: float = 1e-5) -> Tensor:

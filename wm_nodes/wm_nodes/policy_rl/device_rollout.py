@@ -19,7 +19,7 @@ from wm_nodes.core.device import explain_memory
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.rollouts import action_noise, collect_rollout, reset_seeds
+from wm_nodes.policy_rl.rollouts import action_noise, check_whole_groups, collect_rollout, reset_seeds
 from wm_nodes.policy_rl.tensor_rollout import TensorRollout
 from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel
 from wm_nodes.world_model.device_environment import DeviceEnvironment
@@ -32,7 +32,7 @@ Step = Callable[[], None]
 
 
 def rollout_starts(
-    seed: int, policy_version: int, steps: int, num_envs: int, num_starts: int
+    seed: int, policy_version: int, steps: int, num_envs: int, num_starts: int, envs_per_start: int = 1
 ) -> NDArray[np.int64]:
     """Return (T, N) starts; entry (t, i) is used where environment i begins an episode before lock-step t.
 
@@ -40,21 +40,21 @@ def rollout_starts(
     Python for each (29 us); above, one draw of the stream `starts` at (seed, policy version).
     """
     if steps * num_envs > MOST_HASHED_STARTS:
-        return numpy_stream(seed, "starts", policy_version).integers(num_starts, size=(steps, num_envs))
-    rows = [
-        [start_of(int(s), num_starts) for s in reset_seeds(seed, policy_version, max(0, step - 1), num_envs)]
-        for step in range(steps)
-    ]
+        check_whole_groups(num_envs, envs_per_start)
+        shape = steps, num_envs // envs_per_start
+        return numpy_stream(seed, "starts", policy_version).integers(num_starts, size=shape).repeat(envs_per_start, 1)
+    seeds = (reset_seeds(seed, policy_version, max(0, step - 1), num_envs, envs_per_start) for step in range(steps))
+    rows = [[start_of(int(s), num_starts) for s in row] for row in seeds]
     return np.array(rows, np.int64)
 
 
 def make_collector(
-    env: Environment | DeviceEnvironment, policy: ImagePolicy, reward: RewardModel
+    env: Environment | DeviceEnvironment, policy: ImagePolicy, reward: RewardModel, envs_per_start: int = 1
 ) -> Callable[[int, int, int], Rollout | TensorRollout]:
     """Return collect(steps, seed, policy version): on the device where `env` is a DeviceEnvironment, else lock-step."""
     if isinstance(env, DeviceEnvironment):
-        return DeviceCollector(env, policy, reward).collect
-    return partial(collect_rollout, env, policy, reward)
+        return partial(DeviceCollector(env, policy, reward).collect, envs_per_start=envs_per_start)
+    return partial(collect_rollout, env, policy, reward, envs_per_start=envs_per_start)
 
 
 class DeviceCollector:
@@ -94,11 +94,13 @@ class DeviceCollector:
 
     @torch.no_grad()
     def collect(
-        self, steps: int, seed: int, policy_version: int, *, starts_TN: NDArray[np.int64] | None = None
+        self, steps: int, seed: int, policy_version: int, *, envs_per_start: int = 1,
+        starts_TN: NDArray[np.int64] | None = None,
     ) -> TensorRollout:
         """Reset all environments and make `steps` lock-steps, as collect_rollout does.
 
         Args:
+            envs_per_start: as of reset_seeds.
             starts_TN: where episodes begin, see rollout_starts, which gives them by default.
 
         Raises:
@@ -109,7 +111,7 @@ class DeviceCollector:
         if steps < 1:
             raise ValueError(f"steps must be >= 1, got {steps}; see ppo.num_steps in presets/policy/base.yaml")
         if starts_TN is None:
-            starts_TN = rollout_starts(seed, policy_version, steps, num_envs, env.num_starts)
+            starts_TN = rollout_starts(seed, policy_version, steps, num_envs, env.num_starts, envs_per_start)
         if starts_TN.shape != (steps, num_envs) or not 0 <= starts_TN.min() <= starts_TN.max() < env.num_starts:
             raise ValueError(
                 f"starts_TN must be ({steps}, {num_envs}) numbers of 0..{env.num_starts - 1}, got {starts_TN.shape} in "

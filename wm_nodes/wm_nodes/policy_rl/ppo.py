@@ -3,6 +3,8 @@ F features, S state, A action.
 
 loss = RS-10b clipped policy + value_weight * RS-10c value - entropy_weight * entropy
        + kl_reference_weight * KL(policy || SFT policy), summed over valid samples and divided by their number.
+
+With ppo.advantage group this is GRPO: advantages are RS-10e's, and the critic is neither used nor trained.
 """
 
 import math
@@ -18,14 +20,17 @@ from wm_nodes.config.schema import PpoConfig
 from wm_nodes.core.device import DeviceError, explain_memory
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.types import Rollout
-from wm_nodes.policy_rl.advantages import explained_variance, gae, masked_normalise
+from wm_nodes.policy_rl.advantages import GroupAdvantages, explained_variance, gae, group_advantages, masked_normalise
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.losses import approximate_kl, clip_fraction, clipped_policy_loss, value_loss
-from wm_nodes.policy_rl.rollouts import Canceled
+from wm_nodes.policy_rl.rollouts import Canceled, check_whole_groups
 from wm_nodes.policy_rl.tensor_rollout import TensorRollout, tensors_of
 from wm_nodes.training import checkpoint
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.training.weights import check_same_layout
+
+SAME_START = 0.1
+"""Largest difference of a feature or state (m) between environments that begin at the same start: of rounding."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,8 @@ class PpoMetrics:
     """Means over the samples of the update's minibatches; see docs/metrics.md.
 
     approx_kl, kl_reference, entropy: nats. epochs: passes made before target_kl stopped them (fractional).
+    loss_value, explained_variance: NaN without a critic. groups_without_signal, episodes_without_return: see
+        GroupAdvantages; None with one.
     """
 
     loss_policy: float
@@ -47,12 +54,15 @@ class PpoMetrics:
     mean_advantage_std: float
     epochs: float
     samples: int
+    groups_without_signal: int | None = None
+    episodes_without_return: int | None = None
 
 
 @dataclass(frozen=True)
 class _Samples:
-    """The valid samples of one rollout, flattened to (B, ...)."""
+    """The samples of one rollout to train on, flattened to (B, ...). groups: None with a critic."""
 
+    groups: GroupAdvantages | None
     features: Tensor
     states: Tensor
     actions: Tensor
@@ -91,7 +101,7 @@ class PpoLearner:
             Canceled: should_stop, asked before every minibatch, said so on some rank; nothing has changed then.
             FloatingPointError: a loss, a gradient or a new weight is not finite; nothing has changed then.
             DeviceError: too little memory for the minibatches; nothing has changed then.
-            ValueError: no valid sample, or samples whose log_prob or value is unknown (NaN).
+            ValueError: no valid sample, samples whose log_prob or value is unknown (NaN), or no groups of equal starts.
         """
         before = {name: tensor.clone() for name, tensor in self.policy.state_dict().items()}
         optimizer_before = {name: t.clone() for name, t in checkpoint.optimizer_tensors(self._optimizer).items()}
@@ -134,7 +144,8 @@ class PpoLearner:
         count = len(samples.actions)
         totals: dict[str, float] = {}
         trained = 0
-        policy_frozen = self.updates < config.value_warmup_updates
+        groups = samples.groups
+        policy_frozen = groups is None and self.updates < config.value_warmup_updates
         num_minibatches = max(1, round(count / config.minibatch_size))
         stop = False
         for epoch in range(config.epochs):
@@ -159,6 +170,8 @@ class PpoLearner:
                 samples.values, samples.returns, torch.ones_like(samples.values, dtype=torch.bool)
             ),
             mean_advantage_std=float(samples.advantages.std(correction=0)), epochs=trained / count, samples=count,
+            groups_without_signal=groups.groups_without_signal if groups else None,
+            episodes_without_return=groups.episodes_without_return if groups else None,
         )
 
     def _minibatch(self, samples: _Samples, index: Tensor, policy_frozen: bool) -> dict[str, float]:
@@ -170,13 +183,15 @@ class PpoLearner:
             reference = self.reference.distribution(features, states)
         logprobs = distribution.logprob(samples.actions[own])
         old = samples.logprobs[own]
-        values = self.policy.value(features, states)
         policy_losses = clipped_policy_loss(logprobs, old, samples.advantages[own], clip=config.clip)
-        value_losses = value_loss(values, samples.values[own], samples.returns[own], clip=config.value_clip)
+        value_losses = torch.full_like(policy_losses, math.nan)
         entropies, kls = distribution.entropy(), distribution.kl(reference)
-        loss = config.value_weight * value_losses.sum()
-        if not policy_frozen:
-            loss = loss + (policy_losses - config.entropy_weight * entropies + config.kl_reference_weight * kls).sum()
+        loss = (policy_losses - config.entropy_weight * entropies + config.kl_reference_weight * kls).sum()
+        if samples.groups is None:
+            values = self.policy.value(features, states)
+            value_losses = value_loss(values, samples.values[own], samples.returns[own], clip=config.value_clip)
+            critic_loss = config.value_weight * value_losses.sum()
+            loss = critic_loss if policy_frozen else critic_loss + loss
         self._optimizer.zero_grad(set_to_none=True)
         (loss / len(index)).backward()  # type: ignore[no-untyped-call]
         self.ranks.sum_gradients(self.policy)
@@ -192,7 +207,8 @@ class PpoLearner:
         if not math.isfinite(grad_norm):
             raise self._not_finite("gradient")
         means = dict(zip(names, told, strict=True))
-        if not all(math.isfinite(means[name]) for name in ("loss_policy", "loss_value", "entropy", "kl_reference")):
+        finite = ("loss_policy", "entropy", "kl_reference", *(["loss_value"] if samples.groups is None else []))
+        if not all(math.isfinite(means[name]) for name in finite):
             raise self._not_finite("loss")
         self._optimizer.step()
         return means | {"grad_norm": grad_norm}
@@ -204,27 +220,56 @@ class PpoLearner:
 
     @torch.no_grad()
     def _samples(self, rollout: TensorRollout) -> _Samples:
-        valid_TN = rollout.valid_TN
+        groups = self._group_advantages(rollout) if self.config.advantage == "group" else None
+        valid_TN = rollout.valid_TN if groups is None else groups.counted_TN
         chosen = valid_TN.reshape(-1).nonzero().squeeze(1)
         if not len(chosen):
-            raise ValueError("the rollout has no valid transition: no valid reward or step; see the reward's reason")
-        unknown = valid_TN & ~(torch.isfinite(rollout.logprobs_TN) & torch.isfinite(rollout.values_TN))
+            what = "valid transition: no valid reward or step" if groups is None else "first episode with every reward"
+            raise ValueError(f"the rollout has no {what}; see the reward's reason")
+        known_TN = torch.isfinite(rollout.logprobs_TN)
+        if groups is None:
+            known_TN &= torch.isfinite(rollout.values_TN)
+        unknown = valid_TN & ~known_TN
         if unknown.any():
             raise ValueError(
                 f"{int(unknown.sum())} of {len(chosen)} valid transitions have no log_prob or value; PPO trains "
                 "on rollouts of a policy that publishes both"
             )
-        advantages, returns = gae(
-            torch.where(valid_TN, rollout.rewards_TN, 0.0), rollout.values_TN, self._next_values(rollout),
-            rollout.terminated_TN, rollout.truncated_TN, valid_TN,
-            gamma=self.config.gamma, lambda_=self.config.gae_lambda,
-        )
-        advantages = masked_normalise(advantages, valid_TN)
+        if groups is None:
+            advantages, returns = gae(
+                torch.where(valid_TN, rollout.rewards_TN, 0.0), rollout.values_TN, self._next_values(rollout),
+                rollout.terminated_TN, rollout.truncated_TN, valid_TN,
+                gamma=self.config.gamma, lambda_=self.config.gae_lambda,
+            )
+            advantages = masked_normalise(advantages, valid_TN)
+        else:
+            advantages, returns = groups.advantages_TN, torch.zeros_like(groups.advantages_TN)
         columns = (
             rollout.features_TN, rollout.states_TN, rollout.actions_TN, rollout.logprobs_TN, rollout.values_TN,
             advantages, returns,
         )
-        return _Samples(*(column.flatten(0, 1)[chosen] for column in columns))
+        return _Samples(groups, *(column.flatten(0, 1)[chosen] for column in columns))
+
+    def _group_advantages(self, rollout: TensorRollout) -> GroupAdvantages:
+        """Raises ValueError unless every environment's first episode began as the others of its group."""
+        config, (steps, num_envs) = self.config, rollout.valid_TN.shape
+        check_whole_groups(num_envs, config.group_size)
+        if steps > config.num_steps:
+            raise ValueError(
+                f"of {steps} lock-steps most would be left out, as only first episodes count; step ppo.num_envs "
+                f"({config.num_envs}) environments at a time"
+            )
+        first = torch.cat((rollout.features_TN[0], rollout.states_TN[0]), -1)
+        groups = first.view(-1, config.group_size, first.shape[-1])
+        if bool(((groups - groups[:, :1]).abs() > SAME_START).any()):
+            raise ValueError(
+                f"{config.group_size} neighbouring environments began at different starts; collect with the learner's "
+                "ppo.advantage and ppo.group_size"
+            )
+        return group_advantages(
+            rollout.rewards_TN, rollout.terminated_TN, rollout.truncated_TN, rollout.valid_TN,
+            group_size=config.group_size, by_std=config.group_std, leave_one_out=config.leave_one_out,
+        )
 
     def _next_values(self, rollout: TensorRollout) -> Tensor:
         """Values (T, N) of the observations that steps reached: the next row's where the episode goes on, else the

@@ -45,10 +45,25 @@ class RolloutStatistics:
         return self.successes / self.episodes if self.episodes else float("nan")
 
 
-def reset_seeds(seed: int, policy_version: int, step: int, num_envs: int) -> UInt64Array:
-    """Return the (N,) reset seeds of lock-step `step` (stream `reset`); entry i is used where environment i resets."""
+def reset_seeds(
+    seed: int, policy_version: int, step: int, num_envs: int, envs_per_start: int = 1
+) -> UInt64Array:
+    """Return the (N,) reset seeds of lock-step `step` (stream `reset`); entry i is used where environment i resets.
+
+    Neighbours have one seed in groups of envs_per_start. Raises ValueError where these are not whole.
+    """
+    check_whole_groups(num_envs, envs_per_start)
     stream = numpy_stream(seed, "reset", policy_version, step)
-    return stream.integers(0, TRAINING_SEED_LIMIT, num_envs, dtype=np.uint64)
+    return stream.integers(0, TRAINING_SEED_LIMIT, num_envs // envs_per_start, dtype=np.uint64).repeat(envs_per_start)
+
+
+def check_whole_groups(num_envs: int, group_size: int) -> None:
+    """Raise ValueError unless the environments are whole groups."""
+    if num_envs % group_size:
+        raise ValueError(
+            f"{num_envs} environments are not whole groups of {group_size}; set ppo.num_envs to a multiple of "
+            "ppo.group_size"
+        )
 
 
 def action_noise(seed: int, policy_version: int, step: int, num_envs: int, action_dim: int) -> FloatArray:
@@ -59,16 +74,18 @@ def action_noise(seed: int, policy_version: int, step: int, num_envs: int, actio
 
 
 def collect_rollout(
-    env: Environment, policy: ImagePolicy, reward: RewardModel, steps: int, seed: int, policy_version: int
+    env: Environment, policy: ImagePolicy, reward: RewardModel, steps: int, seed: int, policy_version: int,
+    envs_per_start: int = 1,
 ) -> Rollout:
-    """Reset all environments and make `steps` lock-steps. Raises ValueError for steps < 1.
+    """Reset all environments and make `steps` lock-steps. Raises ValueError for steps < 1, and as reset_seeds.
 
     seed: root of the streams `reset` and `action_noise`. policy_version: learner step whose weights act.
+    envs_per_start: as of reset_seeds.
     """
     if steps < 1:
         raise ValueError(f"steps must be >= 1, got {steps}; see ppo.num_steps in presets/policy/base.yaml")
     num_envs, action_dim = env.spec.num_envs, env.spec.action_dim
-    observation = env.reset(None, reset_seeds(seed, policy_version, 0, num_envs))
+    observation = env.reset(None, reset_seeds(seed, policy_version, 0, num_envs, envs_per_start))
     ended = np.zeros(num_envs, np.bool_)
     columns: dict[str, list[NDArray[Any]]] = {}
     for step in range(steps):
@@ -94,7 +111,7 @@ def collect_rollout(
             columns.setdefault(name, []).append(array)
         observation = result.observation
         if ended.any():
-            observation = env.reset(ended, reset_seeds(seed, policy_version, step, num_envs))
+            observation = env.reset(ended, reset_seeds(seed, policy_version, step, num_envs, envs_per_start))
         ended = (result.terminated | result.truncated) & result.valid
     return Rollout(policy_version=policy_version, **{name: np.stack(rows) for name, rows in columns.items()})
 

@@ -1,4 +1,4 @@
-"""Loop 1 on one screen: PPO of a policy in an environment, in one process.
+"""Loop 1 on one screen: PPO or GRPO of a policy in an environment, in one process.
 
 The ROS graph is this loop with the environment, the policy, the reward and the learner in a process each, and gives the
 same weights bit for bit (tests/graph/test_training.py). `python -m wm_nodes.policy_rl.train` runs it: a policy that
@@ -31,7 +31,7 @@ def train_policy(
     A rollout has ppo.num_steps x ppo.num_envs environment steps, however many environments `env` steps at a time.
     """
     learner = PpoLearner(policy, config.ppo, seed=config.seed)
-    collect = make_collector(env, policy, reward)  # act, step, reward
+    collect = make_collector(env, policy, reward, config.ppo.envs_per_start)  # act, step, reward
     num_steps = config.ppo.num_steps * config.ppo.num_envs // env.spec.num_envs
     for version in range(1, config.ppo.updates + 1):
         rollout = collect(num_steps, config.seed, version)

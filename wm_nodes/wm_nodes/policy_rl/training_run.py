@@ -131,10 +131,11 @@ class PolicyTraining(TrainingRun):
             assert isinstance(self.learner, PpoLearner) and self.ranks.size == 1 and not paid_at_end
             learner_metrics = self.learner.update(rollout, should_stop=should_stop)
         statistics = rollout_statistics(rollout)
+        metrics = _read_numbers(learner_metrics)
         progress = self.progress
         progress.updates += 1
         progress.version += 1
-        progress.samples += int(rollout.valid_TN.sum())
+        progress.samples += int(metrics.get("samples", rollout.valid_TN.sum()))
         progress.dropped_invalid += dropped.invalid
         progress.dropped_gap += dropped.gap
         progress.dropped_stale += dropped.stale
@@ -142,7 +143,7 @@ class PolicyTraining(TrainingRun):
         self.save()
         seconds = time.perf_counter() - began
         counts = {"episodes": float(statistics.episodes), "cut_episodes": float(statistics.cut)}
-        return _read_numbers(learner_metrics) | {"update_s": seconds} | counts
+        return metrics | {"update_s": seconds} | counts
 
     def follow(self) -> None:
         while (rollout := broadcast_rollout(None, self.ranks)) is not None:

@@ -51,8 +51,9 @@ class DeviceRollouts:
     def next(self) -> tuple[TensorRollout, DroppedTransitions]:
         assert self._collector is not None  # begin makes it
         self._check()
-        steps, seed, version = self._config.ppo.num_steps, self._config.seed, self._training.progress.version
-        return self._collector.collect(steps, seed, version), DroppedTransitions()
+        ppo, seed, version = self._config.ppo, self._config.seed, self._training.progress.version
+        rollout = self._collector.collect(ppo.num_steps, seed, version, envs_per_start=ppo.envs_per_start)
+        return rollout, DroppedTransitions()
 
     def close(self) -> None:
         return None
