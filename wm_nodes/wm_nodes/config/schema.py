@@ -61,6 +61,9 @@ class DataConfig(SettingsSection):
     """Relative share of each behaviour (expert, noisy, near_miss, biased, waypoint, random, reach, ...)."""
     num_workers: PositiveInt
     """Collecting processes."""
+    start_frames: Literal["first", "any"]
+    """Frames of real episodes that imagined ones begin at: first, after the reset; any: one of each episode at random,
+    before its success."""
     policy_episodes: NonNegativeInt
     """Episodes of each weak cloned policy (policy_rl/pretraining.py) added to the world model's data; 0: none."""
 

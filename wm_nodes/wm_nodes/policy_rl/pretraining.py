@@ -95,7 +95,9 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     tasks = model_tasks(config.task)
     models = WorldModels(tokenizer, action, text, tasks, config.simulation, {}, probe)
     story["heldout"] = model_metrics(models, load_arrays(heldout_bags, config), config)
-    write_starts(bags, folder / STARTS, MODEL_STARTS)
+    write_starts(
+        bags, folder / STARTS, MODEL_STARTS, tasks=tasks, frames=config.data.start_frames, seed=config.seed
+    )
     save_model_folder(folder, tokenizer, action, text, config, tasks=tasks, story=story, probe=probe)
     load_model_folder(folder)
     return folder
