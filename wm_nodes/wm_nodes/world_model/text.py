@@ -3,6 +3,7 @@ longest instruction, R rows: one where all instructions of a batch are equal, el
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from wm_nodes.core.types import BoolArray, UInt8Array
 from wm_nodes.world_model.conditions import text_rows, word_mask
 from wm_nodes.world_model.dynamics import FrameModel, Prediction, done_signal
 from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.sentence_encoder import SentenceCondition, SentenceEncoder
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.transformer import RingCache, TemporalCache
 
@@ -62,7 +64,10 @@ class TextModel(FrameModel):
         self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, vocabulary: tuple[str, ...], num_tasks: int
     ) -> None:
         super().__init__(config, num_tokens, latent_dim, num_tasks)
-        self.condition = InstructionCondition(vocabulary, config.width)
+        self.condition: InstructionCondition | SentenceCondition = (
+            SentenceCondition(SentenceEncoder(Path(config.text_encoder)), config.width) if config.text_encoder
+            else InstructionCondition(vocabulary, config.width)
+        )
 
     def forward(
         self, latents_BTSD: Tensor, instructions: Sequence[str],
