@@ -21,6 +21,7 @@ def episodes(success: list[list[int]], lengths: list[int]) -> EpisodeArrays:
     return EpisodeArrays(
         np.zeros((E, T + 1, 4, 4, 3), np.uint8), np.zeros((E, T + 1, 3), np.float32), np.zeros((E, T, 3), np.float32),
         np.zeros((E, T + 1, 1), np.float32), won, np.array(lengths), ("reach", "push_cube"), ("",) * E, ("",) * E,
+        ("push_cube",) * E,
     )
 
 

@@ -92,6 +92,7 @@ def recorded() -> EpisodeArrays:
         rng.uniform(-0.3, 0.3, (EPISODES, STEPS + 1, len(names))).astype(np.float32), success,
         rng.integers(STEPS // 2 + 1, STEPS + 1, EPISODES), TASKS, ("",) * EPISODES,
         tuple((*demonstrators, "noisy", "random")[i % 4] for i in range(EPISODES)),
+        ("push_cube",) * EPISODES,
     )
 
 

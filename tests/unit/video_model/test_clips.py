@@ -69,7 +69,9 @@ def episodes(steps: int = 4) -> EpisodeArrays:
     success = np.zeros((2, steps + 1, 1), bool)
     states = np.zeros((2, steps + 1, 3), np.float32)
     lengths = np.full(2, steps, np.int64)
-    return EpisodeArrays(images, states, actions, truth, success, lengths, ("t",), ("push", "push"), ("a", "b"))
+    return EpisodeArrays(
+        images, states, actions, truth, success, lengths, ("t",), ("push", "push"), ("a", "b"), ("t", "t")
+    )
 
 
 def test_a_clip_takes_every_second_frame_with_the_actions_between_in_order() -> None:

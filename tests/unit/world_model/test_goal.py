@@ -1,5 +1,7 @@
 """Goals imagined by the text model (RS-6)."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import torch
@@ -24,7 +26,7 @@ class ScriptedTextModel(TextModel):
         self.signals = torch.tensor(signals_BT)
         self.step = 0
 
-    def forward(self, latents_BTSD: Tensor, instruction: str, caches: object = None) -> Prediction:
+    def forward(self, latents_BTSD: Tensor, instructions: Sequence[str], caches: object = None) -> Prediction:
         logits = torch.logit(self.signals[:, self.step]).view(-1, 1, 1, 1)
         self.step += 1
         change = torch.zeros_like(latents_BTSD)
@@ -46,7 +48,7 @@ def test_the_goal_is_the_first_crossing_and_without_one_the_best_frame_marked_as
     tokenizer = make_tokenizer()
     signals = [[0.1, 0.2, 0.8, 0.6, 0.95, 0.1], [0.1, 0.7, 0.3, 0.2, 0.1, 0.1]]
     model = ScriptedTextModel(signals, tokenizer)
-    goals = imagine_goals(model, tokenizer, first_frames(2), "push cube", 0, horizon=HORIZON, threshold=0.7)
+    goals = imagine_goals(model, tokenizer, first_frames(2), ["push cube"] * 2, 0, horizon=HORIZON, threshold=0.7)
     assert goals.found.tolist() == [True, False]
     assert goals.lengths.tolist() == [3 + 1, 2 + 1]
     np.testing.assert_array_equal(goals.goals[0], goals.frames[0, 3])
@@ -56,7 +58,7 @@ def test_the_goal_is_the_first_crossing_and_without_one_the_best_frame_marked_as
 def test_the_golden_trajectory_begins_with_the_first_frame() -> None:
     tokenizer, frames = make_tokenizer(), first_frames(1)
     model = ScriptedTextModel([[0.9] * HORIZON], tokenizer)
-    goals = imagine_goals(model, tokenizer, frames, "push cube", 0, horizon=HORIZON, threshold=0.5)
+    goals = imagine_goals(model, tokenizer, frames, ["push cube"], 0, horizon=HORIZON, threshold=0.5)
     assert goals.frames.shape == (1, HORIZON + 1, 32, 32, 3)
     np.testing.assert_array_equal(goals.frames[:, 0], frames)
     assert goals.lengths.tolist() == [2]
@@ -66,10 +68,10 @@ def test_the_golden_trajectory_begins_with_the_first_frame() -> None:
 def test_an_instruction_outside_the_vocabulary_is_refused(instruction: str) -> None:
     model = ScriptedTextModel([[0.5]], make_tokenizer())
     with pytest.raises(ValueError, match="instruction"):
-        model.condition(instruction)
+        model.condition(["push cube", instruction])
 
 
 def test_the_same_words_in_another_order_are_another_condition() -> None:
     model = ScriptedTextModel([[0.5]], make_tokenizer())
-    assert not model.condition("push cube").equal(model.condition("cube push"))
-    assert model.condition("Push CUBE").equal(model.condition("push cube"))
+    one, other, capitals = (model.condition([text])[0] for text in ("push cube", "cube push", "Push CUBE"))
+    assert not one.equal(other) and capitals.equal(one)

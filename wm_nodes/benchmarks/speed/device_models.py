@@ -212,7 +212,7 @@ def random_episodes(config: RunConfig, steps: int) -> EpisodeArrays:
         actions=rng.uniform(-1, 1, (EPISODES, steps, ACTION_DIM)).astype(np.float32),
         ground_truth=rng.uniform(-0.3, 0.3, (*frames, numbers)).astype(np.float32),
         success=rng.random((*frames, len(tasks))) < 0.2, lengths=np.full(EPISODES, steps), tasks=tasks,
-        instructions=("",) * EPISODES, behaviours=("random",) * EPISODES,
+        instructions=("",) * EPISODES, behaviours=("random",) * EPISODES, recorded_tasks=(config.task,) * EPISODES,
     )
 
 

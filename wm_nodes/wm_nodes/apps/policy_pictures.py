@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import get_task, success
+from wm_nodes.config.tasks import success
 from wm_nodes.core.specs import SOURCE_SIMULATOR
 from wm_nodes.core.types import Environment, Episode, FloatArray, UInt8Array
 from wm_nodes.policy_rl.factories import models_of
@@ -101,7 +101,7 @@ def side_by_side(models: WorldModels, episodes: list[Episode], config: RunConfig
     goals = None
     if models.text is not None:
         goals = imagine_goals(
-            models.text, models.tokenizer, arrays.images[:, 0], get_task(config.task).instruction, task,
+            models.text, models.tokenizer, arrays.images[:, 0], arrays.instructions, task,
             horizon=config.simulation.max_episode_steps, threshold=config.reward.goal_threshold,
         ).goals
     pairs = []

@@ -61,6 +61,9 @@ class DataConfig(SettingsSection):
     """Relative share of each behaviour (expert, noisy, near_miss, biased, waypoint, random, reach, ...)."""
     num_workers: PositiveInt
     """Collecting processes."""
+    start_frames: Literal["first", "any"]
+    """Frames of real episodes that imagined ones begin at: first, after the reset; any: one of each episode at random,
+    before its success."""
     policy_episodes: NonNegativeInt
     """Episodes of each weak cloned policy (policy_rl/pretraining.py) added to the world model's data; 0: none."""
 
@@ -104,6 +107,9 @@ class WorldModelConfig(SettingsSection):
     """MaskGIT passes per frame (lfq only)."""
     text_num_iterations: PositiveInt
     """Iterations of the text model, warm-started from the action model."""
+    text_encoder: str = ""
+    """Folder of a sentence encoder (MiniLM, T5) in the layout of transformers that reads the instructions, any words;
+    empty: a learned embedding of the words of the training instructions."""
     state_weight: NonNegativeFloat
     """Weight of the auxiliary losses on simulator positions, of the predicted frame and of the model's own reading."""
     decoded_weight: NonNegativeFloat

@@ -29,6 +29,7 @@ from wm_nodes.world_model import (
     ImaginedEpisodes,
     WorldModels,
     load_model_folder,
+    load_start_instructions,
     load_starts,
 )
 
@@ -165,7 +166,7 @@ def _imagine(
     with explain_memory(compute_device(config.device), ppo__num_envs=num_envs):
         return make(
             models, spec, load_starts(Path(starts_file)), config.reward, num_envs=num_envs,
-            with_goals=config.reward.dense_weight > 0,
+            instructions=load_start_instructions(Path(starts_file), spec), with_goals=config.reward.dense_weight > 0,
         )
 
 

@@ -1,21 +1,27 @@
-"""Prepare what a run needs besides a world model: first frames to imagine from, the weak policy that RL starts from."""
+"""Prepare what a run needs besides a world model: frames to imagine from, the weak policy that RL starts from."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from safetensors.torch import save
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import success
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode
-from wm_nodes.environments.record import collect_plan, demonstration_plan, first_frames_plan
+from wm_nodes.environments.maniskill.collection import CollectionPlan
+from wm_nodes.environments.record import collect_plan, demonstration_plan, first_frames_plan, scripted_plan
 from wm_nodes.policy_rl.behaviour_cloning import demonstrations, train_sft
 from wm_nodes.policy_rl.factories import make_policy, make_reconstruct
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording import read_episodes
 from wm_nodes.training.weights import save_weights
+from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS, pack_instructions
 
 STARTS = "starts.safetensors"
 MAX_STARTS, MODEL_STARTS = 512, 64
@@ -30,20 +36,46 @@ def num_starts(config: RunConfig) -> int:
     return min(NUM_STARTS, 8 * config.evaluation.episodes)
 
 
-def write_starts(bags: Iterable[Path], path: Path, limit: int = MAX_STARTS) -> int:
-    """Write the first frame and state of up to `limit` recorded episodes; returns how many."""
+def starts_plan(config: RunConfig) -> CollectionPlan:
+    """Return the plan of the episodes that a run's starts are taken from: one step each, or whole scripted ones."""
+    if config.data.start_frames == "first":
+        return first_frames_plan(config, num_starts(config), START_SEEDS)
+    return replace(scripted_plan(config, num_starts(config), START_SEEDS), task=config.task)
+
+
+def write_starts(
+    bags: Iterable[Path], path: Path, limit: int = MAX_STARTS, *, tasks: Sequence[str] = (),
+    frames: Literal["first", "any"] = "first", seed: int = 0,
+) -> int:
+    """Write a frame, its state and the instruction of up to `limit` recorded episodes; returns how many.
+
+    Args:
+        tasks: those that are imagined from these starts, beside the one of the recording.
+        frames: see data.start_frames; `any` is before success in all the tasks, drawn from the stream `start_frames` of
+            the seed.
+    """
     episodes: list[Episode] = []
     for bag in bags:
         episodes += list(read_episodes(bag))
         if len(episodes) >= limit:
             break
     chosen = episodes[:limit]
+    stream = numpy_stream(seed, "start_frames")
+    rows = [int(stream.integers(frames_before_success(e, tasks))) if frames == "any" else 0 for e in chosen]
     tensors = {
-        "images": torch.from_numpy(np.stack([episode.images[0] for episode in chosen])),
-        "states": torch.from_numpy(np.stack([episode.states[0] for episode in chosen])),
+        "images": torch.from_numpy(np.stack([episode.images[row] for episode, row in zip(chosen, rows)])),
+        "states": torch.from_numpy(np.stack([episode.states[row] for episode, row in zip(chosen, rows)])),
+        INSTRUCTIONS: pack_instructions(chosen),
     }
     write_atomic(path, save(tensors))
     return len(chosen)
+
+
+def frames_before_success(episode: Episode, tasks: Sequence[str] = ()) -> int:
+    """Return how many frames an episode has before it succeeds in any of the tasks or its own; at least 1."""
+    others = [success(task, episode.ground_truth) for task in tasks if task != episode.task]
+    done = np.logical_or.reduce([episode.success, *others])
+    return max(1, int(done.argmax())) if done.any() else len(done)
 
 
 def train_weak_policy(config: RunConfig, model_dir: Path, demo_bags: Iterable[Path], path: Path) -> ImagePolicy:
@@ -60,12 +92,12 @@ def train_weak_policy(config: RunConfig, model_dir: Path, demo_bags: Iterable[Pa
 
 
 def start_files(run_dir: Path) -> tuple[Path, Path]:
-    """Return the paths of a run's first frames and of its weak policy, as prepare_start writes them."""
+    """Return the paths of a run's starts and of its weak policy, as prepare_start writes them."""
     return run_dir / STARTS, run_dir / "policies" / "weak.safetensors"
 
 
 def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Path, Path]:
-    """Collect demonstrations and first frames and train the weak policy, as far as missing; return start_files()."""
+    """Collect demonstrations and starts and train the weak policy, as far as missing; return start_files()."""
     spare = max(3, config.sft.num_demonstrations // 3)
     plan = demonstration_plan(
         config, config.sft.num_demonstrations + spare, DEMONSTRATION_SEEDS + SEEDS_PER_RUN * config.seed
@@ -73,8 +105,8 @@ def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Pa
     demos = collect_plan(plan, config, run_dir / "bags" / "demos")
     starts, weak = start_files(run_dir)
     if not starts.exists():
-        first_frames = first_frames_plan(config, num_starts(config), START_SEEDS)
-        write_starts(collect_plan(first_frames, config, run_dir / "bags" / "starts"), starts)
+        bags = collect_plan(starts_plan(config), config, run_dir / "bags" / "starts")
+        write_starts(bags, starts, frames=config.data.start_frames, seed=config.seed)
     if not weak.exists():
         train_weak_policy(config, model_dir, demos, weak)
     return starts, weak

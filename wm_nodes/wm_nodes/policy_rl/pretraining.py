@@ -1,6 +1,7 @@
 """Everything before RL: simulator episodes in, a world-model folder out. Resumable: finished stages are kept."""
 
 import platform
+import sys
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,7 @@ from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model_folder, save_model_folder
 from wm_nodes.world_model.folder import action_model_class
+from wm_nodes.world_model.sentence_encoder import SentenceEncoder
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.position_probe import train_position_probe
@@ -46,11 +48,15 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
 
     Raises:
         DeviceError: there is no such device, which is found out first, or its memory is too small.
+        ModelFolderError, MissingPackageError: world_model.text_encoder cannot be loaded, found out before collecting.
     """
     folder = run_dir / "model"
     if (folder / MANIFEST).exists():
         return folder
     device = compute_device(config.device)
+    if config.world_model.text_encoder:
+        reader = SentenceEncoder(Path(config.world_model.text_encoder))
+        print(f"instructions are read by {reader.folder}, sha256 {reader.sha256[:12]}", file=sys.stderr)
     bags = collect_plan(
         scripted_plan(config, config.data.num_episodes, TRAINING_SEEDS), config, run_dir / "data" / "train"
     )
@@ -95,7 +101,9 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     tasks = model_tasks(config.task)
     models = WorldModels(tokenizer, action, text, tasks, config.simulation, {}, probe)
     story["heldout"] = model_metrics(models, load_arrays(heldout_bags, config), config)
-    write_starts(bags, folder / STARTS, MODEL_STARTS)
+    write_starts(
+        bags, folder / STARTS, MODEL_STARTS, tasks=tasks, frames=config.data.start_frames, seed=config.seed
+    )
     save_model_folder(folder, tokenizer, action, text, config, tasks=tasks, story=story, probe=probe)
     load_model_folder(folder)
     return folder

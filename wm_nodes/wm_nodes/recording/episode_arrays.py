@@ -20,6 +20,7 @@ class EpisodeArrays:
 
     images: uint8 (E, T + 1, H, W, 3). states: float32 (E, T + 1, S). actions: float32 (E, T, A), 0 where padded.
     ground_truth: float32 (E, T + 1, P). success: bool (E, T + 1, J), column j for tasks[j]. lengths: int64 (E,).
+    recorded_tasks: the task that each episode was recorded for, with its instruction.
     """
 
     images: UInt8Array
@@ -31,6 +32,7 @@ class EpisodeArrays:
     tasks: tuple[str, ...]
     instructions: tuple[str, ...]
     behaviours: tuple[str, ...]
+    recorded_tasks: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.images)
@@ -54,7 +56,7 @@ class EpisodeArrays:
         return EpisodeArrays(
             self.images[index], self.states[index], self.actions[index], self.ground_truth[index], self.success[index],
             self.lengths[index], self.tasks, tuple(self.instructions[i] for i in index),
-            tuple(self.behaviours[i] for i in index),
+            tuple(self.behaviours[i] for i in index), tuple(self.recorded_tasks[i] for i in index),
         )
 
     @classmethod
@@ -67,6 +69,7 @@ class EpisodeArrays:
             **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}, tasks=parts[0].tasks,
             instructions=tuple(text for part in parts for text in part.instructions),
             behaviours=tuple(text for part in parts for text in part.behaviours),
+            recorded_tasks=tuple(task for part in parts for task in part.recorded_tasks),
         )
 
 
@@ -96,5 +99,5 @@ def stack_episodes(
         states=np.stack([e.states[rows] for e, rows in zip(listed, frame_rows, strict=True)]), actions=actions,
         ground_truth=truth, success=np.stack([np.asarray(labels(task, truth), bool) for task in tasks], -1),
         lengths=lengths, tasks=tuple(tasks), instructions=tuple(e.instruction for e in listed),
-        behaviours=tuple(e.behaviour for e in listed),
+        behaviours=tuple(e.behaviour for e in listed), recorded_tasks=tuple(e.task for e in listed),
     )

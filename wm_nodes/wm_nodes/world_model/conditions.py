@@ -1,9 +1,26 @@
-"""Condition tokens of the world models. Shapes: B batch, T transitions, A action, S state, N tokens, D width."""
+"""Condition tokens of the world models. Shapes: B batch, T transitions, A action, S state, N tokens, D width, R rows of
+text, L words of the longest one."""
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 NUM_FREQUENCIES = 6
+
+
+def text_rows(instructions: Sequence[str]) -> Sequence[str]:
+    """One row where all instructions of a batch are equal, else one for each."""
+    return instructions[:1] if len(set(instructions)) == 1 else instructions
+
+
+def word_mask(lengths: Sequence[int], device: torch.device) -> Tensor | None:
+    """Mask (R, L + 1) of rows of `lengths` words and then a null token, False where a shorter row is padded; None where
+    none is."""
+    longest = max(lengths)
+    if min(lengths) == longest:
+        return None
+    return torch.tensor([[i < length or i == longest for i in range(longest + 1)] for length in lengths], device=device)
 
 
 class ScalarTokens(nn.Module):

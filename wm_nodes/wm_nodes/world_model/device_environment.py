@@ -8,6 +8,7 @@ batch size.
 Shapes: N environments, M starts, S tokens, D values per token, A action, P state, H W 3 image.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -52,13 +53,14 @@ class DeviceEnvironment:
         goals: goal frame uint8 (M, H, W, 3) and found flag (M,) of every start, on the host; None without goals.
 
     Args:
-        spec, starts, reward, with_goals, exact: as ImaginedEnvironment's.
+        spec, starts, reward, instructions, with_goals, exact: as ImaginedEnvironment's.
         fixed: see RingTimes; by default on all devices but the CPU.
     """
 
     def __init__(
         self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
-        *, num_envs: int, with_goals: bool = True, exact: bool = False, fixed: bool | None = None,
+        *, num_envs: int, instructions: Sequence[str] = (), with_goals: bool = True, exact: bool = False,
+        fixed: bool | None = None,
     ) -> None:
         self.spec, self.device = world_model_spec(models, spec, num_envs), models.tokenizer.device
         self.tokenizer_sha256 = models.tokenizer_sha256
@@ -66,7 +68,7 @@ class DeviceEnvironment:
         images, states = starts
         self.num_starts = len(images)
         self.goals: tuple[UInt8Array, BoolArray] | None = (
-            imagine_start_goals(models, images, self.spec, reward) if with_goals else None
+            imagine_start_goals(models, images, self.spec, reward, instructions) if with_goals else None
         )
         self._fast, self._exact = has_fast_bfloat16(self.device), exact
         self._tokenizer, self._action = models_to_infer(models, exact=exact)
@@ -90,7 +92,8 @@ class DeviceEnvironment:
         """The same model, starts, rules and number of environments, with a state of its own."""
         return cls(
             environment.models, environment.spec, environment.starts, environment.reward,
-            num_envs=environment.spec.num_envs, with_goals=environment.reward.dense_weight > 0,
+            num_envs=environment.spec.num_envs, instructions=environment.instructions,
+            with_goals=environment.reward.dense_weight > 0,
         )
 
     def reset(self, begins_N: Tensor, starts_N: Tensor) -> None:

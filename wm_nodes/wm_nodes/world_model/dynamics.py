@@ -80,11 +80,17 @@ class FrameModel(nn.Module):
         nn.init.zeros_(self.change.bias)
         self.done = DoneHeads(width, config.num_done_heads, num_tasks, len(PROBE_NAMES))
 
-    def predict(self, latents_BTSD: Tensor, condition_BTND: Tensor, caches: Caches | None = None) -> Prediction:
-        """Predict frame t + 1 for each of T given frames; later frames never influence earlier predictions."""
+    def predict(
+        self, latents_BTSD: Tensor, condition_BTND: Tensor, caches: Caches | None = None,
+        visible_BN: Tensor | None = None,
+    ) -> Prediction:
+        """Predict frame t + 1 for each of T given frames; later frames never influence earlier predictions.
+
+        visible_BN: False where a condition token is padding.
+        """
         tokens = self.embed(latents_BTSD) + self.position
         register = self.register.to(tokens.dtype).expand(*tokens.shape[:2], 1, -1)
-        features = self.trunk(torch.cat((tokens, register), 2), condition_BTND, caches)
+        features = self.trunk(torch.cat((tokens, register), 2), condition_BTND, caches, visible_BN)
         tokens, register = features[:, :, :-1], features[:, :, -1]
         logits, positions = self.done(tokens, register)
         return Prediction(self.change(tokens).float(), positions, logits)

@@ -22,6 +22,7 @@ from wm_nodes.core.model_folder import (
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.sentence_encoder import SentenceCondition
 from wm_nodes.world_model.text import TextModel
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
@@ -74,7 +75,7 @@ def save_model_folder(
     packed = {key: _pack(module) for key, module in modules.items() if module is not None}
     for key in FILES.keys() - packed.keys():
         (folder / FILES[key]).unlink(missing_ok=True)
-    manifest = {
+    manifest: dict[str, Any] = {
         "format": FORMAT,
         "tasks": list(tasks),
         "vocabulary": list(text.condition.vocabulary) if text else [],
@@ -88,6 +89,9 @@ def save_model_folder(
         "sha256": _hashes(packed),
         **story,
     }
+    if text and isinstance(text.condition, SentenceCondition):
+        encoder = text.condition.encoder
+        manifest["world_model"]["text_encoder"], manifest["text_encoder_sha256"] = str(encoder.folder), encoder.sha256
     return write_model_folder(folder, {FILES[key]: data for key, data in packed.items()}, manifest)
 
 
@@ -124,6 +128,7 @@ def load_model_folder(folder: Path, device: torch.device | str = "cpu") -> World
     text = probe = None
     if "text" in manifest["sha256"]:
         text = TextModel(config, vocabulary=tuple(manifest["vocabulary"]), num_tasks=num_tasks, **sizes)
+        _check_encoder(folder, text, manifest)
         _load(folder, "text", text, manifest)
     if "probe" in manifest["sha256"]:
         probe = PositionProbe(manifest["height"], manifest["width"])
@@ -143,6 +148,16 @@ def action_model_class(kind: str) -> type[ActionModel] | type[TokenActionModel]:
 def read_world_manifest(folder: Path) -> dict[str, Any]:
     """Read the manifest of a world-model folder. Raises ModelFolderError."""
     return read_manifest(folder, "world model", FORMAT)
+
+
+def _check_encoder(folder: Path, text: TextModel, manifest: Mapping[str, Any]) -> None:
+    if isinstance(text.condition, SentenceCondition):
+        encoder, wanted = text.condition.encoder, manifest["text_encoder_sha256"]
+        if encoder.sha256 != wanted:
+            raise ModelFolderError(
+                f"{folder} was trained with another sentence encoder (sha256 {wanted[:12]}) than {encoder.folder} "
+                f"holds ({encoder.sha256[:12]}); put that one there"
+            )
 
 
 def _load(folder: Path, key: str, module: nn.Module, manifest: Mapping[str, Any]) -> None:

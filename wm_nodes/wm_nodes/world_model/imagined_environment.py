@@ -3,6 +3,8 @@
 Shapes: N environments, M starts, S tokens, D values per token, A action, P state.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -49,16 +51,18 @@ def encode_starts(models: WorldModels, images: UInt8Array) -> Tensor:
 
 
 def imagine_start_goals(
-    models: WorldModels, images: UInt8Array, spec: EnvironmentSpec, reward: RewardConfig
+    models: WorldModels, images: UInt8Array, spec: EnvironmentSpec, reward: RewardConfig,
+    instructions: Sequence[str] = (),
 ) -> tuple[UInt8Array, BoolArray] | None:
-    """Goal frame and found flag of every start: one per (first frame, instruction), so computed once; None without a
-    text model."""
+    """Goal frame and found flag of every start: one per (frame, instruction), so computed once; None without a text
+    model. instructions: of every start; none: that of the spec."""
     if models.text is None:
         return None
+    texts = instructions or [spec.instruction] * len(images)
     parts = [
         imagine_goals(
-            models.text, models.tokenizer, images[i : i + GOAL_BATCH], spec.instruction, models.task_index(spec.task),
-            horizon=spec.max_episode_steps, threshold=reward.goal_threshold,
+            models.text, models.tokenizer, images[i : i + GOAL_BATCH], texts[i : i + GOAL_BATCH],
+            models.task_index(spec.task), horizon=spec.max_episode_steps, threshold=reward.goal_threshold,
         )
         for i in range(0, len(images), GOAL_BATCH)
     ]
@@ -71,23 +75,25 @@ class ImaginedEnvironment(ImaginedEpisodes):
 
     Args:
         spec, starts, reward: as ImaginedEpisodes's; the spec is that of the simulator the model was learned from.
+        instructions: of every start, for its goal; none: that of the spec.
         with_goals: imagine goals by the text model (needed for the dense reward).
         exact: compute in float32 even where bfloat16 is faster.
     """
 
     def __init__(
         self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
-        *, num_envs: int, seed: int = 0, with_goals: bool = True, exact: bool = False,
+        *, num_envs: int, seed: int = 0, instructions: Sequence[str] = (), with_goals: bool = True,
+        exact: bool = False,
     ) -> None:
         super().__init__(
             world_model_spec(models, spec, num_envs), starts, reward, seed=seed, device=models.tokenizer.device
         )
-        self.models, self._exact = models, exact
+        self.models, self.instructions, self._exact = models, instructions, exact
         self._task = models.task_index(spec.task)
         self._tokenizer, self._action = models_to_infer(models, exact=exact)
         images, _ = starts
         self._start_latents = encode_starts(models, images)
-        self._goals = imagine_start_goals(models, images, self.spec, reward) if with_goals else None
+        self._goals = imagine_start_goals(models, images, self.spec, reward, instructions) if with_goals else None
         self._parts = cached_parts(models.action.trunk, num_envs, self.device)
         self._latents = self._start_latents[:1].repeat(num_envs, 1, 1)
 

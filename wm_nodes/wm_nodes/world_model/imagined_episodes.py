@@ -1,8 +1,11 @@
 """What every imagined environment shares: real starts, exact tool positions, step limits, ends by a done signal.
 
+A starts file holds frames and states of real episodes to imagine from, and may hold more about each of them.
+
 Shapes: N environments, M starts, H W 3 image, A action, P state.
 """
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,16 +24,42 @@ from wm_nodes.core.device import explain_memory
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
-from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.core.types import BoolArray, Episode, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.world_model.text import instruction_for
+
+INSTRUCTIONS = "instructions"
+"""Key of a starts file, see pack_instructions."""
 
 
 def load_starts(path: Path) -> tuple[UInt8Array, FloatArray]:
-    """Real first frames uint8 (M, H, W, 3) and states float32 (M, P) to imagine from."""
+    """Real frames uint8 (M, H, W, 3) and states float32 (M, P) to imagine from."""
     tensors = load_file(path)
     missing = {"images", "states"} - tensors.keys()
     if missing or not len(tensors["images"]):
         raise ValueError(f"{path} is no starts file: it must hold images and states of at least one first frame")
     return tensors["images"].numpy(), tensors["states"].numpy()
+
+
+def load_start_instructions(path: Path, spec: EnvironmentSpec) -> list[str]:
+    """The instruction of every start of load_starts for the task of `spec`; that of the spec where the file has none.
+
+    Raises:
+        ValueError: not as many as there are starts.
+    """
+    tensors = load_file(path)
+    count = len(tensors["images"])
+    if INSTRUCTIONS not in tensors:
+        return [spec.instruction] * count
+    told = json.loads(tensors[INSTRUCTIONS].numpy().tobytes())
+    if len(told) != count:
+        raise ValueError(f"{path} has {len(told)} instructions for {count} starts; delete it to have it written again")
+    return [instruction_for(spec.task, task, own, spec.instruction) for task, own in told]
+
+
+def pack_instructions(episodes: Sequence[Episode]) -> Tensor:
+    """The instructions of a starts file, uint8: the UTF-8 bytes of a JSON list of (recorded task, instruction)."""
+    text = json.dumps([(episode.task, episode.instruction) for episode in episodes])
+    return torch.tensor(list(text.encode()), dtype=torch.uint8)
 
 
 def imagined_spec(spec: EnvironmentSpec, env_id: str, sha256: str, num_envs: int) -> EnvironmentSpec:
@@ -52,7 +81,7 @@ class ImaginedEpisodes(ABC):
 
     Args:
         spec: what imagined_spec gives.
-        starts: first frames and states; a reset with seed s begins at start hash(s) mod M.
+        starts: frames and states; a reset with seed s begins at start hash(s) mod M, with the whole step limit.
         seed: root of the stream `reset`, of which resets without seeds take theirs.
         device: where the model is.
     """

@@ -1,6 +1,9 @@
-"""WM_txt and the goals it imagines (RS-6). Shapes: B batch, T frames, S tokens, D values per token, L words."""
+"""WM_txt and the goals it imagines (RS-6). Shapes: B batch, T frames, S tokens, D values per token, L words of the
+longest instruction, R rows: one where all instructions of a batch are equal, else B."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -8,8 +11,10 @@ from torch import Tensor, nn
 
 from wm_nodes.config.schema import WorldModelConfig
 from wm_nodes.core.types import BoolArray, UInt8Array
+from wm_nodes.world_model.conditions import text_rows, word_mask
 from wm_nodes.world_model.dynamics import FrameModel, Prediction, done_signal
 from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.sentence_encoder import SentenceCondition, SentenceEncoder
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.transformer import RingCache, TemporalCache
 
@@ -27,12 +32,21 @@ class InstructionCondition(nn.Module):
         self.position = nn.Parameter(torch.randn(MAX_WORDS, width) * 0.1)
         self.null = nn.Parameter(torch.randn(1, width) * 0.5)
 
-    def forward(self, instruction: str) -> Tensor:
-        """Condition tokens (L + 1, D).
+    def forward(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor | None]:
+        """Condition tokens (R, L + 1, D) of one instruction per row of the batch, and a mask (R, L + 1), True where a
+        token is none of the padding of shorter instructions; None where all are equally long.
 
         Raises:
             ValueError: a word that the model was not trained on, or too many words.
         """
+        rows = [self._places(instruction) for instruction in text_rows(instructions)]
+        lengths = [len(row) for row in rows]
+        padded = [row + [0] * (max(lengths) - len(row)) for row in rows]
+        words = self.words(torch.tensor(padded, device=self.null.device)) + self.position[: max(lengths)]
+        tokens = torch.cat((words, self.null.expand(len(rows), -1, -1)), 1)
+        return tokens, word_mask(lengths, self.null.device)
+
+    def _places(self, instruction: str) -> list[int]:
         words = instruction.lower().split()
         unknown = [word for word in words if word not in self._index]
         if unknown or not 0 < len(words) <= MAX_WORDS:
@@ -40,24 +54,38 @@ class InstructionCondition(nn.Module):
                 f"instruction {instruction!r}: {'unknown words ' + ', '.join(unknown) if unknown else 'length'}; this "
                 f"model knows at most {MAX_WORDS} of {', '.join(self.vocabulary)}"
             )
-        index = torch.tensor([self._index[word] for word in words], device=self.null.device)
-        return torch.cat((self.words(index) + self.position[: len(words)], self.null))
+        return [self._index[word] for word in words]
 
 
 class TextModel(FrameModel):
-    """The same architecture as WM_act; its condition is the instruction, equal for all frames."""
+    """The same architecture as WM_act; its condition is a row's instruction, equal for all its frames."""
 
     def __init__(
         self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, vocabulary: tuple[str, ...], num_tasks: int
     ) -> None:
         super().__init__(config, num_tokens, latent_dim, num_tasks)
-        self.condition = InstructionCondition(vocabulary, config.width)
+        self.condition: InstructionCondition | SentenceCondition = (
+            SentenceCondition(SentenceEncoder(Path(config.text_encoder)), config.width) if config.text_encoder
+            else InstructionCondition(vocabulary, config.width)
+        )
 
     def forward(
-        self, latents_BTSD: Tensor, instruction: str, caches: list[TemporalCache] | list[RingCache] | None = None
+        self, latents_BTSD: Tensor, instructions: Sequence[str],
+        caches: list[TemporalCache] | list[RingCache] | None = None,
     ) -> Prediction:
-        tokens = self.condition(instruction).expand(*latents_BTSD.shape[:2], -1, -1)
-        return self.predict(latents_BTSD, tokens, caches)
+        tokens, visible = self.condition_of(instructions, *latents_BTSD.shape[:2])
+        return self.predict(latents_BTSD, tokens, caches, visible)
+
+    def condition_of(self, instructions: Sequence[str], batch: int, frames: int) -> tuple[Tensor, Tensor | None]:
+        """The condition (B, T, L + 1, D) of every frame, and its mask (B, L + 1)."""
+        tokens, visible = self.condition(instructions)
+        return tokens.unsqueeze(1).expand(batch, frames, -1, -1), visible
+
+
+def instruction_for(task: str, recorded_task: str, own: str, otherwise: str) -> str:
+    """The instruction of an episode for `task`: its own where it was recorded for that task and has one, else that of
+    the task, `otherwise`."""
+    return own if own and recorded_task == task else otherwise
 
 
 def vocabulary_of(instructions: tuple[str, ...]) -> tuple[str, ...]:
@@ -85,17 +113,17 @@ class ImaginedGoals:
 
 @torch.inference_mode()
 def imagine_goals(
-    model: TextModel, tokenizer: Tokenizer, images: UInt8Array, instruction: str, task: int, *, horizon: int,
-    threshold: float,
+    model: TextModel, tokenizer: Tokenizer, images: UInt8Array, instructions: Sequence[str], task: int, *,
+    horizon: int, threshold: float,
 ) -> ImaginedGoals:
-    """Roll the text model out from first frames (B, H, W, 3); the goal is the first frame whose done signal is above
-    `threshold` (RS-6: t* = min{t : d_t > tau_goal}), else the frame of the highest signal, with found=False."""
+    """Roll the text model out from frames (B, H, W, 3) and their B instructions; the goal is the first frame whose done
+    signal is above `threshold` (RS-6: t* = min{t : d_t > tau_goal}), else that of the highest, with found=False."""
     current = tokenizer.encode(images).unsqueeze(1)
     caches = model.trunk.new_ring_caches(len(images), current.device)
     frames, signals = [np.asarray(images)], list[Tensor]()
     for _ in range(horizon):
         with compute_context(current.device):
-            prediction = model(current, instruction, caches)
+            prediction = model(current, instructions, caches)
         current = tokenizer.normalise(current + prediction.change_BTSD)
         frames.append(tokenizer.decode(current[:, 0]).cpu().numpy())
         signals.append(done_signal(prediction.done_logits_BTKJ[:, 0])[0][:, task])

@@ -184,13 +184,14 @@ class CrossAttention(Attention):
     def __init__(self, width: int, num_heads: int) -> None:
         super().__init__(width, num_heads, cross=True)
 
-    def forward(self, x_BTSD: Tensor, condition_BTND: Tensor) -> Tensor:
+    def forward(self, x_BTSD: Tensor, condition_BTND: Tensor, visible_BN: Tensor | None = None) -> Tensor:
         batch, frames, tokens, width = x_BTSD.shape
         assert self.condition is not None
         q = self.heads(self.project(self.norm(x_BTSD))).flatten(0, 1).transpose(1, 2)
         kv = self.condition(condition_BTND).view(batch * frames, -1, 2, self.num_heads, width // self.num_heads)
         k, v = kv.permute(2, 0, 3, 1, 4).unbind(0)
-        out: Tensor = self.out(attend(q, k, v).transpose(1, 2).reshape(batch, frames, tokens, width))
+        mask = None if visible_BN is None else visible_BN.repeat_interleave(frames, 0)[:, None, None]
+        out: Tensor = self.out(attend(q, k, v, mask).transpose(1, 2).reshape(batch, frames, tokens, width))
         return out
 
 
@@ -204,10 +205,12 @@ class SpatioTemporalBlock(nn.Module):
             nn.LayerNorm(width), nn.Linear(width, 4 * width), nn.SiLU(), nn.Linear(4 * width, width)
         )
 
-    def forward(self, x_BTSD: Tensor, condition_BTND: Tensor, cache: TemporalCache) -> Tensor:
+    def forward(
+        self, x_BTSD: Tensor, condition_BTND: Tensor, cache: TemporalCache, visible_BN: Tensor | None = None
+    ) -> Tensor:
         x_BTSD = x_BTSD + self.spatial(x_BTSD)
         x_BTSD = x_BTSD + self.temporal(x_BTSD, cache)
-        x_BTSD = x_BTSD + self.cross(x_BTSD, condition_BTND)
+        x_BTSD = x_BTSD + self.cross(x_BTSD, condition_BTND, visible_BN)
         out: Tensor = x_BTSD + self.mlp(x_BTSD)
         return out
 
@@ -232,11 +235,15 @@ class SpatioTemporalTransformer(nn.Module):
         return [RingCache(times) for _ in self.blocks]
 
     def forward(
-        self, x_BTSD: Tensor, condition_BTND: Tensor, caches: list[TemporalCache] | list[RingCache] | None = None
+        self, x_BTSD: Tensor, condition_BTND: Tensor, caches: list[TemporalCache] | list[RingCache] | None = None,
+        visible_BN: Tensor | None = None,
     ) -> Tensor:
-        """Features (B, T, S, D). With caches, frames continue where the caches' frames end."""
+        """Features (B, T, S, D). With caches, frames continue where the caches' frames end.
+
+        visible_BN: False where a condition token is padding; None where none is.
+        """
         for block, cache in zip(self.blocks, caches or self.new_caches(), strict=True):
-            x_BTSD = block(x_BTSD, condition_BTND, cache)
+            x_BTSD = block(x_BTSD, condition_BTND, cache, visible_BN)
         if caches and isinstance(caches[0], RingCache):
             caches[0].times.advance()
         out: Tensor = self.norm(x_BTSD)

@@ -31,19 +31,20 @@ MOST_ROWS = 65535
 
 def roll_out_on_device(
     model: FrameModel, tokenizer: Tokenizer, real_BTSL: Tensor, anchors_BT: Tensor, condition_BTND: Tensor,
-    dtype: torch.dtype,
+    dtype: torch.dtype, visible_BN: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return next_latents, positions and done_logits of frames 1..T, as training.dynamics.RolloutTerms.
 
     Args:
         real_BTSL: normalised latents of the recorded frames.
         anchors_BT: True where the model goes on from the recorded frame; the first frame always is one.
+        visible_BN: False where a condition token is padding; None where none is.
     """
     batch, steps = condition_BTND.shape[:2]
     given = F.pad(real_BTSL, (0, 0, 0, 1))  # the register's row; the model adds its own value to these zeros
     taken = F.pad(anchors_BT[:, :, None, None].expand(*real_BTSL.shape[:3], 1), (0, 0, 0, 1), value=True)
     with torch.autocast(given.device.type, enabled=False):
-        network = _Network(model, batch, given.shape[2], steps, condition_BTND, dtype)
+        network = _Network(model, batch, given.shape[2], steps, condition_BTND, visible_BN, dtype)
         frames, features = list[Tensor](), list[Tensor]()
         current = given[:, 0]
         for t in range(steps):
@@ -63,7 +64,8 @@ class _Network:
     """A model's layers made ready for one iteration."""
 
     def __init__(
-        self, model: FrameModel, batch: int, tokens: int, steps: int, condition_BTND: Tensor, dtype: torch.dtype
+        self, model: FrameModel, batch: int, tokens: int, steps: int, condition_BTND: Tensor,
+        visible_BN: Tensor | None, dtype: torch.dtype,
     ) -> None:
         blocks: list[SpatioTemporalBlock] = list(model.trunk.blocks)  # type: ignore[arg-type]
         spatial, temporal = [block.spatial for block in blocks], [block.temporal for block in blocks]
@@ -85,6 +87,7 @@ class _Network:
         self.change = _Layers(*_after_norm([model.trunk.norm], [model.change]), dtype)
         conditions = [a.condition for a in cross if a.condition is not None]
         self.conditions = _condition_heads(condition_BTND.to(dtype), *_plain(conditions), heads)
+        self.visible = None if visible_BN is None else visible_BN[:, None, None]
         shape = (steps, batch * tokens, 3, heads, width // heads)
         self.pasts = [_Past(condition_BTND.new_empty(shape, dtype=dtype), model.trunk.window) for _ in blocks]
         self.steps = steps
@@ -101,7 +104,7 @@ class _Network:
             x = x + self.temporal_out(_attend(q, keys, values).flatten(1), i, t)
             x, normal = self._normalise(x)
             q = self.cross_in(normal, i, t).view(self.shape).transpose(1, 2)
-            mixed = F.scaled_dot_product_attention(q, *self.conditions[i * self.steps + t])
+            mixed = F.scaled_dot_product_attention(q, *self.conditions[i * self.steps + t], attn_mask=self.visible)
             x = x + self.cross_out(mixed.transpose(1, 2).reshape(x.shape), i, t)
             x, normal = self._normalise(x)
             x = x + self.mlp_out(F.silu(self.mlp_in(normal, i, t)), i, t)

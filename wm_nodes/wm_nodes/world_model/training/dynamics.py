@@ -227,11 +227,12 @@ def wants_few_kernels(device: torch.device) -> bool:
 
 
 def roll_out_for_device(
-    model: FrameModel, tokenizer: Tokenizer, real: Tensor, anchors: Tensor, condition: Tensor
+    model: FrameModel, tokenizer: Tokenizer, real: Tensor, anchors: Tensor, condition: Tensor,
+    visible: Tensor | None = None,
 ) -> RolloutTerms:
     """roll_out in few kernels: the same numbers to rounding. See device_rollout for the arguments."""
     dtype = torch.bfloat16 if has_fast_bfloat16(real.device) else torch.float32
-    return RolloutTerms(*roll_out_on_device(model, tokenizer, real, anchors, condition, dtype))
+    return RolloutTerms(*roll_out_on_device(model, tokenizer, real, anchors, condition, dtype, visible))
 
 
 def rollout_losses(

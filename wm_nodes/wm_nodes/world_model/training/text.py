@@ -1,6 +1,7 @@
 """Train WM_txt on demonstrations: from a first frame and an instruction, the golden trajectory (RS-4). Shapes:
 B episodes, T steps, S tokens, D values per token, J tasks, P probed values."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.dynamics import ActionModel, Prediction
 from wm_nodes.world_model.precision import compute_context
-from wm_nodes.world_model.text import TextModel, vocabulary_of
+from wm_nodes.world_model.text import TextModel, instruction_for, vocabulary_of
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.dynamics import (
     LatentEpisodes,
@@ -30,15 +31,16 @@ STEPS_AFTER_SUCCESS = 2
 
 def train_text_model(
     tokenizer: Tokenizer, action_model: ActionModel, episodes: EpisodeArrays, data: LatentEpisodes,
-    instructions: tuple[str, ...], config: RunConfig, seed: int, run_dir: Path | None,
+    instructions: Sequence[str], config: RunConfig, seed: int, run_dir: Path | None,
 ) -> tuple[TextModel, dict[str, float]]:
-    """Train on successful noiseless episodes, cut shortly after success; warm-started from the action model.
+    """Train on successful noiseless episodes, cut shortly after success, each with its own instruction for its task;
+    warm-started from the action model.
 
     Args:
-        instructions: one per task of the episodes.
+        instructions: one per task, for episodes that were recorded for another one.
 
     Raises:
-        ValueError: no successful demonstration.
+        ValueError: no successful demonstration, or an instruction without or with too many words.
     """
     rows = golden_rows(episodes)
     if not len(rows):
@@ -47,8 +49,9 @@ def train_text_model(
     with initial_weights(seed, "text_model_init"):
         model = TextModel(
             settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
-            vocabulary=vocabulary_of(instructions), num_tasks=len(instructions),
+            vocabulary=vocabulary_of((*instructions, *episodes.instructions)), num_tasks=len(instructions),
         )
+    model.condition(row_instructions(episodes, rows, instructions))  # raises before a long training, not in it
     shared = {name: t for name, t in action_model.state_dict().items() if not name.startswith("condition.")}
     model.load_state_dict(shared, strict=False)
     model.to(tokenizer.device)
@@ -63,8 +66,9 @@ def train_text_model(
         steps = int(chosen[:, 2].max())
         index, _, length = torch.from_numpy(chosen).to(tokenizer.device).unbind(1)
         mask = (torch.arange(steps, device=length.device) < length[:, None]).float()
+        texts = row_instructions(episodes, chosen, instructions)
         with compute_context(tokenizer.device):
-            terms = _roll_out(model, tokenizer, data.latents[index][:, :1].float(), instructions[task], steps)
+            terms = _roll_out(model, tokenizer, data.latents[index][:, :1].float(), texts, steps)
         all_heads = torch.ones(len(index), settings.num_done_heads, device=length.device)
         return rollout_losses(terms, tokenizer, data, index, mask, all_heads, settings)
 
@@ -72,16 +76,18 @@ def train_text_model(
     return model, loop.run(loss)
 
 
-def _roll_out(model: TextModel, tokenizer: Tokenizer, first: Tensor, instruction: str, steps: int) -> RolloutTerms:
+def _roll_out(
+    model: TextModel, tokenizer: Tokenizer, first: Tensor, instructions: Sequence[str], steps: int
+) -> RolloutTerms:
     if wants_few_kernels(first.device):
-        condition = model.condition(instruction).expand(len(first), steps, -1, -1)
+        condition, visible = model.condition_of(instructions, len(first), steps)
         real = first.expand(-1, steps, -1, -1)
         anchors = torch.arange(steps, device=first.device).expand(len(first), -1) == 0
-        return roll_out_for_device(model, tokenizer, real, anchors, condition)
+        return roll_out_for_device(model, tokenizer, real, anchors, condition, visible)
     caches = model.trunk.new_caches()
 
     def predict(t: int, latents: Tensor) -> Prediction:
-        return model(latents, instruction, caches)  # type: ignore[no-any-return]
+        return model(latents, instructions, caches)  # type: ignore[no-any-return]
 
     return roll_out(predict, tokenizer, first, steps)
 
@@ -100,3 +106,15 @@ def golden_rows(episodes: EpisodeArrays) -> np.ndarray[tuple[int, int], np.dtype
             if len(wins) and wins[0] > 0 and behaviour == get_task(name).demonstrator:
                 rows.append((episode, task, min(int(wins[0]) + STEPS_AFTER_SUCCESS, int(episodes.lengths[episode]))))
     return np.array(rows, np.int64).reshape(-1, 3)
+
+
+def row_instructions(
+    episodes: EpisodeArrays, rows: np.ndarray[tuple[int, int], np.dtype[np.int64]], instructions: Sequence[str]
+) -> list[str]:
+    """The instruction of each of the golden `rows` for its task; `instructions`: one per task, see instruction_for."""
+    return [
+        instruction_for(
+            episodes.tasks[task], episodes.recorded_tasks[episode], episodes.instructions[episode], instructions[task]
+        )
+        for episode, task, _ in rows
+    ]
