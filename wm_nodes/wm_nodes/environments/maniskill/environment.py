@@ -19,7 +19,7 @@ from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.environments.maniskill.cameras import table_top_cameras
-from wm_nodes.environments.maniskill.scenes import make_scene, render
+from wm_nodes.environments.maniskill.scenes import make_scene, render, renew_physics
 
 CONTROLLER_RANGE_M = 0.1
 """A full-scale action of ManiSkill's stock Panda controller."""
@@ -27,7 +27,8 @@ GRIPPER_CLOSED = -1.0
 
 
 class ManiSkillEnvironment:
-    """The simulator. A state is the commanded tool position in the robot base frame, m.
+    """The simulator. A state is the commanded tool position in the robot base frame, m. An episode follows from its
+    seed and its actions, bit for bit: not from the episodes before it, nor from num_envs.
 
     end_on_success=False lets an episode go on to the step limit: a done head needs frames after success.
     pictures=False leaves them black: a step is then physics alone, in a third of the time.
@@ -78,6 +79,7 @@ class ManiSkillEnvironment:
         for i in np.flatnonzero(mask):
             self._num_resets += 1
             seed = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else int(seeds[i])
+            renew_physics(self._scenes[i])
             self._scenes[i].reset(seed=seed % 2**32)
             self._steps[i] = 0
             self._episode_ids[i] = self._num_resets
