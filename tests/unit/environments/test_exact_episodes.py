@@ -79,6 +79,15 @@ def test_an_episode_is_the_same_after_others_beside_others_and_in_any_order(one:
         replay(one, [episode])
 
 
+def test_physics_that_is_not_renewed_remembers_earlier_episodes(one: Watched) -> None:
+    env = ManiSkillEnvironment("push_cube", CONFIG.simulation, pictures=False, new_physics=False)
+    episodes = [scripted_episode(env, "expert", seed, 1).ground_truth for seed in PUSHED]
+    env.close()
+    renewed = [scripted_episode(one, "expert", seed, 1).ground_truth for seed in PUSHED]
+    np.testing.assert_array_equal(episodes[0], renewed[0])
+    assert any(not np.array_equal(*pair) for pair in zip(episodes[1:], renewed[1:], strict=True))
+
+
 def test_evaluation_does_not_depend_on_the_number_of_simulators(one: Watched, three: Watched) -> None:
     policy = pushing_policy()
     results = [evaluate(policy, env, 5, 1_000_000, deterministic=False) for env in (one, three)]
