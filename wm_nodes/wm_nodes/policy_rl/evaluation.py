@@ -9,8 +9,11 @@ from numpy.typing import NDArray
 
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.statistics import wilson_interval
-from wm_nodes.core.types import BoolArray, Environment, UInt64Array
+from wm_nodes.core.types import BoolArray, Environment, FloatArray, Observation, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
+
+ROWS = 16
+"""Of each call of the policy, the last one filled up: products of another number of rows may round otherwise."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +53,8 @@ def evaluate(
 ) -> EvaluationResult:
     """Play one episode per seed. Environments that finish take the next seed, so none waits for the slowest.
 
-    Action noise, where not deterministic, comes from the stream (episode seed, step): the result does not depend on
-    which environment played an episode.
+    Action noise, where not deterministic, comes from the stream (episode seed, step), and the policy acts on ROWS rows
+    at a time: an episode does not depend on the environment that plays it, on the others, or on their number.
 
     Args:
         on_progress: called with (episodes done, successes); may raise to stop.
@@ -75,7 +78,7 @@ def evaluate(
                 _noise(first_seed + max(int(episode), 0), int(step), env.spec.action_dim)
                 for episode, step in zip(playing, observation.episode_step, strict=True)
             ])
-        result = env.step(policy.act(observation.image, observation.state, noise=noise).actions)
+        result = env.step(_act(policy, observation, noise))
         observation = result.observation
         ended = (result.terminated | result.truncated) & result.valid & (playing >= 0)
         if not ended.any():
@@ -95,6 +98,17 @@ def evaluate(
         on_progress(done, int(success.sum()))
     low, high = wilson_interval(int(success.sum()), episodes)
     return EvaluationResult(success, length, first_seed, low, high)
+
+
+def _act(policy: ImagePolicy, seen: Observation, noise: FloatArray | None) -> FloatArray:
+    """Actions (N, A), from calls of ROWS rows."""
+    num_envs = len(seen.image)
+    calls = np.arange(num_envs + -num_envs % ROWS).reshape(-1, ROWS) % num_envs
+    actions = [
+        policy.act(seen.image[rows], seen.state[rows], noise=None if noise is None else noise[rows]).actions
+        for rows in calls
+    ]
+    return np.concatenate(actions)[:num_envs]
 
 
 def _seeds(first_seed: int, playing: NDArray[np.int64]) -> UInt64Array:

@@ -99,9 +99,11 @@ def _collect_shard(path: Path, start: int, stop: int, plan: CollectionPlan, writ
 
 @functools.cache
 def _worker_environment(task: str, simulation_json: str, end_on_success: bool) -> ManiSkillEnvironment:
-    """One simulator per worker process: building it costs seconds."""
+    """One simulator per worker process: building it costs seconds. Its physics is not renewed, so that demonstrations,
+    and policies that begin with them, stay what they were.
+    """
     config = SimulationConfig.model_validate_json(simulation_json)
-    return ManiSkillEnvironment(task, config, 1, end_on_success=end_on_success)
+    return ManiSkillEnvironment(task, config, 1, end_on_success=end_on_success, new_physics=False)
 
 
 def _make_behaviour_actor(env: ManiSkillEnvironment, plan: CollectionPlan) -> Callable[[int, int], Episode]:

@@ -19,7 +19,7 @@ from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.environments.maniskill.cameras import table_top_cameras
-from wm_nodes.environments.maniskill.scenes import make_scene, render
+from wm_nodes.environments.maniskill.scenes import make_scene, render, renew_physics
 
 CONTROLLER_RANGE_M = 0.1
 """A full-scale action of ManiSkill's stock Panda controller."""
@@ -27,15 +27,17 @@ GRIPPER_CLOSED = -1.0
 
 
 class ManiSkillEnvironment:
-    """The simulator. A state is the commanded tool position in the robot base frame, m.
+    """The simulator. A state is the commanded tool position in the robot base frame, m. An episode follows from its
+    seed and its actions, bit for bit: not from the episodes before it, nor from num_envs.
 
     end_on_success=False lets an episode go on to the step limit: a done head needs frames after success.
     pictures=False leaves them black: a step is then physics alone, in a third of the time.
+    new_physics=False leaves the physics its traces of earlier episodes; contacts then depend on them.
     """
 
     def __init__(
         self, task: str, config: SimulationConfig, num_envs: int = 1, seed: int = 0, *, end_on_success: bool = True,
-        pictures: bool = True,
+        pictures: bool = True, new_physics: bool = True,
     ) -> None:
         self.spec = simulation_spec(task, config, num_envs)
         self._task = get_task(task)
@@ -43,6 +45,7 @@ class ManiSkillEnvironment:
         self._seed = seed
         self._end_on_success = end_on_success
         self._pictures = pictures
+        self._new_physics = new_physics
         self._scenes = [make_scene(self._task.scene, config) for _ in range(num_envs)]
         self._num_resets = 0
         self._images = np.zeros((num_envs, self.spec.height, self.spec.width, 3), np.uint8)
@@ -78,6 +81,8 @@ class ManiSkillEnvironment:
         for i in np.flatnonzero(mask):
             self._num_resets += 1
             seed = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else int(seeds[i])
+            if self._new_physics:
+                renew_physics(self._scenes[i])
             self._scenes[i].reset(seed=seed % 2**32)
             self._steps[i] = 0
             self._episode_ids[i] = self._num_resets
