@@ -98,7 +98,7 @@ class Task:
     """(behaviour, ground truth (P,) at the reset, random stream, metres of a full-scale action) -> act(ground truth
     (P,), state (S,)) -> action (A,) of one scripted episode. Raises ValueError for an unknown behaviour."""
     actions: Literal["translation", "pose"] = "translation"
-    """What an action is, see core/action_spaces.py: translation (A = S = 3), or pose (7), with rotation and gripper."""
+    """What an action is, see core/action_spaces.py: translation, A = S = 3, or pose, 7 with rotation and gripper."""
     instruct: Callable[[Scene], str] | None = None
     """The instruction in one scene; None: the task has a scene of its own, and simulation.scenes is empty."""
     clips: ClipRules | None = None

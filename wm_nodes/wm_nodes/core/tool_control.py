@@ -52,6 +52,14 @@ def _moved_pose(xp: Any, states: Any, changes: Any) -> Any:
     return xp.concatenate([states[..., :3] + changes[..., :3], rotation, changes[..., 6:]], -1)
 
 
+def hold_actions(states: FloatArray, spec: EnvironmentSpec) -> FloatArray:
+    """Actions (N, A) that leave the commanded states (N, S) as they are."""
+    held = np.zeros((len(states), spec.action_dim), np.float32)
+    if moves_pose(spec):
+        held[:, 6:] = np.clip(states[:, 6:], -1, 1)
+    return held
+
+
 def check_actions(actions: FloatArray, spec: EnvironmentSpec) -> None:
     """Raise ValueError unless actions are (N, A), finite and inside [-1, 1]."""
     expected = (spec.num_envs, spec.action_dim)

@@ -1,16 +1,20 @@
 """Where the parts of a scene lie at the start of an episode. World frame, m. No simulator."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Point = NDArray[np.float64]
-CONTAINER_LOW_M, CONTAINER_HIGH_M = (-0.10, -0.16), (0.10, 0.16)
+Rectangle = tuple[tuple[float, float], tuple[float, float]]
+"""Least and largest x y."""
+ANYWHERE: Rectangle = (-0.10, -0.13), (0.10, 0.13)
+"""Where objects and carpets may lie."""
+CONTAINERS: Rectangle = (-0.10, -0.16), (0.10, 0.16)
 CONTAINER_CLEARANCE_M = 0.125
 """Least distance of a container's centre from what the object touches on its way: its radius, half a bar, a finger."""
-MAX_TRIES = 1000
+MAX_TRIES = 10_000
 
 
 @dataclass(frozen=True)
@@ -29,24 +33,19 @@ Place = Callable[[np.random.Generator], Layout]
 """Draws the layout of an episode."""
 
 
-def draw(
-    rng: np.random.Generator, low: tuple[float, float], high: tuple[float, float],
-    accept: Callable[[Point], bool] = lambda point: True,
-) -> Point:
-    """Draw x y from a rectangle until it is accepted. Raises RuntimeError where that does not come about."""
+def draw(rng: np.random.Generator, rectangles: Sequence[Rectangle], accept: Callable[..., bool]) -> list[Point]:
+    """Draw one x y from each rectangle, again and again until accept(*them). Raises RuntimeError where that does not
+    come about."""
     for _ in range(MAX_TRIES):
-        point = rng.uniform(low, high)
-        if accept(point):
-            return point
-    raise RuntimeError(f"no place between {low} and {high} is far enough from the others; make the rectangle larger")
+        points = [rng.uniform(low, high) for low, high in rectangles]
+        if accept(*points):
+            return points
+    raise RuntimeError(f"{MAX_TRIES} draws from {rectangles} were all too near to each other; make them larger")
 
 
-def draw_container(rng: np.random.Generator, start: Point, end: Point) -> Point:
-    """A place for the container beside the straight way from start to end."""
-    return draw(
-        rng, CONTAINER_LOW_M, CONTAINER_HIGH_M,
-        lambda point: distance_to_segment(point, start, end) > CONTAINER_CLEARANCE_M,
-    )
+def free_of(container: Point, start: Point, end: Point) -> bool:
+    """Whether the container lies beside the straight way from start to end."""
+    return distance_to_segment(container, start, end) > CONTAINER_CLEARANCE_M
 
 
 def distance_to_segment(point: Point, start: Point, end: Point) -> float:

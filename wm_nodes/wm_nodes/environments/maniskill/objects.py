@@ -53,7 +53,7 @@ def on_table(truth: FloatArray) -> BoolArray:
 
 
 def pushed(truth: FloatArray, direction: int, distance_m: float, aside_m: float) -> BoolArray:
-    """Whether the object went at least `distance_m` along x, forwards (1) or backwards (-1), at most `aside_m` to the
+    """Whether the object went at least `distance_m` along x in `direction`, 1 or -1, at most `aside_m` to the
     side, and lies on the table."""
     way = truth[..., OBJECT][..., :2] - truth[..., OBJECT_START]
     return np.asarray((direction * way[..., 0] >= distance_m) & (np.abs(way[..., 1]) <= aside_m) & on_table(truth))

@@ -8,7 +8,7 @@ from wm_nodes.config.scenes import Scene
 from wm_nodes.config.tasks import Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
-from wm_nodes.environments.maniskill.layouts import Layout, draw, draw_container
+from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, Point, draw, free_of
 from wm_nodes.environments.maniskill.pose_scripts import carry_waypoints, scripted
 
 RADIUS_M, HEIGHT_M = 0.05, 0.02
@@ -17,9 +17,11 @@ LEAST_WAY_M = 0.11
 
 
 def place(rng: np.random.Generator) -> Layout:
-    start = draw(rng, (-0.10, -0.13), (0.10, 0.13))
-    goal = draw(rng, (-0.10, -0.13), (0.10, 0.13), lambda point: bool(np.linalg.norm(point - start) > LEAST_WAY_M))
-    return Layout(start, rng.uniform(-np.pi / 4, np.pi / 4), draw_container(rng, start, goal), goal, carpet=True)
+    def apart(start: Point, goal: Point, container: Point) -> bool:
+        return bool(np.linalg.norm(goal - start) > LEAST_WAY_M) and free_of(container, start, goal)
+
+    start, goal, container = draw(rng, (ANYWHERE, ANYWHERE, CONTAINERS), apart)
+    return Layout(start, rng.uniform(-np.pi / 4, np.pi / 4), container, goal, carpet=True)
 
 
 def scene() -> Any:

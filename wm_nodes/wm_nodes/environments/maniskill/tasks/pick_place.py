@@ -8,7 +8,7 @@ from wm_nodes.config.scenes import Scene
 from wm_nodes.config.tasks import Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
-from wm_nodes.environments.maniskill.layouts import Layout, draw, draw_container
+from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, draw, free_of
 from wm_nodes.environments.maniskill.pose_scripts import place_waypoints, scripted
 
 RIM_M = 0.015
@@ -19,8 +19,7 @@ STILL_M_S = 0.02
 
 
 def place(rng: np.random.Generator) -> Layout:
-    start = draw(rng, (-0.10, -0.13), (0.10, 0.13))
-    container = draw_container(rng, start, start)
+    start, container = draw(rng, (ANYWHERE, CONTAINERS), lambda start, container: free_of(container, start, start))
     return Layout(start, rng.uniform(-np.pi / 4, np.pi / 4), container, container)
 
 

@@ -8,7 +8,7 @@ from wm_nodes.config.scenes import Scene
 from wm_nodes.config.tasks import Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
-from wm_nodes.environments.maniskill.layouts import Layout, draw, draw_container
+from wm_nodes.environments.maniskill.layouts import CONTAINERS, Layout, Point, Rectangle, draw, free_of
 from wm_nodes.environments.maniskill.pose_scripts import push_waypoints, scripted
 
 DISTANCE_M, ASIDE_M = 0.10, 0.05
@@ -19,16 +19,17 @@ BEYOND_M = 0.04
 
 
 def place(rng: np.random.Generator) -> Layout:
-    return place_on_way(rng, 1, (-0.10, -0.12), (0.02, 0.12))
+    return place_on_way(rng, 1, ((-0.10, -0.12), (0.02, 0.12)))
 
 
-def place_on_way(
-    rng: np.random.Generator, direction: int, low: tuple[float, float], high: tuple[float, float]
-) -> Layout:
+def place_on_way(rng: np.random.Generator, direction: int, objects: Rectangle) -> Layout:
     """The object in a rectangle, its way along x (1: forwards, -1: backwards) free of the container."""
-    start = draw(rng, low, high)
     way = np.array([direction, 0.0])
-    container = draw_container(rng, start - BEHIND_M * way, start + (DISTANCE_M + BEYOND_M) * way)
+
+    def free(start: Point, container: Point) -> bool:
+        return free_of(container, start - BEHIND_M * way, start + (DISTANCE_M + BEYOND_M) * way)
+
+    start, container = draw(rng, (objects, CONTAINERS), free)
     return Layout(start, rng.uniform(-np.pi / 4, np.pi / 4), container, start + DISTANCE_M * way)
 
 

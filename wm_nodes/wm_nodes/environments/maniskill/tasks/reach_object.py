@@ -8,21 +8,22 @@ from wm_nodes.config.scenes import Scene
 from wm_nodes.config.tasks import Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
-from wm_nodes.environments.maniskill.layouts import Layout, draw, draw_container
+from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, Point, draw, free_of
 from wm_nodes.environments.maniskill.pose_scripts import CLOSED, scripted, waypoint
 from wm_nodes.environments.maniskill.table_top import TOOL, above_cube
 
 TOLERANCE_M = 0.02
+LEAST_WAY_M = 0.05
 
 
 def place(rng: np.random.Generator) -> Layout:
-    start = draw(rng, (-0.10, -0.13), (0.10, 0.13), far_from_tool)
-    return Layout(start, rng.uniform(-np.pi / 4, np.pi / 4), draw_container(rng, start, start), start)
+    start, container = draw(rng, (ANYWHERE, CONTAINERS), apart)
+    return Layout(start, rng.uniform(-np.pi / 4, np.pi / 4), container, start)
 
 
-def far_from_tool(point: np.ndarray[Any, np.dtype[np.float64]]) -> bool:
-    """Whether the tool, which starts within about 6 cm of x = y = 0, is not there yet."""
-    return bool(np.linalg.norm(point) > 0.05)
+def apart(start: Point, container: Point) -> bool:
+    """The tool starts near x = y = 0, at 15 to 19 cm, and is not to be there yet."""
+    return bool(np.linalg.norm(start) > LEAST_WAY_M) and free_of(container, start, start)
 
 
 def scene() -> Any:
