@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import model_tasks
-from wm_nodes.policy_rl.factories import ACTION_DIM, STATE_DIM
+from wm_nodes.core.specs import simulation_spec
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import save_video_folder
@@ -21,13 +21,13 @@ from wm_nodes.world_model.folder import action_model_class
 def make_model_folder(folder: Path, config: RunConfig | None = None) -> Path:
     """Tokenizer and action model of the configuration (smoke by default), untrained, for its scene's tasks."""
     config = config or load_config("smoke")
-    tasks = model_tasks(config.task)
+    tasks, spec = model_tasks(config.task), simulation_spec(config.task, config.simulation, 1)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         tokenizer = Tokenizer(config.tokenizer, 64, 128)
         action = action_model_class(config.tokenizer.kind)(
             config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
-            action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),
+            action_dim=spec.action_dim, state_dim=spec.state_dim, num_tasks=len(tasks),
         )
     return save_model_folder(folder, tokenizer, action, None, config, tasks=tasks, story={"made": {"seed": 0}})
 
@@ -36,7 +36,7 @@ def make_stepped_folder(folder: Path, task: str = "push_cube", **clip: int) -> P
     """A video model that goes on from its own frames, of pictures of 64 x 128, and its success reader, untrained."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        network = VideoNetwork(NetworkSettings(6, ACTION_DIM, text_dim=4, width=16, depth=2, patch=1, change_std=0.5))
+        network = VideoNetwork(NetworkSettings(6, 3, text_dim=4, width=16, depth=2, patch=1, change_std=0.5))
         for parameter in network.parameters():  # what starts at zero makes the network say nothing
             if not parameter.any():
                 torch.nn.init.normal_(parameter, std=0.1)

@@ -1,4 +1,5 @@
-"""The contract of core.types.Environment, kept by the simulator, the imagined environment and the benchmark's."""
+"""The contract of core.types.Environment, kept by the simulator, the imagined environment and the benchmark's: where
+the tool only moves, and where it turns and grasps in the procedural scenes, too."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -9,46 +10,58 @@ from model_folders import make_model_folder
 
 from benchmarks.speed.noop_environment import NoopEnvironment
 from wm_nodes.config.load import load_config
+from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import Environment, FloatArray, Observation, StepResult
 from wm_nodes.world_model import ImaginedEnvironment, WorldModels, load_model_folder
 
 N, LIMIT = 2, 3
-BASE = load_config("smoke")
-CONFIG = BASE.model_copy(update={"simulation": BASE.simulation.model_copy(update={"max_episode_steps": LIMIT})})
-SPEC = simulation_spec(CONFIG.task, CONFIG.simulation, N)
 SEEDS = np.array([11, 12], np.uint64)
 Make = Callable[[int], Environment]
 
 
-def make_simulator(seed: int) -> Environment:
+def config_of(task: str) -> RunConfig:
+    base = load_config("smoke", {"task": task})
+    return base.model_copy(update={"simulation": base.simulation.model_copy(update={"max_episode_steps": LIMIT})})
+
+
+CONFIGS = {"": config_of("push_cube"), " of poses": config_of("push")}
+
+
+def make_simulator(config: RunConfig, seed: int) -> Environment:
     from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
-    return ManiSkillEnvironment(CONFIG.task, CONFIG.simulation, num_envs=N, seed=seed)
+    return ManiSkillEnvironment(config.task, config.simulation, num_envs=N, seed=seed)
 
 
 @pytest.fixture(scope="module")
-def models(tmp_path_factory: pytest.TempPathFactory) -> WorldModels:
-    return load_model_folder(make_model_folder(tmp_path_factory.mktemp("model") / "model", CONFIG))
+def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, WorldModels]:
+    folder = tmp_path_factory.mktemp("model")
+    made = {kind: make_model_folder(folder / config.task, config) for kind, config in CONFIGS.items()}
+    return {kind: load_model_folder(path) for kind, path in made.items()}
 
 
-@pytest.fixture(params=["maniskill", "imagined", "still"])
-def make(request: pytest.FixtureRequest, models: WorldModels) -> Iterator[Make]:
+@pytest.fixture(params=[f"{name}{kind}" for kind in CONFIGS for name in ("maniskill", "imagined", "still")])
+def make(request: pytest.FixtureRequest, models: dict[str, WorldModels]) -> Iterator[Make]:
     """Builds the environment under test from a root seed; what it built is closed."""
     built: list[Environment] = []
+    name, _, rest = request.param.partition(" ")
+    kind = f" {rest}" if rest else ""
+    config = CONFIGS[kind]
+    spec = simulation_spec(config.task, config.simulation, N)
 
     def build(seed: int) -> Environment:
-        if request.param == "maniskill":
-            environment = make_simulator(seed)
-        elif request.param == "imagined":
+        if name == "maniskill":
+            environment = make_simulator(config, seed)
+        elif name == "imagined":
             rng = numpy_stream(0, "contract")
-            images = rng.integers(0, 256, (5, SPEC.height, SPEC.width, 3), np.uint8)
-            states = rng.uniform(0.5, 0.7, (5, 3)).astype(np.float32)
-            reward = CONFIG.reward.model_copy(update={"success_threshold": 1.0, "uncertainty_limit": 0.0})
-            environment = ImaginedEnvironment(models, SPEC, (images, states), reward, num_envs=N, seed=seed)
+            images = rng.integers(0, 256, (5, spec.height, spec.width, 3), np.uint8)
+            states = rng.uniform(0.5, 0.7, (5, spec.state_dim)).astype(np.float32)
+            reward = config.reward.model_copy(update={"success_threshold": 1.0, "uncertainty_limit": 0.0})
+            environment = ImaginedEnvironment(models[kind], spec, (images, states), reward, num_envs=N, seed=seed)
         else:
-            environment = NoopEnvironment(SPEC)
+            environment = NoopEnvironment(spec)
         built.append(environment)
         return environment
 
@@ -62,8 +75,8 @@ def ends(environment: Environment) -> bool:
     return not isinstance(environment, NoopEnvironment)
 
 
-def actions(step: int) -> FloatArray:
-    return numpy_stream(step, "actions").uniform(-0.3, 0.3, (N, SPEC.action_dim)).astype(np.float32)
+def actions(step: int, environment: Environment) -> FloatArray:
+    return numpy_stream(step, "actions").uniform(-0.3, 0.3, (N, environment.spec.action_dim)).astype(np.float32)
 
 
 def assert_observation(observation: Observation, environment: Environment) -> None:
@@ -83,14 +96,14 @@ def assert_equal(first: Observation, second: Observation, rows: slice = slice(No
 
 
 def run_to_the_limit(environment: Environment) -> list[StepResult]:
-    return [environment.step(actions(step)) for step in range(LIMIT)]
+    return [environment.step(actions(step, environment)) for step in range(LIMIT)]
 
 
 def test_shapes_and_types_are_those_of_the_spec(make: Make) -> None:
     environment = make(0)
     assert environment.spec.num_envs == N
     assert_observation(environment.reset(), environment)
-    result = environment.step(actions(0))
+    result = environment.step(actions(0, environment))
     assert_observation(result.observation, environment)
     for flag in (result.terminated, result.truncated, result.valid):
         assert (flag.dtype, flag.shape) == (np.bool_, (N,))
@@ -102,7 +115,8 @@ def test_shapes_and_types_are_those_of_the_spec(make: Make) -> None:
     assert result.ground_truth.shape == (N, environment.spec.ground_truth_dim)
     goals = environment.goals()
     if goals is not None:
-        assert (goals[0].dtype, goals[0].shape) == (np.uint8, (N, SPEC.height, SPEC.width, 3))
+        spec = environment.spec
+        assert (goals[0].dtype, goals[0].shape) == (np.uint8, (N, spec.height, spec.width, 3))
         assert (goals[1].dtype, goals[1].shape) == (np.bool_, (N,))
 
 
@@ -113,7 +127,7 @@ def test_episode_ids_are_never_used_again_and_grow(make: Make) -> None:
     third = environment.reset(mask=np.array([False, True])).episode_id
     assert first.min() > 0 and first.max() < second.min() and len({*first, *second, third[1]}) == 2 * N + 1
     assert third[0] == second[0] and third[1] > second.max()
-    np.testing.assert_array_equal(environment.step(actions(0)).observation.episode_id, third)
+    np.testing.assert_array_equal(environment.step(actions(0, environment)).observation.episode_id, third)
 
 
 def test_the_step_counter_is_0_after_a_reset_and_counts_the_steps_made(make: Make) -> None:
@@ -125,7 +139,7 @@ def test_the_step_counter_is_0_after_a_reset_and_counts_the_steps_made(make: Mak
 def test_a_reset_by_mask_leaves_the_others_where_they_are(make: Make) -> None:
     environment = make(0)
     environment.reset(seeds=SEEDS)
-    before = environment.step(actions(0)).observation
+    before = environment.step(actions(0, environment)).observation
     after = environment.reset(mask=np.array([False, True]), seeds=SEEDS)
     assert_equal(before, after, slice(0, 1))
     assert after.episode_step.tolist() == [1, 0]
@@ -140,11 +154,11 @@ def test_an_ended_environment_stays_put_and_is_not_valid_until_its_reset(make: M
     results = run_to_the_limit(environment)
     assert all(result.valid.all() and not result.truncated.any() for result in results[:-1])
     assert (results[-1].terminated ^ results[-1].truncated).all()
-    late = environment.step(actions(9))
+    late = environment.step(actions(9, environment))
     assert not (late.valid | late.terminated | late.truncated).any()
     assert_equal(late.observation, results[-1].observation)
     environment.reset(mask=np.array([True, False]))
-    assert environment.step(actions(0)).valid.tolist() == [True, False]
+    assert environment.step(actions(0, environment)).valid.tolist() == [True, False]
 
 
 def test_one_root_seed_gives_one_run_and_an_observation_is_not_written_later(make: Make) -> None:
@@ -153,25 +167,28 @@ def test_one_root_seed_gives_one_run_and_an_observation_is_not_written_later(mak
     assert_equal(shown, second.reset())
     kept = replace(shown, **{name: value.copy() for name, value in vars(shown).items()})
     for step in range(2):
-        mine, other = first.step(actions(step)), second.step(actions(step))
+        mine, other = first.step(actions(step, first)), second.step(actions(step, second))
         assert_equal(mine.observation, other.observation)
         np.testing.assert_array_equal(mine.success_probability, other.success_probability)
     assert_equal(shown, kept)
 
 
-WRONG_ACTIONS = (
-    (np.zeros((N + 1, 3), np.float32), r"shape \(2, 3\).*\(3, 3\)"),
-    (np.zeros((N, 2), np.float32), r"shape \(2, 3\).*\(2, 2\)"),
-    (np.full((N, 3), np.nan, np.float32), "finite.*nan"),
-    (np.full((N, 3), 1.5, np.float32), r"\[-1, 1\].*1\.5"),
-)
+def wrong_actions(size: int) -> tuple[tuple[FloatArray, str], ...]:
+    """And what the refusal says. size: A."""
+    return (
+        (np.zeros((N + 1, size), np.float32), rf"shape \(2, {size}\).*\(3, {size}\)"),
+        (np.zeros((N, 2), np.float32), rf"shape \(2, {size}\).*\(2, 2\)"),
+        (np.full((N, size), np.nan, np.float32), "finite.*nan"),
+        (np.full((N, size), 1.5, np.float32), r"\[-1, 1\].*1\.5"),
+    )
 
 
 def test_a_wrong_action_is_refused_by_value_and_changes_nothing(make: Make) -> None:
     environment, untouched = make(0), make(0)
     environment.reset(seeds=SEEDS)
     untouched.reset(seeds=SEEDS)
-    for wrong, text in WRONG_ACTIONS:
+    for wrong, text in wrong_actions(environment.spec.action_dim):
         with pytest.raises(ValueError, match=text):
             environment.step(wrong)
-    assert_equal(environment.step(actions(0)).observation, untouched.step(actions(0)).observation)
+    action = actions(0, environment)
+    assert_equal(environment.step(action).observation, untouched.step(action).observation)

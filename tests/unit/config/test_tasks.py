@@ -15,6 +15,8 @@ from wm_nodes.config.tasks import VARIABLE, clip_rules, get_task, model_tasks, t
 from wm_nodes.core.specs import simulation_spec
 
 TASKS = ("pull_cube", "push_cube", "reach")
+IN_SCENES = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
+"""Those of the procedural scenes."""
 NAMED_IN = {"launching/scenarios.py", "judge/dataset/build.py", "judge/clip_files.py", "apps/judge_clips.py",
             "policy_rl/train.py"}
 """The default task of launch files, the tasks of a fixed set of clips, two lines of clips.jsonl, an example."""
@@ -33,7 +35,7 @@ def test_a_recorded_specification_of_a_shipped_task_stays_what_it_is(task: str, 
 
 
 def test_the_shipped_tasks_are_found_and_share_models_as_the_shipped_one_says() -> None:
-    assert task_names() == TASKS and default_task() in TASKS
+    assert task_names() == tuple(sorted(TASKS + IN_SCENES)) and default_task() in TASKS
     assert model_tasks("reach") == model_tasks("push_cube") == ("reach", "push_cube")
     assert model_tasks("pull_cube") == ("pull_cube",)
 
@@ -51,7 +53,7 @@ def test_no_module_but_its_file_knows_a_task_by_its_name() -> None:
     root = Path(wm_nodes.__file__).parent
     named = {
         str(path.relative_to(root)) for path in root.rglob("*.py")
-        if re.search(rf"[\"']({'|'.join(TASKS)})[\"']", path.read_text())
+        if re.search(rf"[\"']({'|'.join(TASKS + IN_SCENES)})[\"']", path.read_text())
     }
     assert {name for name in named if not name.startswith("environments/maniskill/tasks/")} == NAMED_IN
 
@@ -73,7 +75,7 @@ def test_launch_files_list_the_tasks_of_a_further_package(tmp_path: Path) -> Non
         [sys.executable, "-c", code], capture_output=True, text=True, check=True,
         env={**os.environ, VARIABLE: "launched_tasks", "PYTHONPATH": path},
     )
-    assert done.stdout == "('pour', 'pull_cube', 'push_cube', 'reach')\n"
+    assert done.stdout == f"{tuple(sorted(('pour', *TASKS, *IN_SCENES)))}\n"
 
 
 def test_the_command_line_and_the_settings_name_the_known_tasks(
@@ -82,7 +84,8 @@ def test_the_command_line_and_the_settings_name_the_known_tasks(
     write_package(tmp_path, "listed_tasks", stir="", _parts="")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv(VARIABLE, " listed_tasks, ")
-    with pytest.raises(ConfigError, match="unknown task 'fly'; choose one of pull_cube, push_cube, reach, stir"):
+    known = ", ".join(sorted((*TASKS, *IN_SCENES, "stir")))
+    with pytest.raises(ConfigError, match=f"unknown task 'fly'; choose one of {known}"):
         load_config("cpu", {"task": "fly"})
     with pytest.raises(SystemExit):
         cli.main(["train-policy", "--task", "fly"])

@@ -190,7 +190,9 @@ def test_a_near_miss_fails_and_is_cut_by_the_step_limit(env: ManiSkillEnvironmen
 def test_every_task_has_an_instruction_of_known_words() -> None:
     assert {get_task(name).instruction for name in task_names()} == {
         "move the gripper above the blue cube", "push the blue cube into the red target",
-        "pull the blue cube into the red target",
+        "pull the blue cube into the red target", "push the object away from the robot",
+        "pull the object towards the robot", "pick up the object and place it in the container",
+        "move the object onto the carpet", "move the gripper above the object",
     }
 
 

@@ -13,17 +13,21 @@ from benchmarks.speed.inputs import NUM_STARTS, interleave
 from benchmarks.speed.simulator import rate_workers, simulator_kinds, simulator_workers
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.action_spaces import TRANSLATION
 from wm_nodes.core.device import CPU
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.policy_rl.device_rollout import rollout_starts
-from wm_nodes.policy_rl.factories import ACTION_DIM, STATE_DIM, models_of
+from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy, PolicyOutput
 from wm_nodes.policy_rl.rollouts import action_noise, collect_rollout
 from wm_nodes.reward import RuleReward
 from wm_nodes.world_model import ImaginedEnvironment, WorldModels
+
+TOOL_DIM = len(TRANSLATION.units)
+"""Of actions and states."""
 
 
 def launch_points(plan: Plan) -> Iterator[Point]:
@@ -83,7 +87,7 @@ class FreeEnvironment(ImaginedEnvironment):
     def __init__(self, models: WorldModels, spec: EnvironmentSpec, config: RunConfig) -> None:
         rng = numpy_stream(config.seed, "benchmark_host")
         images = rng.integers(0, 256, (NUM_STARTS, spec.height, spec.width, 3), np.uint8)
-        states = np.full((len(images), STATE_DIM), 0.5, np.float32)
+        states = np.full((len(images), TOOL_DIM), 0.5, np.float32)
         count = spec.num_envs
         super().__init__(models, spec, (images, states), config.reward, num_envs=count, with_goals=False)
         self._frames, self._signal = np.repeat(images[:1], count, 0), np.zeros(count, np.float32)
@@ -103,7 +107,7 @@ class FreePolicy(ImagePolicy):
     ) -> PolicyOutput:
         count = len(images)
         zeros = np.zeros(count, np.float32)
-        return PolicyOutput(np.zeros((count, ACTION_DIM), np.float32), zeros, zeros)
+        return PolicyOutput(np.zeros((count, TOOL_DIM), np.float32), zeros, zeros)
 
 
 def host_points(plan: Plan, config: RunConfig) -> Iterator[Point]:
@@ -113,7 +117,7 @@ def host_points(plan: Plan, config: RunConfig) -> Iterator[Point]:
     def measure(watch: Stopwatch, envs: int) -> list[float]:
         models = models_of(shipped_model(config.task))
         env = FreeEnvironment(models, simulation_spec(config.task, config.simulation, envs), config)
-        policy = FreePolicy(ImageEncoder(lambda images: images, 1), STATE_DIM, ACTION_DIM, config.policy)
+        policy = FreePolicy(ImageEncoder(lambda images: images, 1), TOOL_DIM, TOOL_DIM, config.policy)
         reward = RuleReward()
         work = partial(collect_rollout, env, policy, reward, plan.num_steps, config.seed, 1)
         return [plan.num_steps * envs / s for s in watch.repeats(work)]
@@ -122,7 +126,7 @@ def host_points(plan: Plan, config: RunConfig) -> Iterator[Point]:
         def draw() -> None:
             rollout_starts(config.seed, 1, plan.num_steps, envs, NUM_STARTS)
             for step in range(plan.num_steps):
-                action_noise(config.seed, 1, step, envs, ACTION_DIM)
+                action_noise(config.seed, 1, step, envs, TOOL_DIM)
 
         return [plan.num_steps * envs / s for s in watch.repeats(draw)]
 

@@ -17,12 +17,11 @@ from benchmarks.video_rl.cost import GROUP, SCENES, pushcube_buffer, toy_buffer
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, model_tasks
+from wm_nodes.core.action_spaces import TRANSLATION
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.device_rollout import DeviceCollector, Step, capture_graph
 from wm_nodes.policy_rl.factories import (
-    ACTION_DIM,
-    STATE_DIM,
     make_device_environment,
     make_endogenous_reward,
     make_imagined_environment,
@@ -40,6 +39,8 @@ from wm_nodes.world_model.training.tokenizer import train_tokenizer
 
 EAGER, CAPTURED, HOST_LOOP = "eager", "captured", "loop over host arrays"
 """Ways to imagine."""
+TOOL_DIM = len(TRANSLATION.units)
+"""Of actions and states."""
 EPISODES = 64
 """Random ones, to train on."""
 WARM_UP = 2
@@ -208,8 +209,8 @@ def random_episodes(config: RunConfig, steps: int) -> EpisodeArrays:
     numbers = len(get_task(config.task).ground_truth_names)
     return EpisodeArrays(
         images=rng.integers(0, 256, (*frames, size, size * len(config.simulation.cameras), 3), np.uint8),
-        states=rng.uniform(0.3, 0.7, (*frames, STATE_DIM)).astype(np.float32),
-        actions=rng.uniform(-1, 1, (EPISODES, steps, ACTION_DIM)).astype(np.float32),
+        states=rng.uniform(0.3, 0.7, (*frames, TOOL_DIM)).astype(np.float32),
+        actions=rng.uniform(-1, 1, (EPISODES, steps, TOOL_DIM)).astype(np.float32),
         ground_truth=rng.uniform(-0.3, 0.3, (*frames, numbers)).astype(np.float32),
         success=rng.random((*frames, len(tasks))) < 0.2, lengths=np.full(EPISODES, steps), tasks=tasks,
         instructions=("",) * EPISODES, behaviours=("random",) * EPISODES, recorded_tasks=(config.task,) * EPISODES,

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.tasks import check_task
 
 PositiveInt = Annotated[int, Field(ge=1)]
@@ -20,6 +21,8 @@ AGENT = "agent"
 
 TaskName = Annotated[str, AfterValidator(check_task)]
 """Name of a task's file, see config/tasks.py."""
+ScenesName = Annotated[str, AfterValidator(check_scenes)]
+"""Name of a split or of a scene, see config/scenes.py."""
 DeviceName = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where models compute: cpu, cuda, cuda:N, or auto (a GPU where there is one), see core/device.py."""
 
@@ -35,7 +38,10 @@ class SettingsSection(BaseModel):
 
 
 class SimulationConfig(SettingsSection):
-    cameras: list[Literal["side", "wrist"]]
+    scenes: ScenesName = ""
+    """Of which scenes an episode has one, by its reset seed: a split of config/scenes.json, or one scene's name. Empty:
+    the task has a scene of its own."""
+    cameras: list[Literal["side", "near", "wrist"]]
     """Rendered side by side, left to right, in every observation."""
     image_size: PositiveInt
     """Height and width of one camera image, px."""
@@ -43,6 +49,8 @@ class SimulationConfig(SettingsSection):
     """Policy and world-model steps per simulated second."""
     max_action_m: PositiveFloat
     """Displacement of the commanded tool position by a full-scale action, m per axis and step."""
+    max_action_rad: PositiveFloat = 0.2
+    """Rotation of the commanded tool by a full-scale action, rad per axis and step; only where Task.actions is pose."""
     workspace_low_m: tuple[float, float, float]
     workspace_high_m: tuple[float, float, float]
     """Box that the commanded tool position stays in, robot base frame, m."""

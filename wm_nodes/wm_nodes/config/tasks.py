@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from wm_nodes.config.scenes import Scene, scenes_of
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -78,7 +80,7 @@ class Task:
     """Everything that is known of one task. Its name is that of its file."""
 
     instruction: str
-    """What the text model and the judge read."""
+    """What the text model and the judge read. Of a task in many scenes, it says `object` and `container`."""
     scene: Callable[[], Any]
     """Returns ManiSkill's environment class, to which scenes.py adds cameras and a plain table top; imports the
     simulator only when it is called. Tasks with the same function share one scene."""
@@ -90,10 +92,15 @@ class Task:
     success: Callable[[Floats], NDArray[np.bool_]]
     """Ground truth (..., P) -> (...,); False where it is NaN."""
     waypoints: Callable[[Floats], list[Floats]]
-    """Ground truth (P,) -> world tool positions (3,) of a demonstration, which MPLib plans a path through."""
+    """Ground truth (P,) -> world tool positions (3,) of a demonstration, which MPLib plans a path through; where
+    actions are poses, states (7,) with the position in the world frame."""
     script: Callable[[str, Floats, np.random.Generator, float], Callable[[Floats, Floats], Floats]]
     """(behaviour, ground truth (P,) at the reset, random stream, metres of a full-scale action) -> act(ground truth
     (P,), state (S,)) -> action (A,) of one scripted episode. Raises ValueError for an unknown behaviour."""
+    actions: Literal["translation", "pose"] = "translation"
+    """What an action is, see core/action_spaces.py: translation, A = S = 3, or pose, 7 with rotation and gripper."""
+    instruct: Callable[[Scene], str] | None = None
+    """The instruction in one scene; None: the task has a scene of its own, and simulation.scenes is empty."""
     clips: ClipRules | None = None
     """None: the judge's data sets have no clips of this task."""
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -144,6 +151,19 @@ def model_tasks(name: str) -> tuple[str, ...]:
 def success(task: str, ground_truth: Floats) -> NDArray[np.bool_]:
     """Whether `task` is done in each (..., P) ground truth; False where it is NaN."""
     return get_task(task).success(ground_truth)
+
+
+def instruction(task: str, scenes: str) -> str:
+    """The instruction of a batch of episodes: of the scene where `scenes` (simulation.scenes) is one, else the task's.
+
+    Raises:
+        ValueError: the task has a scene of its own and `scenes` is not empty, or the other way round.
+    """
+    what, known = get_task(task), scenes_of(scenes)
+    if bool(known) != (what.instruct is not None):
+        needs = "needs simulation.scenes, e.g. train" if what.instruct else "has a scene of its own; leave it empty"
+        raise ValueError(f"simulation.scenes is {scenes!r}, but task {task!r} {needs}")
+    return what.instruct(known[0]) if what.instruct and len(known) == 1 else what.instruction
 
 
 def clip_rules(name: str) -> ClipRules:

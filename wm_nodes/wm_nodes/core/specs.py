@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.schema import SimulationConfig
-from wm_nodes.config.tasks import get_task
+from wm_nodes.config.tasks import get_task, instruction
+from wm_nodes.core.action_spaces import SPACES
 
 SOURCE_IMAGINED, SOURCE_SIMULATOR, SOURCE_REAL, SOURCE_REPLAY = 0, 1, 2, 3
 
@@ -88,13 +89,14 @@ def _round_to_sent(value: Any) -> Any:
 
 def simulation_spec(task: str, config: SimulationConfig, num_envs: int) -> EnvironmentSpec:
     """The spec of `task` in ManiSkill; the imagined environment shares all but env_id, source and ground truth."""
-    axes = ("x", "y", "z")
+    what = get_task(task)
+    space = SPACES[what.actions]
+    low, high = space.box(config)
     return EnvironmentSpec(
-        env_id=f"maniskill/{task}", task=task, instruction=get_task(task).instruction, source=SOURCE_SIMULATOR,
+        env_id=f"maniskill/{task}", task=task, instruction=instruction(task, config.scenes), source=SOURCE_SIMULATOR,
         num_envs=num_envs, height=config.image_size, width=config.image_size * len(config.cameras),
-        cameras=tuple(config.cameras), action_names=tuple(f"tool_d{axis}" for axis in axes), action_units=("m",) * 3,
-        action_scale=(config.max_action_m,) * 3, state_names=tuple(f"tool_target_{axis}" for axis in axes),
-        state_units=("m",) * 3, ground_truth_names=get_task(task).ground_truth_names,
-        control_period_s=1.0 / config.control_hz, max_episode_steps=config.max_episode_steps,
-        state_low=config.workspace_low_m, state_high=config.workspace_high_m,
+        cameras=tuple(config.cameras), action_names=space.action_names, action_units=space.units,
+        action_scale=space.scale(config), state_names=space.state_names, state_units=space.units,
+        ground_truth_names=what.ground_truth_names, control_period_s=1.0 / config.control_hz,
+        max_episode_steps=config.max_episode_steps, state_low=low, state_high=high,
     )

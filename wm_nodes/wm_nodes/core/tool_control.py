@@ -1,19 +1,30 @@
 """The controller's rule, equal in every environment (RS-9): legal actions, and where they command the tool."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from wm_nodes.core.action_spaces import POSE
+from wm_nodes.core.rotations import multiply, to_quaternion, to_vector
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray
 
 
+def moves_pose(spec: EnvironmentSpec) -> bool:
+    """Whether actions turn the tool and command the gripper too."""
+    return spec.action_names == POSE.action_names
+
+
 def next_state(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -> FloatArray:
-    """Commanded tool position (..., S) after actions (..., A): state + scale * action, kept inside the box.
+    """Commanded state (..., S) after actions (..., A): state + scale * action, kept inside the box. Of a pose, the
+    rotation is turned by that of the action, and the gripper takes the action's value.
 
     A state that starts outside the box (a reset pose may) is not pulled in by a zero action.
     """
-    moved = states + np.asarray(spec.action_scale, np.float32) * actions
+    scale = np.asarray(spec.action_scale, np.float32)
+    moved = _moved_pose(np, states, scale * actions) if moves_pose(spec) else states + scale * actions
     if spec.state_low:
         low = np.minimum(np.asarray(spec.state_low, np.float32), states)
         high = np.maximum(np.asarray(spec.state_high, np.float32), states)
@@ -22,16 +33,31 @@ def next_state(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -
 
 
 def next_state_tensor(
-    states_NS: Tensor, actions_NA: Tensor, scale_A: Tensor, box_2S: Tensor | None
+    states_NS: Tensor, actions_NA: Tensor, scale_A: Tensor, box_2S: Tensor | None, *, pose: bool = False
 ) -> Tensor:
     """next_state, to the bit, of tensors on one device. scale_A: the spec's action_scale. box_2S: state_low and
-    state_high; None: no box."""
-    moved = states_NS + scale_A * actions_NA
+    state_high; None: no box. pose: moves_pose(spec)."""
+    moved = _moved_pose(torch, states_NS, scale_A * actions_NA) if pose else states_NS + scale_A * actions_NA
     if box_2S is None:
         return moved
     return torch.minimum(
         torch.maximum(moved, torch.minimum(box_2S[0], states_NS)), torch.maximum(box_2S[1], states_NS)
     )
+
+
+def _moved_pose(xp: Any, states: Any, changes: Any) -> Any:
+    """States (..., 7) after changes (..., 7) in their units, float32. xp: numpy or torch."""
+    turned = multiply(xp, to_quaternion(xp, changes[..., 3:6]), to_quaternion(xp, states[..., 3:6]))
+    rotation = xp.asarray(to_vector(xp, turned), dtype=xp.float32)
+    return xp.concatenate([states[..., :3] + changes[..., :3], rotation, changes[..., 6:]], -1)
+
+
+def hold_actions(states: FloatArray, spec: EnvironmentSpec) -> FloatArray:
+    """Actions (N, A) that leave the commanded states (N, S) as they are."""
+    held = np.zeros((len(states), spec.action_dim), np.float32)
+    if moves_pose(spec):
+        held[:, 6:] = np.clip(states[:, 6:], -1, 1)
+    return held
 
 
 def check_actions(actions: FloatArray, spec: EnvironmentSpec) -> None:

@@ -33,7 +33,6 @@ from wm_nodes.world_model import (
     load_starts,
 )
 
-STATE_DIM, ACTION_DIM = 3, 3
 _Imagined = TypeVar("_Imagined", ImaginedEnvironment, DeviceEnvironment)
 
 
@@ -56,8 +55,8 @@ def make_encoder(model_dir: Path, device: str = CPU) -> ImageEncoder:
 
 def make_policy(config: RunConfig, model_dir: Path) -> ImagePolicy:
     """Return a policy with fresh weights."""
-    encoder = make_encoder(model_dir, config.device)
-    policy = ImagePolicy(encoder, STATE_DIM, ACTION_DIM, config.policy, seed=config.seed)
+    encoder, spec = make_encoder(model_dir, config.device), simulation_spec(config.task, config.simulation, 1)
+    policy = ImagePolicy(encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed)
     return policy.to(compute_device(config.device))
 
 
@@ -181,7 +180,9 @@ def make_training_environment(
 
 def check_scene(config: RunConfig, model_dir: Path, simulation: SimulationConfig) -> None:
     """Raise ValueError unless the model of `model_dir`, made in `simulation`, knows the configuration's scene."""
-    for name in ("cameras", "image_size", "control_hz", "max_action_m", "workspace_low_m", "workspace_high_m"):
+    for name in (
+        "cameras", "image_size", "control_hz", "max_action_m", "max_action_rad", "workspace_low_m", "workspace_high_m",
+    ):
         wanted, trained = getattr(config.simulation, name), getattr(simulation, name)
         if wanted != trained:
             raise ValueError(
@@ -203,7 +204,7 @@ def policy_actor(
 
     def act(observation: Observation, seed: int) -> FloatArray:
         stream = numpy_stream(seed, "exploration", int(observation.episode_step[0]))
-        own = stream.standard_normal((1, ACTION_DIM)).astype(np.float32) if noise is None else None
+        own = stream.standard_normal((1, policy.action_dim)).astype(np.float32) if noise is None else None
         action: FloatArray = policy.act(observation.image, observation.state, noise=own).actions[0]
         if noise is not None:
             action = np.clip(action + stream.normal(0, noise, action.shape), -1, 1).astype(np.float32)

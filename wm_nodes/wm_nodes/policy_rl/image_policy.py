@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from wm_nodes.config.schema import PolicyConfig
+from wm_nodes.core.action_spaces import SPACES
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.policy_rl.gaussian import DiagonalGaussian
 
 TOOL_CENTER_M = (0.6, 0.0, 0.15)
-TOOL_SCALE_M = 0.2
+TOOL_SCALE_M, TURN_SCALE_RAD = 0.2, 0.5
 """The commanded tool position in the robot base frame lies within about one scale of the centre, m."""
 
 _FEATURE_LIMIT = 5.0
@@ -63,7 +64,8 @@ class ImagePolicy(nn.Module):
 
     Args:
         encoder: frozen; see ImageEncoder.
-        state_dim: S. With S = 3 the state is a tool position in m, shifted and scaled by TOOL_CENTER_M, TOOL_SCALE_M.
+        state_dim: S. Of the size of one of core.action_spaces.SPACES, the state is of that one: positions are shifted
+            by TOOL_CENTER_M and scaled by TOOL_SCALE_M, rotations by TURN_SCALE_RAD.
         action_dim: A.
         config: sizes and the initial log standard deviation.
         seed: of the initial weights (stream `policy_init`).
@@ -75,8 +77,10 @@ class ImagePolicy(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.state_dim, self.action_dim, self.config = state_dim, action_dim, config
-        is_tool = state_dim == len(TOOL_CENTER_M)
-        center, scale = (TOOL_CENTER_M, TOOL_SCALE_M) if is_tool else ((0.0,) * state_dim, 1.0)
+        known = {len(space.units): space for space in SPACES.values()}.get(state_dim)
+        units = known.units if known else ("1",) * state_dim
+        center = [TOOL_CENTER_M[i] if unit == "m" else 0.0 for i, unit in enumerate(units)]
+        scale = [{"m": TOOL_SCALE_M, "rad": TURN_SCALE_RAD, "1": 1.0}[unit] for unit in units]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stream_seed(seed, "policy_init"))
             self.actor = _Network(encoder.feature_dim, state_dim, action_dim, config, output_gain=0.01)
@@ -85,7 +89,7 @@ class ImagePolicy(nn.Module):
         self.register_buffer("feature_shift_F", torch.zeros(encoder.feature_dim))
         self.register_buffer("feature_scale_F", torch.ones(encoder.feature_dim))
         self.register_buffer("state_shift_S", torch.tensor(center, dtype=torch.float32))
-        self.register_buffer("state_scale_S", torch.full((state_dim,), scale, dtype=torch.float32))
+        self.register_buffer("state_scale_S", torch.tensor(scale, dtype=torch.float32))
 
     @property
     def device(self) -> torch.device:

@@ -15,9 +15,10 @@ from wm_nodes.config.tasks import get_task, model_tasks
 from wm_nodes.core.device import compute_device, device_label, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import initial_weights
+from wm_nodes.core.specs import simulation_spec
 from wm_nodes.environments.maniskill.collection import CollectionPlan
 from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, demonstration_plan, scripted_plan
-from wm_nodes.policy_rl.factories import ACTION_DIM, STATE_DIM, policy_actor
+from wm_nodes.policy_rl.factories import policy_actor
 from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, STARTS, train_weak_policy, write_starts
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
@@ -137,11 +138,11 @@ def _make_tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenize
     """Make a model folder for policies, which read the tokenizer alone: its action model is untrained."""
     folder = run_dir / "tokenizer_only"
     if not (folder / MANIFEST).exists():
-        tasks = model_tasks(config.task)
+        tasks, spec = model_tasks(config.task), simulation_spec(config.task, config.simulation, 1)
         with initial_weights(config.seed, "action_model_init"):
             untrained = action_model_class(config.tokenizer.kind)(
                 config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
-                action_dim=ACTION_DIM, state_dim=STATE_DIM, num_tasks=len(tasks),
+                action_dim=spec.action_dim, state_dim=spec.state_dim, num_tasks=len(tasks),
             )
         save_model_folder(folder, tokenizer, untrained, None, config, tasks=tasks, story={})
     return folder

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.tool_control import next_state_tensor
+from wm_nodes.core.tool_control import moves_pose, next_state_tensor
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import done_signal
 from wm_nodes.world_model.folder import WorldModels
@@ -119,7 +119,9 @@ class DeviceEnvironment:
     def step(self, actions_NA: Tensor) -> DeviceStep:
         """Take one step with actions in [-1, 1] wherever the episode has not ended."""
         valid = ~self._ended_N
-        moved = next_state_tensor(self.states_NP, actions_NA, self._scale, self._box)
+        moved = next_state_tensor(
+            self.states_NP, actions_NA, self._scale, self._box, pose=moves_pose(self.spec)
+        )
         with self._autocast(exact=self._exact):
             latents, logits = self._action.advance(self._latents, actions_NA, self.states_NP, moved, self._caches)
         self._latents.copy_(torch.where(valid[:, None, None], latents, self._latents))

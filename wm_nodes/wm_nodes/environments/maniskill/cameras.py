@@ -1,13 +1,15 @@
-"""The two cameras of the table-top scenes, for who renders them and for who only says where they are. No simulator."""
+"""The cameras of the table-top scenes, for who renders them and for who only says where they are. No simulator."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from transforms3d.quaternions import quat2mat
 
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
+from wm_nodes.core.rotations import to_quaternion
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 
 TOOL_BELOW_HAND_M = 0.1034
@@ -26,6 +28,7 @@ class Placement:
 
 PLACEMENTS = {
     "side": Placement(eye=(0.09, 0.5, 0.45), target=(0.09, -0.01, 0.02), fov_rad=0.8),
+    "near": Placement(eye=(0.42, 0.0, 0.38), target=(-0.02, 0.0, 0.03), fov_rad=0.85),
     "wrist": Placement(eye=(0.06, 0.0, 0.0), target=(0.03, 0.0, 0.12), fov_rad=1.4, on_hand=True),
 }
 
@@ -52,11 +55,15 @@ def table_top_cameras(config: SimulationConfig, hand: Callable[[int], Matrix]) -
     return tuple(models)
 
 
-def hand_over(tool_m: Any) -> Matrix:
-    """Pose (4, 4) of the link panda_hand, pointing straight down, over a tool position (3,) in the robot's base frame.
+def hand_over(state: Any) -> Matrix:
+    """Pose (4, 4) of the link panda_hand behind a commanded tool (S,) in the robot's base frame: a position, which the
+    hand points straight down at, or a pose.
 
-    The simulator's arm starts up to a few hundredths of a radian off (ManiSkill's reset noise) and keeps that angle.
+    Of a position, the simulator's arm starts up to a few hundredths of a radian off (ManiSkill's reset noise) and keeps
+    that angle.
     """
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
-    pose[:3, 3] = np.add(tool_m, (0.0, 0.0, TOOL_BELOW_HAND_M))
+    if len(state) > 3:
+        pose[:3, :3] = quat2mat(to_quaternion(np, state[3:6])) @ pose[:3, :3]
+    pose[:3, 3] = state[:3] - TOOL_BELOW_HAND_M * pose[:3, 2]
     return pose

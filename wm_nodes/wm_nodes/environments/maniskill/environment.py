@@ -1,16 +1,16 @@
 """ManiSkill behind the Environment interface: N scenes stepped in turn in one process, images from two cameras.
 
-Shapes: N environments, A = 3 action, S = 3 state, P ground truth.
+Shapes: N environments, A action, S state, P ground truth.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 import sapien
-import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from transforms3d.euler import euler2quat
 
+from wm_nodes.config.scenes import Scene, scene_of
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.cameras import CameraModel, Matrix
@@ -19,16 +19,13 @@ from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.environments.maniskill.cameras import table_top_cameras
+from wm_nodes.environments.maniskill.control import CONTROLS
 from wm_nodes.environments.maniskill.scenes import make_scene, render, renew_physics
-
-CONTROLLER_RANGE_M = 0.1
-"""A full-scale action of ManiSkill's stock Panda controller."""
-GRIPPER_CLOSED = -1.0
 
 
 class ManiSkillEnvironment:
-    """The simulator. A state is the commanded tool position in the robot base frame, m. An episode follows from its
-    seed and its actions, bit for bit: not from the episodes before it, nor from num_envs.
+    """The simulator. A state is the commanded tool in the robot base frame, see core/action_spaces.py. An episode
+    follows from its seed and its actions, bit for bit: not from the episodes before it, nor from num_envs.
 
     end_on_success=False lets an episode go on to the step limit: a done head needs frames after success.
     pictures=False leaves them black: a step is then physics alone, in a third of the time.
@@ -46,10 +43,13 @@ class ManiSkillEnvironment:
         self._end_on_success = end_on_success
         self._pictures = pictures
         self._new_physics = new_physics
-        self._scenes = [make_scene(self._task.scene, config) for _ in range(num_envs)]
+        self._control = CONTROLS[self._task.actions]
+        modes = {"control_mode": self._control.control_mode, "obs_mode": self._control.obs_mode}
+        self._scenes = [make_scene(self._task.scene, config, **modes) for _ in range(num_envs)]
+        self._shown: list[Scene | None] = [None] * num_envs
         self._num_resets = 0
         self._images = np.zeros((num_envs, self.spec.height, self.spec.width, 3), np.uint8)
-        self._states = np.zeros((num_envs, 3), np.float32)
+        self._states = np.zeros((num_envs, self.spec.state_dim), np.float32)
         self._truth = np.full((num_envs, self.spec.ground_truth_dim), np.nan, np.float32)
         self._first_truth = self._truth.copy()
         self._steps = np.zeros(num_envs, np.uint32)
@@ -64,6 +64,17 @@ class ManiSkillEnvironment:
     @property
     def cameras(self) -> tuple[CameraModel, ...]:
         return table_top_cameras(self._config, self._hand)
+
+    @property
+    def instructions(self) -> tuple[str, ...]:
+        """Of each environment's episode: where the task has many scenes, that of its scene."""
+        instruct = self._task.instruct
+        return tuple(instruct(shown) if instruct and shown else self.spec.instruction for shown in self._shown)
+
+    @property
+    def shown_scenes(self) -> tuple[Scene | None, ...]:
+        """Of each environment's episode, its scene of the catalogue."""
+        return tuple(self._shown)
 
     def _hand(self, i: int) -> Matrix:
         """Pose (4, 4) of the link panda_hand in the robot's base frame."""
@@ -81,9 +92,10 @@ class ManiSkillEnvironment:
         for i in np.flatnonzero(mask):
             self._num_resets += 1
             seed = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else int(seeds[i])
-            if self._new_physics:
+            self._shown[i] = scene_of(self._config.scenes, seed)
+            if self._new_physics and self._shown[i] is None:  # a scene of the catalogue is built anew
                 renew_physics(self._scenes[i])
-            self._scenes[i].reset(seed=seed % 2**32)
+            self._scenes[i].reset(seed=seed % 2**32, options={"scene": self._shown[i]})
             self._steps[i] = 0
             self._episode_ids[i] = self._num_resets
             self._ended[i] = False
@@ -109,8 +121,7 @@ class ManiSkillEnvironment:
         terminated, truncated = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         for i in np.flatnonzero(valid):
             target = next_state(self._states[i], actions[i], self.spec)
-            command = np.append((target - self._states[i]) / CONTROLLER_RANGE_M, GRIPPER_CLOSED).astype(np.float32)
-            self._scenes[i]._step_action(torch.from_numpy(command)[None])
+            self._states[i] = self._control.step(self._scenes[i], self._states[i], target)
             self._steps[i] += 1
             self._observe(i)
             terminated[i] = self._end_on_success and bool(self._task.success(self._truth[i]))
@@ -131,6 +142,7 @@ class ManiSkillEnvironment:
 
     def _start(self, i: int) -> None:
         self._first_truth[i] = self._task.measure(self._scenes[i], None)
+        self._states[i] = self._control.state(self._scenes[i])
         self._observe(i)
 
     def _observe(self, i: int) -> None:
@@ -138,8 +150,6 @@ class ManiSkillEnvironment:
         if self._pictures:
             self._images[i] = render(scene, self._config.cameras)
         self._truth[i] = self._task.measure(scene, self._first_truth[i])
-        arm = scene.agent.controller.controllers["arm"]
-        self._states[i] = arm._target_pose.p[0].numpy()
 
     def current(self) -> Observation:
         """The observation as of the last reset or step."""

@@ -48,7 +48,7 @@ def record_episode(
         images=np.stack(images), states=np.stack(states), actions=np.stack(actions), ground_truth=np.stack(truths),
         success=succeeded, rewards=(succeeded[1:] & ~succeeded[:-1]).astype(np.float32),
         terminated=bool(result.terminated[0]), truncated=bool(result.truncated[0]), task=env.spec.task,
-        instruction=env.spec.instruction, behaviour=behaviour, seed=seed, episode_id=episode_id, source=env.spec.source,
+        instruction=env.instructions[0], behaviour=behaviour, seed=seed, episode_id=episode_id, source=env.spec.source,
         policy_version=policy_version,
     )
 

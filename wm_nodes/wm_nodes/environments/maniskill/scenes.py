@@ -31,6 +31,9 @@ class TableTopScene(BaseEnv):  # type: ignore[misc]
     """Mixin before a ManiSkill table-top task."""
 
     image_size = 64
+    cameras: Sequence[str] = ("side", "wrist")
+    table_colour = TABLE_COLOUR
+    finger_m = 0.0
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -41,13 +44,13 @@ class TableTopScene(BaseEnv):  # type: ignore[misc]
                 name, pose=sapien_utils.look_at(eye=list(camera.eye), target=list(camera.target)), fov=camera.fov_rad,
                 mount=hand if camera.on_hand else None, **common,
             )
-            for name, camera in PLACEMENTS.items()
+            for name, camera in PLACEMENTS.items() if name in self.cameras
         ]
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         super()._load_scene(options)
         sheet = self.scene.create_actor_builder()
-        material = sapien.render.RenderMaterial(base_color=list(TABLE_COLOUR))
+        material = sapien.render.RenderMaterial(base_color=list(self.table_colour))
         sheet.add_box_visual(half_size=[0.6, 0.8, 0.0003], material=material)
         sheet.initial_pose = sapien.Pose(p=[0.1, 0.0, 0.0003])
         sheet.build_kinematic(name="plain_table_top")
@@ -60,7 +63,7 @@ class TableTopScene(BaseEnv):  # type: ignore[misc]
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
         super()._initialize_episode(env_idx, options)
         joint_positions = self.agent.robot.get_qpos()
-        joint_positions[:, -2:] = 0.0
+        joint_positions[:, -2:] = self.finger_m
         self.agent.reset(joint_positions)
 
 
@@ -83,13 +86,17 @@ def renew_physics(scene: BaseEnv) -> None:
     scene.scene.sub_scenes[0], scene.scene.px = renewed, physics
 
 
-def make_scene(scene: Callable[[], type[BaseEnv]], config: SimulationConfig, *mixins: type[BaseEnv]) -> BaseEnv:
+def make_scene(
+    scene: Callable[[], type[BaseEnv]], config: SimulationConfig, *mixins: type[BaseEnv], **options: Any
+) -> BaseEnv:
     """Build the scene of a task (Task.scene) on the CPU physics, rendered by config.render_device.
 
-    mixins: classes before TableTopScene.
+    mixins: classes before TableTopScene. options: ManiSkill's.
     """
-    TableTopScene.image_size = config.image_size
-    return make(_registered(scene, mixins), config).unwrapped
+    TableTopScene.image_size, TableTopScene.cameras = config.image_size, tuple(config.cameras)
+    made = make(_registered(scene, mixins), config, **options).unwrapped
+    made.image_size, made.cameras = TableTopScene.image_size, TableTopScene.cameras  # where it is built anew
+    return made
 
 
 @functools.cache
@@ -102,10 +109,11 @@ def _registered(scene: Callable[[], type[BaseEnv]], mixins: tuple[type[BaseEnv],
 
 def make(scene: str, config: SimulationConfig, **options: Any) -> gym.Env[Any, Any]:
     """Build a scene of ours or of ManiSkill; options are ManiSkill's."""
+    usual = {"obs_mode": "rgb", "control_mode": "pd_ee_target_delta_pos"}
     return gym.make(
-        scene, obs_mode="rgb", control_mode="pd_ee_target_delta_pos", sim_backend="physx_cpu",
-        render_backend=render_backend(config.render_device),
-        sim_config={"sim_freq": SIMULATION_HZ, "control_freq": _control_frequency(config.control_hz)}, **options,
+        scene, sim_backend="physx_cpu", render_backend=render_backend(config.render_device),
+        sim_config={"sim_freq": SIMULATION_HZ, "control_freq": _control_frequency(config.control_hz)},
+        **(usual | options),
     )
 
 

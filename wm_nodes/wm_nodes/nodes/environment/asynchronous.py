@@ -19,7 +19,7 @@ REMEMBERED = 256
 
 
 class AsynchronousEnvironment:
-    """Makes one step per tick, with the newest action that is not too old; else with zeros, which hold the tool.
+    """Makes one step per tick, with the newest action that is not too old; else it holds the tool.
 
     Ended environments are reset in the next step. A held step carries policy version 0, so that no learner takes it for
     the policy's.
@@ -92,7 +92,7 @@ class AsynchronousEnvironment:
         reset = self._ended if self._ended.any() else None
         command = StepCommand(
             session=self._served.session, step_id=self._served.next_step_id, spec_hash=spec.spec_hash,
-            actions=np.zeros(spec.num_envs * spec.action_dim, np.float32), reset_mask=reset, with_image=False,
+            actions=self._served.hold_actions().reshape(-1), reset_mask=reset, with_image=False,
         )
         if action is not None:
             command = replace(

@@ -17,6 +17,7 @@ import numpy as np
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.tool_control import hold_actions
 from wm_nodes.core.types import BoolArray, Environment, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.ros.wire import EpisodeNote, Goals, Reply, ResetCommand, StepCommand, Transition, WireError
 
@@ -167,14 +168,20 @@ class LockstepEnvironment:
             return self._step(command, actions, seeds)
 
     def hold_now(self) -> None:
-        """Have a robot hold, which without further steps might go on with its last action: zeros, outside of any step.
+        """Have a robot hold, which without further steps might go on with its last action, outside of any step.
 
         Raises:
             WireError: INTERNAL, NAN_MODEL: the environment failed.
         """
         with self._lock, self._environment_errors():
             if self._current is not None:
-                self.environment.step(np.zeros((self.spec.num_envs, self.spec.action_dim), np.float32))
+                self.environment.step(self.hold_actions())
+
+    def hold_actions(self) -> FloatArray:
+        """Actions (N, A) that leave every tool where it is commanded to be; zeros before the first reset."""
+        if self._current is None:
+            return np.zeros((self.spec.num_envs, self.spec.action_dim), np.float32)
+        return hold_actions(self._current.state, self.spec)
 
     def check_estop(self) -> None:
         """Raise WireError(ESTOP) while the emergency stop is set."""

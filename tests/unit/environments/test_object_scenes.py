@@ -1,0 +1,255 @@
+"""The procedural scenes and their tasks in the simulator: control, repetition, pictures, rules, scripts."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from transforms3d.quaternions import mat2quat, qinverse, qmult, quat2axangle
+
+from wm_nodes.config.load import load_config
+from wm_nodes.config.scenes import SCENES, scene_of
+from wm_nodes.config.tasks import get_task, success
+from wm_nodes.core.rotations import multiply, to_quaternion
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.tool_control import hold_actions, next_state
+from wm_nodes.core.types import FloatArray
+from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
+from wm_nodes.environments.maniskill.control import DOWN
+from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
+from wm_nodes.environments.maniskill.episodes import scripted_episode
+from wm_nodes.environments.maniskill.objects import BOTTOM, GRASPED, GROUND_TRUTH_NAMES, OPENING
+
+TASKS = ("push", "pull", "pick_place", "move_to_aim", "reach_object")
+CONFIG = load_config("cpu", {"task": "pick_place"})
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[ManiSkillEnvironment]:
+    environment = ManiSkillEnvironment("pick_place", CONFIG.simulation, end_on_success=False)
+    yield environment
+    environment.close()
+
+
+@pytest.fixture(scope="module")
+def blind() -> Iterator[ManiSkillEnvironment]:
+    environment = ManiSkillEnvironment("push", CONFIG.simulation, pictures=False, end_on_success=False)
+    yield environment
+    environment.close()
+
+
+def start(env: ManiSkillEnvironment, seed: int) -> None:
+    env.reset(seeds=np.array([seed], np.uint64))
+
+
+def hold(env: ManiSkillEnvironment, steps: int, **channels: float) -> None:
+    """Actions that hold the tool, but for some channels by their names."""
+    for _ in range(steps):
+        action = hold_actions(env.current().state, env.spec)
+        for name, value in channels.items():
+            action[0, env.spec.action_names.index(name)] = value
+        env.step(action)
+
+
+def truth(**values: float) -> FloatArray:
+    usual = {"container_radius": 0.06, "container_height": 0.028}
+    return np.array([{**usual, **values}.get(name, 0.0) for name in GROUND_TRUTH_NAMES], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("task", "done", "spoiled"),
+    [
+        (
+            "push", {"object_x": 0.101, "object_y": 0.049},
+            ({"object_x": 0.099}, {"object_y": 0.051}, {"object_bottom_z": 0.02}),
+        ),
+        ("pull", {"object_x": -0.101, "object_y": -0.049}, ({"object_x": 0.101}, {"object_y": -0.051})),
+        (
+            "pick_place", {"object_x": 0.044, "object_bottom_z": 0.004, "object_speed": 0.01},
+            (
+                {"object_x": 0.046}, {"object_bottom_z": 0.049}, {"object_bottom_z": 0.0}, {"object_speed": 0.021},
+                {"grasped": 1},
+            ),
+        ),
+        (
+            "move_to_aim", {"object_x": 0.035, "object_y": 0.035, "grasped": 1},
+            ({"object_x": 0.04}, {"object_bottom_z": 0.021}),
+        ),
+        ("reach_object", {"object_z": 0.02, "tool_z": 0.1, "tool_x": 0.019}, ({"tool_x": 0.021}, {"tool_z": 0.07})),
+    ],
+)
+def test_success_is_what_the_rule_says_and_each_limit_counts(
+    task: str, done: dict[str, float], spoiled: tuple[dict[str, float], ...]
+) -> None:
+    assert success(task, truth(**done))
+    for values in spoiled:
+        assert not success(task, truth(**{**done, **values})), values
+    assert not success(task, np.full(len(GROUND_TRUTH_NAMES), np.nan, np.float32))
+    batch = np.stack([truth(**done), truth(**{**done, **spoiled[0]})])
+    assert success(task, batch[None]).tolist() == [[True, False]]
+
+
+@pytest.mark.rendering
+def test_the_state_is_what_the_controller_aims_at_when_acting_at_random(blind: ManiSkillEnvironment) -> None:
+    start(blind, 3)
+    rng, controller = np.random.default_rng(3), blind.scene.agent.controller.controllers["arm"]
+    for _ in range(blind.spec.max_episode_steps):
+        before = blind.current().state
+        action = np.clip(rng.normal(0, 0.7, (1, 7)), -1, 1).astype(np.float32)
+        after = blind.step(action).observation.state
+        np.testing.assert_array_equal(after, next_state(before, action, blind.spec))
+        aim = controller._target_pose.raw_pose[0].numpy()
+        np.testing.assert_allclose(aim[:3], after[0, :3], atol=1e-4)
+        expected = multiply(np, to_quaternion(np, after[0, 3:6]), DOWN)
+        assert np.arccos(min(1.0, abs(float(expected @ aim[3:])))) * 2 < 1e-3  # arccos near 1 knows no more digits
+        np.testing.assert_allclose(aim[3:] * np.sign(expected @ aim[3:]), expected, atol=1e-4)
+
+
+@pytest.mark.rendering
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_turn_is_about_the_axis_of_the_base_and_not_against_it(blind: ManiSkillEnvironment, axis: int) -> None:
+    start(blind, 4)
+    hold(blind, 3)
+
+    def tool() -> FloatArray:
+        return np.asarray(blind.scene.agent.tcp.pose.q[0].numpy(), np.float64)
+
+    before = tool()
+    hold(blind, 2, **{f"tool_dr{'xyz'[axis]}": 1.0})
+    hold(blind, 4)
+    about, angle = quat2axangle(qmult(tool(), qinverse(before)))
+    np.testing.assert_allclose(angle * about, 0.4 * np.eye(3)[axis], atol=0.02)
+
+
+@pytest.mark.rendering
+def test_the_tool_follows_a_translation_and_the_fingers_their_command(blind: ManiSkillEnvironment) -> None:
+    start(blind, 5)
+    hold(blind, 3)
+    before = blind.ground_truth[0]
+    hold(blind, 1, tool_dy=0.5, gripper=1)
+    hold(blind, 4)
+    after = blind.ground_truth[0]
+    np.testing.assert_allclose(after[4:7] - before[4:7], [0, 0.05, 0], atol=0.004)
+    assert before[OPENING] == pytest.approx(0, abs=1e-3) and after[OPENING] == pytest.approx(0.08, abs=2e-3)
+
+
+@pytest.mark.rendering
+def test_a_seed_gives_the_same_bits_after_other_episodes_and_in_another_slot(blind: ManiSkillEnvironment) -> None:
+    def play(env: ManiSkillEnvironment, slot: int, seed: int) -> FloatArray:
+        """The script of `push` in one slot, the others stay ended or where they are; ground truth of every step."""
+        mask = np.arange(env.spec.num_envs) == slot
+        observation = env.reset(mask, np.full(env.spec.num_envs, seed, np.uint64))
+        act = get_task("push").script("expert", env.ground_truth[slot], numpy_stream(seed, "behaviour"), 0.1)
+        seen = [env.ground_truth[slot]]
+        for _ in range(12):
+            actions = hold_actions(observation.state, env.spec)
+            actions[slot] = act(seen[-1], observation.state[slot])
+            result = env.step(actions)
+            observation = result.observation
+            seen.append(result.ground_truth[slot])
+        return np.stack(seen)
+
+    first = {seed: play(blind, 0, seed) for seed in (11, 12, 13)}
+    assert all(np.abs(truths[-1, :3] - truths[0, :3]).max() > 0.02 for truths in first.values()), "nothing was touched"
+    two = ManiSkillEnvironment("push", CONFIG.simulation, num_envs=2, pictures=False, end_on_success=False)
+    for seed in (13, 11, 12):
+        np.testing.assert_array_equal(play(blind, 0, seed), first[seed])
+        np.testing.assert_array_equal(play(two, 1, seed), first[seed])
+    two.close()
+
+
+@pytest.mark.rendering
+def test_an_episode_has_the_scene_of_its_seed_and_says_so(blind: ManiSkillEnvironment) -> None:
+    for seed in (1, 2):
+        start(blind, seed)
+        scene = scene_of("train", seed)
+        assert scene is not None and blind.shown_scenes == (scene,)
+        assert blind.instructions == (f"push the {scene.object} away from the robot",)
+        assert blind.scene.catalogue_scene == scene
+    assert blind.spec.instruction == "push the object away from the robot"
+
+
+@pytest.mark.rendering
+@pytest.mark.parametrize("task", TASKS)
+def test_the_script_of_a_task_succeeds_from_a_start_that_does_not(task: str) -> None:
+    simulation = load_config("cpu", {"task": task}).simulation
+    env = ManiSkillEnvironment(task, simulation, pictures=False)
+    for seed in (1, 2, 3):
+        episode = scripted_episode(env, "expert", seed, seed)
+        assert episode.terminated and episode.success[-1] and not episode.success[0], (seed, env.shown_scenes)
+        shown = scene_of("train", seed)
+        instruct = get_task(task).instruct
+        assert shown and instruct and episode.instruction == instruct(shown)
+        assert episode.actions.shape[1] == episode.states.shape[1] == 7
+    assert not scripted_episode(env, "random", 1, 4).success[0]
+    with pytest.raises(ValueError, match=r"'dance'.*noisy"):
+        scripted_episode(env, "dance", 1, 5)
+    env.close()
+
+
+@pytest.mark.rendering
+def test_a_grasped_object_is_lifted_and_known_to_be_grasped(env: ManiSkillEnvironment) -> None:
+    start(env, 1)
+    act = get_task("pick_place").script("expert", env.ground_truth[0], numpy_stream(1, "behaviour"), 0.1)
+    lifted = False
+    for _ in range(20):
+        truths = env.step(act(env.ground_truth[0], env.current().state[0])[None]).ground_truth[0]
+        lifted |= bool(truths[BOTTOM] > 0.05 and truths[GRASPED] == 1 and 0.02 < truths[OPENING] < 0.06)
+    assert lifted and truths[GRASPED] == 0 and truths[OPENING] > 0.06
+
+
+@pytest.mark.rendering
+@pytest.mark.parametrize(
+    ("scene", "channel", "fewest"),
+    [
+        ("red_cube-plate-grey_table", 0, 30), ("blue_sphere-bowl-brown_table", 2, 20),
+        ("green_bar-bowl-grey_table", 1, 25),
+    ],
+)
+def test_object_and_gripper_are_seen_near_at_64_px(scene: str, channel: int, fewest: int) -> None:
+    simulation = CONFIG.simulation.with_values(scenes=scene)
+    env = ManiSkillEnvironment("pick_place", simulation)
+    for seed in (1, 2):
+        start(env, seed)
+        near = env.current().image[0, :, :64].astype(int)
+        others = [near[..., c] for c in range(3) if c != channel]
+        assert (near[..., channel] > np.maximum(*others) + 50).sum() >= fewest
+        assert (near[:20].max(2) < 60).sum() > 4  # black finger pads, before the black beyond the table ends
+    assert env.shown_scenes == (SCENES[scene],)
+    env.close()
+
+
+@pytest.mark.rendering
+def test_the_cameras_are_where_they_say_also_after_the_hand_has_turned(env: ManiSkillEnvironment) -> None:
+    start(env, 7)
+    hold(env, 2, tool_drx=0.5, tool_drz=1.0, tool_dz=-0.3)
+    assert [camera.name for camera in env.cameras] == ["near", "wrist"]
+    for camera in env.cameras:
+        rendered = env.scene._sensors[camera.name].camera
+        world_from_camera = camera.pose_in(0).copy()
+        world_from_camera[:3, 3] += ROBOT_BASE
+        seen_from_world = rendered.get_extrinsic_matrix()[0].numpy()
+        np.testing.assert_allclose(seen_from_world @ world_from_camera, np.eye(4)[:3], atol=1e-5, err_msg=camera.name)
+
+
+@pytest.mark.rendering
+def test_a_commanded_pose_says_where_the_hand_is(env: ManiSkillEnvironment) -> None:
+    from wm_nodes.environments.maniskill.cameras import hand_over
+
+    start(env, 8)
+    hold(env, 2, tool_drx=1.0, tool_drz=1.0)
+    hold(env, 4)
+    known, real = hand_over(env.current().state[0]), env._hand(0)
+    np.testing.assert_allclose(known[:3, 3], real[:3, 3], atol=0.006)
+    turn = qmult(mat2quat(known[:3, :3]), qinverse(mat2quat(real[:3, :3])))
+    assert abs(quat2axangle(turn)[1]) < 0.03
+
+
+def test_no_seed_of_training_is_one_of_a_test() -> None:
+    from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS
+
+    for task in TASKS:
+        config = load_config("cpu_full", {"task": task})
+        assert TRAINING_SEEDS + config.data.num_episodes <= HELDOUT_SEEDS
+        assert HELDOUT_SEEDS + config.data.num_heldout <= config.evaluation.first_seed
+    assert replace(get_task("push")) == get_task("push")

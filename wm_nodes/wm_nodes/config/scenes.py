@@ -1,0 +1,85 @@
+"""The catalogue of the table-top scenes: which object, container and table, and which scenes train or test.
+
+A scene's name is <colour>_<shape>-<container>-<table>, e.g. red_cube-bowl-grey_table. Every scene is in one split;
+scenes.json lists them. Standard library only, as tasks.py.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+import json
+from dataclasses import dataclass
+from importlib import resources
+
+SHAPES = ("cube", "bar", "cylinder", "sphere", "capsule")
+COLOURS = ("red", "green", "blue", "yellow")
+CONTAINERS = ("plate", "bowl")
+TABLES = ("grey_table", "brown_table")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What lies on the table, and the table."""
+
+    colour: str
+    shape: str
+    container: str
+    table: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.colour}_{self.shape}-{self.container}-{self.table}"
+
+    @property
+    def object(self) -> str:
+        """The object in words."""
+        return f"{self.colour} {self.shape}"
+
+
+SCENES = {
+    scene.name: scene
+    for scene in (Scene(*parts) for parts in itertools.product(COLOURS, SHAPES, CONTAINERS, TABLES))
+}
+
+
+@functools.cache
+def splits() -> dict[str, tuple[str, ...]]:
+    """Names of the scenes by split: train, ood_object (objects that are nowhere else) and ood_combo (objects,
+    containers and tables of train in combinations that are not)."""
+    text = resources.files("wm_nodes.config").joinpath("scenes.json").read_text()
+    return {split: tuple(names) for split, names in json.loads(text).items()}
+
+
+def scenes_of(setting: str) -> tuple[Scene, ...]:
+    """The scenes of simulation.scenes: those of a split, or one by its name; () for "".
+
+    Raises:
+        ValueError: neither of them; names what is known.
+    """
+    if not setting:
+        return ()
+    names = splits().get(setting) or ((setting,) if setting in SCENES else ())
+    if not names:
+        raise ValueError(
+            f"unknown scenes {setting!r}; choose a split ({', '.join(splits())}) or a scene's name, "
+            f"COLOUR_SHAPE-CONTAINER-TABLE of {', '.join(COLOURS)}; {', '.join(SHAPES)}; {', '.join(CONTAINERS)}; "
+            f"{', '.join(TABLES)}"
+        )
+    return tuple(SCENES[name] for name in names)
+
+
+def check_scenes(setting: str) -> str:
+    """Return a known setting. Raises ValueError as scenes_of."""
+    scenes_of(setting)
+    return setting
+
+
+def scene_of(setting: str, seed: int) -> Scene | None:
+    """The scene of the episode that is reset with `seed`; None for "". Raises ValueError as scenes_of."""
+    scenes = scenes_of(setting)
+    if not scenes:
+        return None
+    drawn = hashlib.sha256(f"scene {seed}".encode()).digest()[:8]
+    return scenes[int.from_bytes(drawn, "little") % len(scenes)]
