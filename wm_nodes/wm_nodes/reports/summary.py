@@ -40,6 +40,8 @@ class Summary:
         difference, low and high (and more); empty where not measured.
     acceptance: AcceptanceReport.to_dict(). samples: environment steps trained on. minutes: of the whole run.
     command: as typed. machine: facts by name.
+    exploit_meter: one mapping for each reading, in order: step (updates made before it) and the numbers of
+        policy_rl.exploit_meter.ExploitReading.metrics(). stopped: why training ended before all updates, by round.
     reward: that the policy was trained for. judge: who gave it, where it is the agent's; else empty.
     rounds: of a run in online rounds, one mapping for each: number, updates, samples, imagined_before, imagined, real
         (successes, episodes, low, high, rate), verdict (accepted, reason, rows; empty after the last). The imagined
@@ -63,6 +65,8 @@ class Summary:
     command: str = ""
     machine: Mapping[str, str] = field(default_factory=dict)
     rounds: Sequence[Mapping[str, Any]] = ()
+    exploit_meter: Sequence[Mapping[str, Any]] = ()
+    stopped: Sequence[str] = ()
     reward: str = "endogenous"
     judge: str = ""
 
