@@ -35,9 +35,8 @@ from wm_nodes.policy_rl.initial_policy import prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import load_arrays, make_model
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.summary import Summary, write_summary
+from wm_nodes.reports.summary import Summary, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table
-from wm_nodes.training.metrics import read_metrics
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.validation.acceptance import accept_success_agreement, accept_world_model
@@ -125,7 +124,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         imagined_paired=asdict(paired_difference(found.imagined_before.tolist(), found.imagined_after.tolist())),
         acceptance=_read_acceptance(run_dir), samples=found.samples, minutes=stage.minutes,
         command=arguments.command, machine=machine_facts(config.device), rounds=found.table, reward=arguments.reward,
-        exploit_meter=_readings(run_dir), stopped=found.stopped,
+        exploit_meter=read_readings(run_dir), stopped=found.stopped,
         judge=judge_name(episode_judge(config)) if arguments.reward == AGENT else "",
     )
     write_summary(run_dir, summary)
@@ -204,12 +203,6 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
             "Train the model longer or on more data (--from-scratch --preset cpu_full), or go on with --force"
         )
     job.stage("acceptance passed" if report.passed else "acceptance FAILED, going on because of --force")
-
-
-def _readings(run_dir: Path) -> list[dict[str, Any]]:
-    """The exploit meter's readings, of each step the last: a resumed run may have repeated one."""
-    lines: dict[Any, dict[str, Any]] = {line["step"]: line for line in read_metrics(run_dir, "exploit_meter")}
-    return [{name: lines[step][name] for name in lines[step] if name != "section"} for step in sorted(lines)]
 
 
 def _read_acceptance(run_dir: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.training.metrics import read_metrics
 
 FILE_NAME = "summary.json"
 
@@ -92,6 +93,12 @@ def read_summary(run_dir: Path) -> dict[str, Any]:
         raise FileNotFoundError(f"{path} does not exist: the run has not come to its end")
     values: dict[str, Any] = json.loads(path.read_text())
     return {"acceptance" if name == "gate" else name: value for name, value in values.items()}
+
+
+def read_readings(run_dir: Path) -> list[dict[str, Any]]:
+    """The exploit meter's readings in a run's metrics, of each step the last: a resumed run may have repeated one."""
+    lines: dict[Any, dict[str, Any]] = {line["step"]: line for line in read_metrics(run_dir, "exploit_meter")}
+    return [{name: lines[step][name] for name in lines[step] if name != "section"} for step in sorted(lines)]
 
 
 def plain(value: Any) -> Any:
