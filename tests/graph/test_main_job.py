@@ -140,3 +140,7 @@ def test_a_wrong_setting_ends_with_one_clear_line(ros_domain: int, tmp_path: Pat
     done = start(["--set", "ppo.updates=many", "--run-dir", str(tmp_path)], ros_domain)
     assert done.returncode == 2
     assert "ppo.updates" in done.stderr and "many" in done.stderr and "Traceback" not in done.stdout + done.stderr
+    meter = ["--set", "exploit_meter.every=1", "--set", "evaluation.episodes=3"]
+    done = start([*meter, "--run-dir", str(tmp_path)], ros_domain)
+    assert done.returncode == 2
+    assert "exploit_meter.episodes is 32, and this run has 24 first frames" in done.stderr, done.stderr

@@ -113,7 +113,10 @@ def run_rounds(
         read_success(first.folder, "imagined_before"), read_success(last.folder, "imagined_after"),
         sum(trained.samples for trained in trainings),
         sum(trained.samples_per_s for trained in trainings) / len(trainings), trainings[-1].bag, tuple(table),
-        tuple(trained.stopped for trained in trainings if trained.stopped),
+        tuple(
+            f"{start.label}: {trained.stopped}".removeprefix(": ")
+            for start, trained in zip(starts, trainings, strict=True) if trained.stopped
+        ),
     )
 
 
