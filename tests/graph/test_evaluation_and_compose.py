@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ import yaml
 from graph import toy
 from graph.harness import Graph, Probe, wait_until
 from model_folders import make_model_folder, make_stepped_folder, write_starts
+from safetensors.numpy import load_file, save_file
 
 from wm_msgs.action import Evaluate, Rollout, Train
 from wm_nodes.config.load import dump_config, load_config
+from wm_nodes.config.schema import RunConfig
 from wm_nodes.nodes.compose import make_nodes
 from wm_nodes.policy_rl.evaluation import evaluate
+from wm_nodes.policy_rl.exploit_meter import make_exploit_meter
 from wm_nodes.policy_rl.factories import (
     make_endogenous_reward,
     make_imagined_environment,
@@ -25,7 +29,9 @@ from wm_nodes.policy_rl.factories import (
 )
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.train import train_policy
+from wm_nodes.reports.summary import plain, read_readings
 from wm_nodes.training.weights import pack_weights, save_weights, unpack_weights
+from wm_nodes.world_model.imagined_episodes import start_of
 
 pytestmark = pytest.mark.graph
 
@@ -145,24 +151,62 @@ def test_device_rollouts_give_the_weights_of_policy_rl_train_and_leave_the_topic
 def test_a_policy_trains_in_a_video_model_to_the_weights_of_one_process(
     graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
-    """Environment, policy, reward and learner in four processes; environments end at different steps."""
+    """Environment, policy, reward and learner in four processes; environments end at different steps. The exploit
+    meter reads in a fifth, a world model that stands in for the simulator."""
     folder, model = make_stepped_folder(tmp_path / "video_model"), Path(imagined["learner"]["model_dir"])
     imagined["environment"] |= {"backend": "video_model", "video_model_dir": str(folder)}
     imagined["policy"]["await_nodes"] = ["environment", "reward_evaluator", "learner"]
-    for node, params in imagined.items():
-        graph.start(node, **params)
+    config, simulated = start_metered(graph, imagined, folder, threshold=0.1307)
+    for node in ("environment", "policy", "reward_evaluator"):
+        graph.start(node, **imagined[node])
+    metrics = probe.listen("learner/metrics")
     result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=2)))
     assert (result.termination_reason, result.policy_version) == (Train.Result.FINISHED, 3), result.message
 
-    config = load_config("smoke")
     policy, reward = make_policy(config, model), make_endogenous_reward(config, model)
     env = make_video_environment(config, folder, model / STARTS, num_envs=8, seed=0)
-    rollouts = [rollout for rollout, _ in train_policy(policy, env, reward, config)]
+    simulator = make_imagined_environment(simulated, model, model / STARTS, num_envs=2, seed=0)
+    meter = make_exploit_meter(config, model, model / STARTS, lambda: simulator, video_model_dir=folder)
+    assert meter is not None
+    rollouts = [rollout for rollout, _ in train_policy(policy, env, reward, config, meter)]
+    readings = read_readings(graph.folder)
+    assert readings == [plain({"step": made, **r.metrics()}) for made, r in meter.readings.items()]
+    assert [reading["step"] for reading in readings] == [0, 1, 2] and 0 < readings[0]["precision"] <= 1
+    wait_until("updates and readings on the topic", lambda: len(metrics) == 5)
+    told = [dict(zip(m.names, m.values)) for m in metrics if "exploit_meter/precision" in m.names]
+    assert [found["exploit_meter/real_success"] for found in told] == [r["real_success"] for r in readings]
     ended = rollouts[0].terminated_TN
     assert ended.any() and not ended.all(), "the reader is to end some episodes"
     found, _ = unpack_weights((graph.folder / "policies" / "policy_000003.safetensors").read_bytes())
     for name, tensor in unpack_weights(pack_weights(policy).data)[0].items():
         np.testing.assert_array_equal(found[name].numpy(), tensor.numpy(), err_msg=name)
+
+
+def start_metered(
+    graph: Graph, imagined: dict[str, dict[str, Any]], folder: Path, threshold: float, **changes: float
+) -> tuple[RunConfig, RunConfig]:
+    """Start a learner that reads the exploit meter before every update, and in namespace sim an untrained world model
+    that calls success what exceeds `threshold`; return the configurations of both. folder: of the video model."""
+    starts = Path(imagined["environment"]["starts_file"])
+    seeds = [next(seed for seed in count() if start_of(seed, 5) == start) for start in range(5)]
+    save_file({**load_file(starts), "seeds": np.array(seeds)}, starts)
+    meter = {f"exploit_meter.{name}": value for name, value in {"every": 1, "episodes": 5, **changes}.items()}
+    config, simulated = load_config("smoke", meter), load_config("smoke", {"reward.success_threshold": threshold})
+    for name, settings in (("config.yaml", config), ("simulated.yaml", simulated)):
+        (graph.folder / name).write_text(dump_config(settings))
+    world = {"backend": "world_model", "num_envs": 2, "model_dir": starts.parent, "starts_file": starts}
+    graph.start("environment", namespace="/wm/sim", config_file=graph.folder / "simulated.yaml", **world)
+    graph.start("learner", **imagined["learner"], starts_file=starts, video_model_dir=folder)
+    return config, simulated
+
+
+def test_a_training_that_the_exploit_meter_stops_ends_with_its_reason_and_the_policy_as_it_is(
+    graph: Graph, probe: Probe, imagined: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    start_metered(graph, imagined, make_stepped_folder(tmp_path / "video_model"), threshold=1.0, stop_precision=1.0)
+    result = probe.finish(probe.send(probe.action(Train, "train"), Train.Goal(updates=2)))
+    assert (result.termination_reason, result.updates, result.policy_version) == (Train.Result.LIMIT, 0, 1)
+    assert "after update 0 only" in result.message and "stop_precision is 1" in result.message, result.message
 
 
 def test_device_rollouts_refuse_a_reward_that_is_not_theirs_and_name_it(

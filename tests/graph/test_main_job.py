@@ -37,7 +37,8 @@ def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_
     ros_domain: int, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
-    arguments = ["--preset", "smoke", "--set", "acceptance.tool_error_ratio=0.001", "--run-dir", str(run_dir)]
+    arguments = ["--preset", "smoke", "--set", "acceptance.tool_error_ratio=0.001", "--run-dir", str(run_dir),
+                 "--set", "exploit_meter.every=2", "--set", "exploit_meter.episodes=3"]
     refused = start(arguments, ros_domain)
     assert refused.returncode == 3, refused.stdout + refused.stderr
     said = refused.stderr
@@ -55,7 +56,10 @@ def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_
     bags = sorted((run_dir / "bags").glob("training_*"))  # the refused run's and the forced one's
     played = [episode.behaviour for bag in bags for episode in read_episodes(bag, namespace="/wm/sim")]
     assert played.count("before") >= 4 and played.count("after") >= 4
-    assert "data:image/png;base64" in (run_dir / "report.html").read_text()
+    assert [(row["step"], row["episodes"]) for row in summary["exploit_meter"]] == [(0, 3), (2, 3)], done.stdout
+    assert played.count("exploit_meter") >= 2 * 4, "of 4 environments one repeats an episode"
+    report = (run_dir / "report.html").read_text()
+    assert "data:image/png;base64" in report and "Exploit meter: success of 3 episodes" in report
     assert json.loads((run_dir / "acceptance.json").read_text())["criteria"]
     assert main(["rescore", summary["bag"]]) == 0, "the recorded rewards, evaluated again, are others"
 
@@ -136,3 +140,7 @@ def test_a_wrong_setting_ends_with_one_clear_line(ros_domain: int, tmp_path: Pat
     done = start(["--set", "ppo.updates=many", "--run-dir", str(tmp_path)], ros_domain)
     assert done.returncode == 2
     assert "ppo.updates" in done.stderr and "many" in done.stderr and "Traceback" not in done.stdout + done.stderr
+    meter = ["--set", "exploit_meter.every=1", "--set", "evaluation.episodes=3"]
+    done = start([*meter, "--run-dir", str(tmp_path)], ros_domain)
+    assert done.returncode == 2
+    assert "exploit_meter.episodes is 32, and this run has 24 first frames" in done.stderr, done.stderr

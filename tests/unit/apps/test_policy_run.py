@@ -47,11 +47,13 @@ def test_metrics_of_consecutive_trainings_are_counted_on(tmp_path: Path) -> None
     folders = [tmp_path / "1", tmp_path / "2"]
     for folder in folders:
         with closing(MetricsWriter(folder, tensorboard=False)) as writer:
+            writer.write("exploit_meter", 0, {"precision": 1.0})
             for step in (1, 2):
                 writer.write("ppo", step, {"loss_policy": 0.5})
     for _ in range(2):
         join_metrics(folders, tmp_path)
-        assert [line["step"] for line in read_metrics(tmp_path)] == [1, 2, 3, 4]
+        assert [line["step"] for line in read_metrics(tmp_path, "ppo")] == [1, 2, 3, 4]
+        assert [line["step"] for line in read_metrics(tmp_path, "exploit_meter")] == [0, 2]
 
 
 def test_the_table_of_rounds_says_what_became_of_the_refreshed_model() -> None:

@@ -5,6 +5,7 @@ import importlib.util
 import json
 import sys
 import types
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,18 @@ def test_composed_process_carries_the_nodes_of_the_namespace_with_their_own_para
     assert parameters["/wm/environment"]["ros__parameters"]["num_envs"] == 8
     assert parameters["/wm/evaluation"]["ros__parameters"]["env_namespace"] == "sim"
     assert not any("__node" in argument for argument in arguments)
+
+
+def test_the_learner_knows_what_is_imagined_from_for_its_exploit_meter(given: dict[str, str]) -> None:
+    def learner(**more: str) -> Mapping[str, object]:
+        graph, _ = launch_arguments.prepare("online_training", of("online_training", given) | more)
+        return graph.node("learner").parameters
+
+    starts = str(Path(given["model_dir"]) / "starts.safetensors")
+    assert learner()["starts_file"] == starts and "video_model_dir" not in learner()
+    video = learner(backend="video_model")
+    assert (video["starts_file"], video["video_model_dir"]) == (starts, given["video_model_dir"])
+    assert "starts_file" not in learner(backend="maniskill")
 
 
 def test_learner_of_several_ranks_is_not_composed(given: dict[str, str]) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from contextlib import closing
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,8 +16,9 @@ from wm_nodes.reports.curves import Panel, curves, read_series
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture, write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.summary import SuccessRate, Summary, read_summary, write_summary
-from wm_nodes.reports.tables import result_rows, verdict
+from wm_nodes.reports.summary import SuccessRate, Summary, read_readings, read_summary, write_summary
+from wm_nodes.reports.tables import EXPLOIT_COLUMNS, exploit_rows, exploit_table, result_rows, verdict
+from wm_nodes.training.metrics import MetricsWriter
 
 PAIRED = {"difference": 0.25, "low": 0.157, "high": 0.348, "gained": 79, "lost": 28}
 SUMMARY = Summary(
@@ -138,6 +140,29 @@ def test_the_table_holds_counts_percent_intervals_and_the_paired_difference() ->
 )
 def test_the_verdict_follows_the_interval_and_not_the_difference(low: float, high: float, words: str) -> None:
     assert words in verdict(replace(SUMMARY, paired=PAIRED | {"low": low, "high": high}))
+
+
+def test_the_exploit_meter_is_in_table_report_summary_and_curves_where_there_are_readings(tmp_path: Path) -> None:
+    known = {
+        "episodes": 32.0, "imagined_success": 1.0, "replayed_success": 0.75, "real_success": 0.5, "precision": 0.75,
+        "precision_low": 0.579, "precision_high": 0.867, "recall": 1.0, "recall_low": 0.862, "recall_high": 1.0,
+    }
+    unknown = known | {"imagined_success": 0.0, "precision": float("nan")}
+    with closing(MetricsWriter(tmp_path, tensorboard=False)) as writer:
+        for step, reading in ((0, unknown), (4, unknown), (4, known)):  # step 4 again, after a resume
+            writer.write("exploit_meter", step, reading)
+    summary = replace(SUMMARY, exploit_meter=read_readings(tmp_path), stopped=("after update 4 <only> 75%",))
+    first, last = exploit_rows(summary)
+    assert len(first) == len(EXPLOIT_COLUMNS) and (first[0], first[4]) == ("0", "undefined")
+    assert last == ("4", "100.0 %", "75.0 %", "50.0 %", "75.0 % (57.9 to 86.7)", "100.0 % (86.2 to 100.0)")
+    assert "after update 4 <only> 75%" in str(exploit_table(summary).caption)
+    text = write_report(tmp_path, summary).read_text()
+    assert "Exploit meter: success of 32 episodes" in text and "75.0 % (57.9 to 86.7)" in text
+    assert "Training ended early: after update 4 &lt;only&gt; 75%." in text
+    write_summary(tmp_path, summary)
+    assert read_summary(tmp_path)["exploit_meter"][1]["precision"] == 0.75
+    assert "xploit meter" not in write_report(tmp_path, SUMMARY).read_text()
+    assert curves(tmp_path / "metrics.jsonl", tmp_path / "curves.png") is not None
 
 
 def test_a_rate_without_episodes_is_refused() -> None:

@@ -42,7 +42,7 @@ class ModelRefreshLoop:
 
     policy: the weights after the last round. model_dir: what it was trained in. samples, samples_per_s: all rounds'
     transitions, and their rate (mean of the rounds). bag: of the last round's training. table: one mapping for each
-    round, as in summary.json; empty where there was one round only.
+    round, as in summary.json; empty where there was one round only. stopped: why rounds ended before all their updates.
     """
 
     policy: Path
@@ -55,6 +55,7 @@ class ModelRefreshLoop:
     samples_per_s: float
     bag: str
     table: tuple[dict[str, Any], ...]
+    stopped: tuple[str, ...] = ()
 
 
 def split_updates(updates: int, rounds: int) -> list[int]:
@@ -112,6 +113,10 @@ def run_rounds(
         read_success(first.folder, "imagined_before"), read_success(last.folder, "imagined_after"),
         sum(trained.samples for trained in trainings),
         sum(trained.samples_per_s for trained in trainings) / len(trainings), trainings[-1].bag, tuple(table),
+        tuple(
+            f"{start.label}: {trained.stopped}".removeprefix(": ")
+            for start, trained in zip(starts, trainings, strict=True) if trained.stopped
+        ),
     )
 
 

@@ -94,13 +94,16 @@ class TrainingStart:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """version: of the last weights. samples: transitions trained on. samples_per_s: of the last uninterrupted part."""
+    """version: of the last weights. samples: transitions trained on. samples_per_s: of the last uninterrupted part.
+    stopped: why training ended before all updates; else empty.
+    """
 
     version: int
     updates: int
     samples: int
     samples_per_s: float
     bag: str
+    stopped: str = ""
 
     def policy(self, folder: Path) -> Path:
         return folder / POLICY_FILES.uri(self.version)
@@ -161,12 +164,13 @@ def train_round(
             before, began = _progress(start.folder), time.monotonic()
             remaining = max(0, start.config.ppo.updates - int(before["updates"]))
             job.stage(f"training the policy in the {job.trained_in}: {remaining} updates")
-            if remaining:
-                _train(operator, remaining)
+            stopped = _train(operator, remaining) if remaining else ""
+            if stopped:
+                job.stage(f"training ends: {stopped}")
             after, seconds = _progress(start.folder), time.monotonic() - began
             samples = int(after["samples"]) - int(before["samples"])
             version, updates, total = (int(after[name]) for name in ("version", "updates", "samples"))
-            trained = TrainingResult(version, updates, total, samples / seconds, str(waiting.bag))
+            trained = TrainingResult(version, updates, total, samples / seconds, str(waiting.bag), stopped)
             _real(operator, job, start, "after", trained.policy(start.folder))
     write_atomic(marker, json.dumps(asdict(trained), indent=1).encode())
     return trained
@@ -241,15 +245,18 @@ def _real(operator: GraphClient, job: RunContext, start: TrainingStart, label: s
     return success
 
 
-def _train(operator: GraphClient, updates: int) -> None:
+def _train(operator: GraphClient, updates: int) -> str:
+    """Make the updates; return why fewer were made, or ""."""
     with tqdm(total=updates, desc="PPO in the model", unit="update") as bar:
 
         def show(feedback: Any) -> None:
             bar.update(feedback.update - bar.n)
             bar.set_postfix(imagined_success=f"{feedback.success_rate:.2f}", mean_return=f"{feedback.mean_return:.2f}")
 
-        operator.train(updates, show)
-        bar.update(updates - bar.n)
+        result = operator.train(updates, show)
+        if not result.message:
+            bar.update(updates - bar.n)
+    return str(result.message)
 
 
 def _progress(folder: Path) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.record import acceptance_plan, collect_plan
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
+from wm_nodes.policy_rl.exploit_meter import ExploitMeter, make_exploit_meter
 from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment, models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
@@ -161,7 +162,8 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         load_arrays(collect_plan(acceptance_plan(config), config, folder / "heldout"), config), config,
         (imagined_before.successes, imagined_before.episodes), (real_before.successes, real_before.episodes),
     )
-    course = _train(policy, real if arm == "simulator" else imagined, config, arm, model_dir)
+    meter = None if arm == "simulator" else make_exploit_meter(config, model_dir, starts, lambda: real)
+    course = _train(policy, real if arm == "simulator" else imagined, config, arm, model_dir, meter)
     real_after, imagined_after = measure()
     real.close()
     save_weights(policy, run_dir / f"{arm}.safetensors", {"tokenizer_sha256": policy.encoder.sha256})
@@ -176,6 +178,7 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         "environment_steps": sum(c["steps"] for c in course),
         "success_before": real_before.success.astype(int).tolist(),
         "success_after": real_after.success.astype(int).tolist(), "course": course,
+        "exploit_meter": meter.rows() if meter is not None else [],
         "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(config.device),
         "config": dump_config(config), "world_model_sha256": models_of(model_dir, config.device).sha256,
     }
@@ -184,13 +187,13 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
 
 
 def _train(
-    policy: ImagePolicy, env: Environment, config: RunConfig, arm: str, model_dir: Path
+    policy: ImagePolicy, env: Environment, config: RunConfig, arm: str, model_dir: Path, meter: ExploitMeter | None
 ) -> list[dict[str, float]]:
     """Train in place; return success rate, KL and environment steps of each update."""
     reward: RewardModel = RuleReward() if arm == "simulator" else make_endogenous_reward(config, model_dir)
     course: list[dict[str, float]] = []
     with tqdm(total=config.ppo.updates, desc=f"{config.task} seed {config.seed} in {arm}", unit="update") as bar:
-        for rollout, metrics in train_policy(policy, env, reward, config):
+        for rollout, metrics in train_policy(policy, env, reward, config, meter):
             success_rate, steps = rollout_statistics(rollout).success_rate, float(rollout.valid_TN.sum())
             course.append({"success_rate": success_rate, "kl_reference": metrics.kl_reference, "steps": steps})
             bar.update()

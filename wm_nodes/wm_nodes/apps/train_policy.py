@@ -30,13 +30,14 @@ from wm_nodes.environments.record import HELDOUT_SEEDS, acceptance_plan, collect
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.launching.scenarios import IMAGINED
+from wm_nodes.policy_rl.exploit_meter import start_seeds
 from wm_nodes.policy_rl.factories import check_scene, load_policy, load_steppable
-from wm_nodes.policy_rl.initial_policy import prepare_start, start_files
+from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import load_arrays, make_model
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.summary import Summary, write_summary
-from wm_nodes.reports.tables import results_table, rounds_table
+from wm_nodes.reports.summary import Summary, read_readings, write_summary
+from wm_nodes.reports.tables import exploit_table, results_table, rounds_table
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.validation.acceptance import accept_success_agreement, accept_world_model
@@ -114,6 +115,8 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         demos = config.sft.num_demonstrations
         stage(f"{demos} MPLib demonstrations, first frames, and the weak policy cloned from them")
         prepare_start(config, run_dir, model_dir)
+        if config.exploit_meter.every:
+            _check_meter(config, starts, stage)
         found = run_rounds(job, model_dir, weak, partial(_judge, job, model_dir, arguments.force), waiting)
     summary = Summary(
         task=config.task, preset=arguments.preset, seed=config.seed,
@@ -124,6 +127,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         imagined_paired=asdict(paired_difference(found.imagined_before.tolist(), found.imagined_after.tolist())),
         acceptance=_read_acceptance(run_dir), samples=found.samples, minutes=stage.minutes,
         command=arguments.command, machine=machine_facts(config.device), rounds=found.table, reward=arguments.reward,
+        exploit_meter=read_readings(run_dir), stopped=found.stopped,
         judge=judge_name(episode_judge(config)) if arguments.reward == AGENT else "",
     )
     write_summary(run_dir, summary)
@@ -132,6 +136,8 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     report = write_report(run_dir, summary, pictures, config_text=dump_config(config))
     if summary.rounds:
         console.print(rounds_table(summary))
+    if summary.exploit_meter:
+        console.print(exploit_table(summary))
     console.print(results_table(summary))
     console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
 
@@ -156,6 +162,9 @@ def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
         made_in = SimulationConfig.model_validate(read_world_manifest(model_dir)["simulation"])
         check_scene(config, model_dir, made_in)
     _check_environment(arguments, config)
+    if config.exploit_meter.every and config.exploit_meter.episodes > num_starts(config):
+        raise ConfigError(f"exploit_meter.episodes is {config.exploit_meter.episodes}, and this run has "
+                          f"{num_starts(config)} first frames (8 x evaluation.episodes, at most 256); lower it")
     judge = options.judge_settings(arguments)
     if judge and arguments.reward != AGENT:
         raise ConfigError(f"{', '.join(judge)} would change nothing without --reward agent")
@@ -170,6 +179,14 @@ def _check_environment(arguments: argparse.Namespace, config: RunConfig) -> None
         load_steppable(config, Path(arguments.video_model))
         if (rounds := config.model_refresh.num_rounds) > 1:
             raise ConfigError(f"--rounds {rounds} refreshes a world model, and a video model is trained in; give 1")
+
+
+def _check_meter(config: RunConfig, starts: Path, stage: Stages) -> None:
+    """Say why the learner will take no readings of the exploit meter, where it will not."""
+    try:
+        start_seeds(config, starts)
+    except ValueError as error:
+        stage(f"[yellow]the exploit meter is off[/]: {error}")
 
 
 def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stage: Stages) -> Path:

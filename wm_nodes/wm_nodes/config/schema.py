@@ -278,6 +278,18 @@ class PpoConfig(SettingsSection):
         return self.group_size if self.advantage == "group" else 1
 
 
+class ExploitMeterConfig(SettingsSection):
+    """How often the training asks the simulator whether what the model calls success is one; see
+    policy_rl/exploit_meter.py."""
+
+    every: NonNegativeInt
+    """Policy updates from one reading to the next; the first is of the policy that training begins with. 0: off."""
+    episodes: PositiveInt
+    """Of a reading, each from another first frame; always the same ones."""
+    stop_precision: Fraction
+    """Training stops where even the upper end of the precision's 95 % interval is below it; 0: never."""
+
+
 class AcceptanceConfig(SettingsSection):
     num_episodes: PositiveInt
     """Held-out real episodes that acceptance is measured on."""
@@ -332,6 +344,7 @@ class RunConfig(SettingsSection):
     policy: PolicyConfig
     sft: SftConfig
     ppo: PpoConfig
+    exploit_meter: ExploitMeterConfig
     acceptance: AcceptanceConfig
     model_refresh: ModelRefreshConfig
     evaluation: EvaluationConfig

@@ -1,7 +1,7 @@
 """Steer a running graph from a plain program: send goals, show feedback, fetch results."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,12 +77,14 @@ class GraphClient:
         )
 
     def train(self, updates: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> Train.Result:
-        """Make policy updates; on_progress gets Train.Feedback messages.
+        """Make policy updates, fewer where the exploit meter stops them (message says why); on_progress gets
+        Train.Feedback messages.
 
         Raises:
             GoalFailed: the training ended early. PeerLost: no learner.
         """
-        return self._run(self._train, Train.Goal(updates=updates), lambda message: on_progress(message.feedback))
+        goal, ends = Train.Goal(updates=updates), (Train.Result.FINISHED, Train.Result.LIMIT)
+        return self._run(self._train, goal, lambda message: on_progress(message.feedback), ends)
 
     def train_video(self, iterations: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> int:
         """Post-train the video model on so many buffers; on_progress gets TrainVideo.Feedback. Return the new version.
@@ -100,11 +102,14 @@ class GraphClient:
         self._node.destroy_node()
         rclpy.try_shutdown()
 
-    def _run(self, client: ActionClient, goal: Any, on_feedback: Callable[[Any], None]) -> Any:
+    def _run(
+        self, client: ActionClient, goal: Any, on_feedback: Callable[[Any], None], ends: Sequence[int] = (0,)
+    ) -> Any:
+        """ends: the reasons that are no failure; 0 is FINISHED in every action."""
         result = run_goal(
             client, goal, accept_s=ACCEPT_S, check=self._alive, alive=lambda: None, on_feedback=on_feedback
         )
-        if result.termination_reason != type(result).FINISHED:
+        if result.termination_reason not in ends:
             raise GoalFailed(result.message or f"the goal ended with reason {result.termination_reason}")
         return result
 

@@ -232,6 +232,10 @@ def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[
 def _online_training(arguments: Mapping[str, str]) -> Graph:
     ranks = _integer(arguments, "learner_ranks", 1, 1024)
     learner = _weights(arguments)
+    if arguments["backend"] in IMAGINED:
+        learner["starts_file"] = arguments["starts_file"]
+    if arguments["backend"] == "video_model":
+        learner["video_model_dir"] = arguments["video_model_dir"]
     if arguments["reward"] == "agent":
         learner["join_timeout_s"] = AGENT_JOIN_S
     rollouts = _rollout_nodes(arguments, arguments["backend"], ("learner",))

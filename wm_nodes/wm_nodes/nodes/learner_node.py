@@ -24,6 +24,7 @@ from wm_nodes.judge.episode_reward import check_horizon, unjudged_reason
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.factories import existing, expected_spec, make_learner, make_policy, refuse_other
 from wm_nodes.nodes.learner.device_rollouts import DeviceRollouts
+from wm_nodes.nodes.learner.meter import LearnerMeter
 from wm_nodes.nodes.learner.replay_assembler import ReplayAssembler
 from wm_nodes.nodes.learner.report import LearnerReport
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
@@ -59,6 +60,8 @@ PARAMS = (
           read_only=True),
     Param("join_timeout_s", 5.0, "How long a rollout's last images and rewards may take to arrive", "s",
           minimum=0.1, maximum=600.0),
+    Param("starts_file", "", "First frames that are imagined from; for the exploit meter", read_only=True),
+    Param("video_model_dir", "", "Video model that is trained in; for the exploit meter", read_only=True),
     Param("replay_at_start", "", "Bag that a player replays and that is trained from (ppo.updates) as soon as active",
           read_only=True),
     Param("replay_rate", 1.0, "Rate asked of the player: recorded seconds per second", minimum=1e-3, maximum=1e6),
@@ -92,6 +95,7 @@ class LearnerNode(TrainingNode):
         self._training = make_run(values, self.run_dir, self.ranks)
         self._report = LearnerReport(self, tensorboard=bool(self.param("tensorboard")))
         self.own(self._report.close)
+        self._meter = LearnerMeter(self, self._config, self._training, self._report)
         self._spec: EnvironmentSpec | None = None
         self._spec_session = 0
         self._refused: WireError | None = None
@@ -151,7 +155,8 @@ class LearnerNode(TrainingNode):
         with closing(self._source(work, goal)) as source:
             for update in range(int(goal.updates)):
                 work.check()
-                if self._over_limit(goal, began, first_samples):
+                result.message = self._meter.check(work.check)
+                if result.message or self._over_limit(goal, began, first_samples):
                     result.termination_reason = Train.Result.LIMIT
                     return
                 following = self._next(source, live=not goal.from_bags and not goal.from_replay)
@@ -161,6 +166,7 @@ class LearnerNode(TrainingNode):
                     return
                 self._count_dropped(following[1])
                 self._update(work, goal, update, *following)
+            self._meter.check(work.check)
 
     def _next(
         self, source: RolloutSource, *, live: bool

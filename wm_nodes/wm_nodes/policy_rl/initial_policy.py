@@ -47,7 +47,8 @@ def write_starts(
     bags: Iterable[Path], path: Path, limit: int = MAX_STARTS, *, tasks: Sequence[str] = (),
     frames: Literal["first", "any"] = "first", seed: int = 0,
 ) -> int:
-    """Write a frame, its state and the instruction of up to `limit` recorded episodes; returns how many.
+    """Write a frame, its state and the instruction of up to `limit` recorded episodes; returns how many. First frames
+    have their reset seeds beside them.
 
     Args:
         tasks: those that are imagined from these starts, beside the one of the recording.
@@ -66,6 +67,7 @@ def write_starts(
         "images": torch.from_numpy(np.stack([episode.images[row] for episode, row in zip(chosen, rows)])),
         "states": torch.from_numpy(np.stack([episode.states[row] for episode, row in zip(chosen, rows)])),
         INSTRUCTIONS: pack_instructions(chosen),
+        **({"seeds": torch.tensor([e.seed for e in chosen], dtype=torch.int64)} if frames == "first" else {}),
     }
     write_atomic(path, save(tensors))
     return len(chosen)

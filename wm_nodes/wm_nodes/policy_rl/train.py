@@ -13,6 +13,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.policy_rl.device_rollout import make_collector
+from wm_nodes.policy_rl.exploit_meter import ExploitMeter
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy, make_training_environment
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import STARTS
@@ -24,16 +25,15 @@ from wm_nodes.world_model import DeviceEnvironment
 
 
 def train_policy(
-    policy: ImagePolicy, env: Environment | DeviceEnvironment, reward: RewardModel, config: RunConfig
+    policy: ImagePolicy, env: Environment | DeviceEnvironment, reward: RewardModel, config: RunConfig,
+    meter: ExploitMeter | None = None,
 ) -> Iterator[tuple[Rollout | TensorRollout, PpoMetrics]]:
-    """Train `policy` in place for ppo.updates updates; yield the rollout and the metrics of each.
-
-    A rollout has ppo.num_steps x ppo.num_envs environment steps, however many environments `env` steps at a time.
-    """
+    """Train `policy` in place for ppo.updates updates or until `meter` stops it; yield rollout and metrics of each."""
     learner = PpoLearner(policy, config.ppo, seed=config.seed)
     collect = make_collector(env, policy, reward, config.ppo.envs_per_start)  # act, step, reward
-    num_steps = config.ppo.num_steps * config.ppo.num_envs // env.spec.num_envs
-    for version in range(1, config.ppo.updates + 1):
+    num_steps = config.ppo.num_steps * config.ppo.num_envs // env.spec.num_envs  # however many step at a time
+    versions = range(1, config.ppo.updates + 1)
+    for version in versions if meter is None else meter.watch(policy, versions):
         rollout = collect(num_steps, config.seed, version)
         yield rollout, learner.update(rollout)  # the policy is version + 1 from here on
 

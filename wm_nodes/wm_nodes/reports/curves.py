@@ -25,6 +25,14 @@ POLICY_PANELS = (
     Panel("imagined return (mean per episode)", {"mean_return": ""}),
     Panel("KL to the SFT policy (nats per step)", {"kl_reference": ""}),
     Panel("value loss (Huber)", {"loss_value": ""}),
+    Panel(
+        "exploit meter: success of the same episodes (share)",
+        {f"exploit_meter/{name}_success": name for name in ("imagined", "replayed", "real")}, (0.0, 1.0),
+    ),
+    Panel(
+        "exploit meter: imagined success (share)",
+        {f"exploit_meter/{name}": name for name in ("precision", "recall")}, (0.0, 1.0),
+    ),
 )
 
 

@@ -9,7 +9,15 @@ from typing import Any
 
 from wm_nodes.core.files import write_atomic
 from wm_nodes.reports.summary import Summary
-from wm_nodes.reports.tables import ROUND_COLUMNS, result_rows, round_rows, verdict
+from wm_nodes.reports.tables import (
+    EXPLOIT_COLUMNS,
+    ROUND_COLUMNS,
+    exploit_rows,
+    exploit_title,
+    result_rows,
+    round_rows,
+    verdict,
+)
 
 FILE_NAME = "report.html"
 
@@ -56,7 +64,7 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
         f"{summary.samples} imagined environment steps at {summary.imagined_steps_per_s:.0f} per second, "
         f"{summary.minutes:.1f} minutes in all</p>",
         "<h2>Success</h2>", _results(summary),
-        *_rounds(summary),
+        *_rounds(summary), *_exploit_meter(summary),
         "<h2>Acceptance of the world model</h2>", _acceptance(summary.acceptance),
         *figures(pictures),
         "<h2>Look closer, do it again</h2>", _again(run_dir, summary),
@@ -144,6 +152,18 @@ def _rounds(summary: Summary) -> Iterable[str]:
         "training on what it saw there. The refreshed model is taken only where it is no worse on held-out episodes. "
         "Imagined rates are those of the model that the round trained in.</p>"
     )
+
+
+def _exploit_meter(summary: Summary) -> Iterable[str]:
+    if not summary.exploit_meter:
+        return
+    table = html_table(EXPLOIT_COLUMNS, (tuple(map(escape, row)) for row in exploit_rows(summary)), numbers=range(4))
+    yield f"<h2>{escape(exploit_title(summary).capitalize())}</h2>{table}" + (
+        '<p class="faint">The same first frames each time. Imagined: the policy in the model. Replayed: the actions it '
+        "chose there, in the simulator. Real: the policy in the simulator. Precision: share of the imagined successes "
+        "that replayed succeed; recall: share of the replayed successes that are imagined ones.</p>"
+    )
+    yield from (f"<p>Training ended early: {escape(reason)}.</p>" for reason in summary.stopped)
 
 
 def _acceptance(report: Mapping[str, Any]) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.training.metrics import read_metrics
 
 FILE_NAME = "summary.json"
 
@@ -40,6 +41,8 @@ class Summary:
         difference, low and high (and more); empty where not measured.
     acceptance: AcceptanceReport.to_dict(). samples: environment steps trained on. minutes: of the whole run.
     command: as typed. machine: facts by name.
+    exploit_meter: one mapping for each reading, in order: step (updates made before it) and the numbers of
+        policy_rl.exploit_meter.ExploitReading.metrics(). stopped: why training ended before all updates, by round.
     reward: that the policy was trained for. judge: who gave it, where it is the agent's; else empty.
     rounds: of a run in online rounds, one mapping for each: number, updates, samples, imagined_before, imagined, real
         (successes, episodes, low, high, rate), verdict (accepted, reason, rows; empty after the last). The imagined
@@ -63,6 +66,8 @@ class Summary:
     command: str = ""
     machine: Mapping[str, str] = field(default_factory=dict)
     rounds: Sequence[Mapping[str, Any]] = ()
+    exploit_meter: Sequence[Mapping[str, Any]] = ()
+    stopped: Sequence[str] = ()
     reward: str = "endogenous"
     judge: str = ""
 
@@ -88,6 +93,12 @@ def read_summary(run_dir: Path) -> dict[str, Any]:
         raise FileNotFoundError(f"{path} does not exist: the run has not come to its end")
     values: dict[str, Any] = json.loads(path.read_text())
     return {"acceptance" if name == "gate" else name: value for name, value in values.items()}
+
+
+def read_readings(run_dir: Path) -> list[dict[str, Any]]:
+    """The exploit meter's readings in a run's metrics, of each step the last: a resumed run may have repeated one."""
+    lines: dict[Any, dict[str, Any]] = {line["step"]: line for line in read_metrics(run_dir, "exploit_meter")}
+    return [{name: lines[step][name] for name in lines[step] if name != "section"} for step in sorted(lines)]
 
 
 def plain(value: Any) -> Any:

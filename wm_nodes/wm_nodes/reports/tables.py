@@ -82,6 +82,37 @@ def rounds_table(summary: Summary) -> Table:
     return make_table(title, ROUND_COLUMNS, round_rows(summary), left=ROUND_COLUMNS[-1:])
 
 
+EXPLOIT_COLUMNS = ("updates", "imagined", "replayed", "real", "precision (95 %)", "recall (95 %)")
+
+
+def exploit_rows(summary: Summary) -> list[tuple[str, ...]]:
+    """One row of texts for each reading of the exploit meter, under EXPLOIT_COLUMNS."""
+    return [
+        (
+            str(reading["step"]), *(f"{100 * reading[f'{name}_success']:.1f} %" for name in EXPLOIT_COLUMNS[1:4]),
+            *(_interval(reading, name) for name in ("precision", "recall")),
+        )
+        for reading in summary.exploit_meter
+    ]
+
+
+def exploit_title(summary: Summary) -> str:
+    return f"exploit meter: success of {summary.exploit_meter[-1]['episodes']:.0f} episodes of the policy"
+
+
+def exploit_table(summary: Summary) -> Table:
+    """The exploit meter's readings for the terminal."""
+    caption = " ".join(f"Training ended early: {reason}." for reason in summary.stopped)
+    return make_table(exploit_title(summary), EXPLOIT_COLUMNS, exploit_rows(summary), caption=caption)
+
+
+def _interval(reading: Mapping[str, Any], name: str) -> str:
+    if reading[name] is None:
+        return "undefined"
+    share, low, high = (100 * reading[f"{name}{end}"] for end in ("", "_low", "_high"))
+    return f"{share:.1f} % ({low:.1f} to {high:.1f})"
+
+
 def _share(rate: Mapping[str, Any]) -> str:
     return f"{100 * rate['rate']:.1f} % ({rate['successes']}/{rate['episodes']})"
 

@@ -51,14 +51,13 @@ class MetricsWriter:
 
 def join_metrics(folders: Sequence[Path], run_dir: Path) -> None:
     """Write <run_dir>/metrics.jsonl from those of consecutive trainings, their steps counted on."""
-    lines, steps = list[str](), dict[str, int]()
+    lines, offset = list[str](), 0
     for folder in folders:
-        offset = dict(steps)
+        steps = [offset]
         for line in read_metrics(folder):
-            section = str(line["section"])
-            step = offset.get(section, 0) + int(str(line["step"]))
-            steps[section] = max(step, steps.get(section, 0))
-            lines.append(json.dumps({**line, "step": step}))
+            steps.append(offset + int(str(line["step"])))
+            lines.append(json.dumps({**line, "step": steps[-1]}))
+        offset = max(steps)
     write_atomic(run_dir / FILE_NAME, "".join(f"{line}\n" for line in lines).encode())
 
 

@@ -62,6 +62,19 @@ def pack_instructions(episodes: Sequence[Episode]) -> Tensor:
     return torch.tensor(list(text.encode()), dtype=torch.uint8)
 
 
+def load_start_seeds(path: Path) -> UInt64Array:
+    """Reset seeds (M,) by which the simulator shows the first frames of load_starts.
+
+    Raises:
+        ValueError: a file without them: of an older version, or of frames in the middle of an episode.
+    """
+    tensors = load_file(path)
+    if "seeds" not in tensors:
+        raise ValueError(f"{path} holds no reset seeds of first frames; delete it to have it written again, with "
+                         "data.start_frames first")
+    return np.asarray(tensors["seeds"].numpy(), np.uint64)
+
+
 def imagined_spec(spec: EnvironmentSpec, env_id: str, sha256: str, num_envs: int) -> EnvironmentSpec:
     """The spec of a simulator as that of a model, of files with this sha256, which stands in for it."""
     return replace(

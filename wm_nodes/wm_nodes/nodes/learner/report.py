@@ -33,6 +33,11 @@ class LearnerReport:
         counts = {name: getattr(progress, name) for name in COUNTS}
         self._writer.write("ppo", progress.updates, {**metrics, "samples_per_s": samples_per_s, **counts})
 
+    def measured(self, section: str, progress: Progress, values: dict[str, float]) -> None:
+        """Something was measured between two updates; its names have the section before them on the topic."""
+        self._publish(progress, {f"{section}/{name}": value for name, value in values.items()}, math.nan)
+        self._writer.write(section, progress.updates, values)
+
     def nonfinite(self, progress: Progress, error: FloatingPointError) -> None:
         """An update was undone; its metrics are unknown."""
         self._nonfinite_updates += 1
