@@ -7,6 +7,7 @@ Waypoints: states (7,) with the position in the world frame, see pose_scripts.py
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -84,7 +85,8 @@ def between(start: FloatArray, end: FloatArray, share: float) -> FloatArray:
     """The waypoint at a share of the straight way, with the gripper of the end."""
     turn = to_vector(np, multiply(np, to_quaternion(np, end[3:6]), to_quaternion(np, -start[3:6])))
     rotation = _turned(start[3:6], share * turn)
-    return np.concatenate([start[:3] + share * (end[:3] - start[:3]), rotation, end[6:]]).astype(np.float32)
+    place = start[:3] + share * (end[:3] - start[:3])
+    return np.asarray(np.concatenate([place, rotation, end[6:]]), np.float32)
 
 
 def scripted(waypoints: Waypoints, speed: float) -> Callable[..., Callable[[FloatArray, FloatArray], FloatArray]]:
@@ -138,7 +140,7 @@ def _with_jitter(points: list[FloatArray], rng: np.random.Generator) -> list[Flo
     return moved
 
 
-def _turned(rotation: FloatArray, turn: FloatArray) -> FloatArray:
+def _turned(rotation: FloatArray, turn: np.ndarray[Any, np.dtype[Any]]) -> FloatArray:
     """A rotation vector (3,) after a further turn (3,) about the base's axes, rad."""
     turned = multiply(np, to_quaternion(np, turn), to_quaternion(np, rotation))
     return np.asarray(to_vector(np, turned), np.float32)
