@@ -70,8 +70,8 @@ def vary(behaviour: str, waypoints: list[FloatArray], start: FloatArray, rng: np
             for point in points:
                 point[6] = OPEN
         case "early_release" if closed and points[0][6] == OPEN:
-            place = int(rng.integers(closed[0] + 1, closed[-1] + 1))
-            dropped = between(points[place - 1], points[place], rng.uniform(0.1, 0.9))
+            place = int(rng.integers(closed[0] + 1, max(closed[0] + 2, closed[-1])))  # not on the last way down
+            dropped = between(points[place - 1], points[place], rng.uniform(0.1, 0.7))
             points.insert(place, dropped)
             points.insert(place + 1, dropped.copy())
             for point in points[place + 1 :]:
