@@ -9,6 +9,7 @@ import pytest
 from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import VARIABLE, get_task
 from wm_nodes.core.types import Episode, FloatArray
+from wm_nodes.environments.maniskill import pose_behaviours
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import planned_episode, planned_or_scripted_episode, scripted_episode
 from wm_nodes.environments.maniskill.objects import GRASPED, OBJECT, OBJECT_START
@@ -165,6 +166,15 @@ def test_kinds_differ_and_repeat_to_the_bit() -> None:
     assert same(episodes["jitter"], planned_episode(env, planner, 2, 0, "jitter"))
     slow, fast = (np.abs(episodes[kind].actions[:, :3]).max(1) for kind in ("interpolated", "expert"))
     assert (slow > 0.02).sum() > (fast > 0.02).sum(), "pieces that each start and end at rest take longer"
+
+
+@pytest.mark.rendering
+def test_a_jitter_that_misses_is_kept_and_labelled_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    env, planner = blind("pick_place")
+    monkeypatch.setattr(pose_behaviours, "JITTER_M", 0.06)
+    episode = planned_or_scripted_episode(env, planner, "jitter", 1, 4)
+    assert episode.behaviour == "jitter" and episode.seed == 1 and episode.episode_id == 4
+    assert not episode.success.any() and episode.rewards.sum() == 0 and episode.truncated
 
 
 @pytest.mark.rendering
