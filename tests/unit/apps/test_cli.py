@@ -21,6 +21,7 @@ OPTIONS = {
     "--judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",
     "check-video-model": "--video-model --context-bags --public --prompt --picture --size --lora-rank --preset --set",
     "seed-study": "--tasks --seeds --arms --preset --set --device --model-dir --threads --out",
+    "collect": "folder --tasks --episodes --first-seed --preset --set --device",
     "rescore": "recording --reward --judge --judge-model --judge-key-env --rubric --json --config --model-dir "
     "--namespace --reads --audit",
     "retrain": "run --run-dir --set --tensorboard",

@@ -33,6 +33,7 @@ GROUPS = {
         "seed-study": "several seeds and tasks: world model against simulator",
     },
     "recordings": {
+        "collect": "episodes of tasks in the simulator, planned and scripted",
         "rescore": "score a recording again, compare bit for bit",
         "retrain": "train a video model again on a run's recorded clips and scores",
         "recover-bag": "bring back a recording whose process was killed",

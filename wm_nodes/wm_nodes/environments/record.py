@@ -1,14 +1,23 @@
 """Simulator episodes into bags: the collector of environments/maniskill with the writer of recording."""
 
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import model_tasks
+from wm_nodes.core.files import write_atomic
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import Episode
 from wm_nodes.environments.maniskill.collection import CollectionPlan, collect
-from wm_nodes.recording import EpisodeBagWriter
+from wm_nodes.recording import Bag, EpisodeBagWriter
 
+INDEX, PLAN = "index.csv", "plan.json"
+FROM_TABLE = ("task", "seed", "behaviour", "instruction")
+INDEX_COLUMNS = ("bag", "task", "scene", "seed", "behaviour", "success", "steps", "planner", "instruction")
 TRAINING_SEEDS, HELDOUT_SEEDS = 0, 500_000
 """First reset seeds of the training and the held-out episodes; evaluation seeds start at evaluation.first_seed."""
 
@@ -29,6 +38,11 @@ def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> Coll
     )
 
 
+def task_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
+    """Return the plan of episodes of the configured task alone, in the shares of data.behaviours."""
+    return CollectionPlan(config.task, config.simulation, num_episodes, first_seed, config.data.behaviours)
+
+
 def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
     """Return the plan of MPLib demonstrations of the configured task, for behaviour cloning."""
     return CollectionPlan(
@@ -44,8 +58,60 @@ def first_frames_plan(config: RunConfig, num_episodes: int, first_seed: int) -> 
 
 
 def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path) -> list[Path]:
-    """Collect the plan's episodes into bags below `folder`; see collect."""
-    return collect(folder, plan, write_shard, num_workers=config.data.num_workers)
+    """Collect the plan's episodes into bags below `folder`, see collect, and list them in its index.csv."""
+    bags = collect(folder, plan, write_shard, num_workers=config.data.num_workers)
+    write_index(folder)
+    return bags
+
+
+def keep_plan(plan: CollectionPlan, folder: Path) -> None:
+    """Write the plan into a folder of its bags alone. Raises ValueError where the folder was begun with another one."""
+    path, text = folder / PLAN, json.dumps({**vars(plan), "simulation": plan.simulation.model_dump()}, default=str)
+    if path.exists() and path.read_text() != text:
+        kept, now = json.loads(path.read_text()), json.loads(text)
+        other = next(name for name in now if now[name] != kept.get(name))
+        raise ValueError(f"{folder} was begun with {other} {kept.get(other)}, not {now[other]}; take another folder")
+    write_atomic(path, text.encode())
+
+
+def read_index(bags: Sequence[Path]) -> list[dict[str, Any]]:
+    """A row (INDEX_COLUMNS) of every episode of the bags. success: at any step. planner: why there was no plan."""
+    rows = list[dict[str, Any]]()
+    for path in bags:
+        with Bag(path) as bag:
+            for row in bag.episode_table():
+                found = row["success"] or bool(row["return_total"])
+                extra = row["extra"] or {}
+                rows.append({
+                    "bag": path.name, "scene": "", "planner": "", **extra, **{name: row[name] for name in FROM_TABLE},
+                    "steps": row["length"], "success": found,
+                })
+    return [{name: row[name] for name in INDEX_COLUMNS} for row in rows]
+
+
+def write_index(folder: Path) -> None:
+    """Write index.csv, what read_index finds in the complete bags of the folder."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, INDEX_COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(read_index(sorted(path for path in folder.glob("shard_*") if not path.suffix)))
+    write_atomic(folder / INDEX, text.getvalue().encode())
+
+
+def success_table(rows: Sequence[Mapping[str, Any]], *by: str) -> str:
+    """Episodes, successes, steps and missing plans of index rows, by the values of some columns."""
+    groups = dict[tuple[str, ...], list[Mapping[str, Any]]]()
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in by), []).append(row)
+    widths = [max(len(name), *(len(key[i]) for key in groups)) for i, name in enumerate(by)]
+    names = "  ".join(f"{name:{width}}" for name, width in zip(by, widths, strict=True))
+    lines = [f"{names}  episodes  success  steps  without plan"]
+    for key, group in sorted(groups.items()):
+        wins, steps = sum(row["success"] for row in group), sum(row["steps"] for row in group)
+        without = sum(bool(row["planner"]) for row in group)
+        names = "  ".join(f"{name:{width}}" for name, width in zip(key, widths, strict=True))
+        lines.append(f"{names}  {len(group):8}  {wins / len(group):7.1%}  {steps / len(group):5.1f}  {without:12}")
+    return "\n".join(lines)
 
 
 def write_shard(path: Path, plan: CollectionPlan, episodes: list[Episode]) -> None:

@@ -19,11 +19,10 @@ from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode, FloatArray, Observation
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.episodes import planned_episode, record_episode, scripted_episode
-from wm_nodes.environments.maniskill.planner import DemonstrationPlanner, PlanningError
+from wm_nodes.environments.maniskill.episodes import planned_or_scripted_episode, record_episode
+from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 
 EPISODES_PER_SHARD = 50
-MPLIB_BEHAVIOUR = "expert"
 
 PolicyAct = Callable[[Observation, int], FloatArray]
 """(observation of one slot, episode seed) -> action (A,)."""
@@ -110,13 +109,7 @@ def _make_behaviour_actor(env: ManiSkillEnvironment, plan: CollectionPlan) -> Ca
     planner = DemonstrationPlanner(env)
 
     def act_episode(seed: int, episode_id: int) -> Episode:
-        behaviour = behaviour_of(seed, plan.behaviours)
-        if behaviour == MPLIB_BEHAVIOUR:
-            try:
-                return planned_episode(env, planner, seed, episode_id)
-            except PlanningError:
-                return scripted_episode(env, "expert", seed, episode_id)
-        return scripted_episode(env, behaviour, seed, episode_id)
+        return planned_or_scripted_episode(env, planner, behaviour_of(seed, plan.behaviours), seed, episode_id)
 
     return act_episode
 

@@ -1,14 +1,20 @@
 """Act one episode in the simulator and return it with its ground truth."""
 
+import sys
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from wm_nodes.config.tasks import get_task, success
 from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.tool_control import moves_pose
 from wm_nodes.core.types import Episode, FloatArray, Observation
+from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.planner import DemonstrationPlanner, follow
+from wm_nodes.environments.maniskill.planner import DemonstrationPlanner, PlanningError, follow, track
+from wm_nodes.environments.maniskill.pose_behaviours import PLANNED, vary
 
 Act = Callable[[Observation, FloatArray], FloatArray]
 """(observation of one slot, ground truth (P,)) -> action (A,); a policy ignores the ground truth."""
@@ -44,21 +50,52 @@ def record_episode(
         if result.terminated[0] or result.truncated[0]:
             break
     succeeded = success(env.spec.task, np.stack(truths))
+    shown = env.shown_scenes[0]
     return Episode(
         images=np.stack(images), states=np.stack(states), actions=np.stack(actions), ground_truth=np.stack(truths),
         success=succeeded, rewards=(succeeded[1:] & ~succeeded[:-1]).astype(np.float32),
         terminated=bool(result.terminated[0]), truncated=bool(result.truncated[0]), task=env.spec.task,
         instruction=env.instructions[0], behaviour=behaviour, seed=seed, episode_id=episode_id, source=env.spec.source,
-        policy_version=policy_version,
+        policy_version=policy_version, extra={"scene": shown.name} if shown else {},
     )
 
 
-def planned_episode(env: ManiSkillEnvironment, planner: DemonstrationPlanner, seed: int, episode_id: int) -> Episode:
-    """One MPLib demonstration (behaviour `expert`). Raises PlanningError where no path is found."""
+def planned_episode(
+    env: ManiSkillEnvironment, planner: DemonstrationPlanner, seed: int, episode_id: int, behaviour: str = "expert"
+) -> Episode:
+    """One MPLib demonstration. behaviour: one of planned_behaviours. Raises PlanningError where no path is found."""
     env.reset(seeds=np.array([seed], np.uint64))
-    track = follow(planner.tool_path(), env.spec.action_scale[0])
+    if moves_pose(env.spec):
+        start = env.current().state[0] + np.pad(ROBOT_BASE, (0, 4))
+        waypoints = get_task(env.spec.task).waypoints(env.ground_truth[0])
+        varied = vary(behaviour, waypoints, start, numpy_stream(seed, "behaviour"))
+        path_follower = track(planner.pose_path(varied), env.spec)
+    else:
+        path_follower = follow(planner.tool_path(), env.spec.action_scale[0])
 
     def act(observation: Observation, truth: FloatArray) -> FloatArray:
-        return track(observation.state[0])
+        return path_follower(observation.state[0])
 
-    return record_episode(env, act, "expert", seed, episode_id)
+    return record_episode(env, act, behaviour, seed, episode_id)
+
+
+def planned_or_scripted_episode(
+    env: ManiSkillEnvironment, planner: DemonstrationPlanner, behaviour: str, seed: int, episode_id: int
+) -> Episode:
+    """One episode of a behaviour. Without a plan, the script follows the same waypoints: a warning says so, and
+    Episode.extra["planner"]."""
+    if behaviour not in planned_behaviours(env.spec):
+        return scripted_episode(env, behaviour, seed, episode_id)
+    try:
+        return planned_episode(env, planner, seed, episode_id, behaviour)
+    except PlanningError as error:
+        shown = env.shown_scenes[0]
+        where = f"seed {seed}, {f'scene {shown.name}, ' if shown else ''}task {env.spec.task}, {behaviour}"
+        print(f"warning: {where}: {error}; its waypoints are followed without a plan", file=sys.stderr, flush=True)
+        episode = scripted_episode(env, behaviour, seed, episode_id)
+        return replace(episode, extra={**episode.extra, "planner": str(error)})
+
+
+def planned_behaviours(spec: EnvironmentSpec) -> tuple[str, ...]:
+    """The behaviours that MPLib plans in a task; the others are scripted alone."""
+    return PLANNED if moves_pose(spec) else PLANNED[:1]

@@ -22,7 +22,7 @@ BOTTOM, SPEED, OPENING, GRASPED, RADIUS, HEIGHT = 11, 12, 13, 14, 17, 18
 CONTAINER = slice(15, 17)
 SETTINGS = {
     "simulation.scenes": "train", "simulation.cameras": ["near", "wrist"], "simulation.max_action_m": 0.1,
-    "simulation.max_episode_steps": 40, "data.behaviours": {"expert": 0.5, "noisy": 0.4, "random": 0.1},
+    "simulation.max_episode_steps": 40,
 }
 """Of every task in these scenes."""
 ON_TABLE_M = 0.01

@@ -1,4 +1,4 @@
-"""Waypoints of the tasks in the procedural scenes, and a simple script that follows them.
+"""Waypoints of the tasks in the procedural scenes, and a closed loop that follows such.
 
 A waypoint (7,) is a commanded state with its position in the world frame: x y z m, rotation vector from the tool that
 points down, rad, gripper -1 closed to 1 open. P: GROUND_TRUTH_NAMES of objects.py.
@@ -24,7 +24,6 @@ MAX_TURN_RAD = 0.2
 """A script asks for a full turning action from here on."""
 WAIT_STEPS = 2
 """At a waypoint where the gripper closes or opens."""
-BEHAVIOURS = ("expert", "noisy", "random")
 Waypoints = Callable[[FloatArray], list[FloatArray]]
 
 
@@ -79,20 +78,6 @@ def push_waypoints(truth: FloatArray, behind_m: float) -> list[FloatArray]:
     ]
 
 
-def scripted(waypoints: Waypoints, speed: float) -> Callable[..., Callable[[FloatArray, FloatArray], FloatArray]]:
-    """Return a Task.script that follows the waypoints. speed: largest action of a translation."""
-    def script(
-        behaviour: str, truth: FloatArray, rng: np.random.Generator, max_action_m: float
-    ) -> Callable[[FloatArray, FloatArray], FloatArray]:
-        if behaviour not in BEHAVIOURS:
-            raise ValueError(f"unknown behaviour {behaviour!r}; choose one of {', '.join(BEHAVIOURS)}")
-        noise = 0.0 if behaviour == "expert" else rng.uniform(0.1, 0.6)
-        targets = _wander(rng) if behaviour == "random" else waypoints(truth)
-        return follow(targets, max_action_m, speed, noise, rng)
-
-    return script
-
-
 def follow(
     targets: list[FloatArray], max_action_m: float, speed: float, noise: float, rng: np.random.Generator
 ) -> Callable[[FloatArray, FloatArray], FloatArray]:
@@ -121,11 +106,3 @@ def difference(state: FloatArray, target: FloatArray) -> tuple[FloatArray, Float
     """Translation, m, and rotation vector, rad, from a state (7,) in the base frame to a waypoint."""
     turn = multiply(np, to_quaternion(np, target[3:6]), to_quaternion(np, -state[3:6]))
     return target[:3] - (state[:3] + ROBOT_BASE), to_vector(np, turn)
-
-
-def _wander(rng: np.random.Generator) -> list[FloatArray]:
-    low, high = [-0.15, -0.15, 0.02], [0.2, 0.15, 0.2]
-    return [
-        waypoint(place[:2], place[2], rng.uniform(-0.5, 0.5), rng.choice([CLOSED, OPEN]))
-        for place in rng.uniform(low, high, (100, 3))
-    ]

@@ -9,7 +9,8 @@ from wm_nodes.config.tasks import Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, Point, draw, free_of
-from wm_nodes.environments.maniskill.pose_scripts import carry_waypoints, scripted
+from wm_nodes.environments.maniskill.pose_behaviours import CARRYING, scripted
+from wm_nodes.environments.maniskill.pose_scripts import carry_waypoints
 
 RADIUS_M, HEIGHT_M = 0.05, 0.02
 LEAST_WAY_M = 0.11
@@ -49,5 +50,5 @@ TASK = Task(
     success=success,
     waypoints=carry_waypoints,
     script=scripted(carry_waypoints, speed=0.8),
-    settings=objects.SETTINGS,
+    settings={**objects.SETTINGS, "data.behaviours": CARRYING},
 )

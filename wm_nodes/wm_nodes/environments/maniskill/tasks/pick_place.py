@@ -9,7 +9,8 @@ from wm_nodes.config.tasks import Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, draw, free_of
-from wm_nodes.environments.maniskill.pose_scripts import place_waypoints, scripted
+from wm_nodes.environments.maniskill.pose_behaviours import CARRYING, scripted
+from wm_nodes.environments.maniskill.pose_scripts import place_waypoints
 
 RIM_M = 0.015
 """The object's centre lies at least this far inside the container's rim,"""
@@ -52,5 +53,5 @@ TASK = Task(
     success=success,
     waypoints=place_waypoints,
     script=scripted(place_waypoints, speed=0.8),
-    settings=objects.SETTINGS,
+    settings={**objects.SETTINGS, "data.behaviours": CARRYING},
 )

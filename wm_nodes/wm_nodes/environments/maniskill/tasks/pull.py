@@ -13,7 +13,7 @@ from wm_nodes.environments.maniskill.tasks import push
 
 
 def place(rng: np.random.Generator) -> Layout:
-    return push.place_on_way(rng, -1, ((0.0, -0.12), (0.10, 0.12)))
+    return push.place_on_way(rng, -1, ((-0.04, -0.12), (0.06, 0.12)))
 
 
 def scene() -> Any:

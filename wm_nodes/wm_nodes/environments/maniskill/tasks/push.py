@@ -9,7 +9,8 @@ from wm_nodes.config.tasks import Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import CONTAINERS, Layout, Point, Rectangle, draw, free_of
-from wm_nodes.environments.maniskill.pose_scripts import push_waypoints, scripted
+from wm_nodes.environments.maniskill.pose_behaviours import MOVING, scripted
+from wm_nodes.environments.maniskill.pose_scripts import push_waypoints
 
 DISTANCE_M, ASIDE_M = 0.10, 0.05
 BEHIND_M = 0.09
@@ -61,5 +62,5 @@ TASK = Task(
     success=success,
     waypoints=waypoints,
     script=scripted(waypoints, speed=0.5),
-    settings=objects.SETTINGS,
+    settings={**objects.SETTINGS, "data.behaviours": MOVING},
 )

@@ -9,7 +9,8 @@ from wm_nodes.config.tasks import Task
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, Point, draw, free_of
-from wm_nodes.environments.maniskill.pose_scripts import CLOSED, scripted, waypoint
+from wm_nodes.environments.maniskill.pose_behaviours import MOVING, scripted
+from wm_nodes.environments.maniskill.pose_scripts import CLOSED, waypoint
 from wm_nodes.environments.maniskill.table_top import TOOL, above_cube
 
 TOLERANCE_M = 0.02
@@ -55,6 +56,6 @@ TASK = Task(
     success=success,
     waypoints=waypoints,
     script=scripted(waypoints, speed=0.8),
-    settings=objects.SETTINGS,
+    settings={**objects.SETTINGS, "data.behaviours": MOVING},
     moves_object=False,
 )
