@@ -215,13 +215,57 @@ def heldout_metric_rows() -> Rows:
 
 
 def closed_loop_rows() -> Rows:
-    """One line per arm and learning rate of the pilots: error of whole rollouts, and how many got better."""
-    for run in runs("video_rl_closed_loop.jsonl").values():
-        for one in run["rows"]:
-            first, last = one["evaluations"][0], one["evaluations"][-1]
-            changed = (f"{last[name] - first[name]:+.2f}" for name in ("object_cm", "tool_cm", "psnr_db"))
-            share = f"{100 * last['win']:.0f}"
-            yield row(one["sampler"], f"{one['learning_rate']:g}", last["iteration"], *changed, share)
+    """One line per arm: change of whole rollouts, and how many got better; an arm of one seed has no interval."""
+    measures = (("error_cm", 2), ("object_cm", 2), ("tool_cm", 2), ("psnr_db", 2))
+    for name, trained in closed_loop_trainings().items():
+        changes = [(rise(trained, measure), digits) for measure, digits in measures]
+        cells = (interval_of(paired_interval(one), digits) if len(one) > 1 else f"{one[0]:+.{digits}f}"
+                 for one, digits in changes)
+        better = mean(one["evaluations"][-1]["win"] for one in trained)
+        yield row(name, len(trained), f"{trained[0]['learning_rate']:g}", *cells, f"{100 * better:.0f}")
+
+
+def horizon_rows() -> Rows:
+    """One line per clip of a rollout: change by CPS."""
+    trained = closed_loop_trainings()["CPS 0.4"]
+    for clip in range(1, 5):
+        cells = [interval_of(paired_interval(rise(trained, f"{name}_cm_{clip}")), 2) for name in ("object", "tool")]
+        yield row(clip, *cells)
+
+
+def closed_loop_trainings() -> dict[str, list[Run]]:
+    rows = [one for run in runs("video_rl_closed_loop.jsonl").values() for one in run["rows"]]
+    return {name: [one for one in rows if one["sampler"] == name] for name in sorted({one["sampler"] for one in rows})}
+
+
+def rise(trained: list[Run], name: str) -> list[float]:
+    return [course[-1] for course in gains(trained, name)]
+
+
+def trained_in_rows() -> Rows:
+    """One line per model: real success of its policies by seed, their mean, the imagined one beside it, and how the
+    model ranks policies."""
+    found = runs("environments.jsonl")
+    rows, correlations = found["trained in"]["rows"], found["ranking"]["correlations"]
+    for model in dict.fromkeys(one["model"] for one in rows):
+        mine = [one for one in rows if one["model"] == model]
+        by_seed = ", ".join(percent(one["real_after"]["rate"]) for one in mine)
+        real, imagined = (mean(one[name]["rate"] for one in mine) for name in ("real_after", "imagined_after"))
+        rank = "{correlation:+.2f} [{low:+.2f}, {high:+.2f}]".format(**correlations[model])
+        yield row(model, by_seed, percent(real), percent(imagined), f"{100 * (imagined - real):+.1f}", rank)
+
+
+def model_pair_rows() -> Rows:
+    """One line per pair of models: the policies' real success after, paired by episode over all seeds."""
+    rows = runs("environments.jsonl")["trained in"]["rows"]
+    after = {(one["model"], one["seed"]): one["success_after"] for one in rows}
+    seeds = sorted({one["seed"] for one in rows})
+    for better, base in (
+        ("video model after", "video model before"), ("world model", "video model after"),
+    ):
+        pair = paired_difference(*([won for seed in seeds for won in after[model, seed]] for model in (base, better)))
+        changed = interval(100 * pair.difference, 100 * pair.low, 100 * pair.high, 1)
+        yield row(f"{better} - {base}", pair.episodes, changed)
 
 
 def clip_learning_rows() -> Rows:
@@ -436,7 +480,9 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         diversity_rows, clip_rows, learning_rows, clip_learning_rows, cost_rows, ablation_rows,
         resolution_rows, hacking_rows,
     ],
-    "video_tasks": [outcome_rows, heldout_metric_rows, closed_loop_rows],
+    "video_tasks": [
+        outcome_rows, heldout_metric_rows, closed_loop_rows, horizon_rows, trained_in_rows, model_pair_rows,
+    ],
     "judge": [
         table_rows, pattern_rows, conformal_rows, stacked_rows, efficiency_rows, judge_hacking_rows, control_rows,
         imagined_rows, policy_camera_rows,
