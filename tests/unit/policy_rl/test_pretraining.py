@@ -45,7 +45,8 @@ def test_a_model_from_scratch_is_collected_in_parallel_and_resumed_where_it_stop
     assert (story["data"]["episodes"], story["data"]["policy_episodes"]) == (6, 2)
     assert set(story["training"]) == {"tokenizer", "action", "text", "probe"} and all(story["training"].values())
     assert story["heldout"]["episodes"] == 2 and story["made"]["command"] == "a test"
-    shards = sorted((tmp_path / "data" / "train").iterdir())
+    shards = sorted((tmp_path / "data" / "train").glob("shard_*"))
+    assert (tmp_path / "data" / "train" / "index.csv").is_file()
     assert [shard.name for shard in shards] == ["shard_00000000", "shard_00000002"]
 
     episodes = [episode for shard in shards for episode in read_episodes(shard)]
