@@ -26,6 +26,14 @@ def test_the_command_line_wins_over_preset_and_task() -> None:
     assert load_config("smoke", {"task": "reach", "sft.num_demonstrations": 7}).sft.num_demonstrations == 7
 
 
+def test_groups_of_environments_must_be_whole() -> None:
+    groups = {"ppo.advantage": "group", "ppo.group_size": 7}
+    with pytest.raises(ConfigError, match="num_envs 64 must be a multiple of group_size 7"):
+        load_config("cpu", groups)
+    assert load_config("cpu", {**groups, "ppo.num_envs": 63}).ppo.envs_per_start == 7
+    assert load_config("cpu", {"ppo.group_size": 7}).ppo.envs_per_start == 1
+
+
 def test_a_saved_configuration_comes_back_equal(tmp_path: Path) -> None:
     config = load_config("smoke", {"seed": 3})
     path = tmp_path / "config.yaml"

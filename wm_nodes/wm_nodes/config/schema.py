@@ -5,7 +5,7 @@ Loop 2's are in video.py.
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.tasks import check_task
@@ -271,6 +271,12 @@ class PpoConfig(SettingsSection):
     """Stop the epochs of an update early beyond this approximate KL, nats; 0: never."""
     value_warmup_updates: NonNegativeInt
     """gae: first updates that train the critic only."""
+
+    @model_validator(mode="after")
+    def _check_groups(self) -> Self:
+        if self.num_envs % self.envs_per_start:
+            raise ValueError(f"num_envs {self.num_envs} must be a multiple of group_size {self.group_size}")
+        return self
 
     @property
     def envs_per_start(self) -> int:
