@@ -78,7 +78,7 @@ def evaluate(
                 _noise(first_seed + max(int(episode), 0), int(step), env.spec.action_dim)
                 for episode, step in zip(playing, observation.episode_step, strict=True)
             ])
-        result = env.step(_act(policy, observation, noise))
+        result = env.step(act_in_rows(policy, observation, noise))
         observation = result.observation
         ended = (result.terminated | result.truncated) & result.valid & (playing >= 0)
         if not ended.any():
@@ -100,8 +100,11 @@ def evaluate(
     return EvaluationResult(success, length, first_seed, low, high)
 
 
-def _act(policy: ImagePolicy, seen: Observation, noise: FloatArray | None) -> FloatArray:
-    """Actions (N, A), from calls of ROWS rows."""
+def act_in_rows(policy: ImagePolicy, seen: Observation, noise: FloatArray | None = None) -> FloatArray:
+    """Return actions (N, A), from calls of ROWS rows: those of an environment do not depend on how many there are.
+
+    noise: as of ImagePolicy.act; None acts without.
+    """
     num_envs = len(seen.image)
     calls = np.arange(num_envs + -num_envs % ROWS).reshape(-1, ROWS) % num_envs
     actions = [
