@@ -28,12 +28,14 @@ LINKS_NOT_DRAWN = tuple(f"panda_link{i}" for i in range(7))
 
 
 class TableTopScene(BaseEnv):  # type: ignore[misc]
-    """Mixin before a ManiSkill table-top task."""
+    """Mixin before a ManiSkill table-top task. cameras: names of PLACEMENTS. image_size: of each, px."""
 
-    image_size = 64
-    cameras: Sequence[str] = ("side", "wrist")
     table_colour = TABLE_COLOUR
     finger_m = 0.0
+
+    def __init__(self, *args: Any, image_size: int, cameras: Sequence[str], **options: Any) -> None:
+        self.image_size, self.cameras = image_size, cameras
+        super().__init__(*args, **options)
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
@@ -93,10 +95,8 @@ def make_scene(
 
     mixins: classes before TableTopScene. options: ManiSkill's.
     """
-    TableTopScene.image_size, TableTopScene.cameras = config.image_size, tuple(config.cameras)
-    made = make(_registered(scene, mixins), config, **options).unwrapped
-    made.image_size, made.cameras = TableTopScene.image_size, TableTopScene.cameras  # where it is built anew
-    return made
+    views = {"image_size": config.image_size, "cameras": tuple(config.cameras)}
+    return make(_registered(scene, mixins), config, **views, **options).unwrapped
 
 
 @functools.cache

@@ -130,7 +130,6 @@ def record_states(env: ManiSkillEnvironment, behaviour: str, seed: int, layout: 
         })
         touched[0] = False
 
-    scene.image_size = env.spec.height  # its own: another scene of this process may have set the class's
     scene.reset(seed=0, options={"reconfigure": True})
     env.reset(seeds=np.array([seed], np.uint64))
     rng, scale = numpy_stream(seed, "behaviour"), env.spec.action_scale[0]
@@ -176,7 +175,7 @@ class ClipStage:
 
     def __init__(self, task: str, config: SimulationConfig, *, policy: bool = False) -> None:
         self._env = make_scene(get_task(task).scene, config, *(() if policy else (_ClipScene,)))
-        self._size = self._env.image_size = config.image_size
+        self._size = config.image_size
         self._build()
 
     def draw(
