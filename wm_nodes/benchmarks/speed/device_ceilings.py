@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.speed.device_suite import Plan, Point, Stopwatch
-from benchmarks.speed.inputs import NUM_STARTS, interleave
+from benchmarks.speed.inputs import NUM_STARTS, TOOL_DIM, interleave
 from benchmarks.speed.simulator import rate_workers, simulator_kinds, simulator_workers
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.core.action_spaces import TRANSLATION
 from wm_nodes.core.device import CPU
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.seeding import numpy_stream
@@ -25,9 +24,6 @@ from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy, PolicyOut
 from wm_nodes.policy_rl.rollouts import action_noise, collect_rollout
 from wm_nodes.reward import RuleReward
 from wm_nodes.world_model import ImaginedEnvironment, WorldModels
-
-TOOL_DIM = len(TRANSLATION.units)
-"""Of actions and states."""
 
 
 def launch_points(plan: Plan) -> Iterator[Point]:

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor
 
 from benchmarks.speed.device_suite import DISC, ModelSize, Plan, Point, Stopwatch
-from benchmarks.speed.inputs import prepare_model, random_model
+from benchmarks.speed.inputs import TOOL_DIM, prepare_model, random_model
 from benchmarks.video_rl.cost import GROUP, SCENES, pushcube_buffer, toy_buffer
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, model_tasks
-from wm_nodes.core.action_spaces import TRANSLATION
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.device_rollout import DeviceCollector, Step, capture_graph
@@ -39,8 +38,6 @@ from wm_nodes.world_model.training.tokenizer import train_tokenizer
 
 EAGER, CAPTURED, HOST_LOOP = "eager", "captured", "loop over host arrays"
 """Ways to imagine."""
-TOOL_DIM = len(TRANSLATION.units)
-"""Of actions and states."""
 EPISODES = 64
 """Random ones, to train on."""
 WARM_UP = 2

@@ -18,6 +18,7 @@ from safetensors.torch import save_file
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task, model_tasks
+from wm_nodes.core.action_spaces import TRANSLATION
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Environment, FloatArray, UInt64Array
@@ -28,6 +29,8 @@ from wm_nodes.world_model.text import TextModel, vocabulary_of
 from wm_nodes.world_model.tokenizer import Tokenizer
 
 NUM_STARTS = 64
+TOOL_DIM = len(TRANSLATION.units)
+"""Of actions and states."""
 
 console = Console()
 T = TypeVar("T")

@@ -4,11 +4,12 @@ A state is in the robot's base frame: see core/action_spaces.py.
 """
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
 
 from wm_nodes.core.rotations import multiply, to_quaternion, to_vector
 from wm_nodes.core.types import FloatArray
@@ -19,6 +20,18 @@ GRIPPER_CLOSED = -1.0
 DOWN = np.array([0.0, 1.0, 0.0, 0.0])
 """Quaternion w x y z of the tool that points straight down."""
 MAX_FINGER_M = 0.04
+
+
+def rotation_of(quaternion: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """The rotation vector (3,) of a state, from a tool's quaternion (4,)."""
+    rotation: NDArray[np.float64] = to_vector(np, multiply(np, quaternion, -DOWN))  # -DOWN is also DOWN's inverse
+    return rotation
+
+
+def quaternion_of(rotation: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """The inverse of rotation_of."""
+    quaternion: NDArray[np.float64] = multiply(np, to_quaternion(np, rotation), DOWN)
+    return quaternion
 
 
 class ToolControl(ABC):
@@ -60,13 +73,11 @@ class PoseControl(ToolControl):
 
     def state(self, scene: BaseEnv) -> FloatArray:
         pose = scene.agent.controller.controllers["arm"]._target_pose.raw_pose[0].numpy().astype(np.float64)
-        rotation = to_vector(np, multiply(np, pose[3:], -DOWN))  # -DOWN is also the inverse of DOWN
         gripper = scene.agent.robot.get_qpos()[0, -1].item() / MAX_FINGER_M * 2 - 1
-        return np.array([*pose[:3], *rotation, gripper], np.float32)
+        return np.array([*pose[:3], *rotation_of(pose[3:]), gripper], np.float32)
 
     def step(self, scene: BaseEnv, state: FloatArray, target: FloatArray) -> FloatArray:
-        turned = multiply(np, to_quaternion(np, target[3:6]), DOWN)
-        pose = np.concatenate([target[:3], turned]).astype(np.float32)
+        pose = np.concatenate([target[:3], quaternion_of(target[3:6])]).astype(np.float32)
         scene.agent.controller.controllers["arm"].set_state({"target_pose": torch.from_numpy(pose)[None]})
         command = np.array([*(0.0,) * 6, target[6]], np.float32)
         scene._step_action(torch.from_numpy(command)[None])

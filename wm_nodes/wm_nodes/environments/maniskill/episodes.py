@@ -11,7 +11,6 @@ from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import moves_pose
 from wm_nodes.core.types import Episode, FloatArray, Observation
-from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner, PlanningError, follow, track
 from wm_nodes.environments.maniskill.pose_behaviours import PLANNED, vary
@@ -66,9 +65,8 @@ def planned_episode(
     """One MPLib demonstration. behaviour: one of planned_behaviours. Raises PlanningError where no path is found."""
     env.reset(seeds=np.array([seed], np.uint64))
     if moves_pose(env.spec):
-        start = env.current().state[0] + np.pad(ROBOT_BASE, (0, 4))
         waypoints = get_task(env.spec.task).waypoints(env.ground_truth[0])
-        varied = vary(behaviour, waypoints, start, numpy_stream(seed, "behaviour"))
+        varied = vary(behaviour, waypoints, planner.start(), numpy_stream(seed, "behaviour"))
         path_follower = track(planner.pose_path(varied), env.spec)
     else:
         path_follower = follow(planner.tool_path(), env.spec.action_scale[0])

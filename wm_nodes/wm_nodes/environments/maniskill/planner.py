@@ -12,12 +12,11 @@ import mplib
 import numpy as np
 
 from wm_nodes.config.tasks import get_task
-from wm_nodes.core.rotations import multiply, to_quaternion, to_vector
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import moves_pose
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
-from wm_nodes.environments.maniskill.control import DOWN
+from wm_nodes.environments.maniskill.control import quaternion_of, rotation_of
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.pose_scripts import difference
 
@@ -83,6 +82,11 @@ class DemonstrationPlanner:
         path: FloatArray = np.stack(tools).astype(np.float32)
         return path
 
+    def start(self) -> FloatArray:
+        """The environment's commanded state (7,), with its position in the world frame."""
+        state: FloatArray = self._env.current().state[0] + np.pad(ROBOT_BASE, (0, 4))
+        return state
+
     def pose_path(self, waypoints: list[FloatArray]) -> FloatArray:
         """Plan through waypoints (7,) from the environment's current pose: commanded states (K, 7), positions in the
         world frame, one per control step.
@@ -92,8 +96,7 @@ class DemonstrationPlanner:
         """
         joints = self._env.scene.agent.robot.get_qpos()[0].numpy().astype(np.float64)
         period_s = self._env.spec.control_period_s
-        state = self._env.current().state[0] + np.pad(ROBOT_BASE, (0, 4))
-        path = list[FloatArray]()
+        state, path = self.start(), list[FloatArray]()
         for number, waypoint in enumerate(waypoints, 1):
             if np.array_equal(waypoint[:6], state[:6]):
                 path += [waypoint] * (round(GRIPPER_S / period_s) if waypoint[6] != state[6] else 0)
@@ -111,7 +114,7 @@ class DemonstrationPlanner:
     def _plan_pose(self, waypoint: FloatArray, joints: Joints, number: str) -> tuple[Joints, JointPath]:
         """Times (K,), s, and joint angles (K, 7) of a screw path. RRT-Connect is no way out where there is none: MPLib
         0.1.1 cannot seed it, and no episode would repeat."""
-        pose = np.concatenate([waypoint[:3], multiply(np, to_quaternion(np, waypoint[3:6]), DOWN)])
+        pose = np.concatenate([waypoint[:3], quaternion_of(waypoint[3:6])])
         for step in SCREW_STEPS:
             try:
                 result = self._planner.plan_screw(pose, joints, qpos_step=step, time_step=PLANNER_TIME_STEP_S)
@@ -127,8 +130,7 @@ class DemonstrationPlanner:
         model = self._planner.pinocchio_model
         model.compute_forward_kinematics(joints)
         pose = model.get_link_pose(self._tool_index)
-        rotation = to_vector(np, multiply(np, pose[3:], -DOWN))
-        return np.asarray(np.concatenate([pose[:3] + ROBOT_BASE, rotation]), np.float32)
+        return np.asarray(np.concatenate([pose[:3] + ROBOT_BASE, rotation_of(pose[3:])]), np.float32)
 
 
 def _quieten(logger: logging.Logger) -> None:

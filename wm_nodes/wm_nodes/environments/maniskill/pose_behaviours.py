@@ -13,7 +13,7 @@ import numpy as np
 
 from wm_nodes.core.rotations import multiply, to_quaternion, to_vector
 from wm_nodes.core.types import FloatArray
-from wm_nodes.environments.maniskill.pose_scripts import CLOSED, OPEN, Waypoints, follow, waypoint
+from wm_nodes.environments.maniskill.pose_scripts import CLOSED, OPEN, Waypoints, follow, turn_between, waypoint
 from wm_nodes.environments.maniskill.table_top import TOOL
 
 PLANNED = ("expert", "detour", "interpolated", "jitter")
@@ -83,8 +83,7 @@ def vary(behaviour: str, waypoints: list[FloatArray], start: FloatArray, rng: np
 
 def between(start: FloatArray, end: FloatArray, share: float) -> FloatArray:
     """The waypoint at a share of the straight way, with the gripper of the end."""
-    turn = to_vector(np, multiply(np, to_quaternion(np, end[3:6]), to_quaternion(np, -start[3:6])))
-    rotation = _turned(start[3:6], share * turn)
+    rotation = _turned(start[3:6], share * turn_between(start[3:6], end[3:6]))
     place = start[:3] + share * (end[:3] - start[:3])
     return np.asarray(np.concatenate([place, rotation, end[6:]]), np.float32)
 

@@ -33,12 +33,16 @@ def waypoint(xy: FloatArray, z: float, yaw: float, gripper: float) -> FloatArray
 
 def grasp_waypoints(truth: FloatArray) -> list[FloatArray]:
     """Above the object, down to it, closed, and up; the fingers close across the object's y axis."""
-    x_y, z = truth[OBJECT][:2], max(float(truth[OBJECT][2]), LEAST_GRASP_M)
-    yaw = grasp_yaw(truth)
+    x_y, z, yaw = truth[OBJECT][:2], grasp_height(truth), grasp_yaw(truth)
     return [
         waypoint(x_y, z + TRAVEL_M, yaw, OPEN), waypoint(x_y, z, yaw, OPEN), waypoint(x_y, z, yaw, CLOSED),
         waypoint(x_y, z + TRAVEL_M, yaw, CLOSED),
     ]
+
+
+def grasp_height(truth: FloatArray) -> float:
+    """Of the tool, m: the object's centre, with fingers clear of the table."""
+    return max(float(truth[OBJECT][2]), LEAST_GRASP_M)
 
 
 def grasp_yaw(truth: FloatArray) -> float:
@@ -49,8 +53,7 @@ def grasp_yaw(truth: FloatArray) -> float:
 
 def place_waypoints(truth: FloatArray) -> list[FloatArray]:
     """Grasp, and release just above the floor of the container."""
-    goal, yaw = truth[CONTAINER], grasp_yaw(truth)
-    grasp_z = max(float(truth[OBJECT][2]), LEAST_GRASP_M)
+    goal, grasp_z, yaw = truth[CONTAINER], grasp_height(truth), grasp_yaw(truth)
     low = grasp_z + 0.015
     return [
         *grasp_waypoints(truth), waypoint(goal, grasp_z + TRAVEL_M, yaw, CLOSED), waypoint(goal, low, yaw, CLOSED),
@@ -60,8 +63,7 @@ def place_waypoints(truth: FloatArray) -> list[FloatArray]:
 
 def carry_waypoints(truth: FloatArray) -> list[FloatArray]:
     """Grasp, and set down at the goal."""
-    goal, yaw = truth[GOAL], grasp_yaw(truth)
-    z = max(float(truth[OBJECT][2]), LEAST_GRASP_M)
+    goal, z, yaw = truth[GOAL], grasp_height(truth), grasp_yaw(truth)
     return [
         *grasp_waypoints(truth), waypoint(goal, z + TRAVEL_M, yaw, CLOSED), waypoint(goal, z + 0.005, yaw, CLOSED),
     ]
@@ -104,5 +106,10 @@ def follow(
 
 def difference(state: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Translation, m, and rotation vector, rad, from a state (7,) in the base frame to a waypoint."""
-    turn = multiply(np, to_quaternion(np, target[3:6]), to_quaternion(np, -state[3:6]))
-    return target[:3] - (state[:3] + ROBOT_BASE), to_vector(np, turn)
+    return target[:3] - (state[:3] + ROBOT_BASE), turn_between(state[3:6], target[3:6])
+
+
+def turn_between(start: FloatArray, end: FloatArray) -> FloatArray:
+    """The rotation vector (3,) that turns one rotation vector (3,) into another."""
+    turn: FloatArray = to_vector(np, multiply(np, to_quaternion(np, end), to_quaternion(np, -start)))
+    return turn
