@@ -11,15 +11,16 @@ import pytest
 import wm_nodes
 from wm_nodes.apps import cli
 from wm_nodes.config.load import ConfigError, default_task, load_config
-from wm_nodes.config.tasks import VARIABLE, clip_rules, get_task, model_tasks, task_names
+from wm_nodes.config.tasks import VARIABLE, clip_rules, get_task, model_tasks, recorded_task, shares_scene, task_names
 from wm_nodes.core.specs import simulation_spec
 
 TASKS = ("pull_cube", "push_cube", "reach")
 IN_SCENES = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
 """Those of the procedural scenes."""
-NAMED_IN = {"launching/scenarios.py", "judge/dataset/build.py", "judge/clip_files.py", "apps/judge_clips.py",
-            "policy_rl/train.py"}
-"""The default task of launch files, the tasks of a fixed set of clips, two lines of clips.jsonl, an example."""
+NAMED_IN = {"launching/scenarios.py", "environments/maniskill/objects.py", "judge/dataset/build.py",
+            "judge/clip_files.py", "apps/judge_clips.py", "policy_rl/train.py"}
+"""The default task of launch files, those that share a model, the tasks of a fixed set of clips, two lines of
+clips.jsonl, an example."""
 
 
 @pytest.mark.parametrize(
@@ -38,13 +39,24 @@ def test_the_shipped_tasks_are_found_and_share_models_as_the_shipped_one_says() 
     assert task_names() == tuple(sorted(TASKS + IN_SCENES)) and default_task() in TASKS
     assert model_tasks("reach") == model_tasks("push_cube") == ("reach", "push_cube")
     assert model_tasks("pull_cube") == ("pull_cube",)
+    assert {model_tasks(task) for task in IN_SCENES} == {IN_SCENES}
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_a_task_belongs_to_its_model_and_its_shares_and_seeds_are_complete(task: str) -> None:
+def test_tasks_in_one_scene_share_their_episodes_and_the_others_have_their_own() -> None:
+    assert [recorded_task(task) for task in TASKS] == ["pull_cube", "push_cube", "push_cube"]
+    assert [recorded_task(task) for task in IN_SCENES] == [*IN_SCENES]
+    assert shares_scene("reach", "push_cube") and not shares_scene("push", "pull") and shares_scene("unheard", "push")
+
+
+@pytest.mark.parametrize("task", TASKS + IN_SCENES)
+def test_a_task_belongs_to_its_model_and_its_seeds_are_its_own(task: str) -> None:
     assert task in model_tasks(task) and {model_tasks(other) for other in model_tasks(task)} == {model_tasks(task)}
     numbers = [policy.number for other in model_tasks(task) for policy in get_task(other).weak_policies]
     assert len(numbers) == len(set(numbers)) > 0
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_shares_of_a_tasks_clips_are_complete(task: str) -> None:
     for shares in (clip_rules(task).behaviours, clip_rules(task).policy_behaviours):
         assert sum(shares.values()) == pytest.approx(1)
 

@@ -62,6 +62,30 @@ def test_a_model_from_scratch_is_collected_in_parallel_and_resumed_where_it_stop
     assert {path.name: path.read_bytes() for path in folder.glob("*.safetensors")} == files
 
 
+@pytest.mark.slow
+@pytest.mark.rendering
+def test_one_model_is_made_of_the_episodes_of_several_tasks_and_measured_on_every_split(tmp_path: Path) -> None:
+    small = {"data.num_episodes": 2, "data.num_heldout": 1, "tokenizer.num_iterations": 2, "data.num_workers": 1}
+    config = load_config("smoke", {
+        "task": "push", "data.behaviours": {"expert": 1.0}, "world_model.num_iterations": 2,
+        "simulation.max_episode_steps": 12, **small,
+    })
+    folder = make_model(config, tmp_path)
+    models, story = load_model_folder(folder), json.loads((folder / "manifest.json").read_text())
+    assert models.tasks == ("move_to_aim", "pick_place", "pull", "push", "reach_object")
+    assert story["data"]["episodes"] == 10 and story["data"]["policy_episodes"] == 0
+    for split in ("heldout", "heldout_ood_object", "heldout_ood_combo"):
+        assert {task: values["episodes"] for task, values in story[split].items()} == dict.fromkeys(models.tasks, 1)
+        assert "done_push_auc" in story[split]["push"] and "done_pull_auc" not in story[split]["push"]
+    recorded = {path.parent.name: path for path in (tmp_path / "data" / "train").glob("*/shard_*")}
+    behaviours = {task: {e.behaviour for e in read_episodes(bag)} for task, bag in recorded.items()}
+    assert set(recorded) == set(models.tasks) and behaviours["push"] == {"expert"} != behaviours["pick_place"]
+    assert len(load_starts(folder / "starts.safetensors")[0]) == 10
+    assert len(load_starts(folder / "starts.safetensors", "push")[0]) == 2
+    with pytest.raises(ValueError, match="has starts of move_to_aim, pick_place, pull, push, reach_object, none of"):
+        load_starts(folder / "starts.safetensors", "reach")
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_a_gpu_that_is_not_there_is_found_out_before_anything_is_collected(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match="device is cuda:0, but torch"):
@@ -81,7 +105,7 @@ def test_too_little_memory_in_training_names_the_batch_of_the_model(
         raise torch.cuda.OutOfMemoryError("CUDA out of memory.\nTried to allocate 20.00 GiB.")
 
     skipped = {
-        "collect_plan": [], "load_arrays": None, "train_tokenizer": (None, {}), "train_position_probe": (None, {}),
+        "collect_scripted": {}, "load_arrays": None, "train_tokenizer": (None, {}), "train_position_probe": (None, {}),
         "tokenise_episodes": None,
     }
     for name, answer in skipped.items():

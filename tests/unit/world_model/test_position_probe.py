@@ -13,7 +13,7 @@ from wm_nodes.world_model.tokenizer import PROBE_NAMES
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.tokenizer import probe_targets
 
-CUBE = [PROBE_NAMES.index(name) for name in ("cube_x", "cube_y")]
+OBJECT = [PROBE_NAMES.index(name) for name in ("object_x", "object_y")]
 
 
 def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
@@ -27,8 +27,8 @@ def test_a_trained_probe_reads_positions_of_episodes_it_has_not_seen(tmp_path: P
     unseen = arrays(16, 10_000)
     truth = probe_targets(unseen.ground_truth, "push_cube")
     assert probe.read(unseen.images).shape == truth.shape
-    guess = np.linalg.norm(truth[..., CUBE] - truth[..., CUBE].mean((0, 1)), axis=-1).mean()
-    found = np.linalg.norm((probe.read(unseen.images) - truth)[..., CUBE], axis=-1).mean()
+    guess = np.linalg.norm(truth[..., OBJECT] - truth[..., OBJECT].mean((0, 1)), axis=-1).mean()
+    found = np.linalg.norm((probe.read(unseen.images) - truth)[..., OBJECT], axis=-1).mean()
     assert found < 0.35 * guess
 
 

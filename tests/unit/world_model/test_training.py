@@ -15,11 +15,15 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.training.loop import EMA_DECAY, TrainingLoop
+from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.dynamics import (
+    LatentEpisodes,
     RolloutTerms,
     bootstrap_masks,
     decoded_losses,
     done_losses,
+    done_mask,
+    first_frames,
     rollout_steps_at,
     shown_frames,
     token_weights,
@@ -51,18 +55,53 @@ def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
 
 def test_rmse_of_one_half_on_balanced_labels_is_one_half() -> None:
     logits, labels = torch.zeros(2, 3, 1, 1), torch.tensor([[0.0, 1, 0], [1, 0, 1]]).unsqueeze(-1)
-    assert_close(done_losses(logits, labels, torch.ones(2, 3, 1), "rmse"), torch.tensor(0.5))
-    assert_close(done_losses(logits, labels, torch.ones(2, 3, 1), "bce"), torch.log(torch.tensor(2.0)))
+    assert_close(done_losses(logits, labels, torch.ones(2, 3, 1, 1), "rmse"), torch.tensor(0.5))
+    assert_close(done_losses(logits, labels, torch.ones(2, 3, 1, 1), "bce"), torch.log(torch.tensor(2.0)))
 
 
 def test_masked_steps_do_not_count_in_the_done_loss() -> None:
     logits, labels = torch.tensor([[[[9.0]], [[9.0]]]]), torch.tensor([[[1.0], [0.0]]])
-    assert done_losses(logits, labels, torch.tensor([[[1.0], [0.0]]])) < 1e-3
+    assert done_losses(logits, labels, torch.tensor([[[[1.0]], [[0.0]]]])) < 1e-3
 
 
 def test_an_unknown_done_loss_is_refused() -> None:
     with pytest.raises(ValueError, match="'bce' or 'rmse'"):
-        done_losses(torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1), torch.ones(1, 1, 1), "mse")
+        done_losses(torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1), torch.ones(1, 1, 1, 1), "mse")
+
+
+def untrained(episodes: EpisodeArrays) -> LatentEpisodes:
+    """The episodes as tokens of a tokenizer without training."""
+    return tokenise_episodes(Tokenizer(config_of().tokenizer, *episodes.images.shape[2:4]), episodes)
+
+
+def test_a_part_is_what_was_recorded_from_its_first_frame_on() -> None:
+    lengths = torch.tensor([12, 12, 5, 3])
+    drawn = torch.stack([first_frames(lengths, 4, torch.Generator().manual_seed(i)) for i in range(200)])
+    assert drawn.amax(0).tolist() == [8, 8, 1, 0] and not drawn.amin(0).any()
+    data = untrained(arrays(3))
+    part = data.parts(torch.tensor([2, 0]), torch.tensor([3, 8]), 4)
+    for name in ("latents", "states", "success", "truth"):
+        values = getattr(data, name)
+        assert_close(getattr(part, name), torch.stack([values[2, 3:8], values[0, 8:13]]), equal_nan=True)
+    assert_close(part.actions, torch.stack([data.actions[2, 3:7], data.actions[0, 8:12]]))
+    assert part.step_mask.shape == (2, 4) and part.step_mask.all()
+
+
+def test_a_model_trains_on_parts_of_episodes() -> None:
+    config, episodes = config_of(world_model__part_steps=5, world_model__num_iterations=3), arrays(4)
+    tokenizer, _ = train_tokenizer(episodes, config_of(tokenizer__num_iterations=2), 0, None)
+    model, metrics = train_action_model(tokenizer, episodes, config, 0, None)
+    assert np.isfinite(metrics["loss"])
+    whole, _ = train_action_model(tokenizer, episodes, config_of(world_model__num_iterations=3), 0, None)
+    assert not torch.equal(model.change.weight, whole.change.weight)
+
+
+def test_a_done_output_learns_from_the_episodes_that_show_whether_its_task_is_done() -> None:
+    data = replace(untrained(arrays(2)), labelled=torch.tensor([[True, False], [True, True]]))
+    heads = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 1.0]])
+    mask = done_mask(data, torch.tensor([0, 1, 0]), torch.ones(3, 12), heads)
+    assert mask.shape == (3, 12, 2, 2)
+    assert mask[:, 0].tolist() == [[[1, 0], [0, 0]], [[1, 1], [1, 1]], [[1, 0], [1, 0]]]
 
 
 def test_the_curriculum_gives_each_stage_an_equal_share() -> None:
@@ -159,7 +198,8 @@ def test_decoded_losses_are_smallest_for_the_true_latents_and_reach_the_predicti
     tokenizer.requires_grad_(False)
     data = tokenise_episodes(tokenizer, episodes)
     index = torch.arange(12)
-    steps, images = shown_frames(data, index, data.step_mask.sum(1), torch.Generator().manual_seed(0))
+    whole = torch.zeros(12, dtype=torch.int64), data.step_mask.sum(1)
+    steps, images = shown_frames(data, index, *whole, torch.Generator().manual_seed(0))
 
     def losses(latents: torch.Tensor) -> dict[str, torch.Tensor]:
         terms = RolloutTerms(latents, torch.zeros(()), torch.zeros(()))

@@ -21,6 +21,7 @@ from benchmarks.environments.policies import (
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_json, add_preset, positive, prepare_torch, settings
 from wm_nodes.config.load import load_config, preset_names
+from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import compute_device
 from wm_nodes.reports.console_table import make_table
@@ -40,10 +41,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                                 help="folders of video models that can be stepped")
         add_preset(experiment, "cpu", preset_names())
         experiment.add_argument("--task", default="push_cube")
+        experiment.add_argument("--model-dir", type=Path, metavar="DIR", help="world model instead of the shipped one")
         experiment.add_argument("--work", type=Path, default=Path("runs/environments"), metavar="DIR",
                                 help="folder of first frames and policies; what is there is kept")
         add_json(experiment, "write every row here; what it holds is not measured again")
     trained.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    trained.add_argument("--scenes", nargs="+", default=[], metavar="SCENES", type=check_scenes,
+                         help="measure the policies there, too: splits or scenes, as simulation.scenes")
     for experiment in (ranking, speed):
         experiment.add_argument("--seed", type=int, default=0)
 
@@ -57,7 +61,8 @@ def run(arguments: argparse.Namespace) -> None:
 def _workplace(arguments: argparse.Namespace, seed: int) -> Workplace:
     config = load_config(arguments.preset, {"task": arguments.task, **settings(arguments), "seed": seed})
     compute_device(config.device)
-    return Workplace(config, shipped_model(config.task), arguments.work.absolute() / f"{config.task}_{seed}")
+    model_dir = arguments.model_dir or shipped_model(config.task)
+    return Workplace(config, model_dir, arguments.work.absolute() / f"{config.task}_{seed}")
 
 
 def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
@@ -66,17 +71,28 @@ def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
         workplace = _workplace(arguments, seed)
         updates = workplace.config.ppo.updates
         for model in models:
-            if any((row["model"], row["seed"], row["updates"]) == (model, seed, updates) for row in rows):
+            wanted = (model, workplace.config.task, seed, updates)
+            if any((row["model"], row["task"], row["seed"], row["updates"]) == wanted for row in rows):
                 continue
             with tqdm(total=updates, desc=f"{Path(model).name}, seed {seed}", unit="update") as bar:
-                rows.append(train_in(workplace, model, bar.update))
+                rows.append(train_in(workplace, model, arguments.scenes, bar.update))
             write_results(arguments, {"rows": rows})
     console.print(make_table(
-        "policies trained in each model", ("trained in", "seed", "real before", "real after", "gain", "imagined"),
-        [(row["model"], str(row["seed"]), _percent(row["real_before"]), _percent(row["real_after"]),
-          "{difference:+.3f} ({low:+.3f} to {high:+.3f})".format(**row["real_gain"]),
-          f"{_percent(row['imagined_before'])} -> {_percent(row['imagined_after'])}") for row in rows],
+        "policies trained in each model",
+        ("trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined"),
+        [line for row in rows for line in _lines(row)],
     ))
+
+
+def _lines(row: dict[str, Any]) -> list[tuple[str, ...]]:
+    """A line of the table for the scenes of the training, and one for each of the others."""
+    first = {"before": row["real_before"], "after": row["real_after"], "gain": row["real_gain"]}
+    imagined = f"{_percent(row['imagined_before'])} -> {_percent(row['imagined_after'])}"
+    return [
+        (row["model"], row["task"], str(row["seed"]), name, _percent(found["before"]), _percent(found["after"]),
+         "{difference:+.3f} ({low:+.3f} to {high:+.3f})".format(**found["gain"]), "" if name else imagined)
+        for name, found in {"": first, **row.get("elsewhere", {})}.items()
+    ]
 
 
 def _ranking(arguments: argparse.Namespace, models: list[str]) -> None:

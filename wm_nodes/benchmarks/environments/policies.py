@@ -62,12 +62,13 @@ class Workplace:
         count = num_envs or self.config.ppo.num_envs
         return make(self.config, folder, self.start[0], num_envs=count, seed=self.config.seed)
 
-    def real(self, policy: ImagePolicy) -> EvaluationResult:
-        """Success in the simulator, on the seeds of the configuration."""
+    def real(self, policy: ImagePolicy, scenes: str = "") -> EvaluationResult:
+        """Success in the simulator, on the seeds of the configuration. scenes: others than the configuration's."""
         from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
         config, how = self.config, self.config.evaluation
-        env = ManiSkillEnvironment(config.task, config.simulation, SIMULATOR_ENVS, seed=config.seed)
+        simulation = config.simulation.with_values(scenes=scenes or config.simulation.scenes)
+        env = ManiSkillEnvironment(config.task, simulation, SIMULATOR_ENVS, seed=config.seed)
         try:
             return evaluate(policy, env, how.episodes, how.first_seed, how.deterministic)
         finally:
@@ -78,15 +79,21 @@ class Workplace:
                         self.config.evaluation.first_seed)
 
 
-def train_in(workplace: Workplace, model: str, on_update: Callable[[], object] = lambda: None) -> dict[str, Any]:
+def train_in(
+    workplace: Workplace, model: str, scenes: Sequence[str] = (), on_update: Callable[[], object] = lambda: None
+) -> dict[str, Any]:
     """Train the weak policy of a seed in a model; return the row of the table.
 
     Every KEPT_EVERY-th version lies in workplace.folder / name of the model.
+
+    Args:
+        scenes: further ones that the policies are measured in, values of simulation.scenes.
     """
     config, began = workplace.config, time.monotonic()
     policy, env = workplace.policy(), workplace.environment(model)
     reward = make_endogenous_reward(config, workplace.model_dir)
     before = workplace.real(policy), workplace.imagined(policy, env)
+    elsewhere = {name: [workplace.real(policy, name)] for name in scenes}
     course, kept, seconds = list[float](), list[str](), time.monotonic()
     for update, (rollout, _) in enumerate(train_policy(policy, env, reward, config), 1):
         course.append(rollout_statistics(rollout).success_rate)
@@ -97,13 +104,18 @@ def train_in(workplace: Workplace, model: str, on_update: Callable[[], object] =
         on_update()
     seconds = time.monotonic() - seconds
     after = workplace.real(policy), workplace.imagined(policy, env)
-    pair = paired_difference(before[0].success.tolist(), after[0].success.tolist())
+    for name, measured in elsewhere.items():
+        measured.append(workplace.real(policy, name))
     return {
         "model": model, "model_sha256": env.spec.world_model_sha256, "task": config.task, "seed": config.seed,
         "updates": config.ppo.updates, "course": course, "policies": kept,
         "real_before": _rate(before[0]), "real_after": _rate(after[0]),
         "imagined_before": _rate(before[1]), "imagined_after": _rate(after[1]),
-        "real_gain": {"difference": pair.difference, "low": pair.low, "high": pair.high},
+        "real_gain": _gain(before[0], after[0]),
+        "elsewhere": {
+            name: {"before": _rate(first), "after": _rate(last), "gain": _gain(first, last)}
+            for name, (first, last) in elsewhere.items()
+        },
         "success_after": after[0].success.astype(int).tolist(),
         "seconds_per_update": seconds / max(1, len(course)), "minutes": (time.monotonic() - began) / 60,
     }
@@ -172,6 +184,11 @@ def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
     _, index, counts = np.unique(values, return_inverse=True, return_counts=True)
     ranks: NDArray[np.float64] = (np.cumsum(counts) - (counts - 1) / 2)[index]
     return ranks
+
+
+def _gain(before: EvaluationResult, after: EvaluationResult) -> dict[str, float]:
+    pair = paired_difference(before.success.tolist(), after.success.tolist())
+    return {"difference": pair.difference, "low": pair.low, "high": pair.high}
 
 
 def _rate(result: EvaluationResult) -> dict[str, float]:

@@ -58,7 +58,7 @@ def prepare_model(config: RunConfig, folder: Path, given: Path | None) -> tuple[
     shipped = model_dir / "starts.safetensors"
     starts_file = folder / "starts.safetensors"
     if shipped.is_file():
-        images, states = (array[:NUM_STARTS] for array in load_starts(shipped))
+        images, states = (array[:NUM_STARTS] for array in load_starts(shipped, config.task))
     else:
         rng = numpy_stream(config.seed, "benchmark_starts")
         size = config.simulation.image_size

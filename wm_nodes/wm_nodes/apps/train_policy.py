@@ -18,6 +18,7 @@ from wm_nodes.apps.policy_pictures import write_pictures
 from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, start_graph, success_rate
 from wm_nodes.apps.run_options import open_run
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
+from wm_nodes.config.scenes import SCENES, splits
 from wm_nodes.config.schema import AGENT, RunConfig, SimulationConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import task_names
@@ -57,6 +58,11 @@ DEFAULTS = {
 def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_preset(parser, "cpu", preset_names())
     parser.add_argument("--task", choices=task_names(), help="default: the preset's")
+    parser.add_argument(
+        "--scenes", metavar="NAME",
+        help=f"where the task has many: {', '.join(splits())}, or one scene such as {next(iter(SCENES))}; "
+        "default: train",
+    )
     options.add_seed(parser, None)
     options.add_run_dir(parser)
     parser.add_argument("--model-dir", type=Path, help="world model to use instead of the shipped one")
@@ -145,6 +151,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
 def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
     chosen = options.settings(arguments) | options.judge_settings(arguments)
     chosen |= {"task": arguments.task} if arguments.task else {}
+    chosen |= {"simulation.scenes": arguments.scenes} if arguments.scenes else {}
     return chosen | ({} if arguments.rounds is None else {"model_refresh.num_rounds": arguments.rounds})
 
 

@@ -181,7 +181,8 @@ def refusal(error: ValidationError, where: str, file: str = "") -> ConfigError:
     """One error that names every refused value. where: what explains the settings. file: of the user's, with them."""
     refused = []
     for row in error.errors():
-        text = f"{'.'.join(map(str, row['loc']))}: {row['msg'].removeprefix('Value error, ')}"
+        where_in = f"{'.'.join(map(str, row['loc']))}: " if row["loc"] else ""
+        text = where_in + row["msg"].removeprefix("Value error, ")
         names_values = row["type"] == "value_error" and not isinstance(row["input"], (str, int, float))
         refused.append(text if names_values else f"{text} (got {row['input']!r})")
     return ConfigError(f"settings{f' in {file}' if file else ''} refused; see {where}: {'; '.join(refused)}")

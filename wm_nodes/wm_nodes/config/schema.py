@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from wm_nodes.config.scenes import check_scenes
-from wm_nodes.config.tasks import check_task
+from wm_nodes.config.tasks import check_task, instruction
 
 PositiveInt = Annotated[int, Field(ge=1)]
 NonNegativeInt = Annotated[int, Field(ge=0)]
@@ -107,6 +107,8 @@ class WorldModelConfig(SettingsSection):
     learning_rate: PositiveFloat
     rollout_steps: list[PositiveInt]
     """Curriculum: imagined steps unrolled and back-propagated through, raised in equal stages over the training."""
+    part_steps: NonNegativeInt
+    """Steps of the random parts of episodes that the action model is rolled out over in training; 0: whole episodes."""
     done_weight: NonNegativeFloat
     """Weight of the done loss (RS-4)."""
     num_done_heads: PositiveInt
@@ -354,3 +356,8 @@ class RunConfig(SettingsSection):
     acceptance: AcceptanceConfig
     model_refresh: ModelRefreshConfig
     evaluation: EvaluationConfig
+
+    @model_validator(mode="after")
+    def _check_scenes(self) -> Self:
+        instruction(self.task, self.simulation.scenes)
+        return self

@@ -108,11 +108,13 @@ class Task:
     pack of the judge (judge.rubric) where the task has one."""
     demonstrator: str = "expert"
     """The scripted behaviour whose successes teach the text model."""
+    shows_goal: bool = True
+    """False: nothing in the pictures says where the goal is, so that no probe learns to read it."""
     moves_object: bool = True
     """False: the error of the object is not part of a world model's acceptance, only the tool's."""
     model_tasks: tuple[str, ...] = ()
-    """The tasks that one world model serves, because they share a scene, this one among them: one done output each,
-    in this order. The last one's episodes are recorded for all. Empty: this task alone."""
+    """The tasks that one world model serves, this one among them: one done output each, in this order. Those with the
+    same `scene` share the episodes of the last of them. Empty: this task alone."""
     weak_policies: tuple[WeakPolicy, ...] = ()
     """Used where data.policy_episodes is not 0."""
 
@@ -146,6 +148,18 @@ def get_task(name: str) -> Task:
 def model_tasks(name: str) -> tuple[str, ...]:
     """The tasks of the world model that serves this one."""
     return get_task(name).model_tasks or (name,)
+
+
+def recorded_task(name: str) -> str:
+    """The task that the episodes for this one's world model are recorded for: the last of its scene."""
+    return [task for task in model_tasks(name) if shares_scene(name, task)][-1]
+
+
+def shares_scene(task: str, other: str) -> bool:
+    """Whether an episode that was recorded for one task shows whether the other is done. So it does where it is not
+    known what it was recorded for."""
+    known = task_names()
+    return task not in known or other not in known or get_task(task).scene is get_task(other).scene
 
 
 def success(task: str, ground_truth: Floats) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import model_tasks
+from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import Episode
@@ -28,14 +28,38 @@ def acceptance_plan(config: RunConfig) -> CollectionPlan:
 
 
 def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
-    """Return the plan of episodes of the scripted behaviours, for the world model that serves the configured task."""
+    """Return the plan of episodes of the scripted behaviours in the configured task's scene, for its world model."""
     return CollectionPlan(
-        task=model_tasks(config.task)[-1],  # one scene and one data set for all tasks of a model
+        task=recorded_task(config.task),
         simulation=config.simulation,
         num_episodes=num_episodes,
         first_seed=first_seed,
         behaviours=config.data.behaviours,
     )
+
+
+def model_configs(config: RunConfig) -> list[RunConfig]:
+    """The configuration for each task that episodes are recorded for, of those that the configured one's world model
+    serves; the other ones' shares of behaviours are their own."""
+    tasks = dict.fromkeys(map(recorded_task, model_tasks(config.task)))
+    if len(tasks) == 1:
+        return [config]
+    shares = {task: get_task(task).settings.get("data.behaviours", config.data.behaviours) for task in tasks}
+    shares[config.task] = config.data.behaviours
+    return [
+        config.with_values(task=task, data=config.data.with_values(behaviours=shares[task])) for task in tasks
+    ]
+
+
+def collect_scripted(config: RunConfig, num_episodes: int, first_seed: int, folder: Path) -> dict[str, list[Path]]:
+    """Collect the plan scripted_plan of each of model_configs into bags below `folder`, one folder for each task where
+    there are several; returns the bags by task."""
+    configs = model_configs(config)
+    folders = [folder / one.task if len(configs) > 1 else folder for one in configs]
+    return {
+        one.task: collect_plan(scripted_plan(one, num_episodes, first_seed), one, where)
+        for one, where in zip(configs, folders, strict=True)
+    }
 
 
 def task_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:

@@ -122,7 +122,7 @@ def make_video_environment(
     spec = simulation_spec(config.task, config.simulation, num_envs)
     with explain_memory(folder.device, ppo__num_envs=num_envs):
         environment = VideoEnvironment(
-            folder, reader, spec, load_starts(Path(starts_file)), config.reward, config.video_environment,
+            folder, reader, spec, load_starts(Path(starts_file), config.task), config.reward, config.video_environment,
             num_envs=num_envs, seed=seed,
         )
     environment.cameras = _cameras(config, environment)
@@ -164,7 +164,7 @@ def _imagine(
     spec = simulation_spec(config.task, config.simulation, num_envs)
     with explain_memory(compute_device(config.device), ppo__num_envs=num_envs):
         return make(
-            models, spec, load_starts(Path(starts_file)), config.reward, num_envs=num_envs,
+            models, spec, load_starts(Path(starts_file), config.task), config.reward, num_envs=num_envs,
             instructions=load_start_instructions(Path(starts_file), spec), with_goals=config.reward.dense_weight > 0,
         )
 

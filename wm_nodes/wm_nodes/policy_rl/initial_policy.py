@@ -1,5 +1,6 @@
 """Prepare what a run needs besides a world model: frames to imagine from, the weak policy that RL starts from."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,8 @@ from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS, pack_instructio
 
 STARTS = "starts.safetensors"
 MAX_STARTS, MODEL_STARTS = 512, 64
-"""Most first frames of a run, and of those beside a model, from which a launch file imagines by default."""
+"""Most first frames of a run, and of those beside a model, from which a launch file imagines by default; of a model of
+several scenes, half as many of each task."""
 NUM_STARTS = 256
 DEMONSTRATION_SEEDS, START_SEEDS = 600_000, 700_000
 SEEDS_PER_RUN = 1000
@@ -47,20 +49,21 @@ def write_starts(
     bags: Iterable[Path], path: Path, limit: int = MAX_STARTS, *, tasks: Sequence[str] = (),
     frames: Literal["first", "any"] = "first", seed: int = 0,
 ) -> int:
-    """Write a frame, its state and the instruction of up to `limit` recorded episodes; returns how many. First frames
-    have their reset seeds beside them.
+    """Write a frame, its state and the instruction of up to `limit` episodes of each task that bags were recorded for;
+    returns how many. First frames have their reset seeds beside them.
 
     Args:
         tasks: those that are imagined from these starts, beside the one of the recording.
         frames: see data.start_frames; `any` is before success in all the tasks, drawn from the stream `start_frames` of
             the seed.
     """
-    episodes: list[Episode] = []
+    chosen, counts = list[Episode](), Counter[str]()
     for bag in bags:
-        episodes += list(read_episodes(bag))
-        if len(episodes) >= limit:
-            break
-    chosen = episodes[:limit]
+        for episode in read_episodes(bag):
+            if counts[episode.task] == limit:
+                break
+            counts[episode.task] += 1
+            chosen.append(episode)
     stream = numpy_stream(seed, "start_frames")
     rows = [int(stream.integers(frames_before_success(e, tasks))) if frames == "any" else 0 for e in chosen]
     tensors = {

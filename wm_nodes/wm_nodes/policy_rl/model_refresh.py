@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
-from wm_nodes.config.tasks import get_task, model_tasks
+from wm_nodes.config.tasks import get_task, recorded_task
 from wm_nodes.core.device import compute_device, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.environments.maniskill.collection import CollectionPlan
@@ -95,7 +95,7 @@ def collect_round(
         ("heldout", ROUND_HELDOUT_SEEDS, config.model_refresh.heldout_episodes),
     ):
         plan = CollectionPlan(
-            model_tasks(config.task)[-1], config.simulation, episodes, first_seed + SEEDS_PER_ROUND * (number - 1), {},
+            recorded_task(config.task), config.simulation, episodes, first_seed + SEEDS_PER_ROUND * (number - 1), {},
             make_policy=partial(policy_actor, config, model_dir, weights, None), policy_version=number,
         )
         bags.append(collect_plan(plan, config, folder / name))

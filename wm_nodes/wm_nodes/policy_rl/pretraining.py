@@ -2,22 +2,31 @@
 
 import platform
 import sys
+from collections.abc import Iterable
 from datetime import date
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import get_task, model_tasks
+from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.device import compute_device, device_label, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.core.specs import simulation_spec
-from wm_nodes.environments.maniskill.collection import CollectionPlan
-from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, demonstration_plan, scripted_plan
+from wm_nodes.environments.maniskill.collection import POLICY_LABEL, CollectionPlan
+from wm_nodes.environments.record import (
+    HELDOUT_SEEDS,
+    TRAINING_SEEDS,
+    collect_plan,
+    collect_scripted,
+    demonstration_plan,
+)
 from wm_nodes.policy_rl.factories import policy_actor
 from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, STARTS, train_weak_policy, write_starts
 from wm_nodes.recording import read_episodes
@@ -36,7 +45,7 @@ from wm_nodes.world_model.validation.acceptance import model_metrics
 POLICY_SEEDS = 300_000
 
 
-def load_arrays(bags: list[Path], config: RunConfig) -> EpisodeArrays:
+def load_arrays(bags: Iterable[Path], config: RunConfig) -> EpisodeArrays:
     """Stack every episode of the bags, labelled for all tasks of the scene."""
     episodes = (episode for bag in bags for episode in read_episodes(bag))
     return stack_episodes(episodes, model_tasks(config.task), num_steps=config.simulation.max_episode_steps)
@@ -58,13 +67,8 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     if config.world_model.text_encoder:
         reader = SentenceEncoder(Path(config.world_model.text_encoder))
         print(f"instructions are read by {reader.folder}, sha256 {reader.sha256[:12]}", file=sys.stderr)
-    bags = collect_plan(
-        scripted_plan(config, config.data.num_episodes, TRAINING_SEEDS), config, run_dir / "data" / "train"
-    )
-    heldout_bags = collect_plan(
-        scripted_plan(config, config.data.num_heldout, HELDOUT_SEEDS), config, run_dir / "data" / "heldout"
-    )
-    episodes = load_arrays(bags, config)
+    bags = collect_scripted(config, config.data.num_episodes, TRAINING_SEEDS, run_dir / "data" / "train")
+    episodes = load_arrays(chain(*bags.values()), config)
     with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
         tokenizer, tokenizer_metrics = train_tokenizer(episodes, config, config.seed, run_dir)
     if config.data.policy_episodes:
@@ -90,7 +94,7 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
             "machine": f"{platform.machine()}, {torch.get_num_threads()} threads", "device": device_label(device),
         },
         "data": {
-            "episodes": len(episodes), "policy_episodes": len(episodes) - config.data.num_episodes,
+            "episodes": len(episodes), "policy_episodes": episodes.behaviours.count(POLICY_LABEL),
             "training_seeds": [TRAINING_SEEDS, TRAINING_SEEDS + config.data.num_episodes - 1],
             "behaviours": config.data.behaviours,
             "heldout_seeds": [HELDOUT_SEEDS, HELDOUT_SEEDS + config.data.num_heldout - 1],
@@ -101,13 +105,26 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     }
     tasks = model_tasks(config.task)
     models = WorldModels(tokenizer, action, text, tasks, config.simulation, {}, probe)
-    story["heldout"] = model_metrics(models, load_arrays(heldout_bags, config), config)
+    for name, scenes in _heldout_configs(config).items():
+        held = collect_scripted(scenes, config.data.num_heldout, HELDOUT_SEEDS, run_dir / "data" / name)
+        found = {task: model_metrics(models, load_arrays(its, config), config) for task, its in held.items()}
+        story[name] = found if len(found) > 1 else next(iter(found.values()))
     write_starts(
-        bags, folder / STARTS, MODEL_STARTS, tasks=tasks, frames=config.data.start_frames, seed=config.seed
+        chain(*bags.values()), folder / STARTS, MODEL_STARTS if len(bags) == 1 else MODEL_STARTS // 2, tasks=tasks,
+        frames=config.data.start_frames, seed=config.seed,
     )
     save_model_folder(folder, tokenizer, action, text, config, tasks=tasks, story=story, probe=probe)
     load_model_folder(folder)
     return folder
+
+
+def _heldout_configs(config: RunConfig) -> dict[str, RunConfig]:
+    """The configurations of held-out episodes by folder: of the scenes trained on, and of the other splits."""
+    others = set(splits()) - {config.simulation.scenes} if config.simulation.scenes in splits() else set[str]()
+    return {"heldout": config} | {
+        f"heldout_{name}": config.with_values(simulation=config.simulation.with_values(scenes=name))
+        for name in sorted(others)
+    }
 
 
 def _collect_policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer) -> list[Path]:
@@ -126,7 +143,7 @@ def _collect_policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer)
             plan = demonstration_plan(chosen, policy.demonstrations + 3, POLICY_SEEDS + 1000 * number)
             train_weak_policy(chosen, folder, collect_plan(plan, config, run_dir / "data" / "demos"), weights)
         plan = CollectionPlan(
-            model_tasks(config.task)[-1], config.simulation, config.data.policy_episodes,
+            recorded_task(task), config.simulation, config.data.policy_episodes,
             POLICY_SEEDS + 10_000 * (number + 1), {},
             make_policy=partial(policy_actor, chosen, folder, weights, policy.noise),
         )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.config.tasks import success
+from wm_nodes.config.tasks import shares_scene, success
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
 
 TaskLabels = Callable[[str, FloatArray], BoolArray]
@@ -19,8 +19,8 @@ class EpisodeArrays:
     """E episodes padded to T steps by repeating their last frame; only the first `lengths` steps are real.
 
     images: uint8 (E, T + 1, H, W, 3). states: float32 (E, T + 1, S). actions: float32 (E, T, A), 0 where padded.
-    ground_truth: float32 (E, T + 1, P). success: bool (E, T + 1, J), column j for tasks[j]. lengths: int64 (E,).
-    recorded_tasks: the task that each episode was recorded for, with its instruction.
+    ground_truth: float32 (E, T + 1, P). success: bool (E, T + 1, J), column j for tasks[j], see `labelled`. lengths:
+    int64 (E,). recorded_tasks: the task that each episode was recorded for, with its instruction.
     """
 
     images: UInt8Array
@@ -50,6 +50,12 @@ class EpisodeArrays:
     def frame_mask(self) -> BoolArray:
         """(E, T + 1), True where the frame was recorded."""
         return np.arange(self.num_steps + 1) <= self.lengths[:, None]
+
+    @property
+    def labelled(self) -> BoolArray:
+        """(E, J), True where the episode shows whether the task is done, see config.tasks.shares_scene."""
+        known = {(own, task): shares_scene(own, task) for own in set(self.recorded_tasks) for task in self.tasks}
+        return np.array([[known[own, task] for task in self.tasks] for own in self.recorded_tasks])
 
     def select(self, rows: Sequence[int] | NDArray[Any]) -> "EpisodeArrays":
         index = np.asarray(rows, np.int64)

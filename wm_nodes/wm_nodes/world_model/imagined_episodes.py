@@ -7,7 +7,7 @@ Shapes: N environments, M starts, H W 3 image, A action, P state.
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
+from wm_nodes.config.tasks import shares_scene
 from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import explain_memory
 from wm_nodes.core.seeding import numpy_stream, stream_seed
@@ -31,29 +32,51 @@ INSTRUCTIONS = "instructions"
 """Key of a starts file, see pack_instructions."""
 
 
-def load_starts(path: Path) -> tuple[UInt8Array, FloatArray]:
-    """Real frames uint8 (M, H, W, 3) and states float32 (M, P) to imagine from."""
+def load_starts(path: Path, task: str = "") -> tuple[UInt8Array, FloatArray]:
+    """Real frames uint8 (M, H, W, 3) and states float32 (M, P) to imagine from, those in the scene of `task`.
+
+    Raises:
+        ValueError: no such file, or none of its starts is in that scene.
+    """
     tensors = load_file(path)
     missing = {"images", "states"} - tensors.keys()
     if missing or not len(tensors["images"]):
         raise ValueError(f"{path} is no starts file: it must hold images and states of at least one first frame")
-    return tensors["images"].numpy(), tensors["states"].numpy()
+    rows = _rows(path, tensors, task)
+    return tensors["images"].numpy()[rows], tensors["states"].numpy()[rows]
 
 
 def load_start_instructions(path: Path, spec: EnvironmentSpec) -> list[str]:
     """The instruction of every start of load_starts for the task of `spec`; that of the spec where the file has none.
 
     Raises:
-        ValueError: not as many as there are starts.
+        ValueError: as load_starts.
     """
     tensors = load_file(path)
-    count = len(tensors["images"])
+    rows = _rows(path, tensors, spec.task)
     if INSTRUCTIONS not in tensors:
-        return [spec.instruction] * count
-    told = json.loads(tensors[INSTRUCTIONS].numpy().tobytes())
+        return [spec.instruction] * len(rows)
+    told = _told(path, tensors)
+    return [instruction_for(spec.task, *told[row], spec.instruction) for row in rows]
+
+
+def _rows(path: Path, tensors: Mapping[str, Tensor], task: str) -> list[int]:
+    """Numbers of the starts in the scene of `task`; all of them for "", or where it is not known what they are of."""
+    rows = list(range(len(tensors["images"])))
+    if not task or INSTRUCTIONS not in tensors:
+        return rows
+    told = _told(path, tensors)
+    if found := [row for row in rows if shares_scene(told[row][0], task)]:
+        return found
+    raise ValueError(f"{path} has starts of {', '.join(sorted({own for own, _ in told}))}, none of {task}")
+
+
+def _told(path: Path, tensors: Mapping[str, Tensor]) -> list[tuple[str, str]]:
+    """(recorded task, instruction) of every start. Raises ValueError: not as many as there are starts."""
+    told, count = json.loads(tensors[INSTRUCTIONS].numpy().tobytes()), len(tensors["images"])
     if len(told) != count:
         raise ValueError(f"{path} has {len(told)} instructions for {count} starts; delete it to have it written again")
-    return [instruction_for(spec.task, task, own, spec.instruction) for task, own in told]
+    return [(task, own) for task, own in told]
 
 
 def pack_instructions(episodes: Sequence[Episode]) -> Tensor:
@@ -62,7 +85,7 @@ def pack_instructions(episodes: Sequence[Episode]) -> Tensor:
     return torch.tensor(list(text.encode()), dtype=torch.uint8)
 
 
-def load_start_seeds(path: Path) -> UInt64Array:
+def load_start_seeds(path: Path, task: str = "") -> UInt64Array:
     """Reset seeds (M,) by which the simulator shows the first frames of load_starts.
 
     Raises:
@@ -72,7 +95,7 @@ def load_start_seeds(path: Path) -> UInt64Array:
     if "seeds" not in tensors:
         raise ValueError(f"{path} holds no reset seeds of first frames; delete it to have it written again, with "
                          "data.start_frames first")
-    return np.asarray(tensors["seeds"].numpy(), np.uint64)
+    return np.asarray(tensors["seeds"].numpy()[_rows(path, tensors, task)], np.uint64)
 
 
 def imagined_spec(spec: EnvironmentSpec, env_id: str, sha256: str, num_envs: int) -> EnvironmentSpec:

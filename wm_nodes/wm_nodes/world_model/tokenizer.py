@@ -17,8 +17,8 @@ from wm_nodes.world_model.parts import in_parts
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.quantizer import quantize
 
-PROBE_NAMES = ("cube_x", "cube_y", "tool_x", "tool_y", "tool_z", "goal_x", "goal_y")
-"""Ground-truth values that the state probe reads off a frame's latents, by their names in Task.ground_truth_names."""
+PROBE_NAMES = ("object_x", "object_y", "tool_x", "tool_y", "tool_z", "goal_x", "goal_y")
+"""Ground-truth values that the state probe reads off a frame's latents, see probe_targets."""
 
 
 def normalise_tokens(latents: Tensor) -> Tensor:

@@ -23,6 +23,8 @@ from wm_nodes.environments.maniskill.episodes import planned_or_scripted_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 
 EPISODES_PER_SHARD = 50
+POLICY_LABEL = "policy"
+"""Episode.behaviour of an episode that a policy acted."""
 
 PolicyAct = Callable[[Observation, int], FloatArray]
 """(observation of one slot, episode seed) -> action (A,)."""
@@ -45,7 +47,7 @@ class CollectionPlan:
     behaviours: dict[str, float]
     end_on_success: bool = False
     make_policy: Callable[[], PolicyAct] | None = None
-    policy_label: str = "policy"
+    policy_label: str = POLICY_LABEL
     policy_version: int = 0
 
 

@@ -20,9 +20,11 @@ grasped: 1 where both fingers press on the object."""
 OBJECT, OBJECT_START = CUBE, CUBE_START
 BOTTOM, SPEED, OPENING, GRASPED, RADIUS, HEIGHT = 11, 12, 13, 14, 17, 18
 CONTAINER = slice(15, 17)
+MODEL_TASKS = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
+"""One world model serves them."""
 SETTINGS = {
     "simulation.scenes": "train", "simulation.cameras": ["near", "wrist"], "simulation.max_action_m": 0.1,
-    "simulation.max_episode_steps": 40,
+    "simulation.max_episode_steps": 40, "world_model.part_steps": 16, "sft.num_demonstrations": 40,
 }
 """Of every task in these scenes."""
 ON_TABLE_M = 0.01

@@ -25,7 +25,7 @@ from wm_nodes.world_model.precision import compute_context, has_fast_bfloat16
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.device_rollout import roll_out_on_device
-from wm_nodes.world_model.training.tokenizer import foreground_weight, probe_loss, probe_targets
+from wm_nodes.world_model.training.tokenizer import episode_targets, foreground_weight, probe_loss
 
 M = TypeVar("M", ActionModel, TokenActionModel)
 
@@ -45,7 +45,7 @@ class LatentEpisodes:
     """Tokenised episodes.
 
     latents: float16 (E, T + 1, S, D). mean_change_S: float32 (S,), mean absolute change of each token since the first
-    frame. images, states, actions, success, step_mask: as in EpisodeArrays. truth: float32 (E, T + 1, P), m.
+    frame. images, states, actions, success, labelled, step_mask: as in EpisodeArrays. truth: float32 (E, T + 1, P), m.
     """
 
     images: Tensor
@@ -54,11 +54,22 @@ class LatentEpisodes:
     states: Tensor
     actions: Tensor
     success: Tensor
+    labelled: Tensor
     truth: Tensor
     step_mask: Tensor
 
     def __len__(self) -> int:
         return len(self.latents)
+
+    def parts(self, index: Tensor, first: Tensor, steps: int) -> "LatentEpisodes":
+        """`steps` steps of each of the episodes `index` (B,), from frame `first` (B,); without images, all on one
+        device."""
+        rows, frames = index[:, None], first[:, None] + torch.arange(steps + 1, device=first.device)
+        return LatentEpisodes(
+            self.images[:0], self.latents[rows, frames], self.mean_change_S, self.states[rows, frames],
+            self.actions[rows, frames[:, :-1]], self.success[rows, frames], self.labelled[index],
+            self.truth[rows, frames], self.step_mask[rows, frames[:, :-1]],
+        )
 
 
 @dataclass(frozen=True)
@@ -82,7 +93,8 @@ def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEp
         images=torch.from_numpy(episodes.images), latents=latents, mean_change_S=change,
         states=torch.from_numpy(episodes.states).to(device), actions=torch.from_numpy(episodes.actions).to(device),
         success=torch.from_numpy(episodes.success).to(device),
-        truth=torch.from_numpy(probe_targets(episodes.ground_truth, episodes.tasks[0])).to(device),
+        truth=torch.from_numpy(episode_targets(episodes)).to(device),
+        labelled=torch.from_numpy(episodes.labelled).to(device),
         step_mask=torch.from_numpy(episodes.step_mask).to(device),
     )
 
@@ -105,6 +117,8 @@ def train_action_model(
     trained = model
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
     lengths = data.step_mask.sum(1).cpu()
+    whole = data.actions.shape[1]
+    num_steps = min(settings.part_steps or whole, whole)
 
     def steps_at(iteration: int) -> int:
         return rollout_steps_at(iteration, settings.num_iterations, settings.rollout_steps)
@@ -112,25 +126,29 @@ def train_action_model(
     def read(iteration: int) -> tuple[Tensor, ...]:
         rows = numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
         index = torch.from_numpy(rows)
+        first = first_frames(lengths[index], num_steps, torch_stream(seed, "action_model_part", iteration))
         generator = torch_stream(seed, "action_model_noise", iteration)
-        batch = index, *starts(data, len(rows), steps_at(iteration), generator)
+        batch = index, first, *starts(data, len(rows), num_steps, steps_at(iteration), generator)
         if not settings.decoded_weight:
             return batch
-        return *batch, *shown_frames(data, index, lengths, torch_stream(seed, "action_model_decoded", iteration))
+        stream = torch_stream(seed, "action_model_decoded", iteration)
+        return *batch, *shown_frames(data, index, first, (lengths[index] - first).clamp(max=num_steps), stream)
 
     batches = BackgroundBatches(read, tokenizer.device)
 
     def loss(iteration: int) -> dict[str, Tensor]:
         steps = steps_at(iteration)
-        index, noise, anchors, *shown = batches(iteration)
+        index, first, noise, anchors, *shown = batches(iteration)
+        part = data.parts(index, first, num_steps)
+        rows = torch.arange(len(index), device=index.device)
         with compute_context(tokenizer.device):
-            terms = unroll(trained, tokenizer, data, index, noise, anchors, one_pass=min(steps, anchors.shape[1]) == 1)
+            terms = unroll(trained, tokenizer, part, rows, noise, anchors, one_pass=min(steps, num_steps) == 1)
             losses = rollout_losses(
-                terms, tokenizer, data, index, data.step_mask[index].float(), heads[index], settings, done_loss
+                terms, tokenizer, part, rows, part.step_mask.float(), heads[index], settings, done_loss
             )
             if settings.decoded_weight:
                 frames, images = shown
-                losses |= decoded_losses(terms, tokenizer, data, index, frames, images, config)
+                losses |= decoded_losses(terms, tokenizer, part, rows, frames, images, config)
                 decoded = losses["pixel"] + losses["recoded"] + losses["recoded_state"]
                 losses["loss"] = losses["loss"] + settings.decoded_weight * decoded
             return losses | {"rollout_steps": torch.tensor(float(steps))}
@@ -159,15 +177,21 @@ def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> 
     return stages[min(len(stages) - 1, iteration * len(stages) // max(1, num_iterations))]
 
 
+def first_frames(lengths: Tensor, num_steps: int, generator: torch.Generator) -> Tensor:
+    """(B,), a random frame of each of B episodes of `lengths` steps from which num_steps more were recorded; 0 where
+    there is none."""
+    choices = (lengths - num_steps).clamp(min=0) + 1
+    return (torch.rand(len(lengths), generator=generator) * choices).long()
+
+
 def starts(
-    data: LatentEpisodes, batch: int, rollout_steps: int, generator: torch.Generator
+    data: LatentEpisodes, batch: int, num_steps: int, rollout_steps: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Noise (B, T, S, D) on real input frames, and anchors (B, T), True where the model goes on from a real frame."""
-    frames = data.latents.shape[1]
-    noise = torch.randn((batch, frames - 1, *data.latents.shape[2:]), generator=generator)
+    noise = torch.randn((batch, num_steps, *data.latents.shape[2:]), generator=generator)
     phase = torch.randint(0, rollout_steps, (batch, 1), generator=generator)
-    anchors = (torch.arange(frames - 1) + phase) % rollout_steps == 0
-    if rollout_steps >= frames - 1:
+    anchors = (torch.arange(num_steps) + phase) % rollout_steps == 0
+    if rollout_steps >= num_steps:
         anchors = torch.zeros_like(anchors)
     anchors[:, 0] = True
     return noise, anchors
@@ -177,8 +201,8 @@ def unroll(
     model: ActionModel, tokenizer: Tokenizer, data: LatentEpisodes, index: Tensor, noise: Tensor, anchors: Tensor, *,
     one_pass: bool,
 ) -> RolloutTerms:
-    """Roll the model out over whole episodes `index`, on its own predictions between real frames (see starts).
-    `one_pass`: every frame is real."""
+    """Roll the model out over all steps of the episodes `index`, on its own predictions between real frames (see
+    starts). `one_pass`: every frame is real."""
     real = data.latents[index].float()
     states, actions = data.states[index], data.actions[index]
     noisy = tokenizer.normalise(real[:, :-1] + INPUT_NOISE * noise)
@@ -249,7 +273,7 @@ def rollout_losses(
     errors = F.huber_loss(terms.next_latents, target[:, 1:], delta=HUBER_DELTA, reduction="none").mean(-1)
     losses = {"latent": (errors * weight).sum() / weight.sum()}
     labels = data.success[index][:, 1 : steps + 1].float()
-    losses["done"] = done_losses(terms.done_logits, labels, mask_BT[:, :, None] * head_mask_BK[:, None], done_loss)
+    losses["done"] = done_losses(terms.done_logits, labels, done_mask(data, index, mask_BT, head_mask_BK), done_loss)
     probed = tokenizer.read_state_normalised(terms.next_latents.flatten(0, 1))
     truth = torch.where(mask_BT[..., None] > 0, data.truth[index][:, 1 : steps + 1], torch.nan).flatten(0, 1)
     losses["state"] = probe_loss(tokenizer, probed, truth)
@@ -260,16 +284,17 @@ def rollout_losses(
 
 
 def shown_frames(
-    data: LatentEpisodes, index: Tensor, lengths: Tensor, generator: torch.Generator
+    data: LatentEpisodes, index: Tensor, first: Tensor, lengths: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """DECODED_FRAMES random steps (B, 2) of each of the episodes `index`, and the images (B, 2, H, W, 3) after them.
+    """DECODED_FRAMES random steps (B, 2) of parts of the episodes `index`, and the images (B, 2, H, W, 3) after them.
 
     Args:
-        lengths: int (E,), recorded steps of every episode. All tensors of this function are on the CPU.
+        first, lengths: int (B,), of each part: its first frame, and its recorded steps. All tensors of this function
+            are on the CPU.
     """
     share = torch.rand(len(index), DECODED_FRAMES, generator=generator)
-    steps = (share * lengths[index].unsqueeze(1)).long()
-    return steps, data.images[index.unsqueeze(1), steps + 1]
+    steps = (share * lengths.unsqueeze(1)).long()
+    return steps, data.images[index.unsqueeze(1), first.unsqueeze(1) + steps + 1]
 
 
 def decoded_losses(
@@ -304,10 +329,14 @@ def token_weights(latents_BTSD: Tensor, mean_change_S: Tensor) -> Tensor:
     return 0.5 + 0.5 * (change / mean_change_S.clamp_min(1e-3)).clamp(max=2 * MAX_TOKEN_WEIGHT)
 
 
-def done_losses(logits_BTKJ: Tensor, labels_BTJ: Tensor, mask_BTK: Tensor, kind: str = "bce") -> Tensor:
+def done_mask(data: LatentEpisodes, index: Tensor, mask_BT: Tensor, head_mask_BK: Tensor) -> Tensor:
+    """(B, T, K, J): 1 where head k learns task j's label of a frame of the episodes `index`; see rollout_losses."""
+    return mask_BT[:, :, None, None] * head_mask_BK[:, None, :, None] * data.labelled[index][:, None, None]
+
+
+def done_losses(logits_BTKJ: Tensor, labels_BTJ: Tensor, mask_BTKJ: Tensor, kind: str = "bce") -> Tensor:
     """kind "rmse": RS-3, the root of the mean squared error; "bce": binary cross-entropy on the same labels."""
-    labels = labels_BTJ.unsqueeze(2).expand_as(logits_BTKJ)
-    weight = mask_BTK.unsqueeze(-1).expand_as(logits_BTKJ)
+    labels, weight = labels_BTJ.unsqueeze(2).expand_as(logits_BTKJ), mask_BTKJ.expand_as(logits_BTKJ)
     if kind == "rmse":
         squared = (logits_BTKJ.sigmoid() - labels).square()
         return ((squared * weight).sum() / weight.sum().clamp_min(1) + 1e-8).sqrt()

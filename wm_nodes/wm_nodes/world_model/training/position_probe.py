@@ -14,7 +14,7 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.position_probe import PositionProbe
-from wm_nodes.world_model.training.tokenizer import probe_targets
+from wm_nodes.world_model.training.tokenizer import episode_targets, position_statistics
 
 LEARNING_RATE = 1.0e-3
 PIXEL_NOISE = 0.02
@@ -29,18 +29,19 @@ def train_position_probe(
     Half of each batch is blurred, as imagined frames are, so that a blur alone does not read as a wrong place.
 
     Raises:
-        ValueError: a position is unknown (NaN) in every recorded frame.
+        ValueError: no position is known (not NaN) in any recorded frame.
     """
     height, width = episodes.images.shape[2:4]
     images = episodes.images.reshape(-1, height, width, 3)
-    truth = probe_targets(episodes.ground_truth.reshape(len(images), -1), episodes.tasks[0])
-    frames = np.flatnonzero(episodes.frame_mask.reshape(-1) & np.isfinite(truth).all(-1))
+    truth = episode_targets(episodes).reshape(len(images), -1)
+    frames = np.flatnonzero(episodes.frame_mask.reshape(-1) & np.isfinite(truth).any(-1))
     if not len(frames):
         raise ValueError("no recorded frame has ground truth; the judge's probe needs simulator episodes")
     with initial_weights(seed, "position_probe_init"):
         probe = PositionProbe(height, width)
-    probe.mean.copy_(torch.from_numpy(truth[frames].mean(0)))
-    probe.std.copy_(torch.from_numpy(truth[frames].std(0)).clamp_min(1e-4))
+    mean, std = position_statistics(truth[frames])
+    probe.mean.copy_(torch.from_numpy(mean))
+    probe.std.copy_(torch.from_numpy(std))
     device = compute_device(config.device)
     probe.to(device)
 
@@ -59,10 +60,10 @@ def train_position_probe(
         pixels = torch.cat((pixels[:half], F.avg_pool2d(pixels[half:], 3, 1, 1, count_include_pad=False)))
         wanted = (positions - probe.mean) / probe.std
         found = probe(pixels + PIXEL_NOISE * noise)
-        return {
-            "loss": F.huber_loss(found, wanted, delta=HUBER_DELTA),
-            "error_m": ((found.detach() - wanted) * probe.std).abs().mean(),
-        }
+        known = torch.isfinite(wanted)
+        found, wanted = found[known], wanted[known]
+        error_m = (found.detach() - wanted) * probe.std.expand_as(known)[known]
+        return {"loss": F.huber_loss(found, wanted, delta=HUBER_DELTA), "error_m": error_m.abs().mean()}
 
     loop = TrainingLoop("position_probe", probe, config.tokenizer.num_iterations, LEARNING_RATE, run_dir)
     return probe, loop.run(loss)

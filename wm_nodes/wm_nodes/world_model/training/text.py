@@ -99,10 +99,10 @@ def demonstrators() -> tuple[str, ...]:
 
 def golden_rows(episodes: EpisodeArrays) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:
     """(R, 3): episode, task, steps to learn from, for every noiseless episode that succeeds at a task."""
-    rows = []
+    rows, labelled = [], episodes.labelled
     for episode, behaviour in enumerate(episodes.behaviours):
         for task, name in enumerate(episodes.tasks):
-            wins = np.flatnonzero(episodes.success[episode, :, task])
+            wins = np.flatnonzero(episodes.success[episode, :, task] & labelled[episode, task])
             if len(wins) and wins[0] > 0 and behaviour == get_task(name).demonstrator:
                 rows.append((episode, task, min(int(wins[0]) + STEPS_AFTER_SUCCESS, int(episodes.lengths[episode]))))
     return np.array(rows, np.int64).reshape(-1, 3)

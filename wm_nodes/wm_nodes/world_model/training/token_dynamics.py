@@ -15,7 +15,13 @@ from wm_nodes.world_model.decoding import choose_codes, code_targets
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
-from wm_nodes.world_model.training.dynamics import LatentEpisodes, bootstrap_masks, done_losses, new_model
+from wm_nodes.world_model.training.dynamics import (
+    LatentEpisodes,
+    bootstrap_masks,
+    done_losses,
+    done_mask,
+    new_model,
+)
 
 MAX_CORRUPTION = 0.2
 """Share of the tokens of the last given frame that are replaced by random codes; it grows linearly with time, so that
@@ -63,7 +69,7 @@ def token_losses(
     labels = data.success[index][:, 1:].float()
     losses = {
         "tokens": (torch.stack(entropies).sum(0) * counted).sum() / count,
-        "done": done_losses(prediction.done_logits_BTKJ, labels, steps[:, :, None] * head_mask_BK[:, None]),
+        "done": done_losses(prediction.done_logits_BTKJ, labels, done_mask(data, index, steps, head_mask_BK)),
         "accuracy": (right * counted).sum() / count,
     }
     return losses | {"loss": losses["tokens"] + done_weight * losses["done"]}

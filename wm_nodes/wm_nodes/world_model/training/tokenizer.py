@@ -1,5 +1,6 @@
 """Train the frame codec (RS-1a). Shapes: B frames, H W 3 image, S tokens, D values per token, P probed values."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ def train_tokenizer(
     height, width = episodes.images.shape[2:4]
     frames = np.flatnonzero(episodes.frame_mask)
     images = episodes.images.reshape(-1, height, width, 3)
-    truth = probe_targets(episodes.ground_truth.reshape(len(images), -1), episodes.tasks[0])
+    truth = episode_targets(episodes).reshape(len(images), -1)
     with initial_weights(seed, "tokenizer_init"):
         codec = Tokenizer(settings, height, width)
     _set_statistics(codec, images[frames], truth[frames], seed)
@@ -89,10 +90,24 @@ def foreground_weight(pixels_B3HW: Tensor, background_3HW: Tensor, extra: float)
 
 
 def probe_targets(ground_truth: FloatArray, task: str) -> FloatArray:
-    """The values of PROBE_NAMES (..., P), in m, out of a task's ground truth; NaN where the task has no such value."""
-    names = get_task(task).ground_truth_names
+    """The values of PROBE_NAMES (..., P), in m, out of a task's ground truth; NaN where the task has no such value, or
+    does not show its goal."""
+    what = get_task(task)
+    names = [name.replace("cube", "object") for name in what.ground_truth_names]
+    known = [name in names and (what.shows_goal or not name.startswith("goal")) for name in PROBE_NAMES]
     unknown = np.full(ground_truth.shape[:-1], np.nan, np.float32)
-    return np.stack([ground_truth[..., names.index(n)] if n in names else unknown for n in PROBE_NAMES], -1)
+    columns = [ground_truth[..., names.index(name)] if k else unknown for name, k in zip(PROBE_NAMES, known)]
+    return np.stack(columns, -1)
+
+
+def episode_targets(episodes: EpisodeArrays) -> FloatArray:
+    """probe_targets (E, T + 1, P) of episodes, each by the task that it was recorded for; by the first task where that
+    is none of `episodes.tasks`."""
+    targets = probe_targets(episodes.ground_truth, episodes.tasks[0])
+    for task in episodes.tasks[1:]:
+        rows = [recorded == task for recorded in episodes.recorded_tasks]
+        targets[rows] = probe_targets(episodes.ground_truth[rows], task)
+    return targets
 
 
 def probe_loss(tokenizer: Tokenizer, probed_BP: Tensor, targets_BP: Tensor) -> Tensor:
@@ -107,8 +122,15 @@ def _set_statistics(tokenizer: Tokenizer, images: np.ndarray, truth: FloatArray,
     rows = numpy_stream(seed, "background").choice(len(images), min(BACKGROUND_FRAMES, len(images)), replace=False)
     median = np.median(images[rows].astype(np.float32), 0) / 255
     tokenizer.background.copy_(torch.from_numpy(median.astype(np.float32)).permute(2, 0, 1))
-    known = np.where(np.isfinite(truth), truth, np.nan)
-    if np.isfinite(known).any():
-        tokenizer.probe_mean.copy_(torch.from_numpy(np.nan_to_num(np.nanmean(known, 0)).astype(np.float32)))
-        spread = np.nan_to_num(np.nanstd(known, 0), nan=1.0).astype(np.float32)
-        tokenizer.probe_std.copy_(torch.from_numpy(np.where(spread < 1e-4, 1.0, spread)))
+    mean, std = position_statistics(truth)
+    tokenizer.probe_mean.copy_(torch.from_numpy(mean))
+    tokenizer.probe_std.copy_(torch.from_numpy(std))
+
+
+def position_statistics(targets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and standard deviation (P,) of the known among targets (F, P); 0 and 1 where none is known, and 1 where all
+    are equal."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of columns without a known value
+        mean, std = np.nanmean(targets, 0), np.nanstd(targets, 0)
+    return np.nan_to_num(mean).astype(np.float32), np.where(std >= 1e-4, std, 1.0).astype(np.float32)

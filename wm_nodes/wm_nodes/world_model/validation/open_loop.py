@@ -24,13 +24,13 @@ from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
-from wm_nodes.world_model.training.tokenizer import probe_targets
+from wm_nodes.world_model.training.tokenizer import episode_targets
 
-HORIZONS = (1, 2, 4, 8, 12, 16)
+HORIZONS = (1, 2, 4, 8, 12, 16, 32, 64)
 MOVED_M = 0.01
 """An object counts as moved when it ends this far from where it began."""
 BATCH = 64
-OBJECT = [PROBE_NAMES.index(name) for name in ("cube_x", "cube_y")]
+OBJECT = [PROBE_NAMES.index(name) for name in ("object_x", "object_y")]
 TOOL = [PROBE_NAMES.index(name) for name in ("tool_x", "tool_y", "tool_z")]
 
 
@@ -96,7 +96,7 @@ def evaluate_rollouts(
     successful when the signal exceeds `threshold` anywhere, against success anywhere in the recording.
     """
     imagined = imagine_episodes(tokenizer, model, episodes)
-    truth = probe_targets(episodes.ground_truth, episodes.tasks[0])
+    truth = episode_targets(episodes)
     read = probe.read if probe else partial(_read_frames, tokenizer)
     real, predicted = read(episodes.images), read(imagined.frames)
     moved = np.linalg.norm(truth[:, -1, OBJECT] - truth[:, 0, OBJECT], axis=-1) > MOVED_M
@@ -112,10 +112,13 @@ def evaluate_rollouts(
             ("object", OBJECT, rows), ("object_moved", OBJECT, rows & moved), ("tool", TOOL, rows),
         ):
             metrics |= _position_metrics(estimates, truth[:, horizon], columns, chosen, f"{name}_{{}}_{label}")
-    frame_mask = episodes.step_mask
+    frame_mask, labelled = episodes.step_mask, episodes.labelled
     for j, task in enumerate(episodes.tasks):
-        happened = (episodes.success[:, 1:, j] & frame_mask).any(1)
-        signal = np.where(frame_mask, imagined.signals[..., j], 0).max(1)
+        rows = labelled[:, j]
+        if not rows.any():
+            continue
+        happened = (episodes.success[rows, 1:, j] & frame_mask[rows]).any(1)
+        signal = np.where(frame_mask[rows], imagined.signals[rows, :, j], 0).max(1)
         detection = detection_metrics(signal, happened, threshold)
         metrics |= {f"done_{task}_{key}": value for key, value in detection.items()}
         metrics[f"done_{task}_uncertainty_p99"] = float(np.quantile(imagined.uncertainty[..., j][frame_mask], 0.99))

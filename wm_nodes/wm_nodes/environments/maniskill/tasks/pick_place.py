@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import Task
+from wm_nodes.config.tasks import Task, WeakPolicy
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import ANYWHERE, CONTAINERS, Layout, draw, free_of
@@ -53,5 +53,7 @@ TASK = Task(
     success=success,
     waypoints=place_waypoints,
     script=scripted(place_waypoints, speed=0.8),
+    model_tasks=objects.MODEL_TASKS,
+    weak_policies=(WeakPolicy(1, 20, 0.25),),
     settings={**objects.SETTINGS, "data.behaviours": CARRYING},
 )

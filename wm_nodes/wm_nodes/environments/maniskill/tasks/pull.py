@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
+from wm_nodes.config.tasks import WeakPolicy
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import Layout
@@ -32,4 +33,5 @@ def instruct(scene: Scene) -> str:
 
 TASK = replace(
     push.TASK, instruction="pull the object towards the robot", instruct=instruct, scene=scene, success=success,
+    weak_policies=(WeakPolicy(4, 20, 0.25),),
 )

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from wm_nodes.config.scenes import Scene
-from wm_nodes.config.tasks import Task
+from wm_nodes.config.tasks import Task, WeakPolicy
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import objects
 from wm_nodes.environments.maniskill.layouts import CONTAINERS, Layout, Point, Rectangle, draw, free_of
@@ -62,5 +62,8 @@ TASK = Task(
     success=success,
     waypoints=waypoints,
     script=scripted(waypoints, speed=0.5),
+    shows_goal=False,
+    model_tasks=objects.MODEL_TASKS,
+    weak_policies=(WeakPolicy(2, 20, 0.25),),
     settings={**objects.SETTINGS, "data.behaviours": MOVING},
 )
