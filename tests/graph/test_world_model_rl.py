@@ -34,7 +34,7 @@ from wm_nodes.training.weights import load_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.recorded_buffers import RecordedClips, read_clips, rescore
-from wm_nodes.video_rl.reference_reward import ClipScores, load_probe
+from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, ClipScores, load_probe
 from wm_nodes.video_rl.sampling import RecordedContexts
 from wm_nodes.video_rl.train import post_train
 from wm_nodes.video_rl.training_run import CHECKPOINT, VIDEO_FILES, VideoRun, evaluated_uri, progress
@@ -43,7 +43,7 @@ from wm_nodes.world_model.position_probe import PositionProbe
 
 pytestmark = pytest.mark.graph
 PROGRAM = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-video-model', *sys.argv[1:]]))"
-SETTINGS = {"grpo.ema_decay": 0.5}
+SETTINGS = {"grpo.ema_decay": 0.5, "rewards.closeness": 0.5}
 ARGUMENTS = ["--preset", "smoke", *(f"--set={name}={value}" for name, value in SETTINGS.items())]
 
 
@@ -131,7 +131,7 @@ def test_the_averaged_weights_are_measured_after_and_the_base_model_once_before(
 def test_every_metric_is_in_the_document_and_tensorboard_has_them_too(run_dir: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    scores = set(ClipScores.__dataclass_fields__)
+    scores = {*ClipScores.__dataclass_fields__, *PICTURE_SCORES}
     assert [line["step"] for line in read_metrics(run_dir, "grpo")] == [1, 2]
     assert [line["step"] for line in read_metrics(run_dir, "heldout")] == [1, 2]
     for line in read_metrics(run_dir):
@@ -173,18 +173,19 @@ def test_recorded_clips_are_scored_again_to_the_same_bits(
     found = json.loads((run_dir / "rescored.json").read_text())
     assert found["equal"] and [row["iteration"] for row in found["buffers"]] == [0, 1]
     assert all(row["recorded"] == row["again"] for row in found["buffers"])
-    first = recorded(run_dir)[0]
+    first, codec = recorded(run_dir)[0], load_video_folder(run_dir / "video_model").codec
+    assert first.weights["closeness"] == 0.5 and first.scores["closeness"].isfinite().all()
     values = first.scores["tool_cm"].clone()
     values[3] = torch.nextafter(values[3], torch.tensor(torch.inf, dtype=torch.float64))
     changed = replace(first, scores={**first.scores, "tool_cm": values})
-    assert rescore(changed, contexts, probe, config.rewards, 1).different == ("tool_cm",)
+    assert rescore(changed, contexts, probe, codec, config.rewards, 1).different == ("tool_cm",)
     assert first.picture is not None
     dark = replace(first, picture=first.picture // 2)
-    assert {"psnr_db", "total"} <= set(rescore(dark, contexts, probe, config.rewards, 1).different)
+    assert {"psnr_db", "total"} <= set(rescore(dark, contexts, probe, codec, config.rewards, 1).different)
     with pytest.raises(BagError, match="picture of iteration 0 is not in the bag"):
-        rescore(replace(first, picture=None), contexts, probe, config.rewards, 1)
+        rescore(replace(first, picture=None), contexts, probe, codec, config.rewards, 1)
     with pytest.raises(BagError, match="beauty cannot be scored again"):
-        rescore(replace(first, scores={"beauty": values}), contexts, probe, config.rewards, 1)
+        rescore(replace(first, scores={"beauty": values}), contexts, probe, codec, config.rewards, 1)
 
 
 @pytest.mark.slow

@@ -5,19 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from recording_samples import make_episode, make_spec
 from torch import Tensor
 
-from wm_nodes.config.load import VIDEO, ConfigError, dump_config, load_video_config, preset_names
+from wm_nodes.config.load import VIDEO, ConfigError, dump_config, load_video_config, preset_names, reward_overrides
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
+from wm_nodes.recording import EpisodeBagWriter
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.video_model import NetworkSettings, RolloutSettings, VideoNetwork
-from wm_nodes.video_model.clips import Clips, cut_clips
+from wm_nodes.video_model.clips import Clips, cut_clips, load_clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
-from wm_nodes.video_rl.reference_reward import mix_rewards, score_clips
+from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, all_scores, mix_rewards, score_clips, score_pictures
 from wm_nodes.video_rl.sampling import rollout_settings
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
 
@@ -117,11 +119,81 @@ def test_a_clip_equal_to_its_recording_has_full_scores_and_a_shifted_object_lose
         score_clips(moved[:, :2], clips, TruthfulProbe(), 1)  # type: ignore[arg-type]
 
 
+class FirstPixel:
+    """The codec whose one latent is the red value of the first pixel, of 255."""
+
+    def encode(self, frames: Tensor) -> Tensor:
+        return frames[..., :1, :1, 0].unsqueeze(1).float() / 255
+
+
+def flat_clips(*levels: int, frames: int = 3) -> Tensor:
+    return torch.stack([torch.full((frames, 16, 16, 3), level, dtype=torch.uint8) for level in levels])
+
+
+def pictures_of(frames: Tensor) -> Clips:
+    """Recordings (N, F) that show these frames and have no simulator state."""
+    N, F = frames.shape[:2]
+    truth = np.full((N, F, len(GROUND_TRUTH_NAMES)), np.nan, np.float32)
+    return Clips(frames, torch.zeros(N, F - 1, 6), truth, ("push",) * N, "push_cube")
+
+
+def test_closeness_is_the_mean_of_psnr_ssim_and_the_perceptual_score_of_the_generated_frames() -> None:
+    """White against grey 51: an error of 0.8 in every pixel and in the latent."""
+    clips, codec = flat_clips(255), FirstPixel()
+    same = score_pictures(clips, pictures_of(clips), codec, 1)  # type: ignore[arg-type]
+    assert tuple(same) == PICTURE_SCORES and [float(same[name]) for name in PICTURE_SCORES] == [1.0, 1.0, 1.0]
+    other = flat_clips(51)
+    other[:, 0] = 255  # the given frame
+    off = score_pictures(clips, pictures_of(other), codec, 1)  # type: ignore[arg-type]
+    assert float(off["perceptual"]) == pytest.approx(np.exp(-0.8)) and off["closeness"].dtype == torch.float64
+    assert float(off["ssim"]) == pytest.approx(0.4001 / 1.0401, abs=2e-4)
+    wanted = (-20 * np.log10(0.8) / 40 + float(off["ssim"]) + np.exp(-0.8)) / 3
+    assert float(off["closeness"]) == pytest.approx(wanted, abs=1e-6)
+    half = other.clone()
+    half[:, 1] = 255  # one of the two generated frames as recorded
+    both = score_pictures(clips, pictures_of(half), codec, 1)  # type: ignore[arg-type]
+    assert float(both["closeness"]) == pytest.approx((1 + wanted) / 2, abs=1e-6)
+    with pytest.raises(ValueError, match="their recordings"):
+        score_pictures(clips[:, :2], pictures_of(clips), codec, 1)  # type: ignore[arg-type]
+
+
+def test_a_clip_with_less_noise_is_closer_and_no_picture_leaves_the_bounds() -> None:
+    codec, clean = PatchCodec(4, 6), pictures(1, 16, 16)[None].expand(5, 3, 16, 16, 3).clone()
+    codec.fit(pictures(40))
+    noise = torch.randint(-1, 2, clean.shape, generator=torch_stream(0, "test_noise"))
+    shown = (clean.int() + noise * torch.tensor([0, 10, 30, 90, 255]).view(5, 1, 1, 1, 1)).clamp(0, 255)
+    found = score_pictures(shown.to(torch.uint8), pictures_of(clean), codec, 1)
+    for name in PICTURE_SCORES:
+        assert found[name].tolist() == sorted(found[name].tolist(), reverse=True), name
+    inverse = score_pictures(255 - clean, pictures_of(clean), codec, 1)["closeness"]
+    assert (found["closeness"][0], bool((inverse > -1 / 3).all())) == (1.0, True)
+
+
+def test_without_simulator_state_pictures_are_scored_and_all_else_is_unknown(tmp_path: Path) -> None:
+    spec = make_spec(ground_truth_names=())
+    with EpisodeBagWriter(tmp_path / "bag", spec, run_id="pictures", start_ns=1) as bag:
+        bag.write(make_episode(spec, 0, 4))
+    clips = load_clips([tmp_path / "bag"], 2)
+    assert clips.ground_truth.shape == (1, 3, len(GROUND_TRUTH_NAMES)) and np.isnan(clips.ground_truth).all()
+    blind, codec, weights = object(), PatchCodec(4, 6), {"closeness": 0.5, "ssim": 0.5, "tracking": 0.0}
+    codec.fit(clips.frames.flatten(0, 1))
+    found = all_scores(clips.frames, clips, blind, codec, 1, weights)  # type: ignore[arg-type]
+    known = {"scenery", "psnr_db", *PICTURE_SCORES}
+    assert {name for name, values in found.items() if torch.isfinite(values).all()} == known
+    assert mix_rewards(found, weights).tolist() == [1.0]
+    plain = all_scores(clips.frames, clips, blind, codec, 1, {"tracking": 1.0})  # type: ignore[arg-type]
+    assert found.keys() - plain.keys() == set(PICTURE_SCORES)
+
+
 def test_rewards_are_mixed_by_weight_and_an_unknown_one_is_named() -> None:
     values = {"tracking": torch.tensor([1.0, 2.0]), "scenery": torch.tensor([0.1, 0.2])}
     assert torch.allclose(mix_rewards(values, {"tracking": 2.0, "scenery": -1.0}), torch.tensor([1.9, 3.8]).double())
     with pytest.raises(ValueError, match="beauty"):
         mix_rewards(values, {"beauty": 1.0})
+    unscored = {"tracking": 0.5, "scenery": 0.5, "beauty": 0.0}
+    assert torch.allclose(mix_rewards(values, unscored), torch.tensor([0.55, 1.1]).double())
+    with pytest.raises(ValueError, match="weigh some of"):
+        mix_rewards(values, {"tracking": 0.0})
 
 
 @pytest.mark.parametrize("preset", preset_names(VIDEO))
@@ -172,6 +244,12 @@ def test_one_reward_can_be_weighed_without_losing_the_others() -> None:
     rewards = load_video_config("smoke").rewards
     assert load_video_config("smoke", {"rewards.object_cm": -0.1}).rewards == {**rewards, "object_cm": -0.1}
     assert load_video_config("smoke", {"rewards": {"psnr_db": 1.0}}).rewards == {"psnr_db": 1.0}
+
+
+def test_the_rewards_that_the_command_line_names_replace_those_of_the_preset() -> None:
+    named = {name: load_video_config("closed_loop", reward_overrides(name)).rewards for name in (None, "closeness")}
+    assert named == {None: {"tracking": 1.0}, "closeness": {"closeness": 1.0}}
+    assert load_video_config("outcome", reward_overrides("reference")).rewards == load_video_config("base").rewards
 
 
 def make_folder(folder: Path) -> Path:

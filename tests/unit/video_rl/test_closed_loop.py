@@ -14,8 +14,19 @@ from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import VideoFolder
+from wm_nodes.video_rl.grpo import GrpoLearner
 from wm_nodes.video_rl.horizons import LEAST_SHARE, Headroom, horizon_scores, measure_headroom
-from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest, RecordedContexts, drawn_history, recorded_place
+from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, score_pictures
+from wm_nodes.video_rl.sampling import (
+    ClipGenerator,
+    GroupRequest,
+    RecordedContexts,
+    drawn_history,
+    recorded_place,
+    rollout_settings,
+)
+from wm_nodes.video_rl.train import post_train
+from wm_nodes.video_rl.validation import WATCHED, context_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
 GIVEN, NEW, FRAMES = 3, 2, 9
@@ -108,6 +119,26 @@ def test_a_continuation_is_scored_on_its_new_frames_alone() -> None:
     wanted = source.references(request).frames[:, GIVEN:].float()
     psnr = -10 * ((frames - wanted) / 255).square().mean((1, 2, 3, 4)).log10()
     torch.testing.assert_close(source.score(request, buffer).rewards["total"], psnr.double(), rtol=1e-5, atol=1e-5)
+
+
+def test_a_group_is_trained_and_evaluated_by_closeness_where_no_recording_has_simulator_state() -> None:
+    config = CONFIG.with_values(rewards={"closeness": 1.0})
+    blind = recorded()
+    blind.ground_truth[:] = np.nan
+    folder, probe = make_folder(), PositionProbe(8, 12)
+    source = RecordedContexts(folder, blind, config, probe)
+    learner = GrpoLearner(folder.network, config.grpo, rollout_settings(config.rollout), seed=0)
+    (buffer, report), = post_train(learner, source, 1)
+    request = source.request(0, 0)
+    frames, given = folder.codec.decode(buffer.rollout.latents), buffer.condition.num_conditioning
+    wanted = score_pictures(frames, source.references(request), folder.codec, given)
+    assert torch.equal(buffer.rewards["total"], wanted["closeness"]) and buffer.valid.all()
+    assert buffer.rewards["tracking"].isnan().all() and buffer.rewards["motion"].isnan().all()
+    assert report.reward_mean == pytest.approx(float(wanted["closeness"].mean())) and learner.version > 0
+    heldout = context_scores(folder, blind, probe, config)
+    assert heldout["closeness"].isfinite().all() and set(PICTURE_SCORES) <= set(WATCHED)
+    for one in measure_headroom(folder, blind, config, probe):
+        assert one.codec > one.reward and one.gain[0] > 0 and np.isnan(one.object_cm).all()
 
 
 def test_settings_that_a_model_or_its_recordings_cannot_have_are_refused() -> None:

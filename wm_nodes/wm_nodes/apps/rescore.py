@@ -41,6 +41,7 @@ from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 from wm_nodes.video_model.clips import Clips, load_clips
+from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers
 from wm_nodes.video_rl.recorded_buffers import BufferJudge, JudgedBuffer, RecordedClips, Rescored
 from wm_nodes.video_rl.reference_reward import load_probe
@@ -54,7 +55,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, help="run folder of train-video-model, or a bag of train-policy")
     parser.add_argument(
         "--reward", choices=REWARDS,
-        help="agent: a judge's verdicts; reference: how well clips follow their recordings (default: as recorded)",
+        help="agent: a judge's verdicts; reference: how well clips follow their recordings; closeness: how alike they "
+        "look (default: as recorded)",
     )
     add_judge(parser)
     add_device(parser)
@@ -124,7 +126,8 @@ def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any],
     """Every recorded picture of a run of loop 2."""
     chosen = {**reward_overrides(arguments.reward), **judge_settings(arguments), **device_settings(arguments)}
     run_dir, config = recorded_buffers.read_run(arguments.recording, chosen)
-    probe = load_probe(shipped_model(config.task), compute_device(config.device))
+    device = compute_device(config.device)
+    probe, folder = load_probe(shipped_model(config.task), device), load_video_folder(run_dir / "video_model", device)
     bags = recorded_buffers.recorded_episodes(run_dir, "train")
     contexts = load_clips(bags, config.model.stride)
     with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
@@ -133,7 +136,9 @@ def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any],
         rows = list[Rescored]()
         for recorded in tqdm(clips, desc="rescoring", unit="buffer"):
             first, given = recorded_place(config, recorded.iteration)
-            rows.append(recorded_buffers.rescore(recorded, contexts, probe, config.rewards, given, judge, first))
+            rows.append(recorded_buffers.rescore(
+                recorded, contexts, probe, folder.codec, config.rewards, given, judge, first
+            ))
     equal = all(not row.different for row in rows)
     path = arguments.json or run_dir / RESCORED
     console.print(_table(rows))

@@ -70,8 +70,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--reward", choices=REWARDS,
-        help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording. Default: what "
-        "the preset weighs",
+        help="agent: a judge's verdict on each clip; reference: how well the clip follows its recording; closeness: "
+        "how alike both look, which needs no simulator state. Default: what the preset weighs",
     )
     options.add_judge(parser)
     options.add_tensorboard(parser)

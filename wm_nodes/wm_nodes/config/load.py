@@ -25,8 +25,8 @@ FORMER_NAMES = {"gate": "acceptance", "rounds": "model_refresh"}
 """Sections of configurations saved before they were renamed."""
 EMBEDDED = "embedded"
 """JudgeConfig.kind of the judge in this process."""
-REWARDS = ("reference", AGENT)
-"""Rewards of the video model: its scores against the recording, or a judge's verdicts."""
+REWARDS = ("reference", "closeness", AGENT)
+"""Rewards of the video model: its scores against the recording, how alike both look, or a judge's verdicts."""
 
 Config = TypeVar("Config", RunConfig, VideoRlConfig)
 
@@ -85,7 +85,7 @@ def reward_overrides(reward: str | None) -> dict[str, Any]:
     """Return the setting of loop 2 for one of REWARDS: the weights of the rewards; {} for None."""
     if reward is None:
         return {}
-    return {"rewards": {AGENT: 1.0} if reward == AGENT else read_preset("base", VIDEO)["rewards"]}
+    return {"rewards": read_preset("base", VIDEO)["rewards"] if reward == "reference" else {reward: 1.0}}
 
 
 def named_pack(rubric: str) -> str:

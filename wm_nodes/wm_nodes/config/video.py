@@ -306,8 +306,9 @@ class VideoRlConfig(SettingsSection):
     context_episodes: PositiveInt
     """Those of a run whose video model is the shipped one."""
     rewards: dict[str, float]
-    """Weight of each reward: a score against the recording (video_rl/reference_reward.py), or `agent`, which needs a
-    judge."""
+    """Weight of each reward: a score against the recording (video_rl/reference_reward.py), of which `closeness`,
+    `ssim`, `perceptual`, `psnr_db`, `scenery` need no simulator state; or `agent`, which needs a judge. Several are
+    added, e.g. {outcome: 0.5, agent: 0.5}."""
     judge: JudgeConfig
     model: VideoModelConfig
     groups: GroupConfig

@@ -33,7 +33,7 @@ from wm_nodes.ros.worker import Work
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
-from wm_nodes.video_rl.reference_reward import load_probe, mix_rewards, score_clips
+from wm_nodes.video_rl.reference_reward import all_scores, load_probe, mix_rewards
 from wm_nodes.video_rl.sampling import ClipGenerator
 
 PARAMS = (
@@ -122,9 +122,10 @@ class ClipEvaluatorNode(ManagedNode):
         self, buffer: RolloutBuffer, frames: torch.Tensor, verdicts: Sequence[Verdict], sha256: str
     ) -> ClipScores:
         request = self._generator.request(buffer.iteration, buffer.policy_version)
-        scores = score_clips(
-            frames, self._generator.references(request), self._probe, buffer.condition.num_conditioning
-        ).named()
+        scores = all_scores(
+            frames, self._generator.references(request), self._probe, self._generator.folder.codec,
+            buffer.condition.num_conditioning, self._config.rewards,
+        )
         if self._agent is not None:
             scores |= agent_scores(verdicts)
         total = mix_rewards(scores, self._config.rewards)

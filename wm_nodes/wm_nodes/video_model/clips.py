@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wm_nodes.core.types import FloatArray
+from wm_nodes.config.tasks import get_task
+from wm_nodes.core.types import Episode, FloatArray
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.video_model import Condition
@@ -22,8 +23,8 @@ from wm_nodes.video_model.tokenizer_codec import Codec
 @dataclass(frozen=True)
 class Clips:
     """frames: uint8 (E, F, H, W, 3). actions: (E, F - 1, stride A), the recorded actions between two frames, one after
-    the other. ground_truth: (E, F, P) simulator state of `task`. instructions: one each. seeds: of the simulator's
-    reset, one each; () where unknown.
+    the other. ground_truth: (E, F, P) simulator state of `task`, NaN where unknown. instructions: one each. seeds: of
+    the simulator's reset, one each; () where unknown.
     """
 
     frames: Tensor
@@ -69,9 +70,17 @@ def load_clips(bags: Sequence[Path], stride: int) -> Clips:
     Raises:
         BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, or of different sizes.
     """
-    episodes = [episode for bag in bags for episode in read_episodes(bag)]
+    episodes = [_with_truth(episode) for bag in bags for episode in read_episodes(bag)]
     clips = cut_clips(stack_episodes(episodes, [episode.task for episode in episodes[:1]]), stride)
     return replace(clips, seeds=tuple(episode.seed for episode in episodes))
+
+
+def _with_truth(episode: Episode) -> Episode:
+    """The episode; recorded without simulator state, with an unknown one."""
+    if episode.ground_truth.shape[1]:
+        return episode
+    names = get_task(episode.task).ground_truth_names
+    return replace(episode, ground_truth=np.full((len(episode.images), len(names)), np.nan, np.float32))
 
 
 def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:

@@ -13,7 +13,7 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.reference_reward import mix_rewards, score_clips
+from wm_nodes.video_rl.reference_reward import all_scores, mix_rewards, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator, GroupRequest
 from wm_nodes.world_model.position_probe import PositionProbe
 
@@ -84,10 +84,11 @@ def measure_headroom(
         request = replace(plain, history=history, iteration=history or 0)
         buffer, recorded = generator.sample(request), generator.references(request)
         K, one = buffer.condition.num_conditioning, recorded.select(torch.arange(0, len(recorded), n))
-        scores = score_clips(folder.codec.decode(buffer.rollout.latents), recorded, probe, K).named()
-        coded = folder.codec.decode(folder.codec.encode(one.frames))
-        ceiling = mix_rewards(score_clips(coded, one, probe, K).named(), config.rewards)
-        rewards = mix_rewards(scores, config.rewards).view(-1, n)
+        codec, weights = folder.codec, config.rewards
+        scores = all_scores(codec.decode(buffer.rollout.latents), recorded, probe, codec, K, weights)
+        coded = codec.decode(codec.encode(one.frames))
+        ceiling = mix_rewards(all_scores(coded, one, probe, codec, K, weights), weights)
+        rewards = mix_rewards(scores, weights).view(-1, n)
         best = rewards.argmax(1, keepdim=True)
 
         def gained(values: Tensor, sign: int, best: Tensor = best) -> Interval:

@@ -25,7 +25,8 @@ from wm_nodes.recording.messages import stamp_ns
 from wm_nodes.recording.raw import PARTIAL_SUFFIX
 from wm_nodes.video_model import RolloutBuffer, RolloutBufferError
 from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_rl.reference_reward import attach_rewards, mix_rewards, score_clips
+from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.video_rl.reference_reward import all_scores, attach_rewards, mix_rewards
 from wm_nodes.world_model.position_probe import PositionProbe
 
 
@@ -164,12 +165,13 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
 
 
 def rescore(
-    recorded: RecordedClips, contexts: Clips, probe: PositionProbe, rewards: Mapping[str, float], num_conditioning: int,
-    judge: BufferJudge | None = None, first: int = 0,
+    recorded: RecordedClips, contexts: Clips, probe: PositionProbe, codec: Codec, rewards: Mapping[str, float],
+    num_conditioning: int, judge: BufferJudge | None = None, first: int = 0,
 ) -> Rescored:
     """Score the pictures against the recordings of their contexts and compare with the recorded scores, bit for bit.
 
     Args:
+        codec: of the video model.
         rewards: weights of the total; where other scores have a weight than were recorded, the total is not compared.
         judge: called where the agent is among the rewards.
         first: frame of the recordings that the clips begin with.
@@ -185,7 +187,7 @@ def rescore(
         )
     references = contexts.select(recorded.contexts).window(first, recorded.num_frames)
     frames = recorded.frames(*references.frames.shape[2:4]).to(device_of(probe))
-    scores = score_clips(frames, references, probe, num_conditioning).named()
+    scores = all_scores(frames, references, probe, codec, num_conditioning, {*recorded.scores, *rewards})
     unknown, verdicts = sorted(set(recorded.scores) - set(scores) - {AGENT}), tuple[Mapping[str, Any], ...]()
     if judge is not None and rewards.get(AGENT):
         verdict = judge(recorded, frames, references)

@@ -1,12 +1,12 @@
-"""Rewards of sampled clips, from the recorded episode that they should show (DD-28).
+"""Rewards of sampled clips, from the recorded episode that they should show (DD-28, DD-28a).
 
 Shapes: N clips, F frames, H W 3 image. Positions are read off the decoded pictures by the judge's probe
-(world_model/position_probe.py), which shares nothing with the video model; the truth is the simulator's. Nothing here
-is a learned preference: these are the verifiable rewards, and the held-out metrics beside which a judge's reward is
-watched (DD-2).
+(world_model/position_probe.py), which shares nothing with the video model; the truth is the simulator's. Where there is
+none, the pictures themselves are compared. Nothing here is a learned preference: these are the verifiable rewards, and
+the held-out metrics beside which a judge's reward is watched (DD-2).
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,8 +18,10 @@ from torch import Tensor
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M
+from wm_nodes.reward.picture_similarity import psnr_db, ssim
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.tokenizer_codec import Codec
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
@@ -33,6 +35,10 @@ SEEN_MOTION = 12
 """A pixel counts as scenery while no recorded frame differs from the first one by more than this, of 255."""
 ERRORS = ("scenery", "object_cm", "tool_cm")
 """Scores of which less is better."""
+PICTURE_SCORES = ("ssim", "perceptual", "closeness")
+"""What score_pictures() gives."""
+FULL_PSNR_DB = 40.0
+"""A frame of this PSNR or more has 1 for it in closeness."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +47,8 @@ class ClipScores:
     frames, in (0, 1]. scenery: mean absolute error, [0, 1], where the recording stands still. psnr_db: of generated
     frames. object_cm, tool_cm: mean position errors. motion: object path length, share of the recorded one, at most 2;
     1 where the recorded object stands still. success: 1 where the task is done in the last frame. outcome:
-    exp(-d / 5 cm), d what is then left to the edge of the goal (DD-32).
+    exp(-d / 5 cm), d what is then left to the edge of the goal (DD-32). All but scenery and psnr_db are NaN where the
+    recording has no simulator state.
     """
 
     tracking: Tensor
@@ -57,17 +64,28 @@ class ClipScores:
         return dict(vars(self))
 
 
+def all_scores(
+    frames: Tensor, references: Clips, probe: PositionProbe, codec: Codec, num_conditioning: int,
+    wanted: Collection[str],
+) -> dict[str, Tensor]:
+    """Return the scores of score_clips() by name, and PICTURE_SCORES, which cost twice as much, where one is wanted."""
+    scores = score_clips(frames, references, probe, num_conditioning).named()
+    if any(name in wanted for name in PICTURE_SCORES):
+        scores |= score_pictures(frames, references, codec, num_conditioning)
+    return scores
+
+
 def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_conditioning: int) -> ClipScores:
     """Score decoded clips, uint8 (N, F, H, W, 3), against the recordings of their contexts, where the clips are.
 
     Raises:
         ValueError: clips and recordings differ in number or size.
     """
-    if frames.shape != references.frames.shape:
-        raise ValueError(f"clips are {tuple(frames.shape)}, their recordings {tuple(references.frames.shape)}")
+    _check_sizes(frames, references)
     generated, recorded = slice(num_conditioning, None), references.frames.to(frames.device)
-    positions = probe.read(frames[:, generated])
     truth = probe_targets(references.ground_truth[:, generated], references.task)
+    unknown = bool(np.isnan(truth).all())  # then the pictures may be of cameras that the probe does not know
+    positions = truth if unknown else probe.read(frames[:, generated])
     object_m = np.linalg.norm(positions[..., OBJECT] - truth[..., OBJECT], axis=-1)
     tool_m = np.linalg.norm(positions[..., TOOL] - truth[..., TOOL], axis=-1)
     tracking = (np.exp(-object_m / TRACKING_SCALE_M) + np.exp(-tool_m / TRACKING_SCALE_M)) / 2
@@ -86,6 +104,27 @@ def score_clips(frames: Tensor, references: Clips, probe: PositionProbe, num_con
         success=torch.from_numpy(np.where(np.isfinite(left_m), left_m <= 0, left_m)).double(),
         outcome=torch.from_numpy(np.exp(-np.maximum(left_m, 0) / OUTCOME_SCALE_M)).double(),
     )
+
+
+def score_pictures(frames: Tensor, references: Clips, codec: Codec, num_conditioning: int) -> dict[str, Tensor]:
+    """Return by name, float64 (N,) in the host's memory, how alike decoded clips, uint8 (N, F, H, W, 3), and their
+    recordings look (DD-28a); no simulator state is read.
+
+    ssim: in [-1, 1]. perceptual: exp(-mean |difference of the codec's latents|), in (0, 1]. closeness: mean of both and
+    of PSNR / 40 dB, at most 1, in (-1/3, 1]. Each is a mean over the generated frames.
+
+    Raises:
+        ValueError: clips and recordings differ in number or size.
+    """
+    _check_sizes(frames, references)
+    shown, wanted = (some[:, num_conditioning:] for some in (frames, references.frames.to(frames.device)))
+    pairs = shown.flatten(0, 1), wanted.flatten(0, 1)
+    psnr, similarity = (measure(*pairs).view(shown.shape[:2]) for measure in (psnr_db, ssim))
+    distance = (codec.encode(shown) - codec.encode(wanted)).abs().mean((1, 3, 4))
+    perceptual = torch.exp(-distance).to(psnr.device)
+    closeness = ((psnr / FULL_PSNR_DB).clamp_max(1) + similarity + perceptual) / 3
+    scores = zip(PICTURE_SCORES, (similarity, perceptual, closeness), strict=True)
+    return {name: values.double().mean(1).cpu() for name, values in scores}
 
 
 def distance_left(positions: FloatArray, truth: FloatArray, task: str) -> FloatArray:
@@ -126,11 +165,12 @@ def load_probe(folder: Path, device: torch.device | str = "cpu") -> PositionProb
 
 
 def mix_rewards(values: Mapping[str, Tensor], weights: Mapping[str, float]) -> Tensor:
-    """Return sum over names of weight x value (DD-13a), float64 (N,).
+    """Return sum over names of weight x value (DD-13a), float64 (N,); what has weight 0 need not be scored.
 
     Raises:
         ValueError: a weight for something that was not scored, or no weight at all.
     """
+    weights = {name: weight for name, weight in weights.items() if weight}
     unknown = sorted(set(weights) - set(values))
     if unknown or not weights:
         raise ValueError(f"unknown rewards {unknown}; weigh some of {', '.join(sorted(values))}")
@@ -144,8 +184,14 @@ def attach_rewards(buffer: RolloutBuffer, scores: Mapping[str, Tensor], total: T
     return replace(scored, rewards={**raw, **scored.rewards})
 
 
+def _check_sizes(frames: Tensor, references: Clips) -> None:
+    if frames.shape != references.frames.shape:
+        raise ValueError(f"clips are {tuple(frames.shape)}, their recordings {tuple(references.frames.shape)}")
+
+
 def _path_share(positions: FloatArray, truth: FloatArray) -> FloatArray:
-    """Return the distance from first to last generated frame over the true one, at most 2; 1 where nothing moves."""
+    """Return the distance from first to last generated frame over the true one, at most 2; 1 where nothing moves, NaN
+    where that is unknown."""
     distance, wanted = (np.linalg.norm(path[:, -1] - path[:, 0], axis=-1) for path in (positions, truth))
     share: FloatArray = np.where(wanted > 0.01, np.minimum(distance / np.maximum(wanted, 1e-6), 2.0), 1.0)
-    return share
+    return np.where(np.isnan(wanted), wanted, share)

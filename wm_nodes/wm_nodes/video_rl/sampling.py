@@ -22,7 +22,7 @@ from wm_nodes.video_model import (
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.continuation import ClipLengths, clip_condition, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.reference_reward import attach_rewards, mix_rewards, score_clips
+from wm_nodes.video_rl.reference_reward import all_scores, attach_rewards, mix_rewards
 from wm_nodes.world_model.position_probe import PositionProbe
 
 _ROLLOUT = TypeAdapter(RolloutSettings)
@@ -237,8 +237,9 @@ class RecordedContexts(ClipGenerator):
         """Return the buffer with every score of its clips and the training reward `total`, mixed by config.rewards."""
         frames = self.folder.codec.decode(clips.rollout.latents)
         given = clips.condition.num_conditioning
-        scores = score_clips(frames, self.references(request), self.probe, given).named()
-        return attach_rewards(clips, scores, mix_rewards(scores, self.config.rewards))
+        rewards = self.config.rewards
+        scores = all_scores(frames, self.references(request), self.probe, self.folder.codec, given, rewards)
+        return attach_rewards(clips, scores, mix_rewards(scores, rewards))
 
 
 def _seeds(seed: int, name: str, iteration: int, group: Tensor, sample: Tensor) -> Tensor:

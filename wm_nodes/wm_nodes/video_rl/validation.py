@@ -16,14 +16,21 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_rl.reference_reward import ClipScores, load_probe, mix_rewards, more_is_better, score_clips
+from wm_nodes.video_rl.reference_reward import (
+    PICTURE_SCORES,
+    ClipScores,
+    all_scores,
+    load_probe,
+    mix_rewards,
+    more_is_better,
+)
 from wm_nodes.video_rl.reward_hacking import HackedMetric, find_hacked_metrics
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.world_model.position_probe import PositionProbe
 
 SECTION = "heldout"
 """Of metrics.jsonl: scores by name, mean over the contexts, at the number of buffers trained on."""
-WATCHED = tuple(ClipScores.__dataclass_fields__)
+WATCHED = (*ClipScores.__dataclass_fields__, *PICTURE_SCORES)
 OUTCOMES = ("success", "outcome")
 
 HeldoutScores = Callable[[], Mapping[str, float]]
@@ -40,7 +47,7 @@ def context_scores(
     contexts = evaluated_contexts(heldout, config)
     folder.network.eval()
     frames = ClipGenerator(folder, contexts, config).evaluate(contexts, config.evaluation.num_steps)
-    scores = score_clips(frames, contexts, probe, folder.clip["num_conditioning"]).named()
+    scores = all_scores(frames, contexts, probe, folder.codec, folder.clip["num_conditioning"], config.rewards)
     return {name: scores[name] for name in OUTCOMES} if config.groups.hide_actions else scores
 
 
