@@ -19,6 +19,7 @@ from benchmarks.video_rl.judged import JudgedContexts, open_judge
 from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import UInt8Array
+from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.precheck import precheck
@@ -71,6 +72,23 @@ def test_the_agents_reward_is_mixed_with_others_and_is_what_the_service_says_of_
         (buffer, report), = post_train(learner, source, 1)
     assert torch.equal(buffer.rewards["total"].nan_to_num(), found.rewards["total"].nan_to_num())
     assert report.reward_mean == pytest.approx(float(found.rewards["total"].mean()))
+
+
+def test_the_preset_outcome_trains_on_half_outcome_and_half_agent(given: Any) -> None:
+    folder, contexts, values = given
+    contexts.ground_truth[..., GROUND_TRUTH_NAMES.index("goal_x")] = 0.3  # no clip reaches it
+    config = load_video_config("outcome", {
+        **values, "rewards": {"outcome": 0.5, "agent": 0.5}, "groups.contexts": 2, "groups.group_size": 4,
+    })
+    before = {name: value.clone() for name, value in folder.network.state_dict().items()}
+    learner = GrpoLearner(folder.network, config.grpo, rollout_settings(config.rollout), seed=config.seed)
+    with JudgedContexts(folder, contexts, config, load_probe(MODEL_DIR), FPS) as source:
+        (buffer, report), = post_train(learner, source, 1)
+    rewards = buffer.rewards
+    assert_close(rewards["total"], (rewards["outcome"] + rewards["agent"]) / 2, equal_nan=True)
+    assert all(rewards[name][buffer.valid].std() > 0 for name in config.rewards) and buffer.valid.sum() >= 4
+    assert learner.version == 1 and report.kept > 0
+    assert any(not torch.equal(value, before[name]) for name, value in folder.network.state_dict().items())
 
 
 def test_recorded_actions_are_not_what_a_clip_of_hidden_actions_should_show(given: Any) -> None:
