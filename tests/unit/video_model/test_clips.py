@@ -99,7 +99,7 @@ def recorded(positions_cm: Tensor) -> Clips:
     frames[:, :, 0, :P, 0] = positions_cm.to(torch.uint8)
     truth = np.zeros((N, F, len(GROUND_TRUTH_NAMES)), np.float32)
     for index, name in enumerate(PROBE_NAMES):
-        truth[..., GROUND_TRUTH_NAMES.index(name)] = positions_cm[..., index].numpy() / 100
+        truth[..., GROUND_TRUTH_NAMES.index(name.replace("object", "cube"))] = positions_cm[..., index].numpy() / 100
     return Clips(frames, torch.zeros(N, F - 1, 6), truth, ("push",) * N, "push_cube")
 
 

@@ -31,6 +31,7 @@ from wm_nodes.policy_rl.factories import policy_actor
 from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, STARTS, train_weak_policy, write_starts
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
+from wm_nodes.reports.summary import plain
 from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model_folder, save_model_folder
 from wm_nodes.world_model.folder import action_model_class
 from wm_nodes.world_model.sentence_encoder import SentenceEncoder
@@ -107,7 +108,7 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     models = WorldModels(tokenizer, action, text, tasks, config.simulation, {}, probe)
     for name, scenes in _heldout_configs(config).items():
         held = collect_scripted(scenes, config.data.num_heldout, HELDOUT_SEEDS, run_dir / "data" / name)
-        found = {task: model_metrics(models, load_arrays(its, config), config) for task, its in held.items()}
+        found = {task: plain(model_metrics(models, load_arrays(its, config), config)) for task, its in held.items()}
         story[name] = found if len(found) > 1 else next(iter(found.values()))
     write_starts(
         chain(*bags.values()), folder / STARTS, MODEL_STARTS if len(bags) == 1 else MODEL_STARTS // 2, tasks=tasks,
