@@ -107,7 +107,7 @@ class WorldModelConfig(SettingsSection):
     learning_rate: PositiveFloat
     rollout_steps: list[PositiveInt]
     """Curriculum: imagined steps unrolled and back-propagated through, raised in equal stages over the training."""
-    part_steps: NonNegativeInt
+    part_steps: NonNegativeInt = 0
     """Steps of the random parts of episodes that the action model is rolled out over in training; 0: whole episodes."""
     done_weight: NonNegativeFloat
     """Weight of the done loss (RS-4)."""
