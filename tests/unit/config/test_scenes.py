@@ -5,7 +5,6 @@ import pytest
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.scenes import COLOURS, CONTAINERS, SCENES, SHAPES, TABLES, scene_of, scenes_of, splits
 from wm_nodes.config.tasks import get_task, instruction, task_names
-from wm_nodes.core.specs import simulation_spec
 from wm_nodes.world_model.text import MAX_WORDS
 
 IN_SCENES = [task for task in task_names() if get_task(task).instruct]
@@ -60,9 +59,8 @@ def test_unknown_scenes_are_refused_in_one_line_that_names_the_known_ones() -> N
 
 @pytest.mark.parametrize(("task", "scenes"), [("push_cube", "train"), ("push", "")])
 def test_a_task_with_a_scene_of_its_own_takes_no_scenes_and_the_others_need_some(task: str, scenes: str) -> None:
-    config = load_config("cpu", {"task": task, "simulation.scenes": scenes})
-    with pytest.raises(ValueError, match=rf"simulation.scenes is '{scenes}', but task '{task}'"):
-        simulation_spec(task, config.simulation, 1)
+    with pytest.raises(ConfigError, match=rf"schema.py: simulation.scenes is '{scenes}', but task '{task}'"):
+        load_config("cpu", {"task": task, "simulation.scenes": scenes})
 
 
 @pytest.mark.parametrize("task", IN_SCENES)

@@ -128,7 +128,7 @@ def train_action_model(
         index = torch.from_numpy(rows)
         first = first_frames(lengths[index], num_steps, torch_stream(seed, "action_model_part", iteration))
         generator = torch_stream(seed, "action_model_noise", iteration)
-        batch = index, first, *starts(data, len(rows), num_steps, steps_at(iteration), generator)
+        batch = torch.stack((index, first)), *starts(data, len(rows), num_steps, steps_at(iteration), generator)
         if not settings.decoded_weight:
             return batch
         stream = torch_stream(seed, "action_model_decoded", iteration)
@@ -138,7 +138,7 @@ def train_action_model(
 
     def loss(iteration: int) -> dict[str, Tensor]:
         steps = steps_at(iteration)
-        index, first, noise, anchors, *shown = batches(iteration)
+        (index, first), noise, anchors, *shown = batches(iteration)
         part = data.parts(index, first, num_steps)
         rows = torch.arange(len(index), device=index.device)
         with compute_context(tokenizer.device):
