@@ -14,11 +14,10 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.position_probe import PositionProbe
-from wm_nodes.world_model.training.tokenizer import episode_targets, position_statistics
+from wm_nodes.world_model.training.tokenizer import episode_targets, known_huber, position_statistics
 
 LEARNING_RATE = 1.0e-3
 PIXEL_NOISE = 0.02
-HUBER_DELTA = 0.5
 
 
 def train_position_probe(
@@ -60,10 +59,8 @@ def train_position_probe(
         pixels = torch.cat((pixels[:half], F.avg_pool2d(pixels[half:], 3, 1, 1, count_include_pad=False)))
         wanted = (positions - probe.mean) / probe.std
         found = probe(pixels + PIXEL_NOISE * noise)
-        known = torch.isfinite(wanted)
-        found, wanted = found[known], wanted[known]
-        error_m = (found.detach() - wanted) * probe.std.expand_as(known)[known]
-        return {"loss": F.huber_loss(found, wanted, delta=HUBER_DELTA), "error_m": error_m.abs().mean()}
+        error_m = (found.detach() - wanted) * probe.std
+        return {"loss": known_huber(found, wanted), "error_m": error_m.abs().nanmean()}
 
     loop = TrainingLoop("position_probe", probe, config.tokenizer.num_iterations, LEARNING_RATE, run_dir)
     return probe, loop.run(loss)

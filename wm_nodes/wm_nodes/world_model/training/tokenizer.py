@@ -112,9 +112,13 @@ def episode_targets(episodes: EpisodeArrays) -> FloatArray:
 
 def probe_loss(tokenizer: Tokenizer, probed_BP: Tensor, targets_BP: Tensor) -> Tensor:
     """Huber loss of normalised positions; unknown (NaN) and constant values do not count."""
-    wanted = (targets_BP - tokenizer.probe_mean) / tokenizer.probe_std
+    return known_huber(probed_BP, (targets_BP - tokenizer.probe_mean) / tokenizer.probe_std)
+
+
+def known_huber(found: Tensor, wanted: Tensor) -> Tensor:
+    """Mean Huber loss (delta 0.5) of the values that are known: wanted is NaN elsewhere. 0 where none is."""
     known = torch.isfinite(wanted)
-    losses = F.huber_loss(probed_BP, wanted.nan_to_num(), delta=0.5, reduction="none")
+    losses = F.huber_loss(found, wanted.nan_to_num(), delta=0.5, reduction="none")
     return (losses * known).sum() / known.sum().clamp_min(1)
 
 

@@ -121,7 +121,9 @@ def evaluate_rollouts(
         signal = np.where(frame_mask[rows], imagined.signals[rows, :, j], 0).max(1)
         detection = detection_metrics(signal, happened, threshold)
         metrics |= {f"done_{task}_{key}": value for key, value in detection.items()}
-        metrics[f"done_{task}_uncertainty_p99"] = float(np.quantile(imagined.uncertainty[..., j][frame_mask], 0.99))
+        metrics[f"done_{task}_uncertainty_p99"] = float(
+            np.quantile(imagined.uncertainty[rows, :, j][frame_mask[rows]], 0.99)
+        )
     return metrics
 
 
