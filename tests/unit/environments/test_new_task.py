@@ -106,7 +106,7 @@ def test_its_demonstrations_are_recorded_and_what_a_world_model_probes_is_found_
     assert (episode.task, episode.instruction, episode.behaviour) == ("nudge", "nudge the blue cube", "expert")
     assert episode.success[-1] and episode.ground_truth.shape[1] == 12
     probed = probe_targets(episode.ground_truth, "nudge")
-    np.testing.assert_array_equal(probed[:, PROBE_NAMES.index("cube_x")], episode.ground_truth[:, 1])
+    np.testing.assert_array_equal(probed[:, PROBE_NAMES.index("object_x")], episode.ground_truth[:, 1])
 
 
 def test_the_judge_draws_and_labels_its_clips_by_its_own_rule() -> None:

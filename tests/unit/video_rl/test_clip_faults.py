@@ -12,7 +12,7 @@ from wm_nodes.world_model.tokenizer import PROBE_NAMES
 
 SIMULATION = load_config("smoke").simulation
 LIMITS = FaultLimits(tool_step_m=0.15, object_px=6)
-CUBE_X, TOOL_X, TOOL_Z = (PROBE_NAMES.index(name) for name in ("cube_x", "tool_x", "tool_z"))
+OBJECT_X, TOOL_X, TOOL_Z = (PROBE_NAMES.index(name) for name in ("object_x", "tool_x", "tool_z"))
 GREEN, TABLE = (20, 160, 40), (200, 190, 170)
 
 
@@ -45,11 +45,11 @@ def test_a_clip_in_which_nothing_happens_has_no_faults() -> None:
 
 def test_an_object_that_moves_alone_is_a_ghost_and_one_beside_the_tool_is_not() -> None:
     positions = still()
-    positions[0, 2:, CUBE_X] = -0.03
+    positions[0, 2:, OBJECT_X] = -0.03
     assert faults(positions)["ghost_motion"] == 0.25
     positions[0, :3, [TOOL_X, TOOL_Z]] = [[0.05], [0.02]]
     assert faults(positions)["ghost_motion"] == 0
-    positions[0, 2:, CUBE_X] = -0.01
+    positions[0, 2:, OBJECT_X] = -0.01
     assert faults(positions)["ghost_motion"] == 0, "less than 2 cm is noise of the reader"
 
 
