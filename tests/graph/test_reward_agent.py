@@ -229,6 +229,7 @@ def test_recorded_verdicts_are_given_again_bit_for_bit_without_asking_the_judge(
     assert all(logged[audit_id].round_number == clips.iteration for audit_id in told.values())
 
     shutil.copytree(judged.bag, run / "data" / "train" / "shard_00000000")
+    shutil.copytree(judged.model, run / "video_model")
     shutil.copytree(bag, run / "bags" / "round")
     shutil.copytree(folder / READS, run / READS)
     settings = (folder / "video_config.yaml").read_text()
