@@ -1,7 +1,7 @@
 """The catalogue of the table-top scenes: which object, container and table, and which scenes train or test.
 
-A scene's name is <colour>_<shape>-<container>-<table>, e.g. red_cube-bowl-grey_table. Every scene is in one split;
-scenes.json lists them. Standard library only, as tasks.py.
+A scene's name is <colour>_<shape>-<container>-<table>, e.g. red_cube-bowl-grey_table. Every scene of SCENES is in one
+split; scenes.json lists them. Those of a user's own shapes are in none. Standard library only, as tasks.py.
 """
 
 from __future__ import annotations
@@ -10,13 +10,19 @@ import functools
 import hashlib
 import itertools
 import json
+import re
 from dataclasses import dataclass
 from importlib import resources
+
+from wm_nodes.config.extensions import find_files
 
 SHAPES = ("cube", "bar", "cylinder", "sphere", "capsule")
 COLOURS = ("red", "green", "blue", "yellow")
 CONTAINERS = ("plate", "bowl")
 TABLES = ("grey_table", "brown_table")
+SHAPE_FILES = "wm_nodes.environments.maniskill.shapes"
+SHAPES_VARIABLE = "WM_SHAPES"
+"""Environment variable with the names of further packages of shapes, separated by commas."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +66,21 @@ def scenes_of(setting: str) -> tuple[Scene, ...]:
     """
     if not setting:
         return ()
-    names = splits().get(setting) or ((setting,) if setting in SCENES else ())
-    if not names:
+    if setting in splits():
+        return tuple(SCENES[name] for name in splits()[setting])
+    match = re.fullmatch(r"([^_-]+)_([^-]+)-([^-]+)-([^-]+)", setting)
+    known = COLOURS, tuple(shapes()), CONTAINERS, TABLES
+    if match is None or any(part not in names for part, names in zip(match.groups(), known)):
         raise ValueError(
             f"unknown scenes {setting!r}; choose a split ({', '.join(splits())}) or a scene's name, "
-            f"COLOUR_SHAPE-CONTAINER-TABLE of {', '.join(COLOURS)}; {', '.join(SHAPES)}; {', '.join(CONTAINERS)}; "
-            f"{', '.join(TABLES)}"
+            f"COLOUR_SHAPE-CONTAINER-TABLE of {'; '.join(', '.join(names) for names in known)}"
         )
-    return tuple(SCENES[name] for name in names)
+    return (Scene(*match.groups()),)
+
+
+def shapes() -> dict[str, str]:
+    """Package by shape. Raises ValueError as find_files."""
+    return find_files("shape", SHAPE_FILES, SHAPES_VARIABLE)
 
 
 def check_scenes(setting: str) -> str:

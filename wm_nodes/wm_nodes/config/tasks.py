@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import functools
 import importlib
-import os
-import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from wm_nodes.config.extensions import find_files
 from wm_nodes.config.scenes import Scene, scenes_of
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float32]
 
-PACKAGES = ("wm_nodes.environments.maniskill.tasks",)
+PACKAGE = "wm_nodes.environments.maniskill.tasks"
 VARIABLE = "WM_TASKS"
 """Environment variable with the names of further packages of task files, separated by commas."""
 
@@ -141,7 +140,7 @@ def get_task(name: str) -> Task:
     module = importlib.import_module(f"{_files()[check_task(name)]}.{name}")
     task = getattr(module, "TASK", None)
     if not isinstance(task, Task):
-        raise ValueError(f"{module.__file__} has no TASK = Task(...); see {PACKAGES[0]}")
+        raise ValueError(f"{module.__file__} has no TASK = Task(...); see {PACKAGE}")
     return task
 
 
@@ -189,21 +188,5 @@ def clip_rules(name: str) -> ClipRules:
 
 
 def _files() -> dict[str, str]:
-    """Package by task.
-
-    Raises:
-        ValueError: a package is missing, or two have the same task.
-    """
-    packages: dict[str, str] = {}
-    for package in (*PACKAGES, *filter(None, (part.strip() for part in os.environ.get(VARIABLE, "").split(",")))):
-        try:
-            folders = importlib.import_module(package).__path__
-        except (ModuleNotFoundError, AttributeError) as error:
-            raise ValueError(f"{VARIABLE} names {package!r}, no package that Python finds; see PYTHONPATH") from error
-        for module in pkgutil.iter_modules(folders):
-            if module.name.startswith("_"):
-                continue
-            if module.name in packages:
-                raise ValueError(f"task {module.name!r} is in {packages[module.name]} and in {package}; rename one")
-            packages[module.name] = package
-    return packages
+    """Package by task. Raises ValueError as find_files."""
+    return find_files("task", PACKAGE, VARIABLE)

@@ -35,7 +35,8 @@ def measure(scene: Any, start: FloatArray | None) -> FloatArray:
     """Ground truth (P,) of an ObjectScene. start: that of the reset, None at the reset."""
     from transforms3d.euler import quat2euler
 
-    from wm_nodes.environments.maniskill.scene_parts import CONTAINER_HEIGHT_M, CONTAINER_RADIUS_M, bottom_m
+    from wm_nodes.environments.maniskill.scene_parts import CONTAINER_HEIGHT_M, CONTAINER_RADIUS_M
+    from wm_nodes.environments.maniskill.shape import bottom_m
 
     layout, shape = scene.layout, scene.catalogue_scene
     pose = scene.object.pose.raw_pose[0].numpy()

@@ -1,4 +1,4 @@
-"""The parts of the procedural scenes: five shapes, two containers, a carpet. Primitives only. Lengths in m.
+"""The parts of the procedural scenes: an object of a shape, two containers, a carpet. Primitives only. Lengths in m.
 
 Every part stands on the table, z = 0, at x y.
 """
@@ -9,69 +9,29 @@ from typing import Any
 import numpy as np
 import sapien
 from transforms3d.euler import euler2quat
-from transforms3d.quaternions import quat2mat
 
 from wm_nodes.config.scenes import Scene
 from wm_nodes.environments.maniskill.layouts import Point
+from wm_nodes.environments.maniskill.shape import UPRIGHT, get_shape
 
 COLOURS = {
     "red": (0.72, 0.05, 0.05), "green": (0.05, 0.45, 0.10), "blue": (0.04, 0.12, 0.62), "yellow": (0.85, 0.66, 0.03),
     "plate": (0.90, 0.90, 0.88), "bowl": (0.06, 0.38, 0.42), "carpet": (0.50, 0.08, 0.42),
     "grey_table": (0.42, 0.43, 0.45), "brown_table": (0.36, 0.22, 0.13),
 }
-CUBE_HALF_M = 0.022
-BAR_HALF_M = (0.038, 0.015, 0.015)
-CYLINDER_RADIUS_M, CYLINDER_HALF_M = 0.019, 0.028
-SPHERE_RADIUS_M = 0.024
-CAPSULE_RADIUS_M, CAPSULE_HALF_M = 0.019, 0.02
-"""The half length of a capsule is that of its axis, without the caps."""
 CONTAINER_RADIUS_M = 0.06
 CONTAINER_HEIGHT_M = {"plate": 0.008, "bowl": 0.028}
 BOWL_FLOOR_M, BOWL_WALL_M, NUM_WALLS = 0.004, 0.004, 12
 CARPET_HALF_M = 0.05
-UPRIGHT = sapien.Pose(q=euler2quat(0, np.pi / 2, 0))
-"""SAPIEN's cylinders and capsules lie along x."""
-REST_HEIGHT_M = {
-    "cube": CUBE_HALF_M, "bar": BAR_HALF_M[2], "cylinder": CYLINDER_HALF_M, "sphere": SPHERE_RADIUS_M,
-    "capsule": CAPSULE_RADIUS_M,
-}
 ANGULAR_DAMPING = 8.0
 """Of every object, 1/s: PhysX has no rolling friction, and a ball that was touched would roll off the table."""
 
 
-def bottom_m(shape: str, height: float, quaternion: Sequence[float]) -> float:
-    """The lowest point of an object whose centre is `height` above the table."""
-    up = quat2mat(quaternion)[2]
-    half = {
-        "cube": CUBE_HALF_M * np.abs(up).sum(),
-        "bar": np.abs(up) @ BAR_HALF_M,
-        "cylinder": CYLINDER_HALF_M * abs(up[2]) + CYLINDER_RADIUS_M * np.sqrt(max(0.0, 1 - up[2] ** 2)),
-        "sphere": SPHERE_RADIUS_M,
-        "capsule": CAPSULE_HALF_M * abs(up[0]) + CAPSULE_RADIUS_M,
-    }[shape]
-    return float(height - half)
-
-
 def build_object(scene: Any, which: Scene, place: Point, yaw: float) -> Any:
     """The dynamic actor of a scene's object, turned by `yaw`, rad."""
-    builder, material = scene.create_actor_builder(), _material(which.colour)
-    match which.shape:
-        case "cube" | "bar":
-            half = [CUBE_HALF_M] * 3 if which.shape == "cube" else list(BAR_HALF_M)
-            builder.add_box_collision(half_size=half)
-            builder.add_box_visual(half_size=half, material=material)
-        case "sphere":
-            builder.add_sphere_collision(radius=SPHERE_RADIUS_M)
-            builder.add_sphere_visual(radius=SPHERE_RADIUS_M, material=material)
-        case "cylinder":
-            size = {"radius": CYLINDER_RADIUS_M, "half_length": CYLINDER_HALF_M}
-            builder.add_cylinder_collision(UPRIGHT, **size)
-            builder.add_cylinder_visual(UPRIGHT, **size, material=material)
-        case "capsule":
-            size = {"radius": CAPSULE_RADIUS_M, "half_length": CAPSULE_HALF_M}
-            builder.add_capsule_collision(**size)
-            builder.add_capsule_visual(**size, material=material)
-    builder.initial_pose = sapien.Pose([*place, REST_HEIGHT_M[which.shape]], euler2quat(0, 0, yaw))
+    builder, shape = scene.create_actor_builder(), get_shape(which.shape)
+    shape.build(builder, _material(which.colour))
+    builder.initial_pose = sapien.Pose([*place, shape.rest_height_m], euler2quat(0, 0, yaw))
     actor = builder.build(which.object)
     actor._bodies[0].angular_damping = ANGULAR_DAMPING
     return actor
