@@ -7,8 +7,17 @@ import numpy as np
 import pytest
 from model_folders import make_model_folder, make_stepped_folder, write_starts
 
-from benchmarks.environments.policies import WORLD_MODEL, Workplace, measure_speed, rank_policies, spearman
+from benchmarks.environments.policies import (
+    SIMULATOR,
+    WORLD_MODEL,
+    Workplace,
+    measure_speed,
+    rank_policies,
+    spearman,
+    train_in,
+)
 from wm_nodes.config.load import load_config
+from wm_nodes.core.files import file_sha256
 from wm_nodes.policy_rl.factories import make_policy
 from wm_nodes.policy_rl.initial_policy import start_files
 from wm_nodes.training.weights import save_weights
@@ -39,13 +48,29 @@ def test_each_model_is_ranked_against_the_simulator() -> None:
     assert (found["a"]["correlation"], found["b"]["correlation"]) == (pytest.approx(1), pytest.approx(-1))
 
 
-def test_speed_and_imagined_success_are_measured_in_each_model(tmp_path: Path) -> None:
+@pytest.fixture
+def work(tmp_path: Path) -> Workplace:
     config = load_config("smoke")
     work = Workplace(config, make_model_folder(tmp_path / "model"), tmp_path / "push_cube_0")
     starts, weak = start_files(work.folder)
     weak.parent.mkdir(parents=True)
     vars(work)["start"] = (write_starts(starts), weak)
     save_weights(make_policy(config, work.model_dir), weak)
+    return work
+
+
+@pytest.mark.rendering
+def test_the_control_is_trained_and_measured_in_the_simulator(work: Workplace) -> None:
+    row, ppo = train_in(work, SIMULATOR), work.config.ppo
+    assert (row["model"], row["updates"], len(row["course"])) == ("simulator", ppo.updates, ppo.updates)
+    assert row["real_before"]["episodes"] == row["real_after"]["episodes"] == work.config.evaluation.episodes
+    assert row["imagined_after"]["episodes"] == 8 * work.config.evaluation.episodes
+    (trained,) = (Path(path) for path in row["policies"])
+    assert trained.parent.name == "simulator" and file_sha256(trained) != file_sha256(work.start[1])
+
+
+def test_speed_and_imagined_success_are_measured_in_each_model(work: Workplace, tmp_path: Path) -> None:
+    config = work.config
     models = [WORLD_MODEL, str(make_stepped_folder(tmp_path / "video_model"))]
     rows = measure_speed(work, models, num_steps=2)
     assert [(row["model"], row["envs"]) for row in rows] == [(model, config.ppo.num_envs) for model in models]

@@ -11,6 +11,7 @@ from rich.console import Console
 from tqdm import tqdm
 
 from benchmarks.environments.policies import (
+    SIMULATOR,
     WORLD_MODEL,
     Workplace,
     measure_policy,
@@ -46,6 +47,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
                                 help="folder of first frames and policies; what is there is kept")
         add_json(experiment, "write every row here; what it holds is not measured again")
     trained.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    trained.add_argument("--control", action="store_true", help="train in the simulator, too, with as many steps")
     trained.add_argument("--scenes", nargs="+", default=[], metavar="SCENES", type=check_scenes,
                          help="measure the policies there, too: splits or scenes, as simulation.scenes")
     for experiment in (ranking, speed):
@@ -70,7 +72,7 @@ def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
     for seed in arguments.seeds:
         workplace = _workplace(arguments, seed)
         updates = workplace.config.ppo.updates
-        for model in models:
+        for model in [*models, *([SIMULATOR] if arguments.control else [])]:
             wanted = (model, workplace.config.task, seed, updates)
             if any((row["model"], row["task"], row["seed"], row["updates"]) == wanted for row in rows):
                 continue

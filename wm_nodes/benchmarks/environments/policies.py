@@ -4,7 +4,8 @@ A model is the task's world model, or a video model that can be stepped, given b
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,10 +30,11 @@ from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
 from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
+from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model import ImaginedEpisodes
 
-WORLD_MODEL = "world_model"
+WORLD_MODEL, SIMULATOR = "world_model", "simulator"
 SIMULATOR_ENVS, IMAGINED_EPISODES = 8, 256
 KEPT_EVERY = 6
 """Updates between two versions of a training that are kept to be ranked."""
@@ -62,17 +64,24 @@ class Workplace:
         count = num_envs or self.config.ppo.num_envs
         return make(self.config, folder, self.start[0], num_envs=count, seed=self.config.seed)
 
-    def real(self, policy: ImagePolicy, scenes: str = "") -> EvaluationResult:
-        """Success in the simulator, on the seeds of the configuration. scenes: others than the configuration's."""
+    @contextmanager
+    def simulator(self, scenes: str = "") -> Iterator[Environment]:
+        """scenes: others than the configuration's."""
         from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
-        config, how = self.config, self.config.evaluation
+        config = self.config
         simulation = config.simulation.with_values(scenes=scenes or config.simulation.scenes)
         env = ManiSkillEnvironment(config.task, simulation, SIMULATOR_ENVS, seed=config.seed)
         try:
-            return evaluate(policy, env, how.episodes, how.first_seed, how.deterministic)
+            yield env
         finally:
             env.close()
+
+    def real(self, policy: ImagePolicy, scenes: str = "") -> EvaluationResult:
+        """Success in the simulator, on the seeds of the configuration. scenes: others than the configuration's."""
+        how = self.config.evaluation
+        with self.simulator(scenes) as env:
+            return evaluate(policy, env, how.episodes, how.first_seed, how.deterministic)
 
     def imagined(self, policy: ImagePolicy, env: Environment) -> EvaluationResult:
         return evaluate(policy, env, min(IMAGINED_EPISODES, 8 * self.config.evaluation.episodes),
@@ -87,16 +96,17 @@ def train_in(
     Every KEPT_EVERY-th version lies in workplace.folder / name of the model.
 
     Args:
+        model: as for Workplace.environment, or SIMULATOR, where success alone pays; that row's imagined success is
+            in the world model.
         scenes: further ones that the policies are measured in, values of simulation.scenes.
     """
     config, began = workplace.config, time.monotonic()
-    policy, env = workplace.policy(), workplace.environment(model)
-    reward = make_endogenous_reward(config, workplace.model_dir)
+    policy, env = workplace.policy(), workplace.environment(WORLD_MODEL if model == SIMULATOR else model)
     before = workplace.real(policy), workplace.imagined(policy, env)
     elsewhere = {name: [workplace.real(policy, name)] for name in scenes}
     course, kept, seconds = list[float](), list[str](), time.monotonic()
-    for update, (rollout, _) in enumerate(train_policy(policy, env, reward, config), 1):
-        course.append(rollout_statistics(rollout).success_rate)
+    for update, success_rate in enumerate(_training(workplace, model, policy, env), 1):
+        course.append(success_rate)
         if update % KEPT_EVERY == 0 or update == config.ppo.updates:
             path = workplace.folder / Path(model).name / f"policy_{update:06d}.safetensors"
             save_weights(policy, path, {"tokenizer_sha256": policy.encoder.sha256})
@@ -119,6 +129,21 @@ def train_in(
         "success_after": after[0].success.astype(int).tolist(),
         "seconds_per_update": seconds / max(1, len(course)), "minutes": (time.monotonic() - began) / 60,
     }
+
+
+def _training(workplace: Workplace, model: str, policy: ImagePolicy, imagined: Environment) -> Iterator[float]:
+    """Train in place; the success rate of each update's rollout."""
+    config = workplace.config
+    if model == SIMULATOR:
+        with workplace.simulator() as env:
+            yield from _success_rates(policy, env, RuleReward(), config)
+    else:
+        yield from _success_rates(policy, imagined, make_endogenous_reward(config, workplace.model_dir), config)
+
+
+def _success_rates(policy: ImagePolicy, env: Environment, reward: RewardModel, config: RunConfig) -> Iterator[float]:
+    for rollout, _ in train_policy(policy, env, reward, config):
+        yield rollout_statistics(rollout).success_rate
 
 
 def measure_policy(workplace: Workplace, weights: Path, models: Sequence[str]) -> dict[str, Any]:
