@@ -171,14 +171,17 @@ def difference(comparison: Run, name: str, digits: int) -> str:
 # --- video_tasks.md ---------------------------------------------------------------------------------------------
 def outcome_rows() -> Rows:
     """One line per arm: success at both ends, gain, and the mean over the training against CPS on the same seeds."""
-    truth, judged = read("video_rl_outcome.json")["rows"], read("video_rl_outcome_judge.json")["rows"]
-    for name, of in (*((name, truth) for name in OUTCOME_ARMS), *((name, judged) for name in JUDGE_ARMS)):
+    truth, early, judged = (read(f"video_rl_outcome{of}.json")["rows"] for of in ("", "_early", "_judge"))
+    arms = [(name, rows) for names, rows in (
+        (OUTCOME_ARMS, truth), (OUTCOME_ARMS[:2], early), (JUDGE_ARMS, judged),
+    ) for name in names]
+    for name, of in arms:
         trained = [one for one in of if one["sampler"] == name]
         ends = (percent(mean(one["evaluations"][place]["success"] for one in trained)) for place in (0, -1))
         gained = paired_interval([course[-1] for course in gains(trained, "success")])
-        against = compare_samplers(truth, name, "CPS 0.4", ["success_path"]) if of is truth else None
+        against = None if of is judged else compare_samplers(of, name, "CPS 0.4", ["success_path"])
         yield row(
-            name, len(trained), " → ".join(ends), interval(gained.mean, gained.low, gained.high, 3),
+            f"{name}, early base" if of is early else name, len(trained), " → ".join(ends), interval(gained.mean, gained.low, gained.high, 3),
             "" if against is None else interval_of(against.differences["success_path"], 3),
         )
 
