@@ -181,7 +181,8 @@ def outcome_rows() -> Rows:
         gained = paired_interval([course[-1] for course in gains(trained, "success")])
         against = None if of is judged else compare_samplers(of, name, "CPS 0.4", ["success_path"])
         yield row(
-            f"{name}, early base" if of is early else name, len(trained), " → ".join(ends), interval(gained.mean, gained.low, gained.high, 3),
+            f"{name}, early base" if of is early else name, len(trained), " → ".join(ends),
+            interval(gained.mean, gained.low, gained.high, 3),
             "" if against is None else interval_of(against.differences["success_path"], 3),
         )
 

@@ -223,7 +223,7 @@ def test_object_and_gripper_are_seen_near_at_64_px(scene: str, channel: int, few
 def test_the_cameras_are_where_they_say_also_after_the_hand_has_turned(env: ManiSkillEnvironment) -> None:
     start(env, 7)
     hold(env, 2, tool_drx=0.5, tool_drz=1.0, tool_dz=-0.3)
-    assert [camera.name for camera in env.cameras] == ["near", "wrist"]
+    assert [camera.name for camera in env.cameras] == ["front", "wrist"]
     for camera in env.cameras:
         rendered = env.scene._sensors[camera.name].camera
         world_from_camera = camera.pose_in(0).copy()

@@ -32,7 +32,7 @@ from wm_nodes.world_model.training.dynamics import (
 )
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.text import train_text_model
-from wm_nodes.world_model.training.tokenizer import train_tokenizer
+from wm_nodes.world_model.training.tokenizer import foreground_weight, train_tokenizer
 from wm_nodes.world_model.validation.open_loop import auc, detection_metrics, evaluate_rollouts
 
 TASKS = ("push_cube", "reach")
@@ -51,6 +51,16 @@ def config_of(**overrides: object) -> RunConfig:
 
 def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
     return stack_episodes([episode(first_seed + i) for i in range(count)], TASKS, success)
+
+
+def test_on_another_table_only_the_object_is_foreground_where_it_is_what_differs_from_its_surroundings() -> None:
+    median, image = torch.full((3, 64, 64), 0.2), torch.full((1, 3, 64, 64), 0.8)
+    image[..., 30:34, 40:44] = 0.3
+    settings = config_of(tokenizer__foreground_weight=4.0, tokenizer__foreground="surroundings").tokenizer
+    weight = foreground_weight(image, median, settings)[0, 0]
+    assert weight[30:34, 40:44].min() == 5 and weight[:20].max() == pytest.approx(1, abs=1e-3)
+    whole_table = foreground_weight(image, median, settings.model_copy(update={"foreground": "background"}))[0, 0]
+    assert whole_table[:20].min() == 5 and whole_table[31, 41] < 5
 
 
 def test_rmse_of_one_half_on_balanced_labels_is_one_half() -> None:

@@ -41,7 +41,7 @@ class SimulationConfig(SettingsSection):
     scenes: ScenesName = ""
     """Of which scenes an episode has one, by its reset seed: a split of config/scenes.json, or one scene's name. Empty:
     the task has a scene of its own."""
-    cameras: list[Literal["side", "near", "wrist"]]
+    cameras: list[Literal["side", "near", "front", "wrist"]]
     """Rendered side by side, left to right, in every observation."""
     image_size: PositiveInt
     """Height and width of one camera image, px."""
@@ -93,7 +93,10 @@ class TokenizerConfig(SettingsSection):
     commitment_weight: NonNegativeFloat
     """lfq only."""
     foreground_weight: NonNegativeFloat
-    """Extra weight of pixels that differ from the episode-independent background."""
+    """Extra weight of foreground pixels."""
+    foreground: Literal["background", "surroundings"] = "background"
+    """Foreground are pixels that differ from the median frame, or, where tables and scenes change, from the mean of the
+    pixels around them."""
 
 
 class WorldModelConfig(SettingsSection):

@@ -29,6 +29,7 @@ class Placement:
 PLACEMENTS = {
     "side": Placement(eye=(0.09, 0.5, 0.45), target=(0.09, -0.01, 0.02), fov_rad=0.8),
     "near": Placement(eye=(0.42, 0.0, 0.38), target=(-0.02, 0.0, 0.03), fov_rad=0.85),
+    "front": Placement(eye=(0.36, 0.0, 0.42), target=(0.01, 0.0, 0.02), fov_rad=0.74),
     "wrist": Placement(eye=(0.06, 0.0, 0.0), target=(0.03, 0.0, 0.12), fov_rad=1.4, on_hand=True),
 }
 

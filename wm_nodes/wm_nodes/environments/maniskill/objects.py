@@ -23,8 +23,9 @@ CONTAINER = slice(15, 17)
 MODEL_TASKS = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
 """One world model serves them."""
 SETTINGS = {
-    "simulation.scenes": "train", "simulation.cameras": ["near", "wrist"], "simulation.max_action_m": 0.1,
-    "simulation.max_episode_steps": 40, "world_model.part_steps": 16, "sft.num_demonstrations": 40,
+    "simulation.scenes": "train", "simulation.cameras": ["front", "wrist"], "simulation.max_action_m": 0.1,
+    "simulation.max_episode_steps": 40, "world_model.part_steps": 16, "sft.num_demonstrations": 400,
+    "tokenizer.foreground": "surroundings", "tokenizer.latent_dim": 48,
 }
 """Of every task in these scenes."""
 ON_TABLE_M = 0.01

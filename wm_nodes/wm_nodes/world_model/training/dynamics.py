@@ -311,7 +311,7 @@ def decoded_losses(
     steps, episodes = steps_B2.flatten(), index[rows]
     wanted = tokenizer.to_pixels(images.flatten(0, 1))
     pixels_R3HW = tokenizer.decode_pixels(terms.next_latents[rows, steps])
-    weight = foreground_weight(wanted, tokenizer.background, config.tokenizer.foreground_weight)
+    weight = foreground_weight(wanted, tokenizer.background, config.tokenizer)
     recoded = tokenizer.bottleneck(tokenizer.features(pixels_R3HW.clamp(0, 1)))
     errors = F.huber_loss(recoded, data.latents[episodes, steps + 1].float(), delta=HUBER_DELTA, reduction="none")
     probed = tokenizer.read_state_normalised(recoded)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.schema import RunConfig, TokenizerConfig
 from wm_nodes.config.tasks import get_task
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.seeding import initial_weights, numpy_stream, torch_stream
@@ -25,6 +25,8 @@ LATENT_NOISE = 0.1
 BACKGROUND_FRAMES = 256
 FOREGROUND_CONTRAST = 0.25
 """A pixel counts as fully foreground when a channel differs from the background by this much, of [0, 1]."""
+SURROUNDINGS_PX = 15
+"""About three times an object's width."""
 PROBE_WEIGHT = 0.1
 
 
@@ -65,7 +67,7 @@ def train_tokenizer(
             reconstruction = codec.decode_pixels(noisy)
             probed = codec.read_state_normalised(noisy)
         error = reconstruction - pixels
-        weight = foreground_weight(pixels, codec.background, settings.foreground_weight)
+        weight = foreground_weight(pixels, codec.background, settings)
         terms = {"pixel": (weight * (error.abs() + 2 * error.square())).mean() / weight.mean()}
         terms["probe"] = probe_loss(codec, probed, positions)
         terms["loss"] = terms["pixel"] + PROBE_WEIGHT * terms["probe"]
@@ -83,10 +85,15 @@ def train_tokenizer(
     return codec, loop.run(loss)
 
 
-def foreground_weight(pixels_B3HW: Tensor, background_3HW: Tensor, extra: float) -> Tensor:
-    """(B, 1, H, W): 1 on the background, up to 1 + extra where a pixel differs from it."""
-    contrast = (pixels_B3HW - background_3HW).abs().amax(1, keepdim=True) / FOREGROUND_CONTRAST
-    return 1 + extra * contrast.clamp(max=1)
+def foreground_weight(pixels_B3HW: Tensor, median_3HW: Tensor, settings: TokenizerConfig) -> Tensor:
+    """(B, 1, H, W): 1 on the background, up to 1 + tokenizer.foreground_weight where a pixel differs from what
+    tokenizer.foreground names: the median frame, or the mean of the SURROUNDINGS_PX x SURROUNDINGS_PX pixels around."""
+    background = median_3HW
+    if settings.foreground == "surroundings":
+        side = SURROUNDINGS_PX
+        background = F.avg_pool2d(pixels_B3HW, side, stride=1, padding=side // 2, count_include_pad=False)
+    contrast = (pixels_B3HW - background).abs().amax(1, keepdim=True) / FOREGROUND_CONTRAST
+    return 1 + settings.foreground_weight * contrast.clamp(max=1)
 
 
 def probe_targets(ground_truth: FloatArray, task: str) -> FloatArray:

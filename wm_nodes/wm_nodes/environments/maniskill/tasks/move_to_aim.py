@@ -51,6 +51,6 @@ TASK = Task(
     waypoints=carry_waypoints,
     script=scripted(carry_waypoints, speed=0.8),
     model_tasks=objects.MODEL_TASKS,
-    weak_policies=(WeakPolicy(0, 20, 0.25),),
+    weak_policies=(WeakPolicy(0, 100, 0.25),),
     settings={**objects.SETTINGS, "data.behaviours": CARRYING},
 )

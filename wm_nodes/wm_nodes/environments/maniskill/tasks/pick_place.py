@@ -54,6 +54,6 @@ TASK = Task(
     waypoints=place_waypoints,
     script=scripted(place_waypoints, speed=0.8),
     model_tasks=objects.MODEL_TASKS,
-    weak_policies=(WeakPolicy(1, 20, 0.25),),
+    weak_policies=(WeakPolicy(1, 100, 0.25),),
     settings={**objects.SETTINGS, "data.behaviours": CARRYING},
 )

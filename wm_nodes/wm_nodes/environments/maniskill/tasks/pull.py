@@ -33,5 +33,5 @@ def instruct(scene: Scene) -> str:
 
 TASK = replace(
     push.TASK, instruction="pull the object towards the robot", instruct=instruct, scene=scene, success=success,
-    weak_policies=(WeakPolicy(4, 20, 0.25),),
+    weak_policies=(WeakPolicy(4, 100, 0.25),),
 )

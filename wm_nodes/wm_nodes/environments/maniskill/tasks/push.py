@@ -64,6 +64,6 @@ TASK = Task(
     script=scripted(waypoints, speed=0.5),
     shows_goal=False,
     model_tasks=objects.MODEL_TASKS,
-    weak_policies=(WeakPolicy(2, 20, 0.25),),
+    weak_policies=(WeakPolicy(2, 100, 0.25),),
     settings={**objects.SETTINGS, "data.behaviours": MOVING},
 )

@@ -58,7 +58,7 @@ TASK = Task(
     script=scripted(waypoints, speed=0.8),
     shows_goal=False,
     model_tasks=objects.MODEL_TASKS,
-    weak_policies=(WeakPolicy(3, 20, 0.25),),
+    weak_policies=(WeakPolicy(3, 100, 0.25),),
     settings={**objects.SETTINGS, "data.behaviours": MOVING},
     moves_object=False,
 )
