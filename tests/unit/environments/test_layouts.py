@@ -4,23 +4,19 @@ import numpy as np
 import pytest
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.scenes import SHAPES
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.maniskill.behaviours import ROBOT_BASE
 from wm_nodes.environments.maniskill.layouts import Layout, distance_to_segment, draw
 from wm_nodes.environments.maniskill.pose_scripts import push_waypoints
-from wm_nodes.environments.maniskill.scene_parts import (
-    BAR_HALF_M,
-    CARPET_HALF_M,
-    CONTAINER_HEIGHT_M,
-    CONTAINER_RADIUS_M,
-    REST_HEIGHT_M,
-    bottom_m,
-)
+from wm_nodes.environments.maniskill.scene_parts import CARPET_HALF_M, CONTAINER_HEIGHT_M, CONTAINER_RADIUS_M
+from wm_nodes.environments.maniskill.shape import bottom_m, get_shape
+from wm_nodes.environments.maniskill.shapes import bar
 from wm_nodes.environments.maniskill.tasks import move_to_aim, pick_place, pull, push, reach_object
 
 SEEDS = 400
-WIDEST_M = float(np.linalg.norm(BAR_HALF_M[:2]))
+WIDEST_M = float(np.linalg.norm(bar.HALF_M[:2]))
 """Of all objects, from the centre."""
 FINGER_M = 0.012
 PLACES = {task.__name__.rsplit(".", 1)[1]: task.place for task in (push, pull, pick_place, move_to_aim, reach_object)}
@@ -88,11 +84,11 @@ def test_a_distance_is_to_the_nearest_point_of_the_way() -> None:
 
 def test_the_lowest_point_of_an_object_is_found_however_it_lies() -> None:
     upright, on_side = (1, 0, 0, 0), (np.sqrt(0.5), 0, np.sqrt(0.5), 0)  # turned by 90 degrees about y
-    for shape, height in REST_HEIGHT_M.items():
-        assert bottom_m(shape, height, upright) == pytest.approx(0, abs=1e-9)
+    for shape in SHAPES:
+        assert bottom_m(shape, get_shape(shape).rest_height_m, upright) == pytest.approx(0, abs=1e-9)
     assert bottom_m("cylinder", 0.05, on_side) == pytest.approx(0.05 - 0.019)
     assert bottom_m("capsule", 0.05, on_side) == pytest.approx(0.05 - 0.039)
-    assert bottom_m("bar", 0.05, on_side) == pytest.approx(0.05 - BAR_HALF_M[0])
+    assert bottom_m("bar", 0.05, on_side) == pytest.approx(0.05 - bar.HALF_M[0])
     on_edge = (np.cos(np.pi / 8), np.sin(np.pi / 8), 0, 0)
     assert bottom_m("cube", 0.05, on_edge) == pytest.approx(0.05 - 0.022 * np.sqrt(2))
     assert CONTAINER_HEIGHT_M == {"plate": 0.008, "bowl": 0.028}
