@@ -25,9 +25,10 @@ MODEL_TASKS = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
 SETTINGS = {
     "simulation.scenes": "train", "simulation.cameras": ["front", "wrist"], "simulation.max_action_m": 0.1,
     "simulation.max_episode_steps": 40, "world_model.part_steps": 16, "sft.num_demonstrations": 400,
-    "tokenizer.foreground": "surroundings", "tokenizer.latent_dim": 48,
+    "tokenizer.foreground": "surroundings", "tokenizer.latent_dim": 48, "ppo.num_envs": 32, "ppo.num_steps": 40,
 }
-"""Of every task in these scenes."""
+"""Of every task in these scenes. A rollout begins with a reset and is as long as an episode: what comes after it would
+never be trained on."""
 ON_TABLE_M = 0.01
 """An object whose lowest point is below this lies on the table."""
 
