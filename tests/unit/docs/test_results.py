@@ -86,10 +86,12 @@ def refresh_rows() -> Rows:
         decision = part.get("verdict") or {}
         answer = {True: "accepted", False: "refused", None: ""}[decision.get("accepted")]
         imagined, real = part["imagined"]["successes"], part["real"]["successes"]
-        yield row(number, 8 * number, f"{imagined}/256", f"{real}/200", answer)
-        for check in decision.get("rows", []):
-            if check["name"] == "object error / copying":
-                yield row(number, check["episodes"], f"{check['old']:.3f}", f"{check['new']:.3f}")
+        errors = {
+            check["episodes"]: f"{check['old']:.3f} → {check['new']:.3f}"
+            for check in decision.get("rows", []) if check["name"] == "object error / copying"
+        }
+        of = (errors.get(episodes, "") for episodes in ("policy", "scripted"))
+        yield row(number, 8 * number, f"{imagined}/256", f"{real}/200", answer, *of)
     found = run["paired"]
     yield interval(100 * found["difference"], 100 * found["low"], 100 * found["high"], 1)
 
@@ -166,6 +168,18 @@ def short(sampler: str) -> str:
 def difference(comparison: Run, name: str, digits: int) -> str:
     found = comparison["differences"][name]
     return interval(found["mean"], found["low"], found["high"], digits)
+
+
+def scenes_rows() -> Rows:
+    """One line per task: success in scenes that were trained on, and in the two splits that were not."""
+    for one in read("policy_rl_scenes.json")["rows"]:
+        gain = one["real_gain"]
+        elsewhere = (f"{of['before']['successes']} → {of['after']['successes']}" for of in one["elsewhere"].values())
+        yield row(
+            one["task"], f"{one['real_before']['successes']} → {one['real_after']['successes']}",
+            interval(*(100 * gain[name] for name in ("difference", "low", "high")), 1), *elsewhere,
+            f"{percent(one['imagined_before']['rate'])} → {percent(one['imagined_after']['rate'])}",
+        )
 
 
 # --- video_tasks.md ---------------------------------------------------------------------------------------------
@@ -479,7 +493,7 @@ def judge_rows() -> Rows:
 
 
 TABLES: dict[str, list[Callable[[], Rows]]] = {
-    "policy_rl": [study_rows, refresh_rows],
+    "policy_rl": [study_rows, refresh_rows, scenes_rows],
     "video_rl": [
         diversity_rows, clip_rows, learning_rows, clip_learning_rows, cost_rows, ablation_rows,
         resolution_rows, hacking_rows,
