@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from own_packages import write_package
 
 import wm_nodes
 from wm_nodes.apps import cli
@@ -132,9 +133,3 @@ def test_a_task_without_rules_for_the_judge_says_what_its_file_lacks(
     monkeypatch.setenv(VARIABLE, "ruleless_tasks")
     with pytest.raises(ValueError, match=r"'wave' has no rule to label clips by; give its file clips=ClipRules"):
         clip_rules("wave")
-
-
-def write_package(folder: Path, name: str, **files: str) -> None:
-    (folder / name).mkdir()
-    for module, text in {"__init__": "", **files}.items():
-        (folder / name / f"{module}.py").write_text(text)

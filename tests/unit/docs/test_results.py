@@ -96,6 +96,18 @@ def refresh_rows() -> Rows:
     yield interval(100 * found["difference"], 100 * found["low"], 100 * found["high"], 1)
 
 
+def scenes_rows() -> Rows:
+    """One line per task: success in scenes that were trained on, and in the two splits that were not."""
+    for one in read("policy_rl_scenes.json")["rows"]:
+        gain = one["real_gain"]
+        elsewhere = (f"{of['before']['successes']} → {of['after']['successes']}" for of in one["elsewhere"].values())
+        yield row(
+            one["task"], f"{one['real_before']['successes']} → {one['real_after']['successes']}",
+            interval(*(100 * gain[name] for name in ("difference", "low", "high")), 1), *elsewhere,
+            f"{percent(one['imagined_before']['rate'])} → {percent(one['imagined_after']['rate'])}",
+        )
+
+
 # --- video_rl.md ------------------------------------------------------------------------------------------------
 def diversity_rows() -> Rows:
     seeds = runs("video_rl_diversity.jsonl").values()
@@ -168,18 +180,6 @@ def short(sampler: str) -> str:
 def difference(comparison: Run, name: str, digits: int) -> str:
     found = comparison["differences"][name]
     return interval(found["mean"], found["low"], found["high"], digits)
-
-
-def scenes_rows() -> Rows:
-    """One line per task: success in scenes that were trained on, and in the two splits that were not."""
-    for one in read("policy_rl_scenes.json")["rows"]:
-        gain = one["real_gain"]
-        elsewhere = (f"{of['before']['successes']} → {of['after']['successes']}" for of in one["elsewhere"].values())
-        yield row(
-            one["task"], f"{one['real_before']['successes']} → {one['real_after']['successes']}",
-            interval(*(100 * gain[name] for name in ("difference", "low", "high")), 1), *elsewhere,
-            f"{percent(one['imagined_before']['rate'])} → {percent(one['imagined_after']['rate'])}",
-        )
 
 
 # --- video_tasks.md ---------------------------------------------------------------------------------------------

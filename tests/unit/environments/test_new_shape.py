@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from own_packages import own_package
 
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.scenes import SHAPES_VARIABLE, scenes_of
@@ -35,14 +36,7 @@ SHAPE = Shape(build, rest_height_m=0.03, lowest_m=lambda up: float(np.abs(up) @ 
 
 @pytest.fixture(scope="module", autouse=True)
 def shape_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    folder = tmp_path_factory.mktemp("packages")
-    (folder / "furniture").mkdir()
-    (folder / "furniture" / "__init__.py").touch()
-    (folder / "furniture" / "post.py").write_text(POST)
-    (folder / "furniture" / "nothing.py").touch()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(folder))
-        patch.setenv(SHAPES_VARIABLE, "furniture")
+    with own_package(tmp_path_factory.mktemp("packages"), "furniture", SHAPES_VARIABLE, post=POST, nothing=""):
         yield
     get_shape.cache_clear()
 

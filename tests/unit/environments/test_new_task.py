@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from own_packages import own_package
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import VARIABLE, clip_rules, get_task, model_tasks
@@ -67,13 +68,7 @@ TASK = replace(
 
 @pytest.fixture(scope="module", autouse=True)
 def task_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    folder = tmp_path_factory.mktemp("packages")
-    (folder / "nudging").mkdir()
-    (folder / "nudging" / "__init__.py").touch()
-    (folder / "nudging" / "nudge.py").write_text(NUDGE)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(folder))
-        patch.setenv(VARIABLE, "nudging")
+    with own_package(tmp_path_factory.mktemp("packages"), "nudging", VARIABLE, nudge=NUDGE):
         yield
     get_task.cache_clear()
 

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from own_packages import own_package
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import VARIABLE, get_task
@@ -53,13 +54,7 @@ def blind(task: str) -> tuple[ManiSkillEnvironment, DemonstrationPlanner]:
 
 @pytest.fixture(scope="module", autouse=True)
 def task_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    folder = tmp_path_factory.mktemp("packages")
-    (folder / "far_tasks").mkdir()
-    (folder / "far_tasks" / "__init__.py").touch()
-    (folder / "far_tasks" / "pick_far.py").write_text(FAR)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(folder))
-        patch.setenv(VARIABLE, "far_tasks")
+    with own_package(tmp_path_factory.mktemp("packages"), "far_tasks", VARIABLE, pick_far=FAR):
         yield
     get_task.cache_clear()
     blind.cache_clear()

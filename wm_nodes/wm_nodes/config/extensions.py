@@ -5,6 +5,9 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 def find_files(what: str, package: str, variable: str) -> dict[str, str]:
@@ -29,3 +32,20 @@ def find_files(what: str, package: str, variable: str) -> dict[str, str]:
                 raise ValueError(f"{what} {module.name!r} is in {packages[module.name]} and in {name}; rename one")
             packages[module.name] = name
     return packages
+
+
+def load_file(name: str, packages: dict[str, str], kind: type[T], guide: str) -> T:
+    """Import a file and return its constant, which is named as its class: TASK = Task(...).
+
+    Args:
+        packages: see find_files.
+        guide: the package that says how to write one, for the error.
+
+    Raises:
+        ValueError: the file has no such constant.
+    """
+    module = importlib.import_module(f"{packages[name]}.{name}")
+    found = getattr(module, kind.__name__.upper(), None)
+    if not isinstance(found, kind):
+        raise ValueError(f"{module.__file__} has no {kind.__name__.upper()} = {kind.__name__}(...); see {guide}")
+    return found

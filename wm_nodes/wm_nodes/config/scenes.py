@@ -68,6 +68,8 @@ def scenes_of(setting: str) -> tuple[Scene, ...]:
         return ()
     if setting in splits():
         return tuple(SCENES[name] for name in splits()[setting])
+    if setting in SCENES:  # as at every reset, without a look into folders
+        return (SCENES[setting],)
     match = re.fullmatch(r"([^_-]+)_([^-]+)-([^-]+)-([^-]+)", setting)
     known = COLOURS, tuple(shapes()), CONTAINERS, TABLES
     if match is None or any(part not in names for part, names in zip(match.groups(), known)):

@@ -8,12 +8,11 @@ library only: launch files list the tasks too. Shapes: P simulator ground truth,
 from __future__ import annotations
 
 import functools
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from wm_nodes.config.extensions import find_files
+from wm_nodes.config.extensions import find_files, load_file
 from wm_nodes.config.scenes import Scene, scenes_of
 
 if TYPE_CHECKING:
@@ -137,11 +136,7 @@ def get_task(name: str) -> Task:
     Raises:
         ValueError: no such task, or its file defines none; names what is known.
     """
-    module = importlib.import_module(f"{_files()[check_task(name)]}.{name}")
-    task = getattr(module, "TASK", None)
-    if not isinstance(task, Task):
-        raise ValueError(f"{module.__file__} has no TASK = Task(...); see {PACKAGE}")
-    return task
+    return load_file(check_task(name), _files(), Task, PACKAGE)
 
 
 def model_tasks(name: str) -> tuple[str, ...]:

@@ -1,7 +1,6 @@
 """What a shape is. Lengths in m."""
 
 import functools
-import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ import sapien
 from transforms3d.euler import euler2quat
 from transforms3d.quaternions import quat2mat
 
+from wm_nodes.config.extensions import load_file
 from wm_nodes.config.scenes import SHAPE_FILES, shapes
 from wm_nodes.core.types import FloatArray
 
@@ -40,11 +40,7 @@ def get_shape(name: str) -> Shape:
     """
     if name not in (known := shapes()):
         raise ValueError(f"unknown shape {name!r}; choose one of {', '.join(known)}")
-    module = importlib.import_module(f"{known[name]}.{name}")
-    shape = getattr(module, "SHAPE", None)
-    if not isinstance(shape, Shape):
-        raise ValueError(f"{module.__file__} has no SHAPE = Shape(...); see {SHAPE_FILES}")
-    return shape
+    return load_file(name, known, Shape, SHAPE_FILES)
 
 
 def bottom_m(name: str, height: float, quaternion: Sequence[float]) -> float:
