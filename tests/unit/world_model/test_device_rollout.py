@@ -21,6 +21,7 @@ def make_models() -> tuple[ActionModel, Tokenizer]:
     config = load_config("base", {
         "tokenizer.width": 16, "tokenizer.depth": 1, "tokenizer.patch_px": 8, "tokenizer.latent_dim": 8,
         "world_model.width": 32, "world_model.depth": 2, "world_model.num_heads": 2, "world_model.window": WINDOW,
+        "world_model.condition_map": 16,
     })
     torch.manual_seed(0)
     tokenizer = Tokenizer(config.tokenizer, 16, 32)

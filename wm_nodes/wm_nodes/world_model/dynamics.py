@@ -64,11 +64,37 @@ class DoneHeads(nn.Module):
         return torch.stack([head(pooled) for head in self.heads], 2).float(), positions
 
 
+class ConditionMap(nn.Module):
+    """An addition to every token's input that depends on the whole condition and on the token's place.
+
+    Where the tool is seen depends on all values of its pose together. Cross-attention mixes one value's token at a
+    time, so it needs many iterations to learn that; here an MLP reads their sum, and every place has its own outputs.
+    """
+
+    RANK = 32
+
+    def __init__(self, width: int, hidden: int, num_tokens: int) -> None:
+        super().__init__()
+        self.num_tokens = num_tokens
+        self.read = nn.Sequential(
+            nn.LayerNorm(width), nn.Linear(width, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(),
+            nn.Linear(hidden, num_tokens * self.RANK),
+        )
+        self.out = nn.Linear(self.RANK, width)
+
+    def forward(self, condition_BTND: Tensor) -> Tensor:
+        """(B, T, S, D)."""
+        values: Tensor = self.read(condition_BTND.sum(2))
+        out: Tensor = self.out(values.unflatten(-1, (self.num_tokens, self.RANK)))
+        return out
+
+
 class FrameModel(nn.Module):
     """Trunk and heads shared by the action model and the text model; they differ in their condition tokens."""
 
     def __init__(self, config: WorldModelConfig, num_tokens: int, latent_dim: int, num_tasks: int) -> None:
         super().__init__()
+        self.condition_map: ConditionMap | None = None
         width = config.width
         self.num_tokens, self.latent_dim, self.num_tasks = num_tokens, latent_dim, num_tasks
         self.embed = nn.Linear(latent_dim, width)
@@ -89,6 +115,8 @@ class FrameModel(nn.Module):
         visible_BN: False where a condition token is padding.
         """
         tokens = self.embed(latents_BTSD) + self.position
+        if self.condition_map is not None:
+            tokens = tokens + self.condition_map(condition_BTND)
         register = self.register.to(tokens.dtype).expand(*tokens.shape[:2], 1, -1)
         features = self.trunk(torch.cat((tokens, register), 2), condition_BTND, caches, visible_BN)
         tokens, register = features[:, :, :-1], features[:, :, -1]
@@ -105,6 +133,8 @@ class ActionModel(FrameModel):
     ) -> None:
         super().__init__(config, num_tokens, latent_dim, num_tasks)
         self.condition = ActionCondition(action_dim, state_dim, config.width)
+        if config.condition_map:
+            self.condition_map = ConditionMap(config.width, config.condition_map, num_tokens)
 
     def forward(
         self, latents_BTSD: Tensor, actions_BTA: Tensor, states_BTP: Tensor, next_states_BTP: Tensor,

@@ -89,12 +89,17 @@ class _Network:
         self.conditions = _condition_heads(condition_BTND.to(dtype), *_plain(conditions), heads)
         self.visible = None if visible_BN is None else visible_BN[:, None, None]
         shape = (steps, batch * tokens, 3, heads, width // heads)
+        self.mapped: Tensor | None = None
+        if model.condition_map is not None:
+            self.mapped = F.pad(model.condition_map(condition_BTND), (0, 0, 0, 1))  # the register's row has none
         self.pasts = [_Past(condition_BTND.new_empty(shape, dtype=dtype), model.trunk.window) for _ in blocks]
         self.steps = steps
 
     def step(self, t: int, current_BSL: Tensor) -> tuple[Tensor, Tensor]:
         """Return of all rows the change (B, S + 1, L) and the features (B, S + 1, D) before the last norm's scale."""
         x = self.embed(current_BSL.flatten(0, 1), 0, t)
+        if self.mapped is not None:
+            x = x + self.mapped[:, t].flatten(0, 1)
         for i in range(len(self.pasts)):
             x, normal = self._normalise(x)
             x = x + self.spatial_out(self._mix_tokens(self.spatial_in(normal, i, t)), i, t)
