@@ -17,7 +17,8 @@ from wm_nodes.core.specs import simulation_spec
 
 TASKS = ("pull_cube", "push_cube", "reach")
 IN_SCENES = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
-"""Those of the procedural scenes."""
+ALL = "all_tasks"
+"""Those of the procedural scenes, and the one whose episodes are of all of them."""
 NAMED_IN = {"launching/scenarios.py", "environments/maniskill/objects.py", "judge/dataset/build.py",
             "judge/clip_files.py", "apps/judge_clips.py", "policy_rl/train.py"}
 """The default task of launch files, those that share a model, the tasks of a fixed set of clips, two lines of
@@ -37,15 +38,16 @@ def test_a_recorded_specification_of_a_shipped_task_stays_what_it_is(task: str, 
 
 
 def test_the_shipped_tasks_are_found_and_share_models_as_the_shipped_one_says() -> None:
-    assert task_names() == tuple(sorted(TASKS + IN_SCENES)) and default_task() in TASKS
+    assert task_names() == tuple(sorted((*TASKS, *IN_SCENES, ALL))) and default_task() in TASKS
     assert model_tasks("reach") == model_tasks("push_cube") == ("reach", "push_cube")
     assert model_tasks("pull_cube") == ("pull_cube",)
-    assert {model_tasks(task) for task in IN_SCENES} == {IN_SCENES}
+    assert {model_tasks(task) for task in (*IN_SCENES, ALL)} == {IN_SCENES}
 
 
 def test_tasks_in_one_scene_share_their_episodes_and_the_others_have_their_own() -> None:
     assert [recorded_task(task) for task in TASKS] == ["pull_cube", "push_cube", "push_cube"]
     assert [recorded_task(task) for task in IN_SCENES] == [*IN_SCENES]
+    assert recorded_task(ALL) == ALL and shares_scene("push", ALL) and not shares_scene(ALL, "push")
     assert shares_scene("reach", "push_cube") and not shares_scene("push", "pull") and shares_scene("unheard", "push")
 
 
@@ -88,7 +90,7 @@ def test_launch_files_list_the_tasks_of_a_further_package(tmp_path: Path) -> Non
         [sys.executable, "-c", code], capture_output=True, text=True, check=True,
         env={**os.environ, VARIABLE: "launched_tasks", "PYTHONPATH": path},
     )
-    assert done.stdout == f"{tuple(sorted(('pour', *TASKS, *IN_SCENES)))}\n"
+    assert done.stdout == f"{tuple(sorted(('pour', *TASKS, *IN_SCENES, ALL)))}\n"
 
 
 def test_the_command_line_and_the_settings_name_the_known_tasks(
@@ -97,7 +99,7 @@ def test_the_command_line_and_the_settings_name_the_known_tasks(
     write_package(tmp_path, "listed_tasks", stir="", _parts="")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv(VARIABLE, " listed_tasks, ")
-    known = ", ".join(sorted((*TASKS, *IN_SCENES, "stir")))
+    known = ", ".join(sorted((*TASKS, *IN_SCENES, ALL, "stir")))
     with pytest.raises(ConfigError, match=f"unknown task 'fly'; choose one of {known}"):
         load_config("cpu", {"task": "fly"})
     with pytest.raises(SystemExit):

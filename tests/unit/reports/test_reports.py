@@ -17,7 +17,15 @@ from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture, write_report
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import SuccessRate, Summary, read_readings, read_summary, write_summary
-from wm_nodes.reports.tables import EXPLOIT_COLUMNS, exploit_rows, exploit_table, result_rows, verdict
+from wm_nodes.reports.tables import (
+    EXPLOIT_COLUMNS,
+    exploit_rows,
+    exploit_table,
+    result_rows,
+    task_rows,
+    tasks_table,
+    verdict,
+)
 from wm_nodes.training.metrics import MetricsWriter
 
 PAIRED = {"difference": 0.25, "low": 0.157, "high": 0.348, "gained": 79, "lost": 28}
@@ -60,6 +68,19 @@ def test_a_long_film_strip_shows_first_and_last_frame_and_even_steps_between() -
     picture = film_strip({"real": frames(17, 40)}, scale=1, max_columns=5)
     shown = [t for t in range(17) if blocks_of(picture, (40 + t, 40, 40))]
     assert shown == [0, 4, 8, 12, 16]
+
+
+def test_a_run_of_several_tasks_shows_the_real_success_of_each(tmp_path: Path) -> None:
+    found = {"successes_before": 12, "successes_after": 20, "episodes": 40}
+    found |= {"difference": 0.2, "low": 0.05, "high": 0.35}
+    summary = replace(SUMMARY, by_task={"push": found, "pull": {**found, "difference": -0.1}})
+    assert task_rows(summary)[0] == ("push", "12 / 40", "20 / 40", "+20.0 (+5.0 to +35.0)")
+    assert len(tasks_table(summary).rows) == 2
+    write_summary(tmp_path, summary)
+    assert read_summary(tmp_path)["by_task"]["pull"]["difference"] == -0.1
+    page = write_report(tmp_path, summary, [], config_text="").read_text()
+    assert "Real success by task" in page and "-10.0 (+5.0 to +35.0)" in page
+    assert "Real success by task" not in write_report(tmp_path, SUMMARY, [], config_text="").read_text()
 
 
 def test_a_marked_step_is_shown_and_framed_in_green() -> None:

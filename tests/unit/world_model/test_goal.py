@@ -48,7 +48,7 @@ def test_the_goal_is_the_first_crossing_and_without_one_the_best_frame_marked_as
     tokenizer = make_tokenizer()
     signals = [[0.1, 0.2, 0.8, 0.6, 0.95, 0.1], [0.1, 0.7, 0.3, 0.2, 0.1, 0.1]]
     model = ScriptedTextModel(signals, tokenizer)
-    goals = imagine_goals(model, tokenizer, first_frames(2), ["push cube"] * 2, 0, horizon=HORIZON, threshold=0.7)
+    goals = imagine_goals(model, tokenizer, first_frames(2), ["push cube"] * 2, [0, 0], horizon=HORIZON, threshold=0.7)
     assert goals.found.tolist() == [True, False]
     assert goals.lengths.tolist() == [3 + 1, 2 + 1]
     np.testing.assert_array_equal(goals.goals[0], goals.frames[0, 3])
@@ -58,7 +58,7 @@ def test_the_goal_is_the_first_crossing_and_without_one_the_best_frame_marked_as
 def test_the_golden_trajectory_begins_with_the_first_frame() -> None:
     tokenizer, frames = make_tokenizer(), first_frames(1)
     model = ScriptedTextModel([[0.9] * HORIZON], tokenizer)
-    goals = imagine_goals(model, tokenizer, frames, ["push cube"], 0, horizon=HORIZON, threshold=0.5)
+    goals = imagine_goals(model, tokenizer, frames, ["push cube"], [0], horizon=HORIZON, threshold=0.5)
     assert goals.frames.shape == (1, HORIZON + 1, 32, 32, 3)
     np.testing.assert_array_equal(goals.frames[:, 0], frames)
     assert goals.lengths.tolist() == [2]

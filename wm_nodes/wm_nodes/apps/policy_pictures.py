@@ -89,24 +89,25 @@ def play(environment: Environment, policy: ImagePolicy, seed: int) -> Episode:
         images=np.stack(images), states=np.stack(states), actions=np.stack(actions), ground_truth=truth,
         success=success(spec.task, truth), rewards=np.full(len(actions), np.nan, np.float32),
         terminated=bool(result.terminated[0]), truncated=bool(result.truncated[0]), task=spec.task,
-        instruction=spec.instruction, behaviour="policy", seed=seed, episode_id=seed, source=SOURCE_SIMULATOR,
+        instruction=getattr(environment, "instructions", (spec.instruction,))[0], behaviour="policy", seed=seed,
+        episode_id=seed, source=SOURCE_SIMULATOR,
     )
 
 
 def side_by_side(models: WorldModels, episodes: list[Episode], config: RunConfig) -> list[SideBySide]:
     """Imagine the actions of real episodes, and the goal of each first frame."""
-    task = models.task_index(config.task)
     arrays: EpisodeArrays = stack_episodes(episodes, models.tasks)
+    tasks = [models.task_index(task) for task in arrays.recorded_tasks]
     imagined = imagine_episodes(models.tokenizer, models.action, arrays)
     goals = None
     if models.text is not None:
         goals = imagine_goals(
-            models.text, models.tokenizer, arrays.images[:, 0], arrays.instructions, task,
+            models.text, models.tokenizer, arrays.images[:, 0], arrays.instructions, tasks,
             horizon=config.simulation.max_episode_steps, threshold=config.reward.goal_threshold,
         ).goals
     pairs = []
     for row, episode in enumerate(episodes):
-        signals = imagined.signals[row, : episode.num_steps, task]
+        signals = imagined.signals[row, : episode.num_steps, tasks[row]]
         frames = np.concatenate([episode.images[:1], imagined.frames[row, : episode.num_steps]])
         above = np.concatenate([[False], signals > config.reward.success_threshold])
         goal = None if goals is None else goals[row]

@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from wm_nodes.apps import options
 from wm_nodes.apps.model_refresh_loop import round_start, run_rounds
 from wm_nodes.apps.policy_pictures import write_pictures
@@ -21,7 +23,7 @@ from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, lo
 from wm_nodes.config.scenes import SCENES, splits
 from wm_nodes.config.schema import AGENT, RunConfig, SimulationConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.config.tasks import task_names
+from wm_nodes.config.tasks import part_of, parts_of, task_names
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.errors import ModelNotAcceptedError
 from wm_nodes.core.model_folder import MANIFEST
@@ -38,7 +40,7 @@ from wm_nodes.policy_rl.pretraining import load_arrays, make_model
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import Summary, read_readings, write_summary
-from wm_nodes.reports.tables import exploit_table, results_table, rounds_table
+from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.validation.acceptance import accept_success_agreement, accept_world_model
@@ -134,6 +136,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         acceptance=_read_acceptance(run_dir), samples=found.samples, minutes=stage.minutes,
         command=arguments.command, machine=machine_facts(config.device), rounds=found.table, reward=arguments.reward,
         exploit_meter=read_readings(run_dir), stopped=found.stopped,
+        by_task=_by_task(config, found.real_before, found.real_after),
         judge=judge_name(episode_judge(config)) if arguments.reward == AGENT else "",
     )
     write_summary(run_dir, summary)
@@ -144,8 +147,26 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         console.print(rounds_table(summary))
     if summary.exploit_meter:
         console.print(exploit_table(summary))
+    if summary.by_task:
+        console.print(tasks_table(summary))
     console.print(results_table(summary))
     console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
+
+
+def _by_task(config: RunConfig, before: BoolArray, after: BoolArray) -> dict[str, dict[str, Any]]:
+    """Summary.by_task of two evaluations in seed order."""
+    parts, first = parts_of(config.task), config.evaluation.first_seed
+    if len(parts) == 1:
+        return {}
+    tasks = np.array([part_of(config.task, first + episode) for episode in range(len(before))])
+    pairs = {part: (before[tasks == part], after[tasks == part]) for part in parts if part in tasks}
+    return {
+        part: {
+            "successes_before": int(old.sum()), "successes_after": int(new.sum()),
+            **asdict(paired_difference(old.tolist(), new.tolist())),
+        }
+        for part, (old, new) in pairs.items()
+    }
 
 
 def _settings(arguments: argparse.Namespace) -> dict[str, Any]:

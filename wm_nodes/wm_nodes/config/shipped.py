@@ -4,6 +4,8 @@ import json
 from importlib import resources
 from pathlib import Path
 
+from wm_nodes.config.tasks import parts_of, task_names
+
 PRETRAINED = Path(str(resources.files("wm_nodes"))) / "pretrained"
 
 
@@ -14,9 +16,10 @@ def shipped_model(task: str) -> Path:
         FileNotFoundError: none does; says how to train one.
     """
     known: list[str] = []
+    wanted = parts_of(task) if task in task_names() else (task,)
     for manifest in sorted(PRETRAINED.glob("*/manifest.json")):
         tasks = json.loads(manifest.read_text())["tasks"]
-        if task in tasks:
+        if set(wanted) <= set(tasks):
             return manifest.parent
         known += tasks
     raise FileNotFoundError(

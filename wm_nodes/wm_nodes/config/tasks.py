@@ -8,6 +8,7 @@ library only: launch files list the tasks too. Shapes: P simulator ground truth,
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
@@ -110,6 +111,9 @@ class Task:
     """False: nothing in the pictures says where the goal is, so that no probe learns to read it."""
     moves_object: bool = True
     """False: the error of the object is not part of a world model's acceptance, only the tool's."""
+    parts: tuple[str, ...] = ()
+    """Of a task whose every episode is one of another task: those, see part_of. Its states end with a value for each of
+    them, 1 for the episode's and 0 for the others, and its ground truth with the number of the episode's."""
     model_tasks: tuple[str, ...] = ()
     """The tasks that one world model serves, this one among them: one done output each, in this order. Those with the
     same `scene` share the episodes of the last of them. Empty: this task alone."""
@@ -144,8 +148,22 @@ def model_tasks(name: str) -> tuple[str, ...]:
     return get_task(name).model_tasks or (name,)
 
 
+def parts_of(name: str) -> tuple[str, ...]:
+    """The tasks that an episode of this one may be of: those of Task.parts, or this one."""
+    return get_task(name).parts or (name,)
+
+
+def part_of(name: str, seed: int) -> str:
+    """The task, of parts_of, that the episode is of which is reset with `seed`."""
+    parts = parts_of(name)
+    drawn = hashlib.sha256(f"task {seed % 2**32}".encode()).digest()[:8]
+    return parts[int.from_bytes(drawn, "little") % len(parts)]
+
+
 def recorded_task(name: str) -> str:
     """The task that the episodes for this one's world model are recorded for: the last of its scene."""
+    if get_task(name).parts:
+        return name
     return [task for task in model_tasks(name) if shares_scene(name, task)][-1]
 
 
@@ -153,7 +171,9 @@ def shares_scene(task: str, other: str) -> bool:
     """Whether an episode that was recorded for one task shows whether the other is done. So it does where it is not
     known what it was recorded for."""
     known = task_names()
-    return task not in known or other not in known or get_task(task).scene is get_task(other).scene
+    if task not in known or other not in known or get_task(task).scene is get_task(other).scene:
+        return True
+    return task in get_task(other).parts
 
 
 def success(task: str, ground_truth: Floats) -> NDArray[np.bool_]:

@@ -15,6 +15,8 @@ from wm_nodes.core.action_spaces import SPACES
 
 SOURCE_IMAGINED, SOURCE_SIMULATOR, SOURCE_REAL, SOURCE_REPLAY = 0, 1, 2, 3
 
+TASK_PREFIX = "task_"
+"""Of the names of those state values that say which task an episode is of."""
 POLICY_FIELDS = (
     "height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale", "state_names",
     "state_units", "control_period_s",
@@ -58,6 +60,11 @@ class EnvironmentSpec:
         return len(self.state_names)
 
     @property
+    def tool_dim(self) -> int:
+        """How many values of a state are the tool's; those that say which task it is come after them."""
+        return sum(not name.startswith(TASK_PREFIX) for name in self.state_names)
+
+    @property
     def ground_truth_dim(self) -> int:
         return len(self.ground_truth_names)
 
@@ -92,11 +99,14 @@ def simulation_spec(task: str, config: SimulationConfig, num_envs: int) -> Envir
     what = get_task(task)
     space = SPACES[what.actions]
     low, high = space.box(config)
+    codes = tuple(TASK_PREFIX + part for part in what.parts)
     return EnvironmentSpec(
         env_id=f"maniskill/{task}", task=task, instruction=instruction(task, config.scenes), source=SOURCE_SIMULATOR,
         num_envs=num_envs, height=config.image_size, width=config.image_size * len(config.cameras),
         cameras=tuple(config.cameras), action_names=space.action_names, action_units=space.units,
-        action_scale=space.scale(config), state_names=space.state_names, state_units=space.units,
+        action_scale=space.scale(config), state_names=space.state_names + codes,
+        state_units=space.units + ("1",) * len(codes),
         ground_truth_names=what.ground_truth_names, control_period_s=1.0 / config.control_hz,
-        max_episode_steps=config.max_episode_steps, state_low=low, state_high=high,
+        max_episode_steps=config.max_episode_steps, state_low=low + (0.0,) * len(codes),
+        state_high=high + (1.0,) * len(codes),
     )

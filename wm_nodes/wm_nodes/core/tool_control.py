@@ -19,7 +19,7 @@ def moves_pose(spec: EnvironmentSpec) -> bool:
 
 def next_state(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -> FloatArray:
     """Commanded state (..., S) after actions (..., A): state + scale * action, kept inside the box. Of a pose, the
-    rotation is turned by that of the action, and the gripper takes the action's value.
+    rotation is turned by that of the action, the gripper takes the action's value, and the rest stays.
 
     A state that starts outside the box (a reset pose may) is not pulled in by a zero action.
     """
@@ -46,17 +46,18 @@ def next_state_tensor(
 
 
 def _moved_pose(xp: Any, states: Any, changes: Any) -> Any:
-    """States (..., 7) after changes (..., 7) in their units, float32. xp: numpy or torch."""
+    """States (..., S) after changes (..., 7) in their units, float32; what follows the pose stays. xp: numpy or
+    torch."""
     turned = multiply(xp, to_quaternion(xp, changes[..., 3:6]), to_quaternion(xp, states[..., 3:6]))
     rotation = xp.asarray(to_vector(xp, turned), dtype=xp.float32)
-    return xp.concatenate([states[..., :3] + changes[..., :3], rotation, changes[..., 6:]], -1)
+    return xp.concatenate([states[..., :3] + changes[..., :3], rotation, changes[..., 6:], states[..., 7:]], -1)
 
 
 def hold_actions(states: FloatArray, spec: EnvironmentSpec) -> FloatArray:
     """Actions (N, A) that leave the commanded states (N, S) as they are."""
     held = np.zeros((len(states), spec.action_dim), np.float32)
     if moves_pose(spec):
-        held[:, 6:] = np.clip(states[:, 6:], -1, 1)
+        held[:, 6:] = np.clip(states[:, 6:7], -1, 1)
     return held
 
 

@@ -65,7 +65,8 @@ class ImagePolicy(nn.Module):
     Args:
         encoder: frozen; see ImageEncoder.
         state_dim: S. Of the size of one of core.action_spaces.SPACES, the state is of that one: positions are shifted
-            by TOOL_CENTER_M and scaled by TOOL_SCALE_M, rotations by TURN_SCALE_RAD.
+            by TOOL_CENTER_M and scaled by TOOL_SCALE_M, rotations by TURN_SCALE_RAD. What a larger state has after a
+            pose says which task it is, and is taken as it is.
         action_dim: A.
         config: sizes and the initial log standard deviation.
         seed: of the initial weights (stream `policy_init`).
@@ -77,8 +78,9 @@ class ImagePolicy(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.state_dim, self.action_dim, self.config = state_dim, action_dim, config
-        known = {len(space.units): space for space in SPACES.values()}.get(state_dim)
-        units = known.units if known else ("1",) * state_dim
+        sizes = {len(space.units): space.units for space in SPACES.values()}
+        known = sizes.get(min(state_dim, max(sizes)), ())
+        units = known + ("1",) * (state_dim - len(known))
         center = [TOOL_CENTER_M[i] if unit == "m" else 0.0 for i, unit in enumerate(units)]
         scale = [{"m": TOOL_SCALE_M, "rad": TURN_SCALE_RAD, "1": 1.0}[unit] for unit in units]
         with torch.random.fork_rng(devices=[]):

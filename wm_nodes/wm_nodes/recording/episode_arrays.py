@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.config.tasks import shares_scene, success
+from wm_nodes.config.tasks import get_task, shares_scene, success, task_names
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
 
 TaskLabels = Callable[[str, FloatArray], BoolArray]
@@ -18,9 +18,10 @@ TaskLabels = Callable[[str, FloatArray], BoolArray]
 class EpisodeArrays:
     """E episodes padded to T steps by repeating their last frame; only the first `lengths` steps are real.
 
-    images: uint8 (E, T + 1, H, W, 3). states: float32 (E, T + 1, S). actions: float32 (E, T, A), 0 where padded.
-    ground_truth: float32 (E, T + 1, P). success: bool (E, T + 1, J), column j for tasks[j], see `labelled`. lengths:
-    int64 (E,). recorded_tasks: the task that each episode was recorded for, with its instruction.
+    images: uint8 (E, T + 1, H, W, 3). states: float32 (E, T + 1, S), of the tool. actions: float32 (E, T, A), 0 where
+    padded. ground_truth: float32 (E, T + 1, P). success: bool (E, T + 1, J), column j for tasks[j], see `labelled`.
+    lengths: int64 (E,). recorded_tasks: the task that each episode was recorded for, with its instruction; where the
+    state says which task it is (Task.parts), that one.
     """
 
     images: UInt8Array
@@ -90,7 +91,7 @@ def stack_episodes(
     listed = list(episodes)
     if not listed:
         raise ValueError("no episodes to train on; collect some first (data.num_episodes) or check the bag path")
-    shapes = {(e.images.shape[1:], e.states.shape[1:], e.actions.shape[1:]) for e in listed}
+    shapes = {(e.images.shape[1:], _tool_states(e).shape[1:], e.actions.shape[1:]) for e in listed}
     if len(shapes) > 1:
         raise ValueError(f"episodes of different image, state or action sizes cannot be mixed: {sorted(shapes)}")
     steps = num_steps or max(e.num_steps for e in listed)
@@ -102,8 +103,21 @@ def stack_episodes(
     truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
     return EpisodeArrays(
         images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
-        states=np.stack([e.states[rows] for e, rows in zip(listed, frame_rows, strict=True)]), actions=actions,
+        states=np.stack([_tool_states(e)[rows] for e, rows in zip(listed, frame_rows, strict=True)]), actions=actions,
         ground_truth=truth, success=np.stack([np.asarray(labels(task, truth), bool) for task in tasks], -1),
         lengths=lengths, tasks=tuple(tasks), instructions=tuple(e.instruction for e in listed),
-        behaviours=tuple(e.behaviour for e in listed), recorded_tasks=tuple(e.task for e in listed),
+        behaviours=tuple(e.behaviour for e in listed), recorded_tasks=tuple(map(_task_of, listed)),
     )
+
+
+def _parts(episode: Episode) -> tuple[str, ...]:
+    return get_task(episode.task).parts if episode.task in task_names() else ()
+
+
+def _tool_states(episode: Episode) -> FloatArray:
+    return episode.states[:, : episode.states.shape[1] - len(_parts(episode))]
+
+
+def _task_of(episode: Episode) -> str:
+    parts = _parts(episode)
+    return parts[int(episode.states[0, -len(parts) :].argmax())] if parts else episode.task

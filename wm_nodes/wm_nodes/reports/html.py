@@ -12,10 +12,12 @@ from wm_nodes.reports.summary import Summary
 from wm_nodes.reports.tables import (
     EXPLOIT_COLUMNS,
     ROUND_COLUMNS,
+    TASK_COLUMNS,
     exploit_rows,
     exploit_title,
     result_rows,
     round_rows,
+    task_rows,
     verdict,
 )
 
@@ -64,7 +66,7 @@ def write_report(run_dir: Path, summary: Summary, pictures: Sequence[Picture] = 
         f"{summary.samples} imagined environment steps at {summary.imagined_steps_per_s:.0f} per second, "
         f"{summary.minutes:.1f} minutes in all</p>",
         "<h2>Success</h2>", _results(summary),
-        *_rounds(summary), *_exploit_meter(summary),
+        *_tasks(summary), *_rounds(summary), *_exploit_meter(summary),
         "<h2>Acceptance of the world model</h2>", _acceptance(summary.acceptance),
         *figures(pictures),
         "<h2>Look closer, do it again</h2>", _again(run_dir, summary),
@@ -152,6 +154,12 @@ def _rounds(summary: Summary) -> Iterable[str]:
         "training on what it saw there. The refreshed model is taken only where it is no worse on held-out episodes. "
         "Imagined rates are those of the model that the round trained in.</p>"
     )
+
+
+def _tasks(summary: Summary) -> Iterable[str]:
+    if summary.by_task:
+        table = html_table(TASK_COLUMNS, (tuple(map(escape, row)) for row in task_rows(summary)), numbers=range(1, 4))
+        yield f"<h2>Real success by task</h2>{table}"
 
 
 def _exploit_meter(summary: Summary) -> Iterable[str]:

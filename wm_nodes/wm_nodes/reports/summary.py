@@ -43,6 +43,8 @@ class Summary:
     command: as typed. machine: facts by name.
     exploit_meter: one mapping for each reading, in order: step (updates made before it) and the numbers of
         policy_rl.exploit_meter.ExploitReading.metrics(). stopped: why training ended before all updates, by round.
+    by_task: of a task whose every episode is one of several, the real success of each: successes_before and _after,
+        episodes, difference, low and high.
     reward: that the policy was trained for. judge: who gave it, where it is the agent's; else empty.
     rounds: of a run in online rounds, one mapping for each: number, updates, samples, imagined_before, imagined, real
         (successes, episodes, low, high, rate), verdict (accepted, reason, rows; empty after the last). The imagined
@@ -68,6 +70,7 @@ class Summary:
     rounds: Sequence[Mapping[str, Any]] = ()
     exploit_meter: Sequence[Mapping[str, Any]] = ()
     stopped: Sequence[str] = ()
+    by_task: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     reward: str = "endogenous"
     judge: str = ""
 

@@ -82,6 +82,24 @@ def rounds_table(summary: Summary) -> Table:
     return make_table(title, ROUND_COLUMNS, round_rows(summary), left=ROUND_COLUMNS[-1:])
 
 
+TASK_COLUMNS = ("task", "before", "after", "difference, points (95 %)")
+
+
+def task_rows(summary: Summary) -> list[tuple[str, ...]]:
+    """One row of texts for the real success of each task, under TASK_COLUMNS."""
+    rows = []
+    for task, found in summary.by_task.items():
+        rates = (f"{found[f'successes_{when}']} / {found['episodes']}" for when in ("before", "after"))
+        points, low, high = (100 * found[name] for name in ("difference", "low", "high"))
+        rows.append((task, *rates, f"{points:+.1f} ({low:+.1f} to {high:+.1f})"))
+    return rows
+
+
+def tasks_table(summary: Summary) -> Table:
+    """The real success of each task for the terminal."""
+    return make_table("real success by task", TASK_COLUMNS, task_rows(summary))
+
+
 EXPLOIT_COLUMNS = ("updates", "imagined", "replayed", "real", "precision (95 %)", "recall (95 %)")
 
 

@@ -27,6 +27,7 @@ from wm_nodes.world_model.imagined_environment import (
     models_to_infer,
     world_model_spec,
 )
+from wm_nodes.world_model.imagined_episodes import task_indices
 from wm_nodes.world_model.precision import has_fast_bfloat16
 
 
@@ -64,17 +65,19 @@ class DeviceEnvironment:
     ) -> None:
         self.spec, self.device = world_model_spec(models, spec, num_envs), models.tokenizer.device
         self.tokenizer_sha256 = models.tokenizer_sha256
-        self._reward, self._task = reward, models.task_index(spec.task)
+        self._reward = reward
         images, states = starts
         self.num_starts = len(images)
         self.goals: tuple[UInt8Array, BoolArray] | None = (
-            imagine_start_goals(models, images, self.spec, reward, instructions) if with_goals else None
+            imagine_start_goals(models, starts, self.spec, reward, instructions) if with_goals else None
         )
         self._fast, self._exact = has_fast_bfloat16(self.device), exact
         self._tokenizer, self._action = models_to_infer(models, exact=exact)
         self._start_frames = torch.from_numpy(images).to(self.device)
         self._start_states = torch.from_numpy(states).to(self.device, torch.float32)
         self._start_latents = encode_starts(models, images).clone()
+        self._start_tasks = torch.from_numpy(task_indices(states, spec, models.task_index)).to(self.device)
+        self._tool = spec.tool_dim
         self._scale = torch.tensor(spec.action_scale, dtype=torch.float32).to(self.device)
         box = torch.tensor((spec.state_low, spec.state_high), dtype=torch.float32)
         self._box = box.to(self.device) if spec.state_low else None
@@ -123,7 +126,9 @@ class DeviceEnvironment:
             self.states_NP, actions_NA, self._scale, self._box, pose=moves_pose(self.spec)
         )
         with self._autocast(exact=self._exact):
-            latents, logits = self._action.advance(self._latents, actions_NA, self.states_NP, moved, self._caches)
+            latents, logits = self._action.advance(
+                self._latents, actions_NA, self.states_NP[:, : self._tool], moved[:, : self._tool], self._caches
+            )
         self._latents.copy_(torch.where(valid[:, None, None], latents, self._latents))
         self.finite.logical_and_(torch.isfinite(self._latents).all())
         with self._autocast():
@@ -132,7 +137,8 @@ class DeviceEnvironment:
         self.frames_NHWC.copy_(torch.where(valid[:, None, None, None], frames, self.frames_NHWC))
         self.states_NP.copy_(torch.where(valid[:, None], moved, self.states_NP))
         self._steps_N.add_(valid)
-        signal, spread = (values[:, self._task] for values in done_signal(logits))
+        tasks_N1 = self._start_tasks[self.starts_N].unsqueeze(1)
+        signal, spread = (values.gather(1, tasks_N1)[:, 0] for values in done_signal(logits))
         terminated = valid & (signal > self._reward.success_threshold)
         over = self._steps_N >= self.spec.max_episode_steps
         if self._reward.uncertainty_limit > 0:

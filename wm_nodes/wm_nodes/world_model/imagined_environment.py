@@ -14,7 +14,7 @@ from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import ActionModel, done_signal
 from wm_nodes.world_model.folder import WorldModels
-from wm_nodes.world_model.imagined_episodes import ImaginedEpisodes, imagined_spec
+from wm_nodes.world_model.imagined_episodes import ImaginedEpisodes, imagined_spec, task_indices
 from wm_nodes.world_model.parts import in_parallel, parts_of
 from wm_nodes.world_model.precision import compute_context, copy_in_bfloat16, has_fast_bfloat16
 from wm_nodes.world_model.text import imagine_goals
@@ -51,18 +51,20 @@ def encode_starts(models: WorldModels, images: UInt8Array) -> Tensor:
 
 
 def imagine_start_goals(
-    models: WorldModels, images: UInt8Array, spec: EnvironmentSpec, reward: RewardConfig,
+    models: WorldModels, starts: tuple[UInt8Array, FloatArray], spec: EnvironmentSpec, reward: RewardConfig,
     instructions: Sequence[str] = (),
 ) -> tuple[UInt8Array, BoolArray] | None:
     """Goal frame and found flag of every start: one per (frame, instruction), so computed once; None without a text
     model. instructions: of every start; none: that of the spec."""
     if models.text is None:
         return None
+    images, states = starts
+    tasks = task_indices(states, spec, models.task_index).tolist()
     texts = instructions or [spec.instruction] * len(images)
     parts = [
         imagine_goals(
             models.text, models.tokenizer, images[i : i + GOAL_BATCH], texts[i : i + GOAL_BATCH],
-            models.task_index(spec.task), horizon=spec.max_episode_steps, threshold=reward.goal_threshold,
+            tasks[i : i + GOAL_BATCH], horizon=spec.max_episode_steps, threshold=reward.goal_threshold,
         )
         for i in range(0, len(images), GOAL_BATCH)
     ]
@@ -89,11 +91,11 @@ class ImaginedEnvironment(ImaginedEpisodes):
             world_model_spec(models, spec, num_envs), starts, reward, seed=seed, device=models.tokenizer.device
         )
         self.models, self.instructions, self._exact = models, instructions, exact
-        self._task = models.task_index(spec.task)
+        self._start_tasks = task_indices(starts[1], spec, models.task_index)
         self._tokenizer, self._action = models_to_infer(models, exact=exact)
         images, _ = starts
         self._start_latents = encode_starts(models, images)
-        self._goals = imagine_start_goals(models, images, self.spec, reward, instructions) if with_goals else None
+        self._goals = imagine_start_goals(models, starts, self.spec, reward, instructions) if with_goals else None
         self._parts = cached_parts(models.action.trunk, num_envs, self.device)
         self._latents = self._start_latents[:1].repeat(num_envs, 1, 1)
 
@@ -113,7 +115,8 @@ class ImaginedEnvironment(ImaginedEpisodes):
         self, actions: FloatArray, moved: FloatArray, valid: BoolArray
     ) -> tuple[UInt8Array, FloatArray, FloatArray]:
         tokenizer, model = self._tokenizer, self._action
-        acted, before, after = (self._tensor(array) for array in (actions, self._states, moved))
+        tool = self.spec.tool_dim
+        acted, before, after = map(self._tensor, (actions, self._states[:, :tool], moved[:, :tool]))
         keep = self._tensor(valid)[:, None, None]
 
         def part(item: CachedPart) -> tuple[Tensor, Tensor, Tensor]:
@@ -129,5 +132,6 @@ class ImaginedEnvironment(ImaginedEpisodes):
             raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
         self._latents = latents
         signal, spread = done_signal(logits)
-        told = torch.stack((signal[:, self._task], spread[:, self._task])).cpu()
+        tasks = self._tensor(self._start_tasks[self._starts]).unsqueeze(1)
+        told = torch.stack((signal.gather(1, tasks)[:, 0], spread.gather(1, tasks)[:, 0])).cpu()
         return frames.cpu().numpy(), told[0].numpy(), told[1].numpy()

@@ -7,7 +7,7 @@ Shapes: N environments, M starts, H W 3 image, A action, P state.
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
-from wm_nodes.config.tasks import shares_scene
+from wm_nodes.config.tasks import get_task, parts_of, shares_scene
 from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import explain_memory
 from wm_nodes.core.seeding import numpy_stream, stream_seed
@@ -43,7 +43,13 @@ def load_starts(path: Path, task: str = "") -> tuple[UInt8Array, FloatArray]:
     if missing or not len(tensors["images"]):
         raise ValueError(f"{path} is no starts file: it must hold images and states of at least one first frame")
     rows = _rows(path, tensors, task)
-    return tensors["images"].numpy()[rows], tensors["states"].numpy()[rows]
+    images, states = (tensors[name].numpy()[rows] for name in ("images", "states"))
+    if not task or not (parts := get_task(task).parts) or INSTRUCTIONS not in tensors:
+        return images, states
+    own = [_told(path, tensors)[row][0] for row in rows]
+    if task in own:  # its states say which task it is
+        return images, states
+    return images, np.concatenate([states, np.float32([[part == one for part in parts] for one in own])], 1)
 
 
 def load_start_instructions(path: Path, spec: EnvironmentSpec) -> list[str]:
@@ -104,6 +110,13 @@ def imagined_spec(spec: EnvironmentSpec, env_id: str, sha256: str, num_envs: int
         spec, env_id=env_id, source=SOURCE_IMAGINED, num_envs=num_envs, ground_truth_names=(),
         world_model_sha256=sha256,
     )
+
+
+def task_indices(states: FloatArray, spec: EnvironmentSpec, index_of: Callable[[str], int]) -> NDArray[np.int64]:
+    """(...,), the output of a world model for the task that each state (..., S) is of. index_of: its task_index."""
+    indices = np.array([index_of(part) for part in parts_of(spec.task)], np.int64)
+    codes = states[..., spec.tool_dim :]
+    return indices[codes.argmax(-1) if codes.shape[-1] else np.zeros(states.shape[:-1], np.int64)]
 
 
 def start_of(seed: int, num_starts: int) -> int:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from wm_nodes.config.schema import WorldModelConfig
+from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.types import BoolArray, UInt8Array
 from wm_nodes.world_model.conditions import text_rows, word_mask
 from wm_nodes.world_model.dynamics import FrameModel, Prediction, done_signal
@@ -85,7 +86,7 @@ class TextModel(FrameModel):
 def instruction_for(task: str, recorded_task: str, own: str, otherwise: str) -> str:
     """The instruction of an episode for `task`: its own where it was recorded for that task and has one, else that of
     the task, `otherwise`."""
-    return own if own and recorded_task == task else otherwise
+    return own if own and recorded_task in (task, *parts_of(task)) else otherwise
 
 
 def vocabulary_of(instructions: tuple[str, ...]) -> tuple[str, ...]:
@@ -113,20 +114,22 @@ class ImaginedGoals:
 
 @torch.inference_mode()
 def imagine_goals(
-    model: TextModel, tokenizer: Tokenizer, images: UInt8Array, instructions: Sequence[str], task: int, *,
+    model: TextModel, tokenizer: Tokenizer, images: UInt8Array, instructions: Sequence[str], tasks: Sequence[int], *,
     horizon: int, threshold: float,
 ) -> ImaginedGoals:
-    """Roll the text model out from frames (B, H, W, 3) and their B instructions; the goal is the first frame whose done
-    signal is above `threshold` (RS-6: t* = min{t : d_t > tau_goal}), else that of the highest, with found=False."""
+    """Roll the text model out from frames (B, H, W, 3), their B instructions and tasks (WorldModels.task_index); the
+    goal is the first frame whose done signal is above `threshold` (RS-6: t* = min{t : d_t > tau_goal}), else that of
+    the highest, with found=False."""
     current = tokenizer.encode(images).unsqueeze(1)
     caches = model.trunk.new_ring_caches(len(images), current.device)
     frames, signals = [np.asarray(images)], list[Tensor]()
+    index = torch.tensor(tasks, device=current.device).unsqueeze(1)
     for _ in range(horizon):
         with compute_context(current.device):
             prediction = model(current, instructions, caches)
         current = tokenizer.normalise(current + prediction.change_BTSD)
         frames.append(tokenizer.decode(current[:, 0]).cpu().numpy())
-        signals.append(done_signal(prediction.done_logits_BTKJ[:, 0])[0][:, task])
+        signals.append(done_signal(prediction.done_logits_BTKJ[:, 0])[0].gather(1, index)[:, 0])
     signal_BT = torch.stack(signals, 1).cpu().numpy()
     crossed = signal_BT > threshold
     found = crossed.any(1)

@@ -12,7 +12,7 @@ from transforms3d.euler import euler2quat
 
 from wm_nodes.config.scenes import Scene, scene_of
 from wm_nodes.config.schema import SimulationConfig
-from wm_nodes.config.tasks import get_task
+from wm_nodes.config.tasks import get_task, part_of, parts_of
 from wm_nodes.core.cameras import CameraModel, Matrix
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import simulation_spec
@@ -38,6 +38,7 @@ class ManiSkillEnvironment:
     ) -> None:
         self.spec = simulation_spec(task, config, num_envs)
         self._task = get_task(task)
+        self._parts = [task] * num_envs
         self._config = config
         self._seed = seed
         self._end_on_success = end_on_success
@@ -68,8 +69,8 @@ class ManiSkillEnvironment:
     @property
     def instructions(self) -> tuple[str, ...]:
         """Of each environment's episode: where the task has many scenes, that of its scene."""
-        instruct = self._task.instruct
-        return tuple(instruct(shown) if instruct and shown else self.spec.instruction for shown in self._shown)
+        told = ((get_task(part).instruct, shown) for part, shown in zip(self._parts, self._shown, strict=True))
+        return tuple(instruct(shown) if instruct and shown else self.spec.instruction for instruct, shown in told)
 
     @property
     def shown_scenes(self) -> tuple[Scene | None, ...]:
@@ -93,6 +94,7 @@ class ManiSkillEnvironment:
             self._num_resets += 1
             seed = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else int(seeds[i])
             self._shown[i] = scene_of(self._config.scenes, seed)
+            self._parts[i] = part_of(self.spec.task, seed)
             if self._new_physics and self._shown[i] is None:  # a scene of the catalogue is built anew
                 renew_physics(self._scenes[i])
             self._scenes[i].reset(seed=seed % 2**32, options={"scene": self._shown[i]})
@@ -121,7 +123,8 @@ class ManiSkillEnvironment:
         terminated, truncated = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         for i in np.flatnonzero(valid):
             target = next_state(self._states[i], actions[i], self.spec)
-            self._states[i] = self._control.step(self._scenes[i], self._states[i], target)
+            tool = self._states[i, : self.spec.tool_dim]
+            tool[:] = self._control.step(self._scenes[i], tool, target[: len(tool)])
             self._steps[i] += 1
             self._observe(i)
             terminated[i] = self._end_on_success and bool(self._task.success(self._truth[i]))
@@ -142,7 +145,8 @@ class ManiSkillEnvironment:
 
     def _start(self, i: int) -> None:
         self._first_truth[i] = self._task.measure(self._scenes[i], None)
-        self._states[i] = self._control.state(self._scenes[i])
+        code = np.array(parts_of(self.spec.task)) == self._parts[i]
+        self._states[i] = [*self._control.state(self._scenes[i]), *code[: self.spec.state_dim - self.spec.tool_dim]]
         self._observe(i)
 
     def _observe(self, i: int) -> None:

@@ -27,7 +27,7 @@ def scripted_episode(env: ManiSkillEnvironment, behaviour: str, seed: int, episo
     scripted = script(behaviour, truth, numpy_stream(seed, "behaviour"), env.spec.action_scale[0])
 
     def act(observation: Observation, truth_now: FloatArray) -> FloatArray:
-        return scripted(truth_now, observation.state[0])
+        return scripted(truth_now, observation.state[0, : env.spec.tool_dim])
 
     return record_episode(env, act, behaviour, seed, episode_id)
 
@@ -72,7 +72,7 @@ def planned_episode(
         path_follower = follow(planner.tool_path(), env.spec.action_scale[0])
 
     def act(observation: Observation, truth: FloatArray) -> FloatArray:
-        return path_follower(observation.state[0])
+        return path_follower(observation.state[0, : env.spec.tool_dim])
 
     return record_episode(env, act, behaviour, seed, episode_id)
 

@@ -26,8 +26,6 @@ class ObjectScene(BaseEnv):  # type: ignore[misc]
     SUPPORTED_ROBOTS = ("panda",)
     place: Place
     """Draws the layout; of the task."""
-    finger_m = 0.04
-    """Of each finger from the middle at the start."""
 
     def __init__(self, *args: Any, robot_uids: str = "panda", **options: Any) -> None:
         super().__init__(*args, robot_uids=robot_uids, **options)
@@ -52,7 +50,7 @@ class ObjectScene(BaseEnv):  # type: ignore[misc]
         scene = options.get("scene") or scene_of("train", seed)
         assert scene is not None
         self.catalogue_scene: Scene = scene
-        self.layout = type(self).place(numpy_stream(seed, "layout"))
+        self.layout = self.place(numpy_stream(seed, "layout"))
         self.table_colour = (*COLOURS[self.catalogue_scene.table], 1.0)
         self.table_scene = TableSceneBuilder(env=self)
         self.table_scene.build()

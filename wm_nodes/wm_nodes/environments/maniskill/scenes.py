@@ -31,7 +31,6 @@ class TableTopScene(BaseEnv):  # type: ignore[misc]
     """Mixin before a ManiSkill table-top task. cameras: names of PLACEMENTS. image_size: of each, px."""
 
     table_colour = TABLE_COLOUR
-    finger_m = 0.0
 
     def __init__(self, *args: Any, image_size: int, cameras: Sequence[str], **options: Any) -> None:
         self.image_size, self.cameras = image_size, cameras
@@ -65,7 +64,7 @@ class TableTopScene(BaseEnv):  # type: ignore[misc]
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
         super()._initialize_episode(env_idx, options)
         joint_positions = self.agent.robot.get_qpos()
-        joint_positions[:, -2:] = self.finger_m
+        joint_positions[:, -2:] = 0.0
         self.agent.reset(joint_positions)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from rich.table import Table
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import get_task
+from wm_nodes.config.tasks import get_task, parts_of
 from wm_nodes.core.statistics import newcombe_difference
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reports.console_table import make_table
@@ -131,8 +131,10 @@ def apply_criteria(
     for kind, threshold, remedy in (
         ("precision", limits.done_precision, MORE_NEAR_MISSES), ("recall", limits.done_recall, MORE_SUCCESSES),
     ):
-        value = float(metrics[f"done_{task}_{kind}"])
-        criteria.append(Criterion(f"done {kind} on rollouts", value, threshold, ">=", value >= threshold, remedy))
+        found = [metrics.get(f"done_{part}_{kind}", math.nan) for part in parts_of(task)]
+        value = float(np.nanmean(found)) if np.isfinite(found).any() else math.nan
+        name = f"done {kind} on rollouts" + (", mean of the tasks" if len(found) > 1 else "")
+        criteria.append(Criterion(name, value, threshold, ">=", value >= threshold, remedy))
     if not limits.require_success_agreement:
         notes.append("Agreement of imagined and real success was not asked for (acceptance.require_success_agreement).")
     elif imagined is None or real is None:

@@ -20,7 +20,7 @@ def place(rng: np.random.Generator) -> Layout:
 def scene() -> Any:
     from wm_nodes.environments.maniskill.object_scene import ObjectScene
 
-    return type("PullScene", (ObjectScene,), {"place": staticmethod(place), "finger_m": 0.0})
+    return type("PullScene", (ObjectScene,), {"place": staticmethod(place)})
 
 
 def success(truth: FloatArray) -> BoolArray:

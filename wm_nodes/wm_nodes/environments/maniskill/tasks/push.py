@@ -37,7 +37,7 @@ def place_on_way(rng: np.random.Generator, direction: int, objects: Rectangle) -
 def scene() -> Any:
     from wm_nodes.environments.maniskill.object_scene import ObjectScene
 
-    return type("PushScene", (ObjectScene,), {"place": staticmethod(place), "finger_m": 0.0})
+    return type("PushScene", (ObjectScene,), {"place": staticmethod(place)})
 
 
 def success(truth: FloatArray) -> BoolArray:

@@ -30,7 +30,7 @@ def apart(start: Point, container: Point) -> bool:
 def scene() -> Any:
     from wm_nodes.environments.maniskill.object_scene import ObjectScene
 
-    return type("ReachObjectScene", (ObjectScene,), {"place": staticmethod(place), "finger_m": 0.0})
+    return type("ReachObjectScene", (ObjectScene,), {"place": staticmethod(place)})
 
 
 def success(truth: FloatArray) -> BoolArray:
