@@ -28,6 +28,7 @@ from wm_nodes.world_model.training.dynamics import (
     shown_frames,
     token_weights,
     tokenise_episodes,
+    tool_moves,
     train_action_model,
 )
 from wm_nodes.world_model.training.position_probe import train_position_probe
@@ -86,7 +87,8 @@ def untrained(episodes: EpisodeArrays) -> LatentEpisodes:
 
 def test_a_part_is_what_was_recorded_from_its_first_frame_on() -> None:
     lengths = torch.tensor([12, 12, 5, 3])
-    drawn = torch.stack([first_frames(lengths, 4, torch.Generator().manual_seed(i)) for i in range(200)])
+    moves = torch.ones(4, 12, dtype=torch.bool)
+    drawn = torch.stack([first_frames(lengths, moves, 4, torch.Generator().manual_seed(i)) for i in range(200)])
     assert drawn.amax(0).tolist() == [8, 8, 1, 0] and not drawn.amin(0).any()
     data = untrained(arrays(3))
     part = data.parts(torch.tensor([2, 0]), torch.tensor([3, 8]), 4)
@@ -95,6 +97,18 @@ def test_a_part_is_what_was_recorded_from_its_first_frame_on() -> None:
         assert_close(getattr(part, name), torch.stack([values[2, 3:8], values[0, 8:13]]), equal_nan=True)
     assert_close(part.actions, torch.stack([data.actions[2, 3:7], data.actions[0, 8:12]]))
     assert part.step_mask.shape == (2, 4) and part.step_mask.all()
+
+
+def test_most_parts_hold_a_step_of_which_the_tool_moves() -> None:
+    data = untrained(arrays(2))
+    data.states[0, 3:] = data.states[0, 3]
+    data.states[1] = data.states[1, 0]
+    moves = tool_moves(data)
+    assert moves[0, :3].any() and not moves[0, 3:].any() and moves[1].tolist() == data.step_mask[1].tolist()
+    lengths = torch.tensor([12, 12])
+    drawn = torch.stack([first_frames(lengths, moves, 2, torch.Generator().manual_seed(i)) for i in range(400)])
+    still = (drawn > 2).float().mean(0)
+    assert 0.1 < still[0] < 0.3 and still[1] > 0.6 and drawn.max() == 10
 
 
 def test_a_model_trains_on_parts_of_episodes() -> None:

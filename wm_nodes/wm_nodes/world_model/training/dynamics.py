@@ -33,6 +33,8 @@ INPUT_NOISE = 0.05
 """Standard deviation of noise on real input frames, against copying tokenizer detail."""
 HUBER_DELTA = 0.5
 MAX_TOKEN_WEIGHT = 4.0
+MOVING_SHARE, MOVED = 0.75, 0.005
+"""See first_frames. A tool has moved whose commanded state has changed by more than MOVED (m, rad, or gripper)."""
 BOOTSTRAP_SHARE = 0.7
 """Each done head learns from its own random share of the episodes, so that heads disagree where data are thin."""
 ENCODING_BATCH = 256
@@ -116,7 +118,7 @@ def train_action_model(
     tokenizer.requires_grad_(False)
     trained = model
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
-    lengths = data.step_mask.sum(1).cpu()
+    lengths, moves = data.step_mask.sum(1).cpu(), tool_moves(data).cpu()
     whole = data.actions.shape[1]
     num_steps = min(settings.part_steps or whole, whole)
 
@@ -126,7 +128,8 @@ def train_action_model(
     def read(iteration: int) -> tuple[Tensor, ...]:
         rows = numpy_stream(seed, "action_model_batch", iteration).integers(0, len(data), settings.batch_size)
         index = torch.from_numpy(rows)
-        first = first_frames(lengths[index], num_steps, torch_stream(seed, "action_model_part", iteration))
+        stream = torch_stream(seed, "action_model_part", iteration)
+        first = first_frames(lengths[index], moves[index], num_steps, stream)
         generator = torch_stream(seed, "action_model_noise", iteration)
         batch = torch.stack((index, first)), *starts(data, len(rows), num_steps, steps_at(iteration), generator)
         if not settings.decoded_weight:
@@ -177,11 +180,24 @@ def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> 
     return stages[min(len(stages) - 1, iteration * len(stages) // max(1, num_iterations))]
 
 
-def first_frames(lengths: Tensor, num_steps: int, generator: torch.Generator) -> Tensor:
+def tool_moves(data: LatentEpisodes) -> Tensor:
+    """Bool (E, T), the recorded steps that change the commanded tool; all of an episode that has none."""
+    moves = ((data.states[:, 1:] - data.states[:, :-1]).abs().amax(-1) > MOVED) & data.step_mask
+    return torch.where(moves.any(1, keepdim=True), moves, data.step_mask)
+
+
+def first_frames(lengths: Tensor, moves: Tensor, num_steps: int, generator: torch.Generator) -> Tensor:
     """(B,), a random frame of each of B episodes of `lengths` steps from which num_steps more were recorded; 0 where
-    there is none."""
-    choices = (lengths - num_steps).clamp(min=0) + 1
-    return (torch.rand(len(lengths), generator=generator) * choices).long()
+    there is none. moves: tool_moves of the episodes (B, T).
+
+    MOVING_SHARE of the parts hold a random step of which the tool moves: an episode that has succeeded long before its
+    end stands still for most of its time.
+    """
+    last = (lengths - num_steps).clamp(min=0)
+    share, anywhere, before = torch.rand(3, len(lengths), generator=generator)
+    step = torch.multinomial(moves.float(), 1, generator=generator)[:, 0]
+    around = (step - (before * num_steps).long()).clamp(min=0)
+    return torch.where(share < MOVING_SHARE, torch.minimum(around, last), (anywhere * (last + 1)).long())
 
 
 def starts(
