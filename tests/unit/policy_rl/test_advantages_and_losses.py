@@ -151,6 +151,12 @@ def test_normalisation_uses_only_masked_entries() -> None:
     assert_close(masked_normalise(values, mask, epsilon=0.0), torch.tensor([-1.0, 1.0, 0.0]))
 
 
+def test_normalisation_does_not_blow_up_what_varies_less_than_the_floor() -> None:
+    values, mask = torch.tensor([0.01, 0.03]), torch.tensor([True, True])
+    assert_close(masked_normalise(values, mask, epsilon=0.0, floor=0.1), torch.tensor([-0.1, 0.1]))
+    assert_close(masked_normalise(100 * values, mask, epsilon=0.0, floor=0.1), torch.tensor([-1.0, 1.0]))
+
+
 def test_normalisation_of_one_or_no_entry_gives_zeros() -> None:
     values = torch.tensor([5.0, 7.0])
     assert_close(masked_normalise(values, torch.tensor([True, False])), torch.zeros(2))

@@ -126,6 +126,7 @@ def train_in(
             name: {"before": _rate(first), "after": _rate(last), "gain": _gain(first, last)}
             for name, (first, last) in elsewhere.items()
         },
+        "success_before": before[0].success.astype(int).tolist(),
         "success_after": after[0].success.astype(int).tolist(),
         "seconds_per_update": seconds / max(1, len(course)), "minutes": (time.monotonic() - began) / 60,
     }

@@ -256,6 +256,9 @@ class PpoConfig(SettingsSection):
     """gae: PPO, with a critic; group: GRPO, of each environment's first episode against those from the same start."""
     group_size: Annotated[int, Field(ge=2)]
     """group: environments that begin at the same start; must divide num_envs."""
+    advantage_floor: NonNegativeFloat = 0.0
+    """Least standard deviation that gae's advantages are divided by. Without rewards they are the critic's errors
+    alone; divided by their own spread, these move the policy as much as rewards would."""
     group_std: bool
     """group: divide by the standard deviation of the group's returns; false: Dr. GRPO."""
     leave_one_out: bool

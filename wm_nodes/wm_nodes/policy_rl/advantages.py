@@ -116,8 +116,8 @@ def group_advantages(
     )
 
 
-def masked_normalise(values: Tensor, mask: Tensor, *, epsilon: float = 1e-5) -> Tensor:
-    """Return (values - mean) / (std + epsilon) over the entries where mask is True, and 0 elsewhere.
+def masked_normalise(values: Tensor, mask: Tensor, *, epsilon: float = 1e-5, floor: float = 0.0) -> Tensor:
+    """Return (values - mean) / (max(std, floor) + epsilon) over the entries where mask is True, and 0 elsewhere.
 
     The standard deviation is the population one, so a single entry gives 0.
     """
@@ -126,7 +126,7 @@ def masked_normalise(values: Tensor, mask: Tensor, *, epsilon: float = 1e-5) -> 
     if not bool(mask.any()):
         return torch.zeros_like(values)
     chosen = values[mask]
-    normalised = (values - chosen.mean()) / (chosen.std(correction=0) + epsilon)
+    normalised = (values - chosen.mean()) / (chosen.std(correction=0).clamp(min=floor) + epsilon)
     return torch.where(mask, normalised, torch.zeros_like(values))
 
 

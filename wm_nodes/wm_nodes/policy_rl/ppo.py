@@ -241,7 +241,7 @@ class PpoLearner:
                 rollout.terminated_TN, rollout.truncated_TN, valid_TN,
                 gamma=self.config.gamma, lambda_=self.config.gae_lambda,
             )
-            advantages = masked_normalise(advantages, valid_TN)
+            advantages = masked_normalise(advantages, valid_TN, floor=self.config.advantage_floor)
         else:
             advantages, returns = groups.advantages_TN, torch.zeros_like(groups.advantages_TN)
         columns = (

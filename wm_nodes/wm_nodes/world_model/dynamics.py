@@ -85,7 +85,7 @@ class ConditionMap(nn.Module):
     def forward(self, condition_BTND: Tensor) -> Tensor:
         """(B, T, S, D)."""
         values: Tensor = self.read(condition_BTND.sum(2))
-        out: Tensor = self.out(values.unflatten(-1, (self.num_tokens, self.RANK)))
+        out: Tensor = self.out(values.view(*values.shape[:2], self.num_tokens, self.RANK))
         return out
 
 

@@ -49,7 +49,7 @@ def load_starts(path: Path, task: str = "") -> tuple[UInt8Array, FloatArray]:
     own = [_told(path, tensors)[row][0] for row in rows]
     if task in own:  # its states say which task it is
         return images, states
-    return images, np.concatenate([states, np.float32([[part == one for part in parts] for one in own])], 1)
+    return images, np.concatenate([states, np.array([[part == one for part in parts] for one in own], np.float32)], 1)
 
 
 def load_start_instructions(path: Path, spec: EnvironmentSpec) -> list[str]:
@@ -116,7 +116,8 @@ def task_indices(states: FloatArray, spec: EnvironmentSpec, index_of: Callable[[
     """(...,), the output of a world model for the task that each state (..., S) is of. index_of: its task_index."""
     indices = np.array([index_of(part) for part in parts_of(spec.task)], np.int64)
     codes = states[..., spec.tool_dim :]
-    return indices[codes.argmax(-1) if codes.shape[-1] else np.zeros(states.shape[:-1], np.int64)]
+    numbers = codes.argmax(-1) if codes.shape[-1] else np.zeros(states.shape[:-1], np.int64)
+    return np.asarray(indices[numbers], np.int64)
 
 
 def start_of(seed: int, num_starts: int) -> int:
