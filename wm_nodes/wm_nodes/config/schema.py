@@ -114,6 +114,9 @@ class WorldModelConfig(SettingsSection):
     """Curriculum: imagined steps unrolled and back-propagated through, raised in equal stages over the training."""
     part_steps: NonNegativeInt = 0
     """Steps of the random parts of episodes that the action model is rolled out over in training; 0: whole episodes."""
+    latent_weight: PositiveFloat = 1.0
+    """Weight of the loss on the predicted latents, a mean over all tokens and values, whose gradient is small beside
+    those of the other losses."""
     done_weight: NonNegativeFloat
     """Weight of the done loss (RS-4)."""
     num_done_heads: PositiveInt

@@ -107,9 +107,9 @@ def train_action_model(
 ) -> tuple[ActionModel, dict[str, float]]:
     """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
 
-    Loss (RS-4): latents + world_model.done_weight * done + world_model.state_weight * positions (those the model says,
-    and those the tokenizer's frozen probe reads off the predicted latents) + world_model.decoded_weight *
-    decoded_losses. `model` continues from given weights (online rounds).
+    Loss (RS-4): world_model.latent_weight * latents + world_model.done_weight * done + world_model.state_weight *
+    positions (those the model says, and those the tokenizer's frozen probe reads off the predicted latents) +
+    world_model.decoded_weight * decoded_losses. `model` continues from given weights (online rounds).
     """
     data = episodes if isinstance(episodes, LatentEpisodes) else tokenise_episodes(tokenizer, episodes)
     settings = config.world_model
@@ -295,7 +295,7 @@ def rollout_losses(
     losses["state"] = probe_loss(tokenizer, probed, truth)
     losses["position"] = probe_loss(tokenizer, terms.positions.flatten(0, 1), truth)
     state = settings.state_weight * (losses["state"] + losses["position"])
-    losses["loss"] = losses["latent"] + settings.done_weight * losses["done"] + state
+    losses["loss"] = settings.latent_weight * losses["latent"] + settings.done_weight * losses["done"] + state
     return losses
 
 
