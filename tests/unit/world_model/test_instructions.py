@@ -108,25 +108,25 @@ def test_goals_of_the_shipped_model_have_the_bits_of_one_instruction_for_the_who
     task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = shipped_model(task)
-    models, images = load_model_folder(folder), load_starts(folder / "starts.safetensors")[0][:4]
+    models, starts = load_model_folder(folder), tuple(a[:4] for a in load_starts(folder / "starts.safetensors"))
     config = load_config("base", {"task": task, "simulation.max_episode_steps": 6})
     spec = simulation_spec(task, config.simulation, 1)
-    found = imagine_start_goals(models, images, spec, config.reward, [spec.instruction] * 4)
+    found = imagine_start_goals(models, starts, spec, config.reward, [spec.instruction] * 4)
     monkeypatch.setattr(TextModel, "forward", one_row_form)
-    wanted = imagine_start_goals(models, images, spec, config.reward)
+    wanted = imagine_start_goals(models, starts, spec, config.reward)
     assert found is not None and wanted is not None
     assert (found[0].tobytes(), found[1].tobytes()) == (wanted[0].tobytes(), wanted[1].tobytes())
 
 
 def test_the_shipped_model_imagines_each_starts_goal_by_its_own_instruction() -> None:
     folder = shipped_model("push_cube")
-    models, images = load_model_folder(folder), load_starts(folder / "starts.safetensors")[0][:2]
+    models, starts = load_model_folder(folder), tuple(a[:2] for a in load_starts(folder / "starts.safetensors"))
     config = load_config("base", {"task": "push_cube", "simulation.max_episode_steps": 6})
     spec = simulation_spec("push_cube", config.simulation, 1)
     reach, push = (
-        imagine_start_goals(models, images, replace(spec, instruction=text), config.reward) for text in TEXTS
+        imagine_start_goals(models, starts, replace(spec, instruction=text), config.reward) for text in TEXTS
     )
-    mixed = imagine_start_goals(models, images, spec, config.reward, TEXTS)
+    mixed = imagine_start_goals(models, starts, spec, config.reward, TEXTS)
     assert mixed is not None and reach is not None and push is not None
 
     def difference(one: np.ndarray, other: np.ndarray) -> int:
