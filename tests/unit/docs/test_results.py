@@ -463,13 +463,13 @@ def scenes_model_rows() -> Rows:
     for task in made["tasks"]:
         first, *_ = found = [split[task] for split in splits]
         moved, tool = (
-            [" / ".join(f"{one[f'{name}_rollout_cm_h16']:.1f}" for one in found),
+            ["/".join(f"{one[f'{name}_rollout_cm_h16']:.1f}" for one in found),
              *(f"{first[f'{name}_{kind}_cm_h16']:.1f}" for kind in ("floor", "copy"))]
             for name in ("object_moved", "tool")
         )
-        done = (", ".join(f"{one[f'done_{task}_{name}']:.2f}" for name in ("precision", "recall")) for one in found)
+        done = ("/".join(f"{one[f'done_{task}_{name}']:.2f}" for one in found) for name in ("precision", "recall"))
         moved = ["", "", ""] if task == "reach_object" else moved
-        yield row(task, *moved, tool[0], tool[2], " / ".join(done))
+        yield row(task, *moved, tool[0], tool[2], *done)
 
 
 def done_rows() -> Rows:
