@@ -418,7 +418,7 @@ def test_wrong_calls_name_the_value_and_the_remedy() -> None:
         edit_states(child("blur", "mild"), "sunk", "fail", 0)
     with pytest.raises(ValueError, match="severity must be mild or fail, got 'clean'"):
         apply(parent(), "blur", "clean", 0)
-    with pytest.raises(ValueError, match="unknown task 'juggle'; choose one of move_to_aim, pick_place, pull"):
+    with pytest.raises(ValueError, match="unknown task 'juggle'; choose one of all_tasks, move_to_aim, pick_place"):
         push_clip(task="juggle")
     with pytest.raises(ValueError, match="temporal unknown and nothing fails"):
         ClipTruth({name: True for name in COMPONENTS if name != "temporal"}, 4)
