@@ -21,12 +21,14 @@ from wm_nodes.environments.maniskill.objects import MODEL_TASKS
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 from wm_nodes.policy_rl.factories import make_imagined_environment, make_policy, models_of
 from wm_nodes.policy_rl.initial_policy import STARTS, write_starts
+from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.policy_rl.rollouts import collect_rollout
 from wm_nodes.recording import EpisodeBagWriter
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.reward import EndogenousReward
 from wm_nodes.world_model import DeviceEnvironment, load_start_instructions, load_starts
 from wm_nodes.world_model.dynamics import done_signal
+from wm_nodes.world_model.validation.acceptance import accept_world_model
 
 TASK = "all_tasks"
 CONFIG = load_config("cpu", {"task": TASK})
@@ -150,6 +152,17 @@ def test_the_device_program_imagines_the_same(imagined: tuple[Path, Path]) -> No
     np.testing.assert_array_equal(device.frames_NHWC.numpy(), seen.observation.image)
     np.testing.assert_array_equal(device.states_NP.numpy(), seen.observation.state)
     np.testing.assert_array_equal(on_device.signal_N.numpy(), seen.success_probability)
+
+
+def test_the_model_is_accepted_by_its_done_signals_of_all_tasks(imagined: tuple[Path, Path]) -> None:
+    model, starts = imagined
+    heldout = load_arrays([starts.parent / "bag"], CONFIG)
+    report = accept_world_model(models_of(model), heldout, CONFIG)
+    names = [criterion.name for criterion in report.criteria]
+    assert [name for name in names if "done" in name] == [
+        f"done {kind} on rollouts, mean of the tasks" for kind in ("precision", "recall")
+    ]
+    assert not report.passed
 
 
 def test_a_policy_sees_which_task_it_is(imagined: tuple[Path, Path]) -> None:

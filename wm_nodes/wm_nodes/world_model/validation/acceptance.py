@@ -168,7 +168,8 @@ def _at(metrics: Mapping[str, float], name: str, step: int) -> float:
 
 
 def _check(models: WorldModels, heldout: EpisodeArrays, task: str) -> None:
-    models.task_index(task)
+    for part in parts_of(task):
+        models.task_index(part)
     if heldout.tasks != models.tasks:
         raise ValueError(
             f"held-out episodes are labelled for {', '.join(heldout.tasks)}, the world model knows "
