@@ -96,5 +96,9 @@ def scene_of(setting: str, seed: int) -> Scene | None:
     scenes = scenes_of(setting)
     if not scenes:
         return None
-    drawn = hashlib.sha256(f"scene {seed}".encode()).digest()[:8]
-    return scenes[int.from_bytes(drawn, "little") % len(scenes)]
+    return scenes[draw(f"scene {seed}", len(scenes))]
+
+
+def draw(name: str, count: int) -> int:
+    """A number below `count` that follows from the name."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little") % count

@@ -109,7 +109,7 @@ class WorldModelConfig(SettingsSection):
     batch_size: PositiveInt
     learning_rate: PositiveFloat
     condition_map: NonNegativeInt = 0
-    """Hidden width of the MLP by which every token's input depends on the whole action and pose; 0: there is none."""
+    """Hidden width of the MLP by which every token's input depends on the whole action and pose; 0: none (not lfq)."""
     rollout_steps: list[PositiveInt]
     """Curriculum: imagined steps unrolled and back-propagated through, raised in equal stages over the training."""
     part_steps: NonNegativeInt = 0

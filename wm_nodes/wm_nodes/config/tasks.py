@@ -8,13 +8,12 @@ library only: launch files list the tasks too. Shapes: P simulator ground truth,
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from wm_nodes.config.extensions import find_files, load_file
-from wm_nodes.config.scenes import Scene, scenes_of
+from wm_nodes.config.scenes import Scene, draw, scenes_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -156,8 +155,7 @@ def parts_of(name: str) -> tuple[str, ...]:
 def part_of(name: str, seed: int) -> str:
     """The task, of parts_of, that the episode is of which is reset with `seed`."""
     parts = parts_of(name)
-    drawn = hashlib.sha256(f"task {seed % 2**32}".encode()).digest()[:8]
-    return parts[int.from_bytes(drawn, "little") % len(parts)]
+    return parts[draw(f"task {seed % 2**32}", len(parts))]
 
 
 def recorded_task(name: str) -> str:

@@ -91,7 +91,10 @@ def stack_episodes(
     listed = list(episodes)
     if not listed:
         raise ValueError("no episodes to train on; collect some first (data.num_episodes) or check the bag path")
-    shapes = {(e.images.shape[1:], _tool_states(e).shape[1:], e.actions.shape[1:]) for e in listed}
+    known = {task: get_task(task).parts if task in task_names() else () for task in {e.task for e in listed}}
+    parts = [known[e.task] for e in listed]
+    tool_states = [e.states[:, : e.states.shape[1] - len(own)] for e, own in zip(listed, parts, strict=True)]
+    shapes = {(e.images.shape[1:], s.shape[1:], e.actions.shape[1:]) for e, s in zip(listed, tool_states, strict=True)}
     if len(shapes) > 1:
         raise ValueError(f"episodes of different image, state or action sizes cannot be mixed: {sorted(shapes)}")
     steps = num_steps or max(e.num_steps for e in listed)
@@ -103,21 +106,10 @@ def stack_episodes(
     truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
     return EpisodeArrays(
         images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
-        states=np.stack([_tool_states(e)[rows] for e, rows in zip(listed, frame_rows, strict=True)]), actions=actions,
+        states=np.stack([s[rows] for s, rows in zip(tool_states, frame_rows, strict=True)]), actions=actions,
         ground_truth=truth, success=np.stack([np.asarray(labels(task, truth), bool) for task in tasks], -1),
         lengths=lengths, tasks=tuple(tasks), instructions=tuple(e.instruction for e in listed),
-        behaviours=tuple(e.behaviour for e in listed), recorded_tasks=tuple(map(_task_of, listed)),
+        behaviours=tuple(e.behaviour for e in listed), recorded_tasks=tuple(
+            own[int(e.states[0, -len(own) :].argmax())] if own else e.task for e, own in zip(listed, parts, strict=True)
+        ),
     )
-
-
-def _parts(episode: Episode) -> tuple[str, ...]:
-    return get_task(episode.task).parts if episode.task in task_names() else ()
-
-
-def _tool_states(episode: Episode) -> FloatArray:
-    return episode.states[:, : episode.states.shape[1] - len(_parts(episode))]
-
-
-def _task_of(episode: Episode) -> str:
-    parts = _parts(episode)
-    return parts[int(episode.states[0, -len(parts) :].argmax())] if parts else episode.task

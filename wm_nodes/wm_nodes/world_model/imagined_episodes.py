@@ -46,7 +46,8 @@ def load_starts(path: Path, task: str = "") -> tuple[UInt8Array, FloatArray]:
     images, states = (tensors[name].numpy()[rows] for name in ("images", "states"))
     if not task or not (parts := get_task(task).parts) or INSTRUCTIONS not in tensors:
         return images, states
-    own = [_told(path, tensors)[row][0] for row in rows]
+    told = _told(path, tensors)
+    own = [told[row][0] for row in rows]
     if task in own:  # its states say which task it is
         return images, states
     return images, np.concatenate([states, np.array([[part == one for part in parts] for one in own], np.float32)], 1)

@@ -12,7 +12,7 @@ from transforms3d.euler import euler2quat
 
 from wm_nodes.config.scenes import Scene, scene_of
 from wm_nodes.config.schema import SimulationConfig
-from wm_nodes.config.tasks import get_task, part_of, parts_of
+from wm_nodes.config.tasks import get_task, part_of
 from wm_nodes.core.cameras import CameraModel, Matrix
 from wm_nodes.core.seeding import stream_seed
 from wm_nodes.core.specs import simulation_spec
@@ -145,8 +145,8 @@ class ManiSkillEnvironment:
 
     def _start(self, i: int) -> None:
         self._first_truth[i] = self._task.measure(self._scenes[i], None)
-        code = np.array(parts_of(self.spec.task)) == self._parts[i]
-        self._states[i] = [*self._control.state(self._scenes[i]), *code[: self.spec.state_dim - self.spec.tool_dim]]
+        code = [part == self._parts[i] for part in self._task.parts]
+        self._states[i] = [*self._control.state(self._scenes[i]), *code]
         self._observe(i)
 
     def _observe(self, i: int) -> None:

@@ -10,7 +10,6 @@
 3. Import the simulator inside `scene` alone: a world model, a judge or a launch file reads the task without one.
 4. Train a world model for it: `python3 launch_scripts/online_rl.py --from-scratch --task <name>`. Its settings go in
    `settings`; its rubric pack, where it has one, is the setting judge.rubric.
-
 5. One policy for several tasks: a file whose TASK has `parts`, as all_tasks.py. A reset's seed chooses the task, the
    state says which it is, and `python3 launch_scripts/online_rl.py --task all_tasks` reports the success of each.
 
