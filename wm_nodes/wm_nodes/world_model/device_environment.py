@@ -18,7 +18,7 @@ from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import moves_pose, next_state_tensor
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
-from wm_nodes.world_model.dynamics import done_signal
+from wm_nodes.world_model.dynamics import task_done_signal
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.imagined_environment import (
     ImaginedEnvironment,
@@ -137,8 +137,7 @@ class DeviceEnvironment:
         self.frames_NHWC.copy_(torch.where(valid[:, None, None, None], frames, self.frames_NHWC))
         self.states_NP.copy_(torch.where(valid[:, None], moved, self.states_NP))
         self._steps_N.add_(valid)
-        tasks_N1 = self._start_tasks[self.starts_N].unsqueeze(1)
-        signal, spread = (values.gather(1, tasks_N1)[:, 0] for values in done_signal(logits))
+        signal, spread = task_done_signal(logits, self._start_tasks[self.starts_N])
         terminated = valid & (signal > self._reward.success_threshold)
         over = self._steps_N >= self.spec.max_episode_steps
         if self._reward.uncertainty_limit > 0:

@@ -157,3 +157,9 @@ def done_signal(done_logits_BKJ: Tensor) -> tuple[Tensor, Tensor]:
     """RS-1d: pessimistic done probability (B, J), the minimum over heads, and the heads' standard deviation (B, J)."""
     probabilities = done_logits_BKJ.sigmoid()
     return probabilities.amin(-2), probabilities.std(-2, correction=0)
+
+
+def task_done_signal(done_logits_BKJ: Tensor, tasks_B: Tensor) -> tuple[Tensor, Tensor]:
+    """done_signal of each row's own task: probability and standard deviation, (B,). tasks_B: WorldModels.task_index."""
+    probability, spread = (values.gather(1, tasks_B.unsqueeze(1))[:, 0] for values in done_signal(done_logits_BKJ))
+    return probability, spread

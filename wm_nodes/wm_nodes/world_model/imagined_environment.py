@@ -12,7 +12,7 @@ from torch import Tensor
 from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
-from wm_nodes.world_model.dynamics import ActionModel, done_signal
+from wm_nodes.world_model.dynamics import ActionModel, task_done_signal
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.imagined_episodes import ImaginedEpisodes, imagined_spec, task_indices
 from wm_nodes.world_model.parts import in_parallel, parts_of
@@ -131,7 +131,5 @@ class ImaginedEnvironment(ImaginedEpisodes):
         if not torch.isfinite(latents).all():
             raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
         self._latents = latents
-        signal, spread = done_signal(logits)
-        tasks = self._tensor(self._start_tasks[self._starts]).unsqueeze(1)
-        told = torch.stack((signal.gather(1, tasks)[:, 0], spread.gather(1, tasks)[:, 0])).cpu()
+        told = torch.stack(task_done_signal(logits, self._tensor(self._start_tasks[self._starts]))).cpu()
         return frames.cpu().numpy(), told[0].numpy(), told[1].numpy()

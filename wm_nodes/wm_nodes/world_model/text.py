@@ -13,7 +13,7 @@ from wm_nodes.config.schema import WorldModelConfig
 from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.types import BoolArray, UInt8Array
 from wm_nodes.world_model.conditions import text_rows, word_mask
-from wm_nodes.world_model.dynamics import FrameModel, Prediction, done_signal
+from wm_nodes.world_model.dynamics import FrameModel, Prediction, task_done_signal
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.sentence_encoder import SentenceCondition, SentenceEncoder
 from wm_nodes.world_model.tokenizer import Tokenizer
@@ -123,13 +123,13 @@ def imagine_goals(
     current = tokenizer.encode(images).unsqueeze(1)
     caches = model.trunk.new_ring_caches(len(images), current.device)
     frames, signals = [np.asarray(images)], list[Tensor]()
-    index = torch.tensor(tasks, device=current.device).unsqueeze(1)
+    tasks_B = torch.tensor(tasks, device=current.device)
     for _ in range(horizon):
         with compute_context(current.device):
             prediction = model(current, instructions, caches)
         current = tokenizer.normalise(current + prediction.change_BTSD)
         frames.append(tokenizer.decode(current[:, 0]).cpu().numpy())
-        signals.append(done_signal(prediction.done_logits_BTKJ[:, 0])[0].gather(1, index)[:, 0])
+        signals.append(task_done_signal(prediction.done_logits_BTKJ[:, 0], tasks_B)[0])
     signal_BT = torch.stack(signals, 1).cpu().numpy()
     crossed = signal_BT > threshold
     found = crossed.any(1)
