@@ -25,6 +25,17 @@ def make_policy(seed: int = 0) -> ImagePolicy:
     return ImagePolicy(encoder(), 3, 3, small, seed=seed)
 
 
+def test_positions_reach_the_hidden_layers_unprojected() -> None:
+    read = ImageEncoder(encoder().function, SIDE_PX * SIDE_PX * 3, "abc", num_positions=2)
+    policy = ImagePolicy(read, 3, 3, load_config("base").policy, seed=0)
+    features = torch.rand(2, SIDE_PX * SIDE_PX * 3)
+    features[1, :-2] = features[0, :-2]
+    assert policy.actor.projection.in_features == features.shape[1] - 2
+    assert policy.actor.hidden[0].in_features == policy.actor.projection.out_features + 2 + 3
+    means = policy.distribution(features, torch.zeros(2, 3)).mean_BA
+    assert (means[0] != means[1]).all()
+
+
 def test_logprob_entropy_and_kl_match_numbers_worked_by_hand() -> None:
     unit = DiagonalGaussian(torch.zeros(1, 2), torch.zeros(2))
     log_sqrt_2pi = 0.5 * math.log(2 * math.pi)

@@ -32,8 +32,9 @@ from wm_nodes.world_model.training.dynamics import (
     train_action_model,
 )
 from wm_nodes.world_model.training.position_probe import train_position_probe
+from wm_nodes.world_model.training.state_probe import train_state_probe
 from wm_nodes.world_model.training.text import train_text_model
-from wm_nodes.world_model.training.tokenizer import foreground_weight, train_tokenizer
+from wm_nodes.world_model.training.tokenizer import episode_targets, foreground_weight, train_tokenizer
 from wm_nodes.world_model.validation.open_loop import auc, detection_metrics, evaluate_rollouts
 
 TASKS = ("push_cube", "reach")
@@ -275,6 +276,24 @@ def test_every_model_of_one_seed_has_equal_weights_whatever_the_global_generator
     with initial_weights(0, "some_init"):
         torch.rand(3)
     assert torch.equal(torch.get_rng_state(), disturbed)
+
+
+def test_a_probe_that_trains_on_alone_reads_positions_better_off_unchanged_latents() -> None:
+    config = config_of(tokenizer__probe_iterations=150, tokenizer__num_iterations=60)
+    training, heldout = arrays(40), arrays(8, 10_000)
+    tokenizer, _ = train_tokenizer(training, config, 0, None)
+
+    def error_cm() -> float:
+        with torch.inference_mode():
+            read = tokenizer.read_state(tokenizer.encode(heldout.images[:, 0])).numpy()
+        return 100 * float(np.linalg.norm((read - episode_targets(heldout)[:, 0])[:, :2], axis=-1).mean())
+
+    before, weights = error_cm(), {name: t.clone() for name, t in tokenizer.state_dict().items()}
+    train_state_probe(tokenizer, tokenise_episodes(tokenizer, training), config.tokenizer, 0, None)
+    changed = {name for name, t in tokenizer.state_dict().items() if not torch.equal(t, weights[name])}
+    assert changed and all(name.startswith("probe.") for name in changed)
+    assert error_cm() < 0.7 * before
+    assert not any(p.requires_grad for p in tokenizer.probe.parameters())
 
 
 @pytest.mark.slow

@@ -94,6 +94,12 @@ class TokenizerConfig(SettingsSection):
     """lfq only."""
     foreground_weight: NonNegativeFloat
     """Extra weight of foreground pixels."""
+    probe_weight: NonNegativeFloat = 0.1
+    """Weight of the loss of the positions that a probe reads off the latents."""
+    probe_depth: PositiveInt = 1
+    """Hidden layers of the probe."""
+    probe_iterations: NonNegativeInt = 0
+    """Iterations for which the probe trains on alone, once the tokenizer is trained."""
     foreground: Literal["background", "surroundings"] = "background"
     """Foreground are pixels that differ from the median frame, or, where tables and scenes change, from the mean of the
     pixels around them."""
@@ -241,6 +247,8 @@ class PolicyConfig(SettingsSection):
     """Width to which the encoder features are projected first; keeps the weights below the 1 MiB that travel inline."""
     init_log_std: float
     """Initial log standard deviation of the Gaussian, normalised action units."""
+    positions: bool
+    """Whether the policy also sees the positions that the tokenizer's probe reads off the latents, unprojected."""
 
 
 class SftConfig(SettingsSection):

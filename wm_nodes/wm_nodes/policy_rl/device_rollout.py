@@ -138,7 +138,7 @@ class DeviceCollector:
             for name, column in columns.items():
                 column[step].copy_(self._row[name])
         columns["images"][-1].copy_(env.frames_NHWC)
-        columns["features"][-1].copy_(env.encode().flatten(1))
+        columns["features"][-1].copy_(self._features())
         columns["states"][-1].copy_(env.states_NP)
         rewards, rewarded = self._rewards(columns)
         if not bool(env.finite):
@@ -165,7 +165,7 @@ class DeviceCollector:
         """One lock-step; its results are in the row. An environment that ended is reset after one idle lock-step."""
         env, policy = self.env, self.policy
         env.reset(self._begins_N, self._starts_N)
-        features = env.encode().flatten(1)
+        features = self._features()
         distribution = policy.distribution(features, env.states_NP)
         actions = distribution.executed(self._noise_NA)
         self._put(
@@ -179,6 +179,9 @@ class DeviceCollector:
         )
         self._begins_N.copy_(self._just_ended_N)
         self._just_ended_N.copy_(result.terminated_N | result.truncated_N)
+
+    def _features(self) -> Tensor:
+        return self.env.encode(positions=self.policy.encoder.num_positions > 0)
 
     def _put(self, **values: Tensor) -> None:
         for name, value in values.items():
@@ -201,6 +204,7 @@ class DeviceCollector:
 
     def _dense(self, features: Tensor, goals_TNF: Tensor) -> Tensor:
         scale = _distance_of(self._reward).scale
+        features = features[..., : goals_TNF.shape[-1]]  # without positions
         after, before = (1 - (f - goals_TNF).abs().mean(-1) / scale for f in (features[1:], features[:-1]))
         if self._reward.config.mode == "abs":
             return after

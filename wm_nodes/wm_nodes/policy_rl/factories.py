@@ -32,6 +32,8 @@ from wm_nodes.world_model import (
     load_start_instructions,
     load_starts,
 )
+from wm_nodes.world_model.precision import compute_context
+from wm_nodes.world_model.tokenizer import PROBE_NAMES
 
 _Imagined = TypeVar("_Imagined", ImaginedEnvironment, DeviceEnvironment)
 
@@ -42,20 +44,25 @@ def models_of(model_dir: Path, device: str = CPU) -> WorldModels:
     return load_model_folder(model_dir, compute_device(device))
 
 
-def make_encoder(model_dir: Path, device: str = CPU) -> ImageEncoder:
-    """Return the tokenizer as the policy's frozen image encoder: latents flattened to (B, S D)."""
+def make_encoder(model_dir: Path, device: str = CPU, *, positions: bool = False) -> ImageEncoder:
+    """Return the tokenizer as the policy's frozen image encoder, see Tokenizer.flatten."""
     models = models_of(Path(model_dir), device)
-    tokenizer = models.tokenizer
+    tokenizer, count = models.tokenizer, len(PROBE_NAMES) if positions else 0
 
     def encode(images: Tensor) -> Tensor:
-        return tokenizer.encode(images).flatten(1).clone()
+        latents = tokenizer.encode(images)
+        with compute_context(tokenizer.device):
+            return tokenizer.flatten(latents, positions=positions).clone()
 
-    return ImageEncoder(encode, tokenizer.num_tokens * tokenizer.latent_dim, models.tokenizer_sha256)
+    return ImageEncoder(
+        encode, tokenizer.num_tokens * tokenizer.latent_dim + count, models.tokenizer_sha256, num_positions=count
+    )
 
 
 def make_policy(config: RunConfig, model_dir: Path) -> ImagePolicy:
     """Return a policy with fresh weights."""
-    encoder, spec = make_encoder(model_dir, config.device), simulation_spec(config.task, config.simulation, 1)
+    encoder = make_encoder(model_dir, config.device, positions=config.policy.positions)
+    spec = simulation_spec(config.task, config.simulation, 1)
     policy = ImagePolicy(encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed)
     return policy.to(compute_device(config.device))
 

@@ -33,11 +33,13 @@ class ImageEncoder:
     """A frozen image encoder.
 
     function: uint8 (B, H, W, 3) -> float (B, F). sha256: of the weights behind it; "" when it has none.
+    num_positions: the last features that are positions, which a policy does not project.
     """
 
     function: Callable[[Tensor], Tensor]
     feature_dim: int
     sha256: str = ""
+    num_positions: int = 0
 
     def __call__(self, images_BHWC: Tensor) -> Tensor:
         with torch.no_grad():
@@ -85,8 +87,8 @@ class ImagePolicy(nn.Module):
         scale = [{"m": TOOL_SCALE_M, "rad": TURN_SCALE_RAD, "1": 1.0}[unit] for unit in units]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stream_seed(seed, "policy_init"))
-            self.actor = _Network(encoder.feature_dim, state_dim, action_dim, config, output_gain=0.01)
-            self.critic = _Network(encoder.feature_dim, state_dim, 1, config, output_gain=1.0)
+            self.actor = _Network(encoder, state_dim, action_dim, config, output_gain=0.01)
+            self.critic = _Network(encoder, state_dim, 1, config, output_gain=1.0)
         self.log_std_A = nn.Parameter(torch.full((action_dim,), config.init_log_std))
         self.register_buffer("feature_shift_F", torch.zeros(encoder.feature_dim))
         self.register_buffer("feature_scale_F", torch.ones(encoder.feature_dim))
@@ -179,21 +181,23 @@ class ImagePolicy(nn.Module):
 
 
 class _Network(nn.Module):
-    """Features -> LayerNorm -> projection; with the state -> MLP of `depth` hidden layers -> output."""
+    """Features -> LayerNorm -> projection; with positions and state -> MLP of `depth` hidden layers -> output."""
 
     def __init__(
-        self, feature_dim: int, state_dim: int, output_dim: int, config: PolicyConfig, *, output_gain: float
+        self, encoder: ImageEncoder, state_dim: int, output_dim: int, config: PolicyConfig, *, output_gain: float
     ) -> None:
         super().__init__()
-        self.norm = nn.LayerNorm(feature_dim)
-        self.projection = _linear(feature_dim, config.projection)
-        sizes = [config.projection + state_dim, *[config.width] * config.depth]
+        self.projected_dim = encoder.feature_dim - encoder.num_positions
+        self.norm = nn.LayerNorm(self.projected_dim)
+        self.projection = _linear(self.projected_dim, config.projection)
+        sizes = [config.projection + encoder.num_positions + state_dim, *[config.width] * config.depth]
         self.hidden = nn.ModuleList([_linear(i, o) for i, o in pairwise(sizes)])
         self.output = _linear(config.width, output_dim, gain=output_gain)
 
     def forward(self, features_BF: Tensor, states_BS: Tensor) -> Tensor:
-        projected = nn.functional.silu(self.projection(self.norm(features_BF)))
-        hidden = torch.cat([projected, states_BS], dim=-1)
+        latents, positions = features_BF[..., : self.projected_dim], features_BF[..., self.projected_dim :]
+        projected = nn.functional.silu(self.projection(self.norm(latents)))
+        hidden = torch.cat([projected, positions, states_BS], dim=-1)
         for layer in self.hidden:
             hidden = nn.functional.silu(layer(hidden))
         return cast(Tensor, self.output(hidden))

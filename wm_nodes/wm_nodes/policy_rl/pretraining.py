@@ -38,6 +38,7 @@ from wm_nodes.world_model.sentence_encoder import SentenceEncoder
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.position_probe import train_position_probe
+from wm_nodes.world_model.training.state_probe import train_state_probe
 from wm_nodes.world_model.training.text import demonstrators, train_text_model
 from wm_nodes.world_model.training.token_dynamics import train_token_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
@@ -77,6 +78,8 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         episodes = EpisodeArrays.concatenate([episodes, load_arrays(policy_bags, config)])
     probe, probe_metrics = train_position_probe(episodes, config, config.seed, run_dir)
     data = tokenise_episodes(tokenizer, episodes)
+    if config.tokenizer.probe_iterations:
+        tokenizer_metrics["probe"] = train_state_probe(tokenizer, data, config.tokenizer, config.seed, run_dir)["loss"]
     action: ActionModel | TokenActionModel
     text, text_metrics = None, dict[str, float]()
     with explain_memory(device, world_model__batch_size=config.world_model.batch_size):

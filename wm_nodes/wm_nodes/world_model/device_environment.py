@@ -112,12 +112,13 @@ class DeviceEnvironment:
         self._steps_N.masked_fill_(begins_N, 0)
         self._ended_N.masked_fill_(begins_N, False)
 
-    def encode(self) -> Tensor:
-        """Latents (N, S, D) float32 of the frames shown: what Tokenizer.encode gives, the policy's features."""
+    def encode(self, *, positions: bool = False) -> Tensor:
+        """Features (N, F) float32 of the frames shown for a policy: Tokenizer.flatten of Tokenizer.encode."""
         with self._autocast():
-            return self._tokenizer.bottleneck(
+            latents = self._tokenizer.bottleneck(
                 self._tokenizer.features(self.frames_NHWC.permute(0, 3, 1, 2).float() / 255)
             )
+            return self._tokenizer.flatten(latents, positions=positions)
 
     def step(self, actions_NA: Tensor) -> DeviceStep:
         """Take one step with actions in [-1, 1] wherever the episode has not ended."""

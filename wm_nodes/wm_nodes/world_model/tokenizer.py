@@ -74,9 +74,10 @@ class Tokenizer(nn.Module):
         for previous, current in pairwise(channels[::-1]):
             up += [nn.Conv2d(previous, 4 * current, 1), nn.PixelShuffle(2), nn.SiLU(), ResidualConv(current)]
         self.decoder = nn.Sequential(*up, nn.Conv2d(channels[0], 48, 3, padding=1), nn.PixelShuffle(4))
-        self.probe = nn.Sequential(
-            nn.Linear(self.num_tokens * config.latent_dim, 256), nn.SiLU(), nn.Linear(256, len(PROBE_NAMES))
-        )
+        probe: list[nn.Module] = [nn.Linear(self.num_tokens * config.latent_dim, 256), nn.SiLU()]
+        for _ in range(config.probe_depth - 1):
+            probe += [nn.Linear(256, 256), nn.SiLU()]
+        self.probe = nn.Sequential(*probe, nn.Linear(256, len(PROBE_NAMES)))
         self.background: Tensor
         self.probe_mean: Tensor
         self.probe_std: Tensor
@@ -120,6 +121,11 @@ class Tokenizer(nn.Module):
     def read_state_normalised(self, latents_BSD: Tensor) -> Tensor:
         values: Tensor = self.probe(latents_BSD.flatten(1))
         return values.float()
+
+    def flatten(self, latents_BSD: Tensor, *, positions: bool) -> Tensor:
+        """A policy's features (B, S D) of latents; with `positions`, the normalised ones (B, P) follow."""
+        flat = latents_BSD.flatten(1)
+        return torch.cat([flat, self.read_state_normalised(latents_BSD)], 1) if positions else flat
 
     def to_pixels(self, images: UInt8Array | Tensor) -> Tensor:
         """Float (B, 3, H, W) in [0, 1] of uint8 images (B, H, W, 3).

@@ -27,7 +27,6 @@ FOREGROUND_CONTRAST = 0.25
 """A pixel counts as fully foreground when a channel differs from the background by this much, of [0, 1]."""
 SURROUNDINGS_PX = 15
 """About three times an object's width."""
-PROBE_WEIGHT = 0.1
 
 
 def train_tokenizer(
@@ -70,7 +69,7 @@ def train_tokenizer(
         weight = foreground_weight(pixels, codec.background, settings)
         terms = {"pixel": (weight * (error.abs() + 2 * error.square())).mean() / weight.mean()}
         terms["probe"] = probe_loss(codec, probed, positions)
-        terms["loss"] = terms["pixel"] + PROBE_WEIGHT * terms["probe"]
+        terms["loss"] = terms["pixel"] + settings.probe_weight * terms["probe"]
         if codec.kind == "lfq":
             terms["entropy"] = entropy_loss(features)
             terms["commitment"] = (features - latents.detach()).square().mean()

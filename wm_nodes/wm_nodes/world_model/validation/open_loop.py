@@ -91,9 +91,10 @@ def evaluate_rollouts(
 ) -> dict[str, float]:
     """Metrics by name (see docs/metrics.md); positions in cm, PSNR in dB, `_hNN` at step NN.
 
-    object_/tool_: mean error of `rollout`, of the probe on real frames (`floor`), of the first frame (`copy`), and
-    rollout / copy (`ratio`). object_moved_: over the episodes whose object moved. done_<task>_: episodes counted as
-    successful when the signal exceeds `threshold` anywhere, against success anywhere in the recording.
+    object_/tool_: mean error of `rollout`, of the probe on real frames (`floor`), of the tokenizer's probe on their
+    `latents`, of the first frame (`copy`), and rollout / copy (`ratio`). object_moved_: over the episodes whose object
+    moved. done_<task>_: episodes counted as successful when the signal exceeds `threshold` anywhere, against success
+    anywhere in the recording.
     """
     imagined = imagine_episodes(tokenizer, model, episodes)
     truth = episode_targets(episodes)
@@ -107,7 +108,10 @@ def evaluate_rollouts(
             continue
         label = f"h{horizon:02d}"
         metrics |= _picture_metrics(tokenizer, imagined, episodes, rows, horizon, label)
-        estimates = {"rollout": predicted[:, horizon - 1], "floor": real[:, horizon], "copy": real[:, 0]}
+        estimates = {
+            "rollout": predicted[:, horizon - 1], "floor": real[:, horizon], "copy": real[:, 0],
+            "latents": _read_frames(tokenizer, episodes.images[:, [horizon]])[:, 0],
+        }
         for name, columns, chosen in (
             ("object", OBJECT, rows), ("object_moved", OBJECT, rows & moved), ("tool", TOOL, rows),
         ):
