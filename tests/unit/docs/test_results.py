@@ -173,6 +173,16 @@ def learning_rows() -> Rows:
         yield row(f"{short(name)} - {base}", *(difference(one, *measure) for measure in measures[:2]))
 
 
+def long_learning_rows() -> Rows:
+    found = read("video_rl_learning_long.json")["rows"]
+    for name in dict.fromkeys(sampler_of(one) for one in found):
+        courses = [one["evaluations"] for one in found if sampler_of(one) == name]
+        yield row(short(name), *(
+            f"{mean(one['obeyed'] for course in courses for one in course if one['iteration'] == buffer):.3f}"
+            for buffer in (0, 40, 80, 120, 160)
+        ))
+
+
 def short(sampler: str) -> str:
     return sampler.replace("DynDiff 0.6 gated, rms, cps", "DynDiff")
 
@@ -511,7 +521,7 @@ def judge_rows() -> Rows:
 TABLES: dict[str, list[Callable[[], Rows]]] = {
     "policy_rl": [study_rows, refresh_rows, scenes_rows],
     "video_rl": [
-        diversity_rows, clip_rows, learning_rows, clip_learning_rows, cost_rows, ablation_rows,
+        diversity_rows, clip_rows, learning_rows, long_learning_rows, clip_learning_rows, cost_rows, ablation_rows,
         resolution_rows, hacking_rows,
     ],
     "video_tasks": [
