@@ -19,7 +19,7 @@ from wm_nodes.environments.maniskill import backend
 from wm_nodes.environments.maniskill.backend import NoRendererError, render_backend
 from wm_nodes.environments.maniskill.behaviours import sample_style
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.episodes import planned_episode, scripted_episode
+from wm_nodes.environments.maniskill.episodes import EXTREME, HOLD_STEPS, planned_episode, scripted_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.environments.record import collect_plan, demonstration_plan
@@ -185,6 +185,14 @@ def test_a_near_miss_fails_and_is_cut_by_the_step_limit(env: ManiSkillEnvironmen
     episode = scripted_episode(env, "over", seed=3, episode_id=2)
     assert not episode.success.any() and episode.truncated and not episode.terminated
     assert episode.num_steps == CONFIG.simulation.max_episode_steps
+
+
+def test_extreme_actions_are_full_scale_each_held_for_some_steps_and_repeat(env: ManiSkillEnvironment) -> None:
+    episode, again = (scripted_episode(env, EXTREME, seed=3, episode_id=number) for number in (2, 3))
+    actions = episode.actions.reshape(-1, HOLD_STEPS, 3)
+    assert (np.abs(actions) == 1).all() and (actions == actions[:, :1]).all()
+    assert len({tuple(held[0]) for held in actions}) > 1
+    np.testing.assert_array_equal(again.actions, episode.actions)
 
 
 def test_every_task_has_an_instruction_of_known_words() -> None:

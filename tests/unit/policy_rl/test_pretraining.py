@@ -43,8 +43,10 @@ def test_a_model_from_scratch_is_collected_in_parallel_and_resumed_where_it_stop
     assert len(load_starts(folder / "starts.safetensors")[0]) == 4
     story = json.loads((folder / "manifest.json").read_text())
     assert (story["data"]["episodes"], story["data"]["policy_episodes"]) == (6, 2)
-    assert set(story["training"]) == {"tokenizer", "action", "text", "probe"} and all(story["training"].values())
-    assert story["heldout"]["episodes"] == 2 and story["made"]["command"] == "a test"
+    trained = {"tokenizer", "decoder", "action", "text", "probe"}
+    assert set(story["training"]) == trained and all(story["training"].values())
+    assert (folder / "decoder.safetensors").is_file() and "psnr_shuffled_drop_db_h04" in story["heldout"]
+    assert {story[name]["episodes"] for name in ("heldout", "heldout_extreme")} == {2} and story["made"]["command"] == "a test"
     shards = sorted((tmp_path / "data" / "train").glob("shard_*"))
     assert (tmp_path / "data" / "train" / "index.csv").is_file()
     assert [shard.name for shard in shards] == ["shard_00000000", "shard_00000002"]

@@ -15,7 +15,9 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.training.loop import EMA_DECAY, TrainingLoop
+from wm_nodes.world_model import load_model_folder, save_model_folder, save_refreshed_folder
 from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.training.decoder import predict_all, train_decoder
 from wm_nodes.world_model.training.dynamics import (
     LatentEpisodes,
     RolloutTerms,
@@ -294,6 +296,42 @@ def test_a_probe_that_trains_on_alone_reads_positions_better_off_unchanged_laten
     assert changed and all(name.startswith("probe.") for name in changed)
     assert error_cm() < 0.7 * before
     assert not any(p.requires_grad for p in tokenizer.probe.parameters())
+
+
+def test_a_decoder_for_rollouts_shows_them_closer_to_the_recording_and_leaves_the_tokenizer_alone(
+    tmp_path: Path,
+) -> None:
+    config = config_of(
+        tokenizer__decoder_iterations=60, tokenizer__adversarial_weight=0.05, tokenizer__num_iterations=60,
+        world_model__num_iterations=20,
+    )
+    training = arrays(40)
+    tokenizer, _ = train_tokenizer(training, config, 0, None)
+    data = tokenise_episodes(tokenizer, training)
+    model, _ = train_action_model(tokenizer, data, config, 0, None)
+    imagined, wanted = predict_all(tokenizer, model, data).float(), data.images[:, 1:]
+    assert imagined.shape == data.latents[:, 1:].shape
+
+    def error(shown_by: Tokenizer) -> float:
+        with torch.inference_mode():
+            shown = shown_by.decode(imagined[data.step_mask])
+        return float((shown.float() - wanted[data.step_mask].float()).abs().mean())
+
+    weights = {name: t.clone() for name, t in tokenizer.state_dict().items()}
+    shown_by, metrics = train_decoder(tokenizer, model, data, config, 0, None)
+    assert {"pixel", "recoded", "adversarial", "discriminator"} <= metrics.keys()
+    assert all(torch.equal(t, weights[name]) for name, t in tokenizer.state_dict().items())
+    changed = {name for name, t in shown_by.state_dict().items() if not torch.equal(t, weights[name])}
+    assert changed and all(name.startswith("decoder.") for name in changed)
+    assert error(shown_by) < 0.9 * error(tokenizer)
+
+    decoder = shown_by.decoder
+    folder = save_model_folder(tmp_path, tokenizer, model, None, config, tasks=TASKS, story={}, decoder=decoder)
+    refreshed = save_refreshed_folder(tmp_path / "refreshed", folder, model, {})
+    for where, rollouts, meant in ((folder, True, shown_by), (refreshed, True, shown_by), (folder, False, tokenizer)):
+        loaded = load_model_folder(where, rollout_decoder=rollouts).tokenizer
+        for name, weight in loaded.state_dict().items():
+            assert_close(weight, meant.state_dict()[name], atol=1e-3, rtol=1e-3)
 
 
 @pytest.mark.slow

@@ -100,6 +100,11 @@ class TokenizerConfig(SettingsSection):
     """Hidden layers of the probe."""
     probe_iterations: NonNegativeInt = 0
     """Iterations for which the probe trains on alone, once the tokenizer is trained."""
+    decoder_iterations: NonNegativeInt = 0
+    """Iterations for which a copy of the decoder trains on, for rollouts of the trained action model; 0: rollouts are
+    shown by the tokenizer's own (not lfq)."""
+    adversarial_weight: NonNegativeFloat = 0.0
+    """Weight, in these iterations, of the loss against a discriminator of image patches."""
     foreground: Literal["background", "surroundings"] = "background"
     """Foreground are pixels that differ from the median frame, or, where tables and scenes change, from the mean of the
     pixels around them."""

@@ -51,10 +51,14 @@ def model_configs(config: RunConfig) -> list[RunConfig]:
     ]
 
 
-def collect_scripted(config: RunConfig, num_episodes: int, first_seed: int, folder: Path) -> dict[str, list[Path]]:
+def collect_scripted(
+    config: RunConfig, num_episodes: int, first_seed: int, folder: Path, *, behaviour: str = ""
+) -> dict[str, list[Path]]:
     """Collect the plan scripted_plan of each of model_configs into bags below `folder`, one folder for each task where
-    there are several; returns the bags by task."""
+    there are several; returns the bags by task. behaviour: the only one, instead of the configured shares."""
     configs = model_configs(config)
+    if behaviour:
+        configs = [one.with_values(data=one.data.with_values(behaviours={behaviour: 1.0})) for one in configs]
     folders = [folder / one.task if len(configs) > 1 else folder for one in configs]
     return {
         one.task: collect_plan(scripted_plan(one, num_episodes, first_seed), one, where)

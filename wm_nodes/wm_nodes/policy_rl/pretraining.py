@@ -20,6 +20,7 @@ from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import initial_weights
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.environments.maniskill.collection import POLICY_LABEL, CollectionPlan
+from wm_nodes.environments.maniskill.episodes import EXTREME
 from wm_nodes.environments.record import (
     HELDOUT_SEEDS,
     TRAINING_SEEDS,
@@ -36,6 +37,7 @@ from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model
 from wm_nodes.world_model.folder import action_model_class
 from wm_nodes.world_model.sentence_encoder import SentenceEncoder
 from wm_nodes.world_model.token_dynamics import TokenActionModel
+from wm_nodes.world_model.training.decoder import train_decoder
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.state_probe import train_state_probe
@@ -43,6 +45,7 @@ from wm_nodes.world_model.training.text import demonstrators, train_text_model
 from wm_nodes.world_model.training.token_dynamics import train_token_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.acceptance import model_metrics
+from wm_nodes.world_model.validation.controllability import controllability_metrics
 
 POLICY_SEEDS = 300_000
 
@@ -81,12 +84,14 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     if config.tokenizer.probe_iterations:
         tokenizer_metrics["probe"] = train_state_probe(tokenizer, data, config.tokenizer, config.seed, run_dir)["loss"]
     action: ActionModel | TokenActionModel
-    text, text_metrics = None, dict[str, float]()
+    text, text_metrics, shown_by, decoder_metrics = None, dict[str, float](), tokenizer, dict[str, float]()
     with explain_memory(device, world_model__batch_size=config.world_model.batch_size):
         if config.tokenizer.kind == "lfq":
             action, action_metrics = train_token_model(tokenizer, data, config, config.seed, run_dir)
         else:
             action, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir)
+            if config.tokenizer.decoder_iterations:
+                shown_by, decoder_metrics = train_decoder(tokenizer, action, data, config, config.seed, run_dir)
             golden = episodes.select(np.flatnonzero(np.isin(episodes.behaviours, demonstrators())))
             texts = tuple(get_task(task).instruction for task in model_tasks(config.task))
             text, text_metrics = train_text_model(
@@ -104,29 +109,43 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
             "heldout_seeds": [HELDOUT_SEEDS, HELDOUT_SEEDS + config.data.num_heldout - 1],
         },
         "training": {
-            "tokenizer": tokenizer_metrics, "action": action_metrics, "text": text_metrics, "probe": probe_metrics,
+            "tokenizer": tokenizer_metrics, "decoder": decoder_metrics, "action": action_metrics, "text": text_metrics,
+            "probe": probe_metrics,
         },
     }
     tasks = model_tasks(config.task)
-    models = WorldModels(tokenizer, action, text, tasks, config.simulation, {}, probe)
-    for name, scenes in _heldout_configs(config).items():
-        held = collect_scripted(scenes, config.data.num_heldout, HELDOUT_SEEDS, run_dir / "data" / name)
-        found = {task: plain(model_metrics(models, load_arrays(its, config), config)) for task, its in held.items()}
+    models = WorldModels(shown_by, action, text, tasks, config.simulation, {}, probe)
+    for name, (scenes, behaviour) in _heldout_sets(config).items():
+        where = run_dir / "data" / name
+        held = collect_scripted(scenes, config.data.num_heldout, HELDOUT_SEEDS, where, behaviour=behaviour)
+        found = {task: heldout_metrics(models, load_arrays(its, config), config, task) for task, its in held.items()}
         story[name] = found if len(found) > 1 else next(iter(found.values()))
     write_starts(
         chain(*bags.values()), folder / STARTS, MODEL_STARTS if len(bags) == 1 else MODEL_STARTS // 2, tasks=tasks,
         frames=config.data.start_frames, seed=config.seed,
     )
-    save_model_folder(folder, tokenizer, action, text, config, tasks=tasks, story=story, probe=probe)
+    decoder = shown_by.decoder if config.tokenizer.decoder_iterations else None
+    save_model_folder(folder, tokenizer, action, text, config, tasks=tasks, story=story, probe=probe, decoder=decoder)
     load_model_folder(folder)
     return folder
 
 
-def _heldout_configs(config: RunConfig) -> dict[str, RunConfig]:
-    """The configurations of held-out episodes by folder: of the scenes trained on, and of the other splits."""
+def heldout_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig, task: str) -> dict[str, Any]:
+    """Metrics of rollouts of the recorded actions, and of others, of held-out episodes of a task, for the manifest."""
+    spec = simulation_spec(task, config.simulation, 1)
+    metrics: dict[str, Any] = plain(
+        model_metrics(models, episodes, config) | controllability_metrics(models, episodes, spec)
+    )
+    return metrics
+
+
+def _heldout_sets(config: RunConfig) -> dict[str, tuple[RunConfig, str]]:
+    """Configuration and only behaviour, "" for the configured ones, of held-out episodes by folder: of the scenes
+    trained on, of the same under extreme actions, and of the other splits."""
     others = set(splits()) - {config.simulation.scenes} if config.simulation.scenes in splits() else set[str]()
-    return {"heldout": config} | {
-        f"heldout_{name}": config.with_values(simulation=config.simulation.with_values(scenes=name))
+    sets = {"heldout": (config, ""), f"heldout_{EXTREME}": (config, EXTREME)}
+    return sets | {
+        f"heldout_{name}": (config.with_values(simulation=config.simulation.with_values(scenes=name)), "")
         for name in sorted(others)
     }
 

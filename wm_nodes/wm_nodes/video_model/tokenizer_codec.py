@@ -81,8 +81,9 @@ class TokenizerCodec(nn.Module):
 
 
 def codec_of_world_model(folder: Path) -> TokenizerCodec:
-    """Return the tokenizer of a world-model folder as a codec, on the CPU. Raises ModelFolderError."""
-    models = load_model_folder(folder)
+    """Return the tokenizer of a world-model folder as a codec, with the decoder that it was trained with, on the CPU.
+    Raises ModelFolderError."""
+    models = load_model_folder(folder, rollout_decoder=False)
     config = TokenizerConfig.model_validate(models.manifest["tokenizer"])
     codec = TokenizerCodec(config, models.tokenizer.height, models.tokenizer.width)
     codec.tokenizer.load_state_dict(models.tokenizer.state_dict())

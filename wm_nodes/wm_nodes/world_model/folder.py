@@ -29,6 +29,7 @@ from wm_nodes.world_model.tokenizer import Tokenizer
 
 FILES = {
     "tokenizer": "tokenizer.safetensors",
+    "decoder": "decoder.safetensors",
     "action": "action_model.safetensors",
     "text": "text_model.safetensors",
     "probe": "position_probe.safetensors",
@@ -38,8 +39,8 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class WorldModels:
-    """tasks: the done head's outputs, in order. text is None where no text model was trained. probe: the judge's, None
-    where the model was saved without it."""
+    """tokenizer: with the decoder of rollouts, where the folder has one. tasks: the done head's outputs, in order. text
+    is None where no text model was trained. probe: the judge's, None where the model was saved without it."""
 
     tokenizer: Tokenizer
     action: ActionModel | TokenActionModel
@@ -66,12 +67,17 @@ class WorldModels:
 def save_model_folder(
     folder: Path, tokenizer: Tokenizer, action: ActionModel | TokenActionModel, text: TextModel | None,
     config: RunConfig, *, tasks: tuple[str, ...], story: Mapping[str, Any], probe: PositionProbe | None = None,
+    decoder: nn.Module | None = None,
 ) -> Path:
     """Write the models, made with `config`, as float16, and the manifest.
 
-    story: further entries of the manifest: data, seeds, commands, metrics, machine, date.
+    Args:
+        story: further entries of the manifest: data, seeds, commands, metrics, machine, date.
+        decoder: of rollouts, see train_decoder; None: the tokenizer's.
     """
-    modules: dict[str, nn.Module | None] = {"tokenizer": tokenizer, "action": action, "text": text, "probe": probe}
+    modules: dict[str, nn.Module | None] = {
+        "tokenizer": tokenizer, "decoder": decoder, "action": action, "text": text, "probe": probe,
+    }
     packed = {key: _pack(module) for key, module in modules.items() if module is not None}
     for key in FILES.keys() - packed.keys():
         (folder / FILES[key]).unlink(missing_ok=True)
@@ -108,8 +114,12 @@ def save_refreshed_folder(folder: Path, source: Path, action: ActionModel, story
     return write_model_folder(folder, {FILES[key]: data for key, data in packed.items()}, manifest)
 
 
-def load_model_folder(folder: Path, device: torch.device | str = "cpu") -> WorldModels:
+def load_model_folder(
+    folder: Path, device: torch.device | str = "cpu", *, rollout_decoder: bool = True
+) -> WorldModels:
     """Load and verify a model folder; weights come back as float32 on `device`, in evaluation mode, without gradients.
+
+    rollout_decoder: False leaves the tokenizer the decoder that it was trained with.
 
     Raises:
         ModelFolderError: names the file, what is wrong, and the remedy.
@@ -124,6 +134,8 @@ def load_model_folder(folder: Path, device: torch.device | str = "cpu") -> World
         config, action_dim=manifest["action_dim"], state_dim=manifest["state_dim"], num_tasks=num_tasks, **sizes
     )
     _load(folder, "tokenizer", tokenizer, manifest)
+    if rollout_decoder and "decoder" in manifest["sha256"]:
+        _load(folder, "decoder", tokenizer.decoder, manifest)
     _load(folder, "action", action, manifest)
     text = probe = None
     if "text" in manifest["sha256"]:

@@ -17,19 +17,39 @@ from wm_nodes.environments.maniskill.pose_behaviours import PLANNED, vary
 
 Act = Callable[[Observation, FloatArray], FloatArray]
 """(observation of one slot, ground truth (P,)) -> action (A,); a policy ignores the ground truth."""
+EXTREME, HOLD_STEPS = "extreme", 4
+"""The behaviour of every task that no world model is trained on: full-scale actions in random directions, each held for
+so many steps. A single one would hardly move the tool before the next takes it back."""
 
 
 def scripted_episode(env: ManiSkillEnvironment, behaviour: str, seed: int, episode_id: int) -> Episode:
     """One episode of a scripted behaviour; everything random follows from `seed`."""
     env.reset(seeds=np.array([seed], np.uint64))
-    truth = env.ground_truth[0]
+    truth, rng = env.ground_truth[0], numpy_stream(seed, "behaviour")
     script = get_task(env.spec.task).script
-    scripted = script(behaviour, truth, numpy_stream(seed, "behaviour"), env.spec.action_scale[0])
+    scripted = (
+        extreme_actions(rng, env.spec.action_dim) if behaviour == EXTREME
+        else script(behaviour, truth, rng, env.spec.action_scale[0])
+    )
 
     def act(observation: Observation, truth_now: FloatArray) -> FloatArray:
         return scripted(truth_now, observation.state[0, : env.spec.tool_dim])
 
     return record_episode(env, act, behaviour, seed, episode_id)
+
+
+def extreme_actions(rng: np.random.Generator, action_dim: int) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """Return act(ground truth, state) -> action (A,) of the behaviour EXTREME."""
+    action, left = np.zeros(action_dim, np.float32), 0
+
+    def act(_truth: FloatArray, _state: FloatArray) -> FloatArray:
+        nonlocal action, left
+        if not left:
+            action, left = rng.choice(np.array([-1.0, 1.0], np.float32), action_dim), HOLD_STEPS
+        left -= 1
+        return action
+
+    return act
 
 
 def record_episode(

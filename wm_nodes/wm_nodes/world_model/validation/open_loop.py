@@ -8,6 +8,7 @@ are encoded again and read by the tokenizer's probe. The reader's own error on r
 floor, and copying the first frame is measured in the same way.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.reward.picture_similarity import psnr_db, ssim
 from wm_nodes.world_model.dynamics import ActionModel, done_signal
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.precision import compute_context
@@ -85,6 +87,12 @@ def imagine(
     return ImaginedEpisodes(*(torch.stack(steps, 1).cpu().numpy() for steps in (frames, signals, spreads)))
 
 
+def position_reader(tokenizer: Tokenizer, probe: PositionProbe | None) -> Callable[[UInt8Array], FloatArray]:
+    """What reads positions (E, T, P), m, off frames (E, T, H, W, 3), see above."""
+    return probe.read if probe else partial(_read_frames, tokenizer)
+
+
+@torch.inference_mode()
 def evaluate_rollouts(
     tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays, *, threshold: float = 0.7,
     probe: PositionProbe | None = None,
@@ -98,7 +106,7 @@ def evaluate_rollouts(
     """
     imagined = imagine_episodes(tokenizer, model, episodes)
     truth = episode_targets(episodes)
-    read = probe.read if probe else partial(_read_frames, tokenizer)
+    read = position_reader(tokenizer, probe)
     real, predicted = read(episodes.images), read(imagined.frames)
     moved = np.linalg.norm(truth[:, -1, OBJECT] - truth[:, 0, OBJECT], axis=-1) > MOVED_M
     metrics: dict[str, float] = {"episodes": float(len(episodes)), "moved_share": float(moved.mean())}
@@ -107,10 +115,11 @@ def evaluate_rollouts(
         if not rows.any():
             continue
         label = f"h{horizon:02d}"
-        metrics |= _picture_metrics(tokenizer, imagined, episodes, rows, horizon, label)
+        latents = tokenizer.encode(episodes.images[:, horizon])
+        metrics |= _picture_metrics(tokenizer, imagined, episodes, latents, rows, horizon)
         estimates = {
             "rollout": predicted[:, horizon - 1], "floor": real[:, horizon], "copy": real[:, 0],
-            "latents": _read_frames(tokenizer, episodes.images[:, [horizon]])[:, 0],
+            "latents": tokenizer.read_state(latents).cpu().numpy(),
         }
         for name, columns, chosen in (
             ("object", OBJECT, rows), ("object_moved", OBJECT, rows & moved), ("tool", TOOL, rows),
@@ -169,21 +178,22 @@ def _position_metrics(
 
 
 def _picture_metrics(
-    tokenizer: Tokenizer, imagined: ImaginedEpisodes, episodes: EpisodeArrays, rows: BoolArray, horizon: int, label: str
+    tokenizer: Tokenizer, imagined: ImaginedEpisodes, episodes: EpisodeArrays, latents_ESD: Tensor, rows: BoolArray,
+    horizon: int,
 ) -> dict[str, float]:
-    wanted = episodes.images[rows, horizon]
+    """latents_ESD: of the recorded frames at the horizon."""
+    device, label = tokenizer.device, f"h{horizon:02d}"
+    real, latents = torch.from_numpy(episodes.images[rows, horizon]).to(device), latents_ESD[torch.from_numpy(rows)]
     shown = {
-        "rollout": imagined.frames[rows, horizon - 1],
-        "recon": tokenizer.decode(tokenizer.encode(wanted)).cpu().numpy(),
-        "copy": episodes.images[rows, 0],
+        "rollout": torch.from_numpy(imagined.frames[rows, horizon - 1]).to(device),
+        "recon": tokenizer.decode(latents), "copy": torch.from_numpy(episodes.images[rows, 0]).to(device),
     }
-    return {f"psnr_{key}_db_{label}": psnr(value, wanted) for key, value in shown.items()}
-
-
-def psnr(images: UInt8Array, others: UInt8Array) -> float:
-    """Peak signal-to-noise ratio in dB, mean over images (B, H, W, 3)."""
-    squared = ((images.astype(np.float32) - others.astype(np.float32)) ** 2).reshape(len(images), -1).mean(1)
-    return float((10 * np.log10(255**2 / np.maximum(squared, 1e-3))).mean())
+    metrics = dict[str, float]()
+    for name, frames in shown.items():
+        metrics[f"psnr_{name}_db_{label}"] = float(psnr_db(frames, real).mean())
+        metrics[f"ssim_{name}_{label}"] = float(ssim(frames, real).mean())
+        metrics[f"perceptual_{name}_{label}"] = float((tokenizer.encode(frames) - latents).abs().mean())
+    return metrics
 
 
 def _read_frames(tokenizer: Tokenizer, images_ETHW3: UInt8Array) -> FloatArray:

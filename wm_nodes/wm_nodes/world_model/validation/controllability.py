@@ -1,0 +1,66 @@
+"""Whether imagined frames obey actions, also such as no recording holds. Shapes: E episodes, T steps, A action,
+S state.
+
+A model that only goes on as recordings usually do predicts recorded actions well and ignores others.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.tool_control import next_state
+from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.reward.picture_similarity import psnr_db
+from wm_nodes.world_model.folder import WorldModels
+from wm_nodes.world_model.training.tokenizer import episode_targets
+from wm_nodes.world_model.validation.open_loop import HORIZONS, TOOL, imagine_episodes, position_reader
+
+
+def controllability_metrics(
+    models: WorldModels, episodes: EpisodeArrays, spec: EnvironmentSpec
+) -> dict[str, float]:
+    """Metrics by name (see docs/metrics.md), `_hNN` at step NN. Episodes count that are at least that long, and whose
+    other actions are.
+
+    psnr_shuffled_drop_db: PSNR of rollouts of the recorded actions less that of rollouts of the next episode's actions,
+    both against the recording. tool_command_cm: how far the imagined tool is from where the recorded actions command
+    it; tool_shuffled_cm: the same of the next episode's.
+
+    Args:
+        spec: of the simulator, whose rule turns actions into commands.
+    """
+    actions = {"command": episodes.actions, "shuffled": np.roll(episodes.actions, 1, axis=0)}
+    read = position_reader(models.tokenizer, models.probe)
+    first = episode_targets(episodes)[:, 0][:, TOOL]
+    frames, errors = dict[str, UInt8Array](), dict[str, FloatArray]()
+    for name, taken in actions.items():
+        states = follow(episodes.states[:, 0], taken, spec)
+        told = replace(episodes, actions=taken, states=states)
+        frames[name] = imagine_episodes(models.tokenizer, models.action, told).frames
+        wanted = first[:, None] + states[:, 1:, :3] - states[:, :1, :3]
+        errors[name] = 100 * np.linalg.norm(read(frames[name])[..., TOOL] - wanted, axis=-1)
+    metrics = dict[str, float]()
+    for horizon in sorted({min(h, episodes.num_steps) for h in HORIZONS}):
+        rows = np.minimum(episodes.lengths, np.roll(episodes.lengths, 1)) >= horizon
+        if not rows.any():
+            continue
+        likeness = {
+            name: psnr_db(*map(torch.from_numpy, (shown[rows, horizon - 1], episodes.images[rows, horizon])))
+            for name, shown in frames.items()
+        }
+        drop = float((likeness["command"] - likeness["shuffled"]).mean())
+        metrics[f"psnr_shuffled_drop_db_h{horizon:02d}"] = drop
+        for name, error in errors.items():
+            metrics[f"tool_{name}_cm_h{horizon:02d}"] = float(error[rows, horizon - 1].mean())
+    return metrics
+
+
+def follow(first_ES: FloatArray, actions_ETA: FloatArray, spec: EnvironmentSpec) -> FloatArray:
+    """Commanded states (E, T + 1, S) of actions, from the first ones on."""
+    states = [first_ES]
+    for t in range(actions_ETA.shape[1]):
+        states.append(next_state(states[-1], actions_ETA[:, t], spec))
+    return np.stack(states, 1)
