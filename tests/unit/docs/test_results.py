@@ -454,8 +454,8 @@ def stage_rows() -> Rows:
 
 
 # --- shipped_models.md ------------------------------------------------------------------------------------------
-def heldout(folder: str) -> Run:
-    metrics: Run = json.loads((SHIPPED / folder / "manifest.json").read_text())["heldout"]
+def heldout(folder: str, name: str = "heldout") -> Run:
+    metrics: Run = json.loads((SHIPPED / folder / "manifest.json").read_text())[name]
     return metrics
 
 
@@ -463,7 +463,14 @@ def world_model_rows() -> Rows:
     found = heldout("table_top_cube")
     for text, name in (("object that moved, cm", "object_moved"), ("tool, cm", "tool")):
         yield row(text, *(f"{found[f'{name}_{kind}_cm_h16']:.2f}" for kind in ("rollout", "floor", "copy")))
-    yield row("PSNR, dB", *(f"{found[f'psnr_{kind}_db_h16']:.1f}" for kind in ("rollout", "recon", "copy")))
+    kinds = ("rollout", "recon", "copy")
+    extreme = heldout("table_top_cube", "heldout_extreme")
+    yield row("PSNR, dB", *(f"{found[f'psnr_{kind}_db_h16']:.1f}" for kind in kinds))
+    yield row("PSNR under extreme actions, dB", *(f"{extreme[f'psnr_{kind}_db_h16']:.1f}" for kind in kinds))
+    for text, name in (("SSIM", "ssim"), ("perceptual distance (RS-5a)", "perceptual")):
+        yield row(text, *(f"{found[f'{name}_{kind}_h16']:.2f}" for kind in kinds))
+    for step in (4, 16):
+        yield f"{found[f'psnr_shuffled_drop_db_h{step:02d}']:.1f} dB at step {step}"
 
 
 def scenes_model_rows() -> Rows:

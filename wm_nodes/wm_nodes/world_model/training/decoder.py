@@ -1,4 +1,4 @@
-"""Train a decoder for rollouts, so that imagined frames are sharp. Shapes: E episodes, T steps,
+"""Train a decoder for rollouts, so that imagined frames are sharp (RS-4a). Shapes: E episodes, T steps,
 F frames of a batch, H W 3 image, S tokens, D values per token."""
 
 from copy import deepcopy
