@@ -1,6 +1,7 @@
 """`wm collect` in the simulator: an interrupted collection goes on, the index and the table tell what was collected."""
 
 import csv
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +60,15 @@ def test_an_interrupted_collection_goes_on_and_gives_what_one_in_one_go_gives(
         assert row["planner"] == "" and episode.extra["scene"] == row["scene"]
     assert sum(int(line.split()[2]) for line in table.splitlines() if line.startswith("push ")) == 3
     assert all(row["scene"] in (interrupted / "success.txt").read_text() for row in rows)
+    assert main(arguments(whole, episodes=2)) == 2
+    assert "was begun with num_episodes 3, not 2; take another folder" in capsys.readouterr().err
+
+    short = whole / "push" / "shard_00000002"
     assert main(arguments(whole, episodes=4)) == 2
-    assert "was begun with num_episodes 3, not 4; take another folder" in capsys.readouterr().err
+    assert f"{short} holds the last 1 of 3 episodes; delete it to go on to 4" in capsys.readouterr().err
+    shutil.rmtree(short)
+    assert main(arguments(whole, episodes=4)) == 0
+    assert [row["seed"] for row in csv.DictReader((whole / "push" / "index.csv").open())] == ["0", "1", "2", "3"]
 
 
 def test_seeds_of_the_evaluation_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

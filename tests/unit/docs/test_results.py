@@ -80,20 +80,25 @@ def points(before: list[bool], after: list[bool]) -> str:
     return interval(100 * found.difference, 100 * found.low, 100 * found.high, 1)
 
 
+def decoder_rows() -> Rows:
+    """One line per world model: its held-out rollouts, and the success of policies trained in it."""
+    for one in read("policy_rl_decoders.json")["rows"]:
+        found, trained = one["heldout"], one["trained_in"]
+        real = [each["real_after"]["successes"] / each["real_after"]["episodes"] for each in trained]
+        yield row(
+            one["model"], ", ".join(f"{found[f'psnr_rollout_db_h{step}']:.1f}" for step in ("01", "04", "16")),
+            f"{found['perceptual_rollout_h16']:.2f}",
+            ", ".join(f"{found[f'{name}_rollout_cm_h16']:.2f}" for name in ("object_moved", "tool")),
+            ", ".join(map(percent, real)), percent(mean(real)),
+            percent(mean(each["imagined_after"]["successes"] / each["imagined_after"]["episodes"] for each in trained)),
+        )
+
+
 def refresh_rows() -> Rows:
     run = read("policy_rl_model_refresh.json")
-    for number, part in enumerate(run["rounds"], 1):
-        decision = part.get("verdict") or {}
-        answer = {True: "accepted", False: "refused", None: ""}[decision.get("accepted")]
-        imagined, real = part["imagined"]["successes"], part["real"]["successes"]
-        errors = {
-            check["episodes"]: f"{check['old']:.3f} → {check['new']:.3f}"
-            for check in decision.get("rows", []) if check["name"] == "object error / copying"
-        }
-        of = (errors.get(episodes, "") for episodes in ("policy", "scripted"))
-        yield row(number, 8 * number, f"{imagined}/256", f"{real}/200", answer, *of)
     found = run["paired"]
     yield interval(100 * found["difference"], 100 * found["low"], 100 * found["high"], 1)
+    yield f"ends at {run['rounds'][-1]['real']['successes']} of 200"
 
 
 def scenes_rows() -> Rows:
@@ -526,7 +531,7 @@ def judge_rows() -> Rows:
 
 
 TABLES: dict[str, list[Callable[[], Rows]]] = {
-    "policy_rl": [study_rows, refresh_rows, scenes_rows],
+    "policy_rl": [study_rows, decoder_rows, refresh_rows, scenes_rows],
     "video_rl": [
         diversity_rows, clip_rows, learning_rows, long_learning_rows, clip_learning_rows, cost_rows, ablation_rows,
         resolution_rows, hacking_rows,

@@ -3,7 +3,8 @@
     wm collect FOLDER --tasks pick_place,push --episodes 500 [--set simulation.scenes=ood_object]
 
 Each task has its own shares of behaviours (data.behaviours). FOLDER/<task>/index.csv lists the episodes,
-FOLDER/success.txt counts successes by behaviour and by scene. The same command goes on where it was interrupted.
+FOLDER/success.txt counts successes by behaviour and by scene. The same command goes on where it was interrupted, one
+with more --episodes where the former ended.
 """
 
 import argparse

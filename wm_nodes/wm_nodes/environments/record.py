@@ -12,6 +12,7 @@ from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import Episode
+from wm_nodes.environments.maniskill import collection
 from wm_nodes.environments.maniskill.collection import CollectionPlan, collect
 from wm_nodes.recording import Bag, EpisodeBagWriter
 
@@ -93,12 +94,23 @@ def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path) -> list[
 
 
 def keep_plan(plan: CollectionPlan, folder: Path) -> None:
-    """Write the plan into a folder of its bags alone. Raises ValueError where the folder was begun with another one."""
+    """Write the plan into a folder of its bags alone.
+
+    Raises:
+        ValueError: the folder was begun with another plan; more episodes are none, but for a short last bag.
+    """
     path, text = folder / PLAN, json.dumps({**vars(plan), "simulation": plan.simulation.model_dump()}, default=str)
     if path.exists() and path.read_text() != text:
         kept, now = json.loads(path.read_text()), json.loads(text)
-        other = next(name for name in now if now[name] != kept.get(name))
-        raise ValueError(f"{folder} was begun with {other} {kept.get(other)}, not {now[other]}; take another folder")
+        others = [name for name in now if now[name] != kept.get(name)]
+        count, wanted = kept.get("num_episodes", 0), plan.num_episodes
+        if others != ["num_episodes"] or wanted < count:
+            name, value = others[0], now[others[0]]
+            raise ValueError(f"{folder} was begun with {name} {kept.get(name)}, not {value}; take another folder")
+        short = count % collection.EPISODES_PER_SHARD
+        last = folder / f"shard_{plan.first_seed + count - short:08d}"
+        if short and last.exists():
+            raise ValueError(f"{last} holds the last {short} of {count} episodes; delete it to go on to {wanted}")
     write_atomic(path, text.encode())
 
 
