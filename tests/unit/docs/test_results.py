@@ -72,7 +72,8 @@ def study_rows() -> Rows:
         pairs = [(model, control) for model, control in zip(models, controls) if control]
         in_model = [x for model, _ in pairs for x in model["success_after"]]
         in_simulator = [x for _, control in pairs for x in control["success_after"]]
-        yield row(task, percent(mean(in_model)), percent(mean(in_simulator)), points(in_model, in_simulator))
+        if pairs:
+            yield row(task, percent(mean(in_model)), percent(mean(in_simulator)), points(in_model, in_simulator))
 
 
 def points(before: list[bool], after: list[bool]) -> str:
@@ -84,13 +85,15 @@ def decoder_rows() -> Rows:
     """One line per world model: its held-out rollouts, and the success of policies trained in it."""
     for one in read("policy_rl_decoders.json")["rows"]:
         found, trained = one["heldout"], one["trained_in"]
-        real = [each["real_after"]["successes"] / each["real_after"]["episodes"] for each in trained]
+        real, imagined = (
+            [each[name]["successes"] / each[name]["episodes"] for each in trained]
+            for name in ("real_after", "imagined_after")
+        )
         yield row(
             one["model"], ", ".join(f"{found[f'psnr_rollout_db_h{step}']:.1f}" for step in ("01", "04", "16")),
             f"{found['perceptual_rollout_h16']:.2f}",
             ", ".join(f"{found[f'{name}_rollout_cm_h16']:.2f}" for name in ("object_moved", "tool")),
-            ", ".join(map(percent, real)), percent(mean(real)),
-            percent(mean(each["imagined_after"]["successes"] / each["imagined_after"]["episodes"] for each in trained)),
+            ", ".join(map(percent, real)), *(percent(mean(rates)) if trained else "" for rates in (real, imagined)),
         )
 
 

@@ -87,7 +87,7 @@ def bands_of(rows: Sequence[tuple[Row, bool]], tail: float) -> dict[str, dict[st
                 f"{len(values)}; name more bags"
             )
         edge = float(np.quantile(values, tail if signal.side == "low" else 1 - tail))
-        bands[name] = {"component": signal.component, signal.side: float(f"{edge:.4g}")}
+        bands[name] = {"component": signal.component, signal.side: float(f"{edge:.6g}")}
     return bands
 
 
