@@ -116,6 +116,13 @@ def scenes_rows() -> Rows:
         )
 
 
+def scenes_decoder_rows() -> Rows:
+    (one,) = read("policy_rl_scenes.json")["with_decoder_for_rollouts"]
+    before, after = (one[name]["successes"] for name in ("real_before", "real_after"))
+    imagined = (percent(one[name]["rate"]) for name in ("imagined_before", "imagined_after"))
+    yield f"{one['task']} goes from {before} to {after}, imagined from {' to '.join(imagined)}"
+
+
 # --- video_rl.md ------------------------------------------------------------------------------------------------
 def diversity_rows() -> Rows:
     seeds = runs("video_rl_diversity.jsonl").values()
@@ -534,7 +541,7 @@ def judge_rows() -> Rows:
 
 
 TABLES: dict[str, list[Callable[[], Rows]]] = {
-    "policy_rl": [study_rows, decoder_rows, refresh_rows, scenes_rows],
+    "policy_rl": [study_rows, decoder_rows, refresh_rows, scenes_rows, scenes_decoder_rows],
     "video_rl": [
         diversity_rows, clip_rows, learning_rows, long_learning_rows, clip_learning_rows, cost_rows, ablation_rows,
         resolution_rows, hacking_rows,
