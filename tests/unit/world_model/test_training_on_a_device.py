@@ -13,6 +13,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.training.decoder import train_decoder
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.text import train_text_model
 
@@ -26,6 +27,7 @@ def config_of(device: str, iterations: int, **overrides: Any) -> RunConfig:
     return load_config("cpu_full", {
         "task": "push_cube", "device": device, "world_model.num_iterations": iterations, "world_model.batch_size": 2,
         "world_model.text_num_iterations": iterations, "world_model.rollout_steps": [STEPS],
+        "tokenizer.decoder_iterations": iterations,
     } | {key.replace("__", "."): value for key, value in overrides.items()})
 
 
@@ -37,14 +39,15 @@ def make_episodes() -> EpisodeArrays:
 
 
 def train(config: RunConfig) -> dict[str, dict[str, float]]:
-    """The last metrics of the action model and of the text model."""
+    """The last metrics of the action model, of the decoder for rollouts and of the text model."""
     episodes = make_episodes()
     torch.manual_seed(0)
     tokenizer = Tokenizer(config.tokenizer, *episodes.images.shape[2:4]).to(config.device)
     data = tokenise_episodes(tokenizer, episodes)
     action, metrics = train_action_model(tokenizer, data, config, 0, None)
+    _, decoder = train_decoder(tokenizer, action, data, config, 0, None)
     text = train_text_model(tokenizer, action, episodes, data, ("push", "reach"), config, 0, None)
-    return {"action_model": metrics, "text_model": text[1]}
+    return {"action_model": metrics, "decoder": decoder, "text_model": text[1]}
 
 
 def test_an_iteration_costs_few_kernels_one_wait_and_few_copies(

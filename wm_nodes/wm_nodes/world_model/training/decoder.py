@@ -76,11 +76,12 @@ def train_decoder(
             "pixel": (weight * (pixels - wanted).abs()).mean() / weight.mean(),
             "recoded": F.huber_loss(recoded, recorded, delta=HUBER_DELTA),
         }
-        terms |= adversarial_losses(discriminator, wanted - tokenizer.background, pixels - tokenizer.background)
-        terms["loss"] = (
-            terms["pixel"] + RECODED_WEIGHT * terms["recoded"] + settings.adversarial_weight * terms["adversarial"]
-            + terms["discriminator"]
-        )
+        terms["loss"] = terms["pixel"] + RECODED_WEIGHT * terms["recoded"]
+        if settings.adversarial_weight:
+            background = tokenizer.background
+            terms |= adversarial_losses(discriminator, wanted - background, pixels - background)
+            adversarial = settings.adversarial_weight * terms["adversarial"]
+            terms["loss"] = terms["loss"] + adversarial + terms["discriminator"]
         return terms
 
     tokenizer.decoder.requires_grad_(True)
