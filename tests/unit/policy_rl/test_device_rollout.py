@@ -81,7 +81,7 @@ def test_a_device_rollout_is_the_lock_step_rollout_bit_for_bit(fast: bool, monke
 
 
 def test_too_much_disagreement_truncates_and_pays_nothing() -> None:
-    lockstep, found = both(config_of(reward__uncertainty_limit=1e-6), 24)
+    lockstep, found = both(config_of(reward__uncertainty_limit=1e-8), 24)
     assert lockstep.truncated_TN[:2].any()
     assert_same(lockstep, found)
 
