@@ -6,8 +6,8 @@ python3 launch_scripts/run_tests.py --fast     # without the tests marked slow
 python3 launch_scripts/run_tests.py tests/unit -k setup    # other arguments go to pytest; the checks still run
 python3 launch_scripts/run_tests.py --device cuda          # only the tests of a CUDA device, on the GPU that is here
 
-Tests run two at a time, those with deadlines after the others. A test of a graph that fails so is run once more by
-itself, which the output says: deadlines are promised where nothing else keeps the machine busy.
+Tests run two at a time, those with deadlines after the others. A graph test that fails so, or that hangs inside DDS, is
+run once more by itself, which the output says: deadlines are promised where nothing else keeps the machine busy.
 """
 
 import json
@@ -21,10 +21,12 @@ from setup import system
 from setup.entry import ensure
 
 ROOT = Path(__file__).resolve().parents[1]
-LAST_FAILED = Path(".pytest_cache/v/cache/lastfailed")
+FAILED, CRASHED = (Path(".pytest_cache/v") / name for name in ("cache/lastfailed", "wm/crashed"))
 MOST_AGAIN = 8
 """More failed tests than this are no accident of their neighbours."""
-BY_FILE = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
+MOST_CRASHES = 2
+"""After more ended processes pytest-xdist stops, and tests are left out."""
+BY_FILE = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", f"--max-worker-restart={MOST_CRASHES}")
 LONG_FIRST = ("tests/graph", "tests/parity", "tests/unit", "tests/contracts")
 WITH_DEADLINES = ("tests/graph",)  # tests/conftest.py sees to it that there are no others
 
@@ -47,17 +49,27 @@ def main(argv):
         print(f"failed before the tests: {', '.join(failed)}", flush=True)
     if named:
         return _pytest(["-m", " and ".join(fast), *named]) or int(bool(failed))
+    forget()
     codes = [
-        _pytest(["-m", " and ".join(["not alone", *fast]), "--cache-clear", *BY_FILE, *LONG_FIRST]),
+        _pytest(["-m", " and ".join(["not alone", *fast]), *BY_FILE, *LONG_FIRST]),
         _pytest(["-m", " and ".join(["alone", *fast]), *BY_FILE, *WITH_DEADLINES]),
     ]
     return (repeated() if max(codes) == 1 else max(codes)) or int(bool(failed))
 
 
+def forget():
+    """Forget what failed before. pytest's --cache-clear would do so again in each process that replaces another."""
+    for file in (FAILED, CRASHED):
+        (ROOT / file).unlink(missing_ok=True)
+
+
 def repeated():
     """Run the tests that failed once more, without neighbours, if all are of graphs and few. Return pytest's code."""
-    tests = list(json.loads((ROOT / LAST_FAILED).read_text()))
-    if len(tests) > MOST_AGAIN or not all(test.startswith("tests/graph/") for test in tests):
+    files = (ROOT / FAILED, ROOT / CRASHED)
+    failed, crashed = (list(json.loads(file.read_text())) if file.exists() else [] for file in files)
+    tests = sorted({*failed, *crashed})
+    few = len(tests) <= MOST_AGAIN and len(crashed) <= MOST_CRASHES
+    if not tests or not few or not all(test.startswith("tests/graph/") for test in tests):
         return 1
     print("\nonce more, by themselves:", *tests, sep="\n  ", flush=True)
     return _pytest(tests)

@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from graph.shm_maps import mapped, processes
@@ -63,6 +63,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("device")
         if item.get_closest_marker("alone") and "graph" not in item.path.parts:
             raise pytest.UsageError(f"{item.nodeid} is marked alone; run_tests.py looks for such tests in tests/graph")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_handlecrashitem(crashitem: str, sched: Any) -> None:
+    """For run_tests.py: pytest-xdist runs a test whose process ended again, and lastfailed forgets it if it passes."""
+    cache = sched.config.cache
+    cache.set("wm/crashed", [*cache.get("wm/crashed", []), crashitem])
 
 
 def pytest_unconfigure() -> None:

@@ -195,7 +195,8 @@ def test_one():
 
     def first(*paths: Path) -> None:
         names = [str(path.relative_to(tmp_path)) for path in paths]
-        assert run_tests._pytest(["-q", "-p", "no:xdist", "--cache-clear", *names]) == 1
+        run_tests.forget()
+        assert run_tests._pytest(["-q", "-p", "no:xdist", *names]) == 1
 
     first(second)
     capfd.readouterr()
@@ -205,6 +206,49 @@ def test_one():
     assert run_tests.repeated() == 1
     first(unit)
     assert run_tests.repeated() == 1 and (tmp_path / "test_unit").read_text() == "."
+
+
+HANGS = """
+import ctypes
+from pathlib import Path
+
+def test_hang():
+    with Path("{0}").open("a+") as runs:
+        if runs.write(".") and runs.tell() <= {1}:
+            mutex = ctypes.create_string_buffer(64)
+            while True:
+                ctypes.CDLL(None).pthread_mutex_lock(mutex)
+
+def test_after():
+    pass
+"""
+PLUGIN = """
+from importlib.util import module_from_spec, spec_from_file_location
+
+spec = spec_from_file_location("conftest_of_all", "{0}")
+module = module_from_spec(spec)
+spec.loader.exec_module(module)
+pytest_handlecrashitem = module.pytest_handlecrashitem
+"""
+
+
+@pytest.mark.slow
+def test_a_graph_test_that_hangs_inside_a_library_ends_and_has_to_pass_by_itself(
+    tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run_tests, "ROOT", tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(repository / "tests"))
+    (tmp_path / "conftest.py").write_text(PLUGIN.format(repository / "tests/conftest.py"))
+    (tmp_path / "tests/graph").mkdir(parents=True)
+    test = tmp_path / "tests/graph/test_hangs.py"
+    limits = ["--timeout=1", "-o", "faulthandler_timeout=3", "-o", "faulthandler_exit_on_timeout=true"]
+    for hangs, crashes, code in ((1, 1, 0), (99, run_tests.MOST_CRASHES + 1, 1)):
+        test.write_text(HANGS.format(tmp_path / f"runs_{hangs}", hangs))
+        run_tests.forget()
+        assert run_tests._pytest(["-q", *limits, *run_tests.BY_FILE, "tests/graph"]) == 1
+        assert capfd.readouterr().out.count("crashed while running") >= crashes
+        assert run_tests.repeated() == code
+    assert len((tmp_path / "runs_1").read_text()) == 3, "it hung, ran in another process, and by itself"
 
 
 def test_the_tests_of_a_device_can_be_run_on_a_gpu_and_say_that_there_is_none(
