@@ -46,6 +46,7 @@ from wm_nodes.world_model.training.token_dynamics import train_token_model
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.acceptance import model_metrics
 from wm_nodes.world_model.validation.controllability import controllability_metrics
+from wm_nodes.world_model.validation.goals import goal_metrics
 
 POLICY_SEEDS = 300_000
 
@@ -131,10 +132,11 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
 
 
 def heldout_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig, task: str) -> dict[str, Any]:
-    """Metrics of rollouts of the recorded actions, and of others, of held-out episodes of a task, for the manifest."""
+    """Metrics of rollouts of the recorded actions, of other actions, and of goals, over held-out episodes of a task."""
     spec = simulation_spec(task, config.simulation, 1)
     metrics: dict[str, Any] = plain(
         model_metrics(models, episodes, config) | controllability_metrics(models, episodes, spec)
+        | goal_metrics(models, episodes, config, task)
     )
     return metrics
 

@@ -1,0 +1,52 @@
+"""How near the goals that the text model imagines (RS-6) are to what was reached. Shapes: E episodes."""
+
+import numpy as np
+import torch
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.tasks import get_task
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.world_model.folder import WorldModels
+from wm_nodes.world_model.text import imagine_goals, instruction_for
+from wm_nodes.world_model.training.tokenizer import episode_targets
+from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL, position_reader
+
+
+def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig, task: str) -> dict[str, float]:
+    """Metrics by name (see docs/metrics.md) over the episodes that succeed at `task` after their first frame; none
+    without such episodes or without a text model.
+
+    goal_found: share of imagined episodes whose done signal exceeds reward.goal_threshold. goal_object_cm,
+    goal_tool_cm, goal_perceptual: distance of the goal, imagined from the first frame and the instruction, from the
+    frame of the first success; `_copy`: of the first frame from it. Positions are read by the probe.
+    """
+    column = models.task_index(task)
+    won = episodes.success[..., column] & episodes.labelled[:, column, None] & episodes.frame_mask
+    rows = np.flatnonzero(won.any(1) & ~won[:, 0])
+    if models.text is None or not len(rows):
+        return {}
+    reached = won[rows].argmax(1)
+    instructions = [
+        instruction_for(task, episodes.recorded_tasks[row], episodes.instructions[row], get_task(task).instruction)
+        for row in rows
+    ]
+    imagined = imagine_goals(
+        models.text, models.tokenizer, episodes.images[rows, 0], instructions, [column] * len(rows),
+        horizon=episodes.num_steps, threshold=config.reward.goal_threshold,
+    )
+    metrics = {"goal_episodes": float(len(rows)), "goal_found": float(imagined.found.mean())}
+    read, truth = position_reader(models.tokenizer, models.probe), episode_targets(episodes)[rows, reached]
+    real = _latents(models, episodes.images[rows, reached])
+    for ending, frames in (("", imagined.goals), ("_copy", episodes.images[rows, 0])):
+        found = read(frames[:, None])[:, 0]
+        for name, columns in (("object", OBJECT), ("tool", TOOL)):
+            errors = 100 * np.linalg.norm(found[:, columns] - truth[:, columns], axis=-1)
+            metrics[f"goal_{name}{ending}_cm"] = float(errors.mean())
+        metrics[f"goal_perceptual{ending}"] = float((_latents(models, frames) - real).abs().mean())
+    return metrics
+
+
+@torch.inference_mode()
+def _latents(models: WorldModels, images_EHW3: UInt8Array) -> torch.Tensor:
+    return models.tokenizer.encode(images_EHW3)
