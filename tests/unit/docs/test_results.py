@@ -496,8 +496,8 @@ def world_model_rows() -> Rows:
         yield row(text, *(f"{found[f'{name}_{kind}_h16']:.2f}" for kind in kinds))
     for step in (4, 16):
         yield f"{found[f'psnr_shuffled_drop_db_h{step:02d}']:.1f} dB at step {step}"
-    errors = (f"{found[f'goal_{name}_cm']:.1f} ({found[f'goal_{name}_copy_cm']:.1f})" for name in ("object", "tool"))
-    yield "object {} cm, tool {} cm".format(*errors)
+    goals = (beside_copy(found, f"goal_{name}{{}}_cm", "", "_copy") for name in ("object", "tool"))
+    yield "object {} cm, tool {} cm".format(*goals)
 
 
 def scenes_model_rows() -> Rows:
@@ -514,10 +514,16 @@ def scenes_model_rows() -> Rows:
         done = ("/".join(f"{one[f'done_{task}_{name}']:.2f}" for one in found) for name in ("precision", "recall"))
         moved = ["", "", ""] if task == "reach_object" else moved
         yield row(task, *moved, tool[0], tool[2], *done)
-        likeness = (f"{first[f'psnr_{name}_db_h16']:.1f}" for name in ("rollout", "copy", "shuffled_drop"))
-        goal = (f"{first[f'goal_{name}_cm']:.1f}" for name in ("object", "object_copy", "tool", "tool_copy"))
-        yield row(task, *likeness, *(f"{made['heldout_extreme'][task][f'psnr_{name}_db_h16']:.1f}" for name in
-                                     ("rollout", "copy")), *goal)
+        extreme = made["heldout_extreme"][task]
+        yield row(
+            task, beside_copy(first, "psnr_{}_db_h16", "rollout"), f"{first['psnr_shuffled_drop_db_h16']:.1f}",
+            beside_copy(extreme, "psnr_{}_db_h16", "rollout"),
+            *(beside_copy(first, f"goal_{name}{{}}_cm", "", "_copy") for name in ("object", "tool")),
+        )
+
+
+def beside_copy(metrics: Run, pattern: str, ours: str, copy: str = "copy") -> str:
+    return "{:.1f} ({:.1f})".format(*(metrics[pattern.format(name)] for name in (ours, copy)))
 
 
 def done_rows() -> Rows:
