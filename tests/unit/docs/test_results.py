@@ -97,6 +97,20 @@ def decoder_rows() -> Rows:
         )
 
 
+def exploit_rows() -> Rows:
+    """One line per reading, over the seeds: shares of episodes, precision and recall of imagined success."""
+    studies = read("policy_rl_exploit_meter.json")["rows"]
+    for readings in zip(*(one["exploit_meter"] for one in studies), strict=True):
+        counts = {name: [round(one[f"{name}_success"] * one["episodes"]) for one in readings]
+                  for name in ("imagined", "replayed", "real")}
+        hits = [round(one["precision"] * n) for one, n in zip(readings, counts["imagined"], strict=True)]
+        n = sum(int(one["episodes"]) for one in readings)
+        yield row(
+            int(readings[0]["update"]), *(percent(sum(counts[name]) / n) for name in counts),
+            *(of_counts(sum(hits), sum(counts[name])).partition(", ")[2] for name in ("imagined", "replayed")),
+        )
+
+
 def more_updates_rows() -> Rows:
     found = read("policy_rl_decoders.json")
     shipped = found["rows"][-1]["trained_in"][:2]
@@ -115,15 +129,25 @@ def refresh_rows() -> Rows:
 
 
 def scenes_rows() -> Rows:
-    """One line per task: success in scenes that were trained on, and in the two splits that were not."""
-    for one in read("policy_rl_scenes.json")["rows"]:
-        gain = one["real_gain"]
-        elsewhere = (f"{of['before']['successes']} → {of['after']['successes']}" for of in one["elsewhere"].values())
+    """One line per task and training, over its seeds: success in the scenes of the training, and in those of the two
+    other splits where it was measured there."""
+    places = {("world_model", "gae"): "model, PPO", ("world_model", "group"): "model, GRPO",
+              ("simulator", "gae"): "simulator, PPO"}
+    found = read("policy_rl_scenes.json")
+    for task, place in dict.fromkeys((one["task"], (one["model"], one["advantage"])) for one in found["rows"]):
+        mine = [one for one in found["rows"] if (one["task"], one["model"], one["advantage"]) == (task, *place)]
+        before, after = ([x for one in mine for x in one[key]] for key in ("success_before", "success_after"))
+        unseen = [split for one in mine for split in one["elsewhere"].values()]
         yield row(
-            one["task"], f"{one['real_before']['successes']} → {one['real_after']['successes']}",
-            interval(*(100 * gain[name] for name in ("difference", "low", "high")), 1), *elsewhere,
-            f"{percent(one['imagined_before']['rate'])} → {percent(one['imagined_after']['rate'])}",
+            task, places[place], ", ".join(str(one["seed"]) for one in mine),
+            f"{sum(before)} → {sum(after)} / {len(after)}", points(before, after),
+            "{} → {} / {}".format(*(sum(split[when][name] for split in unseen) for when, name in (
+                ("before", "successes"), ("after", "successes"), ("after", "episodes")
+            ))) if unseen else "",
+            " → ".join(percent(mean(one[f"imagined_{when}"]["rate"] for one in mine)) for when in ("before", "after")),
         )
+    for one in found["other_settings"]:
+        yield f"{one['real_before']['successes']} → {one['real_after']['successes']} with `{one['settings']}`"
 
 
 def scenes_decoder_rows() -> Rows:
@@ -564,7 +588,7 @@ def judge_rows() -> Rows:
 
 TABLES: dict[str, list[Callable[[], Rows]]] = {
     "policy_rl": [
-        study_rows, decoder_rows, more_updates_rows, refresh_rows, scenes_rows, scenes_decoder_rows,
+        study_rows, decoder_rows, exploit_rows, more_updates_rows, refresh_rows, scenes_rows, scenes_decoder_rows,
     ],
     "video_rl": [
         diversity_rows, clip_rows, learning_rows, long_learning_rows, clip_learning_rows, cost_rows, ablation_rows,

@@ -118,7 +118,7 @@ def train_in(
         measured.append(workplace.real(policy, name))
     return {
         "model": model, "model_sha256": env.spec.world_model_sha256, "task": config.task, "seed": config.seed,
-        "updates": config.ppo.updates, "course": course, "policies": kept,
+        "updates": config.ppo.updates, "advantage": config.ppo.advantage, "course": course, "policies": kept,
         "real_before": _rate(before[0]), "real_after": _rate(after[0]),
         "imagined_before": _rate(before[1]), "imagined_after": _rate(after[1]),
         "real_gain": _gain(before[0], after[0]),
