@@ -148,6 +148,12 @@ def scenes_rows() -> Rows:
         )
     for one in found["other_settings"]:
         yield f"{one['real_before']['successes']} → {one['real_after']['successes']} with `{one['settings']}`"
+    (one,) = found["all_tasks"]
+    real, imagined = ([one[f"{where}_{when}"] for when in ("before", "after")] for where in ("real", "imagined"))
+    yield (
+        f"{real[0]['successes']} → {real[1]['successes']} of {real[1]['episodes']}, "
+        f"imagined {' → '.join(percent(rate['rate']) for rate in imagined)} %"
+    )
 
 
 def scenes_decoder_rows() -> Rows:
