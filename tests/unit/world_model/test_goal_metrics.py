@@ -28,7 +28,7 @@ class Oracle(TextModel):
     def __init__(self, tokenizer: Tokenizer, frames: np.ndarray, sure: bool = True) -> None:
         super().__init__(
             CONFIG.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
-            vocabulary=("push",), num_tasks=1,
+            vocabulary=("push", "the", "square", *map(str, range(20))), num_tasks=1,
         )
         self.told: list[str] = []
         self._wanted, self._signal = tokenizer.encode(frames), 5.0 if sure else -5.0
@@ -76,6 +76,18 @@ def test_a_goal_that_was_reached_is_near_and_the_first_frame_is_as_far_as_copyin
     still = goal_metrics(models(tokenizer, Oracle(tokenizer, first, sure=False)), episodes, CONFIG, "push_cube")
     assert still["goal_found"] == 0.0
     assert still["goal_object_cm"] == pytest.approx(still["goal_object_copy_cm"], rel=0.3)
+
+
+def test_an_instruction_of_unknown_words_is_left_out_and_counted(tokenizer: Tokenizer) -> None:
+    episodes, _, reached = won(arrays(20, 2000))
+    texts = ("push the mug", *("push the square",) * (len(episodes) - 1))
+    told = replace(episodes, instructions=texts)
+    metrics = goal_metrics(models(tokenizer, Oracle(tokenizer, reached[1:])), told, CONFIG, "push_cube")
+    assert (metrics["goal_left_out"], metrics["goal_episodes"]) == (1, len(episodes) - 1)
+    assert metrics["goal_object_cm"] < 0.5 * metrics["goal_object_copy_cm"]
+    nobody = replace(episodes, instructions=("push the mug",) * len(episodes))
+    left = goal_metrics(models(tokenizer, Oracle(tokenizer, reached)), nobody, CONFIG, "push_cube")
+    assert left == {"goal_episodes": 0, "goal_left_out": len(episodes)}
 
 
 def test_each_episode_is_told_its_own_instruction_and_no_success_gives_no_metric(tokenizer: Tokenizer) -> None:

@@ -8,7 +8,7 @@ from wm_nodes.config.tasks import get_task
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model.folder import WorldModels
-from wm_nodes.world_model.text import imagine_goals, instruction_for
+from wm_nodes.world_model.text import TextModel, imagine_goals, instruction_for
 from wm_nodes.world_model.training.tokenizer import episode_targets
 from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL, position_reader
 
@@ -17,6 +17,7 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
     """Metrics by name (see docs/metrics.md) over the episodes that succeed at `task` after their first frame; none
     without such episodes or without a text model.
 
+    goal_episodes: with an instruction of words that the text model knows; goal_left_out: the others.
     goal_found: share of imagined episodes whose done signal exceeds reward.goal_threshold. goal_object_cm,
     goal_tool_cm, goal_perceptual: distance of the goal, imagined from the first frame and the instruction, from the
     frame of the first success; `_copy`: of the first frame from it. Positions are read by the probe.
@@ -26,16 +27,21 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
     rows = np.flatnonzero(won.any(1) & ~won[:, 0])
     if models.text is None or not len(rows):
         return {}
-    reached = won[rows].argmax(1)
-    instructions = [
+    told = [
         instruction_for(task, episodes.recorded_tasks[row], episodes.instructions[row], get_task(task).instruction)
         for row in rows
     ]
+    known = np.array([_knows(models.text, text) for text in told])
+    rows, instructions = rows[known], [text for text, knows in zip(told, known) if knows]
+    metrics = {"goal_episodes": float(known.sum()), "goal_left_out": float((~known).sum())}
+    if not len(rows):
+        return metrics
+    reached = won[rows].argmax(1)
     imagined = imagine_goals(
         models.text, models.tokenizer, episodes.images[rows, 0], instructions, [column] * len(rows),
         horizon=episodes.num_steps, threshold=config.reward.goal_threshold,
     )
-    metrics = {"goal_episodes": float(len(rows)), "goal_found": float(imagined.found.mean())}
+    metrics["goal_found"] = float(imagined.found.mean())
     read, truth = position_reader(models.tokenizer, models.probe), episode_targets(episodes)[rows, reached]
     real = _latents(models, episodes.images[rows, reached])
     for ending, frames in (("", imagined.goals), ("_copy", episodes.images[rows, 0])):
@@ -45,6 +51,14 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
             metrics[f"goal_{name}{ending}_cm"] = float(errors.mean())
         metrics[f"goal_perceptual{ending}"] = float((_latents(models, frames) - real).abs().mean())
     return metrics
+
+
+def _knows(text: TextModel, instruction: str) -> bool:
+    try:
+        text.condition([instruction])
+    except ValueError:
+        return False
+    return True
 
 
 @torch.inference_mode()
