@@ -5,7 +5,6 @@ import torch
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task
-from wm_nodes.core.types import UInt8Array
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.text import TextModel, imagine_goals, instruction_for
@@ -13,6 +12,7 @@ from wm_nodes.world_model.training.tokenizer import episode_targets
 from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL, position_reader
 
 
+@torch.inference_mode()
 def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig, task: str) -> dict[str, float]:
     """Metrics by name (see docs/metrics.md) over the episodes that succeed at `task` after their first frame; none
     without such episodes or without a text model.
@@ -43,13 +43,13 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
     )
     metrics["goal_found"] = float(imagined.found.mean())
     read, truth = position_reader(models.tokenizer, models.probe), episode_targets(episodes)[rows, reached]
-    real = _latents(models, episodes.images[rows, reached])
+    real = models.tokenizer.encode(episodes.images[rows, reached])
     for ending, frames in (("", imagined.goals), ("_copy", episodes.images[rows, 0])):
         found = read(frames[:, None])[:, 0]
         for name, columns in (("object", OBJECT), ("tool", TOOL)):
             errors = 100 * np.linalg.norm(found[:, columns] - truth[:, columns], axis=-1)
             metrics[f"goal_{name}{ending}_cm"] = float(errors.mean())
-        metrics[f"goal_perceptual{ending}"] = float((_latents(models, frames) - real).abs().mean())
+        metrics[f"goal_perceptual{ending}"] = float((models.tokenizer.encode(frames) - real).abs().mean())
     return metrics
 
 
@@ -59,8 +59,3 @@ def _knows(text: TextModel, instruction: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-@torch.inference_mode()
-def _latents(models: WorldModels, images_EHW3: UInt8Array) -> torch.Tensor:
-    return models.tokenizer.encode(images_EHW3)
