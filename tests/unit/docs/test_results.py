@@ -101,13 +101,13 @@ def exploit_rows() -> Rows:
     """One line per reading, over the seeds: shares of episodes, precision and recall of imagined success."""
     studies = read("policy_rl_exploit_meter.json")["rows"]
     for readings in zip(*(one["exploit_meter"] for one in studies), strict=True):
-        counts = {name: [round(one[f"{name}_success"] * one["episodes"]) for one in readings]
-                  for name in ("imagined", "replayed", "real")}
-        hits = [round(one["precision"] * n) for one, n in zip(readings, counts["imagined"], strict=True)]
+        counted = {name: [round(one[f"{name}_success"] * one["episodes"]) for one in readings]
+                   for name in ("imagined", "replayed", "real")}
+        hits = [round(one["precision"] * n) for one, n in zip(readings, counted["imagined"], strict=True)]
         n = sum(int(one["episodes"]) for one in readings)
         yield row(
-            int(readings[0]["update"]), *(percent(sum(counts[name]) / n) for name in counts),
-            *(of_counts(sum(hits), sum(counts[name])).partition(", ")[2] for name in ("imagined", "replayed")),
+            int(readings[0]["update"]), *(percent(sum(each) / n) for each in counted.values()),
+            *(share_of(sum(hits), sum(counted[name])) for name in ("imagined", "replayed")),
         )
 
 
@@ -129,31 +129,40 @@ def refresh_rows() -> Rows:
 
 
 def scenes_rows() -> Rows:
-    """One line per task and training, over its seeds: success in the scenes of the training, and in those of the two
-    other splits where it was measured there."""
-    places = {("world_model", "gae"): "model, PPO", ("world_model", "group"): "model, GRPO",
-              ("simulator", "gae"): "simulator, PPO"}
+    """One line per task: GRPO in the model over its seeds, also in the two splits that were not trained on, and PPO in
+    the simulator; then PPO in the model, and other settings."""
     found = read("policy_rl_scenes.json")
-    for task, place in dict.fromkeys((one["task"], (one["model"], one["advantage"])) for one in found["rows"]):
-        mine = [one for one in found["rows"] if (one["task"], one["model"], one["advantage"]) == (task, *place)]
-        before, after = ([x for one in mine for x in one[key]] for key in ("success_before", "success_after"))
+    by_ppo = list[str]()
+    for task in dict.fromkeys(one["task"] for one in found["rows"]):
+        mine, ppo, control = (
+            [one for one in found["rows"] if (one["task"], one["model"], one["advantage"]) == (task, *way)]
+            for way in (("world_model", "group"), ("world_model", "gae"), ("simulator", "gae"))
+        )
         unseen = [split for one in mine for split in one["elsewhere"].values()]
         yield row(
-            task, places[place], ", ".join(str(one["seed"]) for one in mine),
-            f"{sum(before)} → {sum(after)} / {len(after)}", points(before, after),
-            "{} → {} / {}".format(*(sum(split[when][name] for split in unseen) for when, name in (
-                ("before", "successes"), ("after", "successes"), ("after", "episodes")
-            ))) if unseen else "",
+            task, counts(mine, "real_{}"), points(*outcomes(mine)), counts(unseen, "{}"),
             " → ".join(percent(mean(one[f"imagined_{when}"]["rate"] for one in mine)) for when in ("before", "after")),
+            counts(control, "real_{}") if control else "",
         )
+        by_ppo.append(f"{task} {points(*outcomes(ppo))}")
+    yield ", ".join(by_ppo)
     for one in found["other_settings"]:
-        yield f"{one['real_before']['successes']} → {one['real_after']['successes']} with `{one['settings']}`"
+        yield f"{counts([one], 'real_{}')} with `{one['settings']}`"
     (one,) = found["all_tasks"]
-    real, imagined = ([one[f"{where}_{when}"] for when in ("before", "after")] for where in ("real", "imagined"))
-    yield (
-        f"{real[0]['successes']} → {real[1]['successes']} of {real[1]['episodes']}, "
-        f"imagined {' → '.join(percent(rate['rate']) for rate in imagined)} %"
-    )
+    imagined = " → ".join(percent(one[f"imagined_{when}"]["rate"]) for when in ("before", "after"))
+    yield f"{counts([one], 'real_{}')}, imagined {imagined} %"
+
+
+def counts(found: list[Run], pattern: str) -> str:
+    """Successes before and after, and episodes."""
+    before, after = ([one[pattern.format(when)] for one in found] for when in ("before", "after"))
+    successes = (sum(rate["successes"] for rate in rates) for rates in (before, after))
+    return f"{' → '.join(map(str, successes))} / {sum(rate['episodes'] for rate in after)}"
+
+
+def outcomes(found: list[Run]) -> list[list[bool]]:
+    """Of every episode, before and after."""
+    return [[x for one in found for x in one[f"success_{when}"]] for when in ("before", "after")]
 
 
 def scenes_decoder_rows() -> Rows:
@@ -567,8 +576,12 @@ def done_rows() -> Rows:
 
 
 def of_counts(hits: int, n: int) -> str:
+    return f"{hits} of {n}, {share_of(hits, n)}"
+
+
+def share_of(hits: int, n: int) -> str:
     low, high = wilson_interval(hits, n)
-    return f"{hits} of {n}, {percent(hits / n)} [{percent(low)}, {percent(high)}]"
+    return f"{percent(hits / n)} [{percent(low)}, {percent(high)}]"
 
 
 def video_model_rows() -> Rows:
