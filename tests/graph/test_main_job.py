@@ -20,6 +20,7 @@ from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.summary import read_summary
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.world_model import load_model_folder
+from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS
 
 pytestmark = pytest.mark.graph
 PROGRAM = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-policy', *sys.argv[1:]]))"
@@ -68,7 +69,8 @@ def write_some_starts(path: Path) -> None:
     """Grey first frames: enough for a model without quality, and no simulator is needed for them."""
     path.parent.mkdir()
     images, states = np.full((8, 64, 128, 3), 128, np.uint8), np.tile(np.float32([0.6, 0.0, 0.1]), (8, 1))
-    save_file({"images": images, "states": states}, path)
+    told = np.frombuffer(json.dumps([("push_cube", "push the blue cube forward")] * 8).encode(), np.uint8)
+    save_file({"images": images, "states": states, INSTRUCTIONS: told}, path)
 
 
 @pytest.mark.slow

@@ -12,11 +12,14 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.policy_rl import model_refresh
 from wm_nodes.policy_rl.factories import make_policy
-from wm_nodes.policy_rl.model_refresh import ModelComparison, RefreshDecision, compare_models, is_worse, refresh_model
+from wm_nodes.policy_rl.initial_policy import write_round_starts, write_starts
+from wm_nodes.policy_rl.model_refresh import ModelComparison, RefreshDecision, compare_models, refresh_model
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.recording import read_episodes
 from wm_nodes.training.weights import save_weights
-from wm_nodes.world_model import load_model_folder
+from wm_nodes.world_model import load_model_folder, load_starts
+from wm_nodes.world_model.imagined_episodes import load_start_seeds
+from wm_nodes.world_model.validation.open_loop import episode_errors, evaluate_rollouts
 
 
 @pytest.fixture(scope="module")
@@ -67,30 +70,53 @@ def test_a_refresh_changes_the_action_model_and_nothing_else(
     assert (folder / "manifest.json").stat().st_mtime_ns == written
 
 
-def test_a_model_is_no_worse_than_itself(
+def test_a_model_is_neither_better_nor_worse_than_itself(
     config: RunConfig, model_dir: Path, bags: tuple[list[Path], list[Path]]
 ) -> None:
     models = load_model_folder(model_dir)
-    verdict = compare_models(models, models, {"policy": load_arrays(bags[1], config)}, config)
-    assert verdict.accepted and len(verdict.rows) == 4
-    assert verdict.to_dict()["rows"][0]["old"] == pytest.approx(verdict.rows[0].new)
+    verdict = compare_models(models, models, load_arrays(bags[1], config), config)
+    assert [row.name for row in verdict.rows] == ["tool error, cm", "object error, cm", "done signal right"]
+    assert not verdict.accepted and verdict.reason == "no difference beyond chance in 3 numbers"
+    assert [row.new for row in verdict.rows] == [row.old for row in verdict.rows]
 
 
-def test_an_undefined_number_is_worse_than_any_other() -> None:
-    nan = math.nan
-    assert is_worse(0.5, nan, 0.1, error=True) and is_worse(0.5, nan, 0.1, error=False)
-    assert not is_worse(nan, nan, 0.1, error=True) and not is_worse(nan, 0.1, 0.1, error=False)
-    assert is_worse(0.5, 0.56, 0.1, error=True) and not is_worse(0.5, 0.54, 0.1, error=True)
-    assert is_worse(0.5, 0.39, 0.1, error=False) and not is_worse(0.5, 0.41, 0.1, error=False)
+def test_a_model_is_taken_when_it_is_better_in_a_number_and_worse_in_none() -> None:
+    error = ModelComparison("tool error, cm", 3.0, 2.0, -1.5, -0.5, True)
+    same = ModelComparison("done signal right", 0.8, 0.9, -0.1, 0.3, False)
+    worse = replace(same, new=0.5, low=-0.5, high=-0.1)
+    assert RefreshDecision((error, same)).accepted
+    assert RefreshDecision((error, same)).reason == "better: tool error, cm 3.000 -> 2.000 (-1.500 to -0.500)"
+    assert not RefreshDecision((same,)).accepted and not RefreshDecision((error, worse)).accepted
+    assert RefreshDecision((error, worse)).reason == "worse: done signal right 0.800 -> 0.500 (-0.500 to -0.100)"
+    assert [row["better"] for row in RefreshDecision((error, worse)).to_dict()["rows"]] == [True, False]
 
 
-def test_a_verdict_names_what_got_worse() -> None:
-    good = ModelComparison("policy", "done recall", 0.5, 0.6, False)
-    bad = replace(good, name="done precision", new=math.nan, worse=True)
-    assert RefreshDecision((good,)).accepted
-    assert not RefreshDecision((good, bad)).accepted
-    assert "done precision on policy episodes 0.500 -> undefined" in RefreshDecision((good, bad)).reason
-    assert RefreshDecision((good, bad)).to_dict()["rows"][1]["new"] is None
+def test_errors_of_an_episode_are_those_at_its_own_last_step(
+    config: RunConfig, model_dir: Path, bags: tuple[list[Path], list[Path]]
+) -> None:
+    """Cut after four steps, an episode errs as its rollout did there."""
+    models, episodes = load_model_folder(model_dir), load_arrays(bags[1], config)
+    cut = replace(episodes, lengths=np.full(len(episodes), 4))
+    found = episode_errors(models.tokenizer, models.action, cut, config.task, threshold=0.7, probe=models.probe)
+    means = evaluate_rollouts(models.tokenizer, models.action, episodes, probe=models.probe)
+    assert found["tool_cm"].mean() == pytest.approx(means["tool_rollout_cm_h04"], rel=1e-4)
+    assert found["object_cm"].mean() == pytest.approx(means["object_rollout_cm_h04"], rel=1e-4)
+    whole = episode_errors(models.tokenizer, models.action, episodes, config.task, threshold=0.7, probe=models.probe)
+    assert whole["done_right"].mean() == pytest.approx(means[f"done_{config.task}_agreement"])
+
+
+def test_the_next_round_also_imagines_from_frames_of_the_policys_own_episodes(
+    config: RunConfig, bags: tuple[list[Path], list[Path]], tmp_path: Path
+) -> None:
+    write_starts(bags[1], tmp_path / "first.safetensors")
+    write_round_starts(config, tmp_path / "first.safetensors", bags[0], tmp_path / "round.safetensors")
+    first, joined = (load_starts(tmp_path / f"{name}.safetensors", config.task) for name in ("first", "round"))
+    assert len(first[0]) == 2 and len(joined[0]) == 5
+    np.testing.assert_array_equal(joined[0][:2], first[0])
+    own = {frame.tobytes() for bag in bags[0] for episode in read_episodes(bag) for frame in episode.images}
+    assert all(frame.tobytes() in own for frame in joined[0][2:])
+    with pytest.raises(ValueError, match="no reset seeds"):
+        load_start_seeds(tmp_path / "round.safetensors")
 
 
 def test_quantised_models_are_refused_with_the_remedy(config: RunConfig, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from wm_nodes.core.tool_control import next_state
 from wm_nodes.core.types import FloatArray, StepResult
 from wm_nodes.world_model import (
     ActionModel,
+    DeviceEnvironment,
     ImaginedEnvironment,
     TextModel,
     Tokenizer,
@@ -65,11 +66,12 @@ def starts() -> tuple[np.ndarray, FloatArray]:
 
 
 def make(
-    models: WorldModels, seed: int = 0, num_envs: int = NUM_ENVS, exact: bool = False, **reward: float
+    models: WorldModels, seed: int = 0, num_envs: int = NUM_ENVS, exact: bool = False, picture_noise: float = 0.0,
+    **reward: float,
 ) -> ImaginedEnvironment:
     return ImaginedEnvironment(
         models, spec_of(), starts(), config_of(**reward).reward, num_envs=num_envs, seed=seed, with_goals=False,
-        exact=exact,
+        exact=exact, picture_noise=picture_noise,
     )
 
 
@@ -90,6 +92,23 @@ def test_equal_seeds_give_bit_identical_episodes(models: WorldModels) -> None:
     np.testing.assert_array_equal(first.reset(seeds=seeds).image, second.reset(seeds=seeds).image)
     for step in range(4):
         assert_same(first.step(actions(step)), second.step(actions(step)))
+
+
+def test_picture_noise_is_shown_and_not_imagined_on(models: WorldModels) -> None:
+    clean, noisy, again = make(models), make(models, picture_noise=0.5), make(models, picture_noise=0.5)
+    seeds = np.full(NUM_ENVS, 7, np.uint64)
+    for env in (clean, noisy, again):
+        env.reset(seeds=seeds)
+    for step in range(3):
+        same = np.repeat(actions(step)[:1], NUM_ENVS, 0)
+        shown, hidden, repeated = (env.step(same) for env in (clean, noisy, again))
+        assert_same(hidden, repeated)
+        np.testing.assert_array_equal(shown.success_probability, hidden.success_probability)
+        np.testing.assert_array_equal(shown.observation.state, hidden.observation.state)
+        frames = hidden.observation.image
+        assert (frames != shown.observation.image).any((1, 2, 3)).all() and (frames[0] != frames[1]).any()
+    with pytest.raises(ValueError, match=r"picture_noise is 0\.5, and device rollouts have none"):
+        DeviceEnvironment.beside(noisy)
 
 
 def test_one_environment_reset_later_lives_the_same_episode_bit_for_bit(models: WorldModels) -> None:

@@ -19,13 +19,12 @@ from rich.table import Table
 from wm_nodes.apps import policy_run
 from wm_nodes.apps.policy_run import RunContext, TrainingResult, TrainingStart, WaitingGraph, console, read_success
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.core.device import compute_device
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import BoolArray
 from wm_nodes.policy_rl import model_refresh
-from wm_nodes.policy_rl.model_refresh import RefreshDecision
-from wm_nodes.policy_rl.pretraining import load_arrays
+from wm_nodes.policy_rl.initial_policy import STARTS
+from wm_nodes.policy_rl.model_refresh import RefreshDecision, round_folder
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 from wm_nodes.training.metrics import join_metrics
@@ -73,10 +72,14 @@ def split_updates(updates: int, rounds: int) -> list[int]:
 def round_start(job: RunContext, number: int, model_dir: Path, policy: Path) -> TrainingStart:
     """What round `number`, counted from 1, begins with."""
     shares = split_updates(job.config.ppo.updates, job.config.model_refresh.num_rounds)
-    start = TrainingStart(_folder(job, number), model_dir, policy, job.config)
+    start = TrainingStart(_folder(job, number), model_dir, policy, job.config, job.starts)
     if len(shares) == 1:
         return start
-    return replace(start, config=round_config(job.config, number, shares[number - 1]), label=f"round {number}")
+    own_starts = number > 1 and job.config.model_refresh.own_starts > 0
+    return replace(
+        start, config=round_config(job.config, number, shares[number - 1]), label=f"round {number}",
+        starts=round_folder(job.run_dir, number - 1) / STARTS if own_starts else job.starts,
+    )
 
 
 def run_rounds(
@@ -121,7 +124,7 @@ def run_rounds(
 
 
 def _folder(job: RunContext, number: int) -> Path:
-    return job.run_dir if job.config.model_refresh.num_rounds == 1 else job.run_dir / "rounds" / str(number)
+    return job.run_dir if job.config.model_refresh.num_rounds == 1 else round_folder(job.run_dir, number)
 
 
 def round_config(config: RunConfig, number: int, updates: int) -> RunConfig:
@@ -159,22 +162,8 @@ def _finish(
 
 
 def _refresh(job: RunContext, start: TrainingStart, policy: Path, number: int) -> RefreshDecision:
-    """Collect with the policy, go on training the model on all rounds' episodes and the replay, and compare."""
-    config, settings = job.config, job.config.model_refresh
-    job.stage(
-        f"collecting {settings.episodes_per_round} + {settings.heldout_episodes} (held out) episodes of the policy in "
-        "the simulator"
-    )
-    bags, heldout = model_refresh.collect_round(config, start.model_dir, policy, start.folder / "bags", number)
-    replay, scripted = model_refresh.collect_replay(config, job.run_dir)
-    earlier = [bag for k in range(1, number) for bag in sorted((_folder(job, k) / "bags" / "train").glob("shard_*"))]
-    job.stage(f"refreshing the world model: {settings.refresh_iterations} iterations")
-    episodes, folder = [*replay, *earlier, *bags], start.folder / "model"
-    model_refresh.refresh_model(config, start.model_dir, episodes, folder, number=number)
-    old, new = (load_model_folder(path, compute_device(config.device)) for path in (start.model_dir, folder))
-    verdict = model_refresh.compare_models(
-        old, new,
-        {"policy": load_arrays(heldout, config), "scripted": load_arrays(scripted, config)}, config,
+    verdict = model_refresh.refresh_round(
+        job.config, start.model_dir, policy, job.starts, job.run_dir, number, say=job.stage
     )
     console.print(_verdict_table(verdict, number))
     words = "taken" if verdict.accepted else "NOT taken, the old one is kept"
@@ -185,8 +174,7 @@ def _refresh(job: RunContext, start: TrainingStart, policy: Path, number: int) -
 def _verdict_table(verdict: RefreshDecision, number: int) -> Table:
     rows = []
     for row in verdict.rows:
-        values = (f"{value:.3f}" if value == value else "undefined" for value in (row.old, row.new))
-        rows.append((row.episodes, row.name, *values, "[red]worse" if row.worse else "[green]no worse"))
-    title = f"round {number}: the old and the refreshed model on held-out real episodes"
-    columns = ("episodes of", "number", "old", "new", "")
-    return make_table(title, columns, rows, left=("episodes of", "number", ""))
+        word = "[red]worse" if row.worse else "[green]better" if row.better else ""
+        rows.append((row.name, f"{row.old:.3f}", f"{row.new:.3f}", f"{row.low:+.3f} to {row.high:+.3f}", word))
+    title = f"round {number}: the old and the refreshed model on the policy's held-out real episodes"
+    return make_table(title, ("number", "old", "new", "new - old, 95 %", ""), rows, left=("number", ""))

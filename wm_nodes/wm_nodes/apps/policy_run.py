@@ -83,12 +83,14 @@ class RunContext:
 
 @dataclass(frozen=True)
 class TrainingStart:
-    """What one training begins with. folder: its own run folder. label: for bags and messages, e.g. "round 2"."""
+    """What one training begins with. folder: its own run folder. starts: frames to imagine from. label: for bags and
+    messages, e.g. "round 2"."""
 
     folder: Path
     model_dir: Path
     policy: Path
     config: RunConfig
+    starts: Path
     label: str = ""
 
 
@@ -127,7 +129,8 @@ def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
     bag = job.run_dir / "bags" / name
     graph, _ = launch_arguments.prepare("online_training", {
         "config_file": str(config_file), "reward": job.reward, "run_dir": str(start.folder),
-        "model_dir": str(start.model_dir), "starts_file": str(job.starts), "initial_policy": str(start.policy),
+        "model_dir": str(start.model_dir), "starts_file": str(start.starts), "first_frames_file": str(job.starts),
+        "initial_policy": str(start.policy),
         "seed": str(start.config.seed), "bag_uri": str(bag), "domain_id": job.domain_id,
         "compose": "true" if job.compose else "false", "autostart": "false", **job.environment,
     })

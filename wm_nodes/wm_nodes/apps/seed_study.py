@@ -1,6 +1,7 @@
 """Compare RL in the world model with RL in the simulator, over several seeds and tasks, with intervals.
 
-By policy_rl/train.py, in one process: the updates are bit-equal to those of the graph, without its start-up.
+By policy_rl/train.py, in one process: the updates are bit-equal to those of the graph, without its start-up. In the
+world model, model_refresh.num_rounds above 1 trains in rounds, as apps/model_refresh_loop.py does.
 Each (task, seed, arm) is one line of results.jsonl; finished lines are not run again.
 """
 
@@ -8,7 +9,7 @@ import argparse
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -17,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from wm_nodes.apps.model_refresh_loop import round_config, split_updates
 from wm_nodes.apps.options import add_preset, add_threads, prepare_torch, settings
 from wm_nodes.apps.policy_run import success_rate
 from wm_nodes.config.load import default_task, dump_config, load_config, preset_names
@@ -31,7 +33,8 @@ from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.exploit_meter import ExploitMeter, make_exploit_meter
 from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment, models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.initial_policy import prepare_start
+from wm_nodes.policy_rl.initial_policy import STARTS, prepare_start
+from wm_nodes.policy_rl.model_refresh import refresh_round, round_folder
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
@@ -45,6 +48,17 @@ FORMER_NAMES = {"gate": "acceptance", "gate_passed": "accepted"}
 ARMS = ("world_model", "simulator")
 SIMULATOR_ENVS = 8
 IMAGINED_EPISODES = 256
+
+
+@dataclass
+class _Trained:
+    """course: of each update, see _train. model_dir: trained in last. readings: rows of the exploit meter. refreshes:
+    the verdict on each refreshed model."""
+
+    course: list[dict[str, float]]
+    model_dir: Path
+    readings: list[dict[str, float]] = field(default_factory=list)
+    refreshes: list[dict[str, Any]] = field(default_factory=list)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -146,25 +160,27 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
     starts, weak = prepare_start(config, run_dir, model_dir)
     policy = load_policy(config, model_dir, weak)
     real = ManiSkillEnvironment(config.task, config.simulation, SIMULATOR_ENVS, seed=config.seed)
-    imagined = make_imagined_environment(config, model_dir, starts, num_envs=config.ppo.num_envs, seed=config.seed)
 
-    def measure() -> tuple[EvaluationResult, EvaluationResult]:
-        """In the simulator and in the world model."""
+    def measure(folder: Path) -> tuple[EvaluationResult, EvaluationResult]:
+        """In the simulator and in the world model of a folder."""
         how = config.evaluation
+        imagined = make_imagined_environment(config, folder, starts, num_envs=config.ppo.num_envs, seed=config.seed)
         return (
             evaluate(policy, real, how.episodes, how.first_seed, how.deterministic),
             evaluate(policy, imagined, IMAGINED_EPISODES, how.first_seed),
         )
 
-    real_before, imagined_before = measure()
+    real_before, imagined_before = measure(model_dir)
     acceptance = accept_world_model(
         models_of(model_dir, config.device),
         load_arrays(collect_plan(acceptance_plan(config), config, folder / "heldout"), config), config,
         (imagined_before.successes, imagined_before.episodes), (real_before.successes, real_before.episodes),
     )
-    meter = None if arm == "simulator" else make_exploit_meter(config, model_dir, starts, lambda: real)
-    course = _train(policy, real if arm == "simulator" else imagined, config, arm, model_dir, meter)
-    real_after, imagined_after = measure()
+    if arm == "simulator":
+        trained = _Trained(_train(policy, real, config, arm, model_dir), model_dir)
+    else:
+        trained = _train_in_rounds(policy, real, config, model_dir, starts, run_dir)
+    real_after, imagined_after = measure(trained.model_dir)
     real.close()
     save_weights(policy, run_dir / f"{arm}.safetensors", {"tokenizer_sha256": policy.encoder.sha256})
     row = {
@@ -175,10 +191,10 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         "imagined_after": asdict(success_rate(imagined_after.success)),
         "paired": asdict(paired_difference(real_before.success.tolist(), real_after.success.tolist())),
         "accepted": acceptance.passed, "acceptance": acceptance.to_dict(),
-        "environment_steps": sum(c["steps"] for c in course),
+        "environment_steps": sum(c["steps"] for c in trained.course),
         "success_before": real_before.success.astype(int).tolist(),
-        "success_after": real_after.success.astype(int).tolist(), "course": course,
-        "exploit_meter": meter.rows() if meter is not None else [],
+        "success_after": real_after.success.astype(int).tolist(), "course": trained.course,
+        "exploit_meter": trained.readings, "refreshes": trained.refreshes,
         "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(config.device),
         "config": dump_config(config), "world_model_sha256": models_of(model_dir, config.device).sha256,
     }
@@ -186,8 +202,36 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         file.write(json.dumps(row) + "\n")
 
 
+def _train_in_rounds(
+    policy: ImagePolicy, real: Environment, config: RunConfig, model_dir: Path, starts: Path, run_dir: Path
+) -> _Trained:
+    """Train in place."""
+    shares, first_frames = split_updates(config.ppo.updates, config.model_refresh.num_rounds), starts
+    trained = _Trained([], model_dir)
+    for number, updates in enumerate(shares, 1):
+        part = round_config(config, number, updates)
+        env = make_imagined_environment(
+            part, model_dir, starts, num_envs=config.ppo.num_envs, seed=part.seed, training=True
+        )
+        meter = make_exploit_meter(part, model_dir, first_frames, lambda: real)
+        made = sum(shares[: number - 1])
+        trained.course += _train(policy, env, part, "world_model", model_dir, meter)
+        trained.readings += [] if meter is None else [{**row, "update": row["update"] + made} for row in meter.rows()]
+        if number == len(shares):
+            break
+        weights = round_folder(run_dir, number) / "policy.safetensors"
+        weights.parent.mkdir(parents=True, exist_ok=True)
+        save_weights(policy, weights, {"tokenizer_sha256": policy.encoder.sha256})
+        verdict = refresh_round(config, model_dir, weights, first_frames, run_dir, number)
+        trained.refreshes.append(verdict.to_dict())
+        trained.model_dir = model_dir = weights.with_name("model") if verdict.accepted else model_dir
+        starts = weights.with_name(STARTS) if config.model_refresh.own_starts else starts
+    return trained
+
+
 def _train(
-    policy: ImagePolicy, env: Environment, config: RunConfig, arm: str, model_dir: Path, meter: ExploitMeter | None
+    policy: ImagePolicy, env: Environment, config: RunConfig, arm: str, model_dir: Path,
+    meter: ExploitMeter | None = None,
 ) -> list[dict[str, float]]:
     """Train in place; return success rate, KL and environment steps of each update."""
     reward: RewardModel = RuleReward() if arm == "simulator" else make_endogenous_reward(config, model_dir)

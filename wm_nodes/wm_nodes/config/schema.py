@@ -145,6 +145,13 @@ class WorldModelConfig(SettingsSection):
     """Weight of the losses on predicted frames after decoding, and after encoding them again (0: off)."""
 
 
+class ImaginedEnvironmentConfig(SettingsSection):
+    """How the world model shows itself to a policy that is trained in it."""
+
+    picture_noise: NonNegativeFloat
+    """Standard deviation of Gaussian noise on the latents of shown frames; the model goes on without it."""
+
+
 class VideoEnvironmentConfig(SettingsSection):
     """How the video model makes a frame where it is the environment."""
 
@@ -349,9 +356,8 @@ class ModelRefreshConfig(SettingsSection):
     refresh_iterations: PositiveInt
     learning_rate: PositiveFloat
     """Peak learning rate of a refresh."""
-    tolerance: NonNegativeFloat
-    """A new model is no worse while no error ratio grows by more than this share and no done precision or recall falls
-    by more than this."""
+    own_starts: Annotated[int, Field(ge=0, le=5000)]
+    """Frames of the policy's own episodes, before success, to imagine from after a refresh, beside the first frames."""
 
 
 class EvaluationConfig(SettingsSection):
@@ -370,6 +376,7 @@ class RunConfig(SettingsSection):
     data: DataConfig
     tokenizer: TokenizerConfig
     world_model: WorldModelConfig
+    imagined_environment: ImaginedEnvironmentConfig
     video_environment: VideoEnvironmentConfig
     reward: RewardConfig
     judge: JudgeConfig

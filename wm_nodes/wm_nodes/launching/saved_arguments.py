@@ -35,8 +35,8 @@ NOT_KEPT = (
 FREE = ("namespace", "params_file", "record", "bag_uri", "rate", "train", "keep_buffers", "tensorboard")
 """Kept, and may be given anew."""
 FILES = (
-    "config_file", "params_file", "model_dir", "starts_file", "initial_policy", "video_model_dir", "context_bags",
-    "heldout_bags", "bag_uri",
+    "config_file", "params_file", "model_dir", "starts_file", "first_frames_file", "initial_policy", "video_model_dir",
+    "context_bags", "heldout_bags", "bag_uri",
 )
 ARGUMENT_OF = {
     "rewards": "reward", "judge.kind": "judge", "judge.endpoints": "judge", "judge.folder": "judge",

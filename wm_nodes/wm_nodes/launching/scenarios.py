@@ -54,7 +54,8 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("keep_buffers", "4", "Rollout buffers kept in run_dir/buffers; training again needs all of them"),
     LaunchArgument("tensorboard", "false", "Also write the learner's metrics to run_dir/tensorboard", TRUTHS),
     LaunchArgument("video_preset", "recommended", "Settings of loop 2: a name, or a .yaml file"),
-    LaunchArgument("starts_file", "", "First frames to imagine from; empty: starts.safetensors in model_dir"),
+    LaunchArgument("starts_file", "", "Frames to imagine from; empty: starts.safetensors in model_dir"),
+    LaunchArgument("first_frames_file", "", "First frames with reset seeds, for the exploit meter; empty: starts_file"),
     LaunchArgument("initial_policy", "", "Weights (safetensors) that the policy and the learner start from"),
     LaunchArgument("backend", "world_model", "What the environment node steps",
                    (*IMAGINED, "maniskill", "factory")),
@@ -233,7 +234,7 @@ def _online_training(arguments: Mapping[str, str]) -> Graph:
     ranks = _integer(arguments, "learner_ranks", 1, 1024)
     learner = _weights(arguments)
     if arguments["backend"] in IMAGINED:
-        learner["starts_file"] = arguments["starts_file"]
+        learner["starts_file"] = arguments["first_frames_file"] or arguments["starts_file"]
     if arguments["backend"] == "video_model":
         learner["video_model_dir"] = arguments["video_model_dir"]
     if arguments["reward"] == "agent":
@@ -302,9 +303,9 @@ class Scenario:
 
 _JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
 _TRAINING = (
-    *_COMMON, "model_dir", "starts_file", "initial_policy", "backend", "video_model_dir", "reward", "num_envs",
-    "simulator_envs", "simulator", "seed", "learner_ranks", "record", "bag_uri", "backend_factory", "policy_factory",
-    "reward_factory", *_JUDGE,
+    *_COMMON, "model_dir", "starts_file", "first_frames_file", "initial_policy", "backend", "video_model_dir",
+    "reward", "num_envs", "simulator_envs", "simulator", "seed", "learner_ranks", "record", "bag_uri",
+    "backend_factory", "policy_factory", "reward_factory", *_JUDGE,
 )
 _ROLLOUT = (
     "model_dir", "starts_file", "initial_policy", "backend", "video_model_dir", "mode", "reward", "num_envs", "seed",

@@ -61,8 +61,9 @@ def make_environment(
 
     name, folder = ("model_dir", model_dir) if backend == "world_model" else ("video_model_dir", video_model_dir)
     model, starts = existing(folder, name), existing(starts_file, "starts_file")
-    make = make_imagined_environment if backend == "world_model" else make_video_environment
-    return make(config, model, starts, num_envs=num_envs, seed=seed)
+    if backend == "video_model":
+        return make_video_environment(config, model, starts, num_envs=num_envs, seed=seed)
+    return make_imagined_environment(config, model, starts, num_envs=num_envs, seed=seed, training=True)
 
 
 def make_reward(kind: str, config: RunConfig, model_dir: str, factory: str = "") -> RewardModel:

@@ -109,14 +109,19 @@ def make_endogenous_reward(config: RunConfig, model_dir: Path) -> EndogenousRewa
 
 
 def make_imagined_environment(
-    config: RunConfig, model_dir: Path, starts_file: Path, *, num_envs: int, seed: int
+    config: RunConfig, model_dir: Path, starts_file: Path, *, num_envs: int, seed: int, training: bool = False
 ) -> ImaginedEnvironment:
     """Return the world model as an environment for config.task.
+
+    Args:
+        training: show frames with imagined_environment.picture_noise.
 
     Raises:
         ValueError: the folder was trained for another scene than the configuration describes.
     """
-    environment = _imagine(partial(ImaginedEnvironment, seed=seed), config, model_dir, starts_file, num_envs)
+    noise = config.imagined_environment.picture_noise if training else 0.0
+    make = partial(ImaginedEnvironment, seed=seed, picture_noise=noise)
+    environment = _imagine(make, config, model_dir, starts_file, num_envs)
     environment.cameras = _cameras(config, environment)
     return environment
 
@@ -179,9 +184,10 @@ def _imagine(
 def make_training_environment(
     config: RunConfig, model_dir: Path, starts_file: Path, *, num_envs: int, seed: int
 ) -> ImaginedEnvironment | DeviceEnvironment:
-    """Return the environment that policy_rl.train trains in fastest: on a GPU rollouts stay there."""
-    if compute_device(config.device).type == CPU:
-        return make_imagined_environment(config, model_dir, starts_file, num_envs=num_envs, seed=seed)
+    """Return the environment that policy_rl.train trains in fastest: on a GPU rollouts stay there, unless frames are
+    shown with noise."""
+    if compute_device(config.device).type == CPU or config.imagined_environment.picture_noise:
+        return make_imagined_environment(config, model_dir, starts_file, num_envs=num_envs, seed=seed, training=True)
     return make_device_environment(config, model_dir, starts_file, num_envs=num_envs)
 
 

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import save
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import success
+from wm_nodes.config.tasks import get_task, success
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode
@@ -22,7 +22,7 @@ from wm_nodes.policy_rl.factories import make_policy, make_reconstruct
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording import read_episodes
 from wm_nodes.training.weights import save_weights
-from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS, pack_instructions
+from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS, join_starts, pack_instructions
 
 STARTS = "starts.safetensors"
 MAX_STARTS, MODEL_STARTS = 512, 64
@@ -74,6 +74,18 @@ def write_starts(
     }
     write_atomic(path, save(tensors))
     return len(chosen)
+
+
+def write_round_starts(config: RunConfig, first_frames: Path, bags: Iterable[Path], path: Path) -> None:
+    """Write a run's first frames and up to model_refresh.own_starts frames of a policy's episodes, before success.
+
+    Args:
+        first_frames: as write_starts wrote it. bags: of the policy's episodes.
+    """
+    tasks = () if get_task(config.task).parts else (config.task,)
+    own, limit = path.with_name("own_starts.safetensors"), config.model_refresh.own_starts
+    write_starts(bags, own, limit, tasks=tasks, frames="any", seed=config.seed)
+    write_atomic(path, save(join_starts(first_frames, own)))
 
 
 def frames_before_success(episode: Episode, tasks: Sequence[str] = ()) -> int:

@@ -1,12 +1,13 @@
 """Refresh a world model on what the current policy does in the simulator, and keep the better of the two models.
 
+Shapes: E episodes.
+
 The action model goes on training on all rounds' policy episodes and on scripted ones (replay). Tokenizer, text model
 and probe stay as they are, byte for byte: policies are tied to the tokenizer.
 """
 
 import copy
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -16,15 +17,18 @@ from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.config.tasks import get_task, recorded_task
 from wm_nodes.core.device import compute_device, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
+from wm_nodes.core.statistics import bootstrap_mean, paired_difference
 from wm_nodes.environments.maniskill.collection import CollectionPlan
-from wm_nodes.environments.record import TRAINING_SEEDS, acceptance_plan, collect_plan, scripted_plan
+from wm_nodes.environments.record import TRAINING_SEEDS, collect_plan, scripted_plan
 from wm_nodes.policy_rl.factories import policy_actor
+from wm_nodes.policy_rl.initial_policy import STARTS, write_round_starts
+from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import ActionModel, WorldModels, load_model_folder, save_refreshed_folder
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.training.dynamics import train_action_model
-from wm_nodes.world_model.validation.acceptance import model_metrics
+from wm_nodes.world_model.validation.open_loop import episode_errors
 
 ROUND_SEEDS, ROUND_HELDOUT_SEEDS = 800_000, 900_000
 SEEDS_PER_ROUND = 5_000
@@ -33,38 +37,47 @@ SEEDS_PER_ROUND = 5_000
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """One number of the old and of the new model; NaN where undefined, which is the worst value there is."""
+    """Means over the same held-out episodes, and the 95 % interval of new less old. error: whether less is better."""
 
-    episodes: str
     name: str
     old: float
     new: float
-    worse: bool
+    low: float
+    high: float
+    error: bool
+
+    @property
+    def better(self) -> bool:
+        return self.high < 0 if self.error else self.low > 0
+
+    @property
+    def worse(self) -> bool:
+        return self.low > 0 if self.error else self.high < 0
 
 
 @dataclass(frozen=True)
 class RefreshDecision:
-    """accepted: the new model is no worse than the old one in any number."""
+    """accepted: beyond chance the new model is better in one number at least and worse in none."""
 
     rows: tuple[ModelComparison, ...]
 
     @property
     def accepted(self) -> bool:
-        return not any(row.worse for row in self.rows)
+        return any(row.better for row in self.rows) and not any(row.worse for row in self.rows)
 
     @property
     def reason(self) -> str:
         """One sentence for people."""
-        if self.accepted:
-            return f"no worse than the old model in {len(self.rows)} numbers on held-out episodes"
-        return "worse: " + ", ".join(
-            f"{row.name} on {row.episodes} episodes {_text(row.old)} -> {_text(row.new)}"
-            for row in self.rows if row.worse
+        worse, better = ([row for row in self.rows if getattr(row, name)] for name in ("worse", "better"))
+        if not worse and not better:
+            return f"no difference beyond chance in {len(self.rows)} numbers"
+        return ("worse: " if worse else "better: ") + ", ".join(
+            f"{row.name} {row.old:.3f} -> {row.new:.3f} ({row.low:+.3f} to {row.high:+.3f})" for row in worse or better
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, NaN as None."""
-        rows = [{key: None if value != value else value for key, value in asdict(row).items()} for row in self.rows]
+        """Plain values for JSON."""
+        rows = [{**asdict(row), "better": row.better, "worse": row.worse} for row in self.rows]
         return {"accepted": self.accepted, "reason": self.reason, "rows": rows}
 
 
@@ -102,13 +115,10 @@ def collect_round(
     return bags[0], bags[1]
 
 
-def collect_replay(config: RunConfig, run_dir: Path) -> tuple[list[Path], list[Path]]:
-    """Scripted simulator episodes of a run, collected once: (replay for every refresh, held out as for acceptance)."""
-    replay = scripted_plan(config, config.model_refresh.replay_episodes, TRAINING_SEEDS)
-    return (
-        collect_plan(replay, config, run_dir / "bags" / "replay"),
-        collect_plan(acceptance_plan(config), config, run_dir / "bags" / "heldout"),
-    )
+def collect_replay(config: RunConfig, run_dir: Path) -> list[Path]:
+    """Scripted simulator episodes of a run, collected once: the replay of every refresh."""
+    plan = scripted_plan(config, config.model_refresh.replay_episodes, TRAINING_SEEDS)
+    return collect_plan(plan, config, run_dir / "bags" / "replay")
 
 
 def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], folder: Path, *, number: int = 1) -> Path:
@@ -157,39 +167,61 @@ def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], fold
     return folder
 
 
-def compare_models(
-    old: WorldModels, new: WorldModels, heldout: Mapping[str, EpisodeArrays], config: RunConfig
-) -> RefreshDecision:
-    """Compare both models on held-out real episodes, by the name of their kind, in the numbers of model acceptance."""
+def compare_models(old: WorldModels, new: WorldModels, heldout: EpisodeArrays, config: RunConfig) -> RefreshDecision:
+    """Compare both models on a policy's held-out real episodes: positions at the end, cm, and whether the done signal
+    is right.
+
+    Intervals: of errors by bootstrap over the episodes (stream of config.seed), of the done signal Tango's.
+    """
+    before, after = (
+        episode_errors(
+            models.tokenizer, models.action, heldout, config.task, threshold=config.reward.success_threshold,
+            probe=models.probe,
+        )
+        for models in (old, new)
+    )
+    names = {"tool error, cm": "tool_cm", "object error, cm": "object_cm"}
+    if not get_task(config.task).moves_object:
+        del names["object error, cm"]
     rows = []
-    for name, episodes in heldout.items():
-        numbers = [_numbers(model_metrics(models, episodes, config), config, episodes.num_steps)
-                   for models in (old, new)]
-        for key, before in numbers[0].items():
-            after = numbers[1][key]
-            worse = is_worse(before, after, config.model_refresh.tolerance, key.endswith("copying"))
-            rows.append(ModelComparison(name, key, before, after, worse))
+    for name, key in names.items():
+        _, low, high = bootstrap_mean(after[key] - before[key], seed=config.seed)
+        rows.append(ModelComparison(name, float(before[key].mean()), float(after[key].mean()), low, high, True))
+    right = paired_difference(before["done_right"].tolist(), after["done_right"].tolist())
+    old_share, new_share = (float(errors["done_right"].mean()) for errors in (before, after))
+    rows.append(ModelComparison("done signal right", old_share, new_share, right.low, right.high, False))
     return RefreshDecision(tuple(rows))
 
 
-def is_worse(old: float, new: float, tolerance: float, error: bool) -> bool:
-    """Whether `new` is worse than `old`: an error that grew by more than the share `tolerance`, or a rate that fell by
-    more than it. NaN (undefined) is worse than every number, and equal to itself."""
-    if math.isnan(new):
-        return not math.isnan(old)
-    if math.isnan(old):
-        return False
-    return new > old * (1 + tolerance) if error else new < old - tolerance
+def round_folder(run_dir: Path, number: int) -> Path:
+    """Of round `number`, counted from 1, of a run with several."""
+    return run_dir / "rounds" / str(number)
 
 
-def _numbers(metrics: Mapping[str, float], config: RunConfig, num_steps: int) -> dict[str, float]:
-    label = f"h{num_steps:02d}"
-    errors = {"tool error / copying": f"tool_ratio_{label}"}
-    if get_task(config.task).moves_object:
-        errors["object error / copying"] = f"object_moved_ratio_{label}"
-    rates = {f"done {kind}": f"done_{config.task}_{kind}" for kind in ("precision", "recall")}
-    return {name: float(metrics.get(key, math.nan)) for name, key in (errors | rates).items()}
+def refresh_round(
+    config: RunConfig, model_dir: Path, weights: Path, first_frames: Path, run_dir: Path, number: int, *,
+    say: Callable[[str], None] = lambda text: None,
+) -> RefreshDecision:
+    """Collect with a round's policy, refresh the model on all rounds' episodes and the replay, and compare.
 
+    Writes to the round's folder: bags, model, and the starts of the next round.
 
-def _text(value: float) -> str:
-    return "undefined" if math.isnan(value) else f"{value:.3f}"
+    Args:
+        model_dir: that the round trained in. weights: of its policy. first_frames: see write_round_starts.
+    """
+    settings, folder = config.model_refresh, round_folder(run_dir, number)
+    say(
+        f"collecting {settings.episodes_per_round} + {settings.heldout_episodes} (held out) episodes of the policy in "
+        "the simulator"
+    )
+    bags, heldout = collect_round(config, model_dir, weights, folder / "bags", number)
+    earlier = (round_folder(run_dir, k) / "bags" / "train" for k in range(1, number))
+    own = [*(bag for part in earlier for bag in sorted(part.glob("shard_*"))), *bags]
+    if settings.own_starts:
+        write_round_starts(config, first_frames, own, folder / STARTS)
+    say(f"refreshing the world model: {settings.refresh_iterations} iterations")
+    refreshed = refresh_model(
+        config, model_dir, [*collect_replay(config, run_dir), *own], folder / "model", number=number
+    )
+    old, new = (load_model_folder(path, compute_device(config.device)) for path in (model_dir, refreshed))
+    return compare_models(old, new, load_arrays(heldout, config), config)

@@ -92,7 +92,16 @@ class DeviceEnvironment:
 
     @classmethod
     def beside(cls, environment: ImaginedEnvironment) -> "DeviceEnvironment":
-        """The same model, starts, rules and number of environments, with a state of its own."""
+        """The same model, starts, rules and number of environments, with a state of its own.
+
+        Raises:
+            ValueError: an environment with picture noise.
+        """
+        if environment.picture_noise:
+            raise ValueError(
+                f"imagined_environment.picture_noise is {environment.picture_noise}, and device rollouts have none; "
+                "set it to 0, or leave the rollouts to the graph"
+            )
         return cls(
             environment.models, environment.spec, environment.starts, environment.reward,
             num_envs=environment.spec.num_envs, instructions=environment.instructions,

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
+from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import ActionModel, task_done_signal
@@ -80,17 +81,20 @@ class ImaginedEnvironment(ImaginedEpisodes):
         instructions: of every start, for its goal; none: that of the spec.
         with_goals: imagine goals by the text model (needed for the dense reward).
         exact: compute in float32 even where bfloat16 is faster.
+        picture_noise: standard deviation of noise on the latents of shown frames, of the stream picture_noise of
+            (episode's reset seed, environment, step); the model goes on without it.
     """
 
     def __init__(
         self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
         *, num_envs: int, seed: int = 0, instructions: Sequence[str] = (), with_goals: bool = True,
-        exact: bool = False,
+        exact: bool = False, picture_noise: float = 0.0,
     ) -> None:
         super().__init__(
             world_model_spec(models, spec, num_envs), starts, reward, seed=seed, device=models.tokenizer.device
         )
         self.models, self.instructions, self._exact = models, instructions, exact
+        self.picture_noise = picture_noise
         self._start_tasks = task_indices(starts[1], spec, models.task_index)
         self._tokenizer, self._action = models_to_infer(models, exact=exact)
         images, _ = starts
@@ -118,13 +122,14 @@ class ImaginedEnvironment(ImaginedEpisodes):
         tool = self.spec.tool_dim
         acted, before, after = map(self._tensor, (actions, self._states[:, :tool], moved[:, :tool]))
         keep = self._tensor(valid)[:, None, None]
+        noise = self._noise()
 
         def part(item: CachedPart) -> tuple[Tensor, Tensor, Tensor]:
             rows, caches = item
             with compute_context(tokenizer.device, exact=self._exact):
                 latents, logits = model.advance(self._latents[rows], acted[rows], before[rows], after[rows], caches)
             latents = torch.where(keep[rows], latents, self._latents[rows])
-            return latents, logits, tokenizer.decode(latents)
+            return latents, logits, tokenizer.decode(latents if noise is None else latents + noise[rows])
 
         parts = in_parallel(part, self._parts)
         latents, logits, frames = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
@@ -133,3 +138,14 @@ class ImaginedEnvironment(ImaginedEpisodes):
         self._latents = latents
         told = torch.stack(task_done_signal(logits, self._tensor(self._start_tasks[self._starts]))).cpu()
         return frames.cpu().numpy(), told[0].numpy(), told[1].numpy()
+
+    def _noise(self) -> Tensor | None:
+        """Noise on the shown latents (N, S, D) at this step; None without."""
+        if not self.picture_noise:
+            return None
+        streams = (
+            torch_stream(int(seed), "picture_noise", env, int(step))
+            for env, (seed, step) in enumerate(zip(self._seeds, self._steps, strict=True))
+        )
+        drawn = torch.stack([torch.randn(self._latents.shape[1:], generator=stream) for stream in streams])
+        return self.picture_noise * drawn.to(self.device)

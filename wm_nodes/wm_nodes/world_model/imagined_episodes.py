@@ -88,8 +88,26 @@ def _told(path: Path, tensors: Mapping[str, Tensor]) -> list[tuple[str, str]]:
 
 def pack_instructions(episodes: Sequence[Episode]) -> Tensor:
     """The instructions of a starts file, uint8: the UTF-8 bytes of a JSON list of (recorded task, instruction)."""
-    text = json.dumps([(episode.task, episode.instruction) for episode in episodes])
-    return torch.tensor(list(text.encode()), dtype=torch.uint8)
+    return _packed([(episode.task, episode.instruction) for episode in episodes])
+
+
+def _packed(told: Sequence[tuple[str, str]]) -> Tensor:
+    return torch.tensor(list(json.dumps(told).encode()), dtype=torch.uint8)
+
+
+def join_starts(*paths: Path) -> dict[str, Tensor]:
+    """The tensors of one starts file with the starts of several, without reset seeds.
+
+    Raises:
+        ValueError: a file without instructions.
+    """
+    files = [load_file(path) for path in paths]
+    for path, tensors in zip(paths, files, strict=True):
+        if INSTRUCTIONS not in tensors:
+            raise ValueError(f"{path} has no instructions; delete it to have it written again")
+    told = [entry for path, tensors in zip(paths, files, strict=True) for entry in _told(path, tensors)]
+    joined = {name: torch.cat([tensors[name] for tensors in files]) for name in ("images", "states")}
+    return {**joined, INSTRUCTIONS: _packed(told)}
 
 
 def load_start_seeds(path: Path, task: str = "") -> UInt64Array:

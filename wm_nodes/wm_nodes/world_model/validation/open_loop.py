@@ -8,7 +8,7 @@ are encoded again and read by the tokenizer's probe. The reader's own error on r
 floor, and copying the first frame is measured in the same way.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
@@ -130,14 +130,44 @@ def evaluate_rollouts(
         rows = labelled[:, j]
         if not rows.any():
             continue
-        happened = (episodes.success[rows, 1:, j] & frame_mask[rows]).any(1)
-        signal = np.where(frame_mask[rows], imagined.signals[rows, :, j], 0).max(1)
-        detection = detection_metrics(signal, happened, threshold)
+        signal, happened = _done(imagined, episodes, [j] * len(episodes))
+        detection = detection_metrics(signal[rows], happened[rows], threshold)
         metrics |= {f"done_{task}_{key}": value for key, value in detection.items()}
         metrics[f"done_{task}_uncertainty_p99"] = float(
             np.quantile(imagined.uncertainty[rows, :, j][frame_mask[rows]], 0.99)
         )
     return metrics
+
+
+@torch.inference_mode()
+def episode_errors(
+    tokenizer: Tokenizer, model: ActionModel | TokenActionModel, episodes: EpisodeArrays, task: str, *,
+    threshold: float, probe: PositionProbe | None = None,
+) -> dict[str, FloatArray]:
+    """Of the rollout of each episode, (E,): error of the object and of the tool after its last step (object_cm,
+    tool_cm), and whether the done signal exceeds `threshold` if and only if the episode succeeds (done_right, bool), in
+    `task` or, where that has parts, in the task it was recorded for.
+    """
+    imagined, rows = imagine_episodes(tokenizer, model, episodes), np.arange(len(episodes))
+    last = imagined.frames[rows, episodes.lengths - 1][:, None]
+    estimate = position_reader(tokenizer, probe)(last)[:, 0]
+    truth = episode_targets(episodes)[rows, episodes.lengths]
+    own = [episodes.tasks.index(task if task in episodes.tasks else name) for name in episodes.recorded_tasks]
+    signal, happened = _done(imagined, episodes, own)
+    errors = {
+        name: 100 * np.linalg.norm(estimate[:, columns] - truth[:, columns], axis=-1)
+        for name, columns in (("object_cm", OBJECT), ("tool_cm", TOOL))
+    }
+    return {**errors, "done_right": (signal > threshold) == happened}
+
+
+def _done(
+    imagined: ImaginedEpisodes, episodes: EpisodeArrays, tasks: Sequence[int]
+) -> tuple[FloatArray, BoolArray]:
+    """(E,), the highest done signal of each episode's task within the recorded steps, and whether it succeeds."""
+    rows, mask = np.arange(len(episodes)), episodes.step_mask
+    signal: FloatArray = np.where(mask, imagined.signals[rows, :, tasks], 0).max(1)
+    return signal, (episodes.success[rows, 1:, tasks] & mask).any(1)
 
 
 def detection_metrics(scores: FloatArray, positive: BoolArray, threshold: float) -> dict[str, float]:
