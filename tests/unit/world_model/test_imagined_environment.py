@@ -1,6 +1,8 @@
 """The world model behind the Environment interface, and its folder on disk. Untrained weights: only the rules count."""
 
+import copy
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,11 +69,11 @@ def starts() -> tuple[np.ndarray, FloatArray]:
 
 def make(
     models: WorldModels, seed: int = 0, num_envs: int = NUM_ENVS, exact: bool = False, picture_noise: float = 0.0,
-    **reward: float,
+    second: WorldModels | None = None, **reward: float,
 ) -> ImaginedEnvironment:
     return ImaginedEnvironment(
         models, spec_of(), starts(), config_of(**reward).reward, num_envs=num_envs, seed=seed, with_goals=False,
-        exact=exact, picture_noise=picture_noise,
+        exact=exact, picture_noise=picture_noise, second=second,
     )
 
 
@@ -107,8 +109,29 @@ def test_picture_noise_is_shown_and_not_imagined_on(models: WorldModels) -> None
         np.testing.assert_array_equal(shown.observation.state, hidden.observation.state)
         frames = hidden.observation.image
         assert (frames != shown.observation.image).any((1, 2, 3)).all() and (frames[0] != frames[1]).any()
-    with pytest.raises(ValueError, match=r"picture_noise is 0\.5, and device rollouts have none"):
+    with pytest.raises(ValueError, match=r"device rollouts know neither .*picture_noise nor second_model"):
         DeviceEnvironment.beside(noisy)
+
+
+def test_of_two_models_the_lower_done_signal_counts_and_their_difference_is_disagreement(
+    models: WorldModels, tmp_path: Path
+) -> None:
+    other = replace(models, action=copy.deepcopy(models.action))
+    torch.nn.init.normal_(other.action.change.weight, std=0.4)
+    alone, rival, both = make(models), make(other), make(models, second=other)
+    seeds = np.arange(NUM_ENVS, dtype=np.uint64)
+    for env in (alone, rival, both):
+        env.reset(seeds=seeds)
+    for step in range(3):
+        one, two, found = (env.step(actions(step)) for env in (alone, rival, both))
+        np.testing.assert_array_equal(found.observation.image, one.observation.image)
+        signals = np.stack([one.success_probability, two.success_probability])
+        np.testing.assert_array_equal(found.success_probability, signals.min(0))
+        spreads = np.stack([one.uncertainty, two.uncertainty, np.ptp(signals, 0)])
+        np.testing.assert_array_equal(found.uncertainty, spreads.max(0))
+    assert np.ptp(signals, 0).max() > 0
+    with pytest.raises(ValueError, match="second_model has another tokenizer or other tasks"):
+        make(models, second=replace(other, manifest={"sha256": {"tokenizer": "0" * 64}}))
 
 
 def test_one_environment_reset_later_lives_the_same_episode_bit_for_bit(models: WorldModels) -> None:

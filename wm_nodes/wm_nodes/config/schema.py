@@ -150,6 +150,9 @@ class ImaginedEnvironmentConfig(SettingsSection):
 
     picture_noise: NonNegativeFloat
     """Standard deviation of Gaussian noise on the latents of shown frames; the model goes on without it."""
+    second_model: str
+    """Folder of another world model with the same tokenizer, e.g. a refreshed one, that imagines the same actions: the
+    lower done signal of both counts, and their difference as disagreement. Empty: none."""
 
 
 class VideoEnvironmentConfig(SettingsSection):

@@ -119,8 +119,10 @@ def make_imagined_environment(
     Raises:
         ValueError: the folder was trained for another scene than the configuration describes.
     """
-    noise = config.imagined_environment.picture_noise if training else 0.0
-    make = partial(ImaginedEnvironment, seed=seed, picture_noise=noise)
+    settings = config.imagined_environment
+    second = models_of(Path(settings.second_model), config.device) if settings.second_model else None
+    noise = settings.picture_noise if training else 0.0
+    make = partial(ImaginedEnvironment, seed=seed, picture_noise=noise, second=second)
     environment = _imagine(make, config, model_dir, starts_file, num_envs)
     environment.cameras = _cameras(config, environment)
     return environment
@@ -184,9 +186,10 @@ def _imagine(
 def make_training_environment(
     config: RunConfig, model_dir: Path, starts_file: Path, *, num_envs: int, seed: int
 ) -> ImaginedEnvironment | DeviceEnvironment:
-    """Return the environment that policy_rl.train trains in fastest: on a GPU rollouts stay there, unless frames are
-    shown with noise."""
-    if compute_device(config.device).type == CPU or config.imagined_environment.picture_noise:
+    """Return the environment that policy_rl.train trains in fastest: on a GPU rollouts stay there, unless
+    imagined_environment is set."""
+    settings = config.imagined_environment
+    if compute_device(config.device).type == CPU or settings.picture_noise or settings.second_model:
         return make_imagined_environment(config, model_dir, starts_file, num_envs=num_envs, seed=seed, training=True)
     return make_device_environment(config, model_dir, starts_file, num_envs=num_envs)
 

@@ -95,12 +95,12 @@ class DeviceEnvironment:
         """The same model, starts, rules and number of environments, with a state of its own.
 
         Raises:
-            ValueError: an environment with picture noise.
+            ValueError: an environment with picture noise or a second model.
         """
-        if environment.picture_noise:
+        if environment.picture_noise or environment.second:
             raise ValueError(
-                f"imagined_environment.picture_noise is {environment.picture_noise}, and device rollouts have none; "
-                "set it to 0, or leave the rollouts to the graph"
+                "device rollouts know neither imagined_environment.picture_noise nor second_model; leave them unset, "
+                "or leave the rollouts to the graph"
             )
         return cls(
             environment.models, environment.spec, environment.starts, environment.reward,

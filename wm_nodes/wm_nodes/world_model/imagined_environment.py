@@ -3,7 +3,7 @@
 Shapes: N environments, M starts, S tokens, D values per token, A action, P state.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -72,6 +72,50 @@ def imagine_start_goals(
     return np.concatenate([part.goals for part in parts]), np.concatenate([part.found for part in parts])
 
 
+class ModelRollouts:
+    """What one action model imagines for N environments; latents: (N, S, D), of the newest frames.
+
+    Args:
+        model: as models_to_infer casts it.
+    """
+
+    def __init__(self, model: ActionModel | TokenActionModel, latents: Tensor, *, exact: bool) -> None:
+        self.latents, self._model, self._exact = latents, model, exact
+        self._parts = cached_parts(model.trunk, len(latents), latents.device)
+
+    def begin(self, begins: Tensor, first: Tensor) -> None:
+        """Begin an episode at latents `first` (N, S, D) where `begins` (N,)."""
+        self.latents = torch.where(begins[:, None, None], first, self.latents)
+        for rows, caches in self._parts:
+            caches[0].restart(begins[rows])
+
+    def step(
+        self, acted: Tensor, before: Tensor, after: Tensor, valid: Tensor, show: Callable[[Tensor, slice], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Take the step where `valid`; return the logits of the done heads and show(latents of some rows, rows).
+
+        Raises:
+            FloatingPointError: a latent is NaN.
+        """
+        keep = valid[:, None, None]
+
+        def part(item: CachedPart) -> tuple[Tensor, Tensor, Tensor]:
+            rows, caches = item
+            with compute_context(self.latents.device, exact=self._exact):
+                latents, logits = self._model.advance(
+                    self.latents[rows], acted[rows], before[rows], after[rows], caches
+                )
+            latents = torch.where(keep[rows], latents, self.latents[rows])
+            return latents, logits, show(latents, rows)
+
+        parts = in_parallel(part, self._parts)
+        latents, logits, shown = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
+        if not torch.isfinite(latents).all():
+            raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
+        self.latents = latents
+        return logits, shown
+
+
 class ImaginedEnvironment(ImaginedEpisodes):
     """N imagined environments in lock-step. An episode terminates when the done signal exceeds
     reward.success_threshold (RS-7), and is truncated at the step limit or above reward.uncertainty_limit.
@@ -83,25 +127,36 @@ class ImaginedEnvironment(ImaginedEpisodes):
         exact: compute in float32 even where bfloat16 is faster.
         picture_noise: standard deviation of noise on the latents of shown frames, of the stream picture_noise of
             (episode's reset seed, environment, step); the model goes on without it.
+        second: another model of the same tokenizer and tasks; the lower done signal of both counts, and their
+            difference as disagreement.
+
+    Raises:
+        ValueError: a second model with another tokenizer, or with other tasks.
     """
 
     def __init__(
         self, models: WorldModels, spec: EnvironmentSpec, starts: tuple[UInt8Array, FloatArray], reward: RewardConfig,
         *, num_envs: int, seed: int = 0, instructions: Sequence[str] = (), with_goals: bool = True,
-        exact: bool = False, picture_noise: float = 0.0,
+        exact: bool = False, picture_noise: float = 0.0, second: WorldModels | None = None,
     ) -> None:
         super().__init__(
             world_model_spec(models, spec, num_envs), starts, reward, seed=seed, device=models.tokenizer.device
         )
         self.models, self.instructions, self._exact = models, instructions, exact
-        self.picture_noise = picture_noise
+        self.picture_noise, self.second = picture_noise, second
+        if second and (second.tokenizer_sha256, second.tasks) != (models.tokenizer_sha256, models.tasks):
+            raise ValueError(
+                "imagined_environment.second_model has another tokenizer or other tasks than the world model; refresh "
+                "that model (--rounds), or leave it empty"
+            )
         self._start_tasks = task_indices(starts[1], spec, models.task_index)
-        self._tokenizer, self._action = models_to_infer(models, exact=exact)
+        self._tokenizer, action = models_to_infer(models, exact=exact)
         images, _ = starts
         self._start_latents = encode_starts(models, images)
         self._goals = imagine_start_goals(models, starts, self.spec, reward, instructions) if with_goals else None
-        self._parts = cached_parts(models.action.trunk, num_envs, self.device)
-        self._latents = self._start_latents[:1].repeat(num_envs, 1, 1)
+        first = self._start_latents[:1].repeat(num_envs, 1, 1)
+        actions = [action, *([models_to_infer(second, exact=exact)[1]] if second else [])]
+        self._rollouts = [ModelRollouts(model, first, exact=exact) for model in actions]
 
     def goals(self) -> tuple[UInt8Array, BoolArray] | None:
         if self._goals is None:
@@ -111,32 +166,28 @@ class ImaginedEnvironment(ImaginedEpisodes):
 
     def _begin(self, mask: BoolArray) -> None:
         begins, first = self._tensor(mask), self._start_latents[self._tensor(self._starts)]
-        self._latents = torch.where(begins[:, None, None], first, self._latents)
-        for rows, caches in self._parts:
-            caches[0].restart(begins[rows])
+        for rollouts in self._rollouts:
+            rollouts.begin(begins, first)
 
     def _predict(
         self, actions: FloatArray, moved: FloatArray, valid: BoolArray
     ) -> tuple[UInt8Array, FloatArray, FloatArray]:
-        tokenizer, model = self._tokenizer, self._action
-        tool = self.spec.tool_dim
+        tool, noise = self.spec.tool_dim, self._noise()
         acted, before, after = map(self._tensor, (actions, self._states[:, :tool], moved[:, :tool]))
-        keep = self._tensor(valid)[:, None, None]
-        noise = self._noise()
+        inputs = acted, before, after, self._tensor(valid)
+        tasks = self._tensor(self._start_tasks[self._starts])
 
-        def part(item: CachedPart) -> tuple[Tensor, Tensor, Tensor]:
-            rows, caches = item
-            with compute_context(tokenizer.device, exact=self._exact):
-                latents, logits = model.advance(self._latents[rows], acted[rows], before[rows], after[rows], caches)
-            latents = torch.where(keep[rows], latents, self._latents[rows])
-            return latents, logits, tokenizer.decode(latents if noise is None else latents + noise[rows])
+        def show(latents: Tensor, rows: slice) -> Tensor:
+            return self._tokenizer.decode(latents if noise is None else latents + noise[rows])
 
-        parts = in_parallel(part, self._parts)
-        latents, logits, frames = (torch.cat(pieces) for pieces in zip(*parts, strict=True))
-        if not torch.isfinite(latents).all():
-            raise FloatingPointError("the world model predicted NaN; its weights are damaged or were trained too hot")
-        self._latents = latents
-        told = torch.stack(task_done_signal(logits, self._tensor(self._start_tasks[self._starts]))).cpu()
+        logits, frames = self._rollouts[0].step(*inputs, show)
+        signal, spread = task_done_signal(logits, tasks)
+        for rollouts in self._rollouts[1:]:
+            logits, _ = rollouts.step(*inputs, lambda latents, rows: latents[:0])
+            other, other_spread = task_done_signal(logits, tasks)
+            spread = torch.stack([spread, other_spread, (signal - other).abs()]).amax(0)
+            signal = torch.minimum(signal, other)
+        told = torch.stack((signal, spread)).cpu()
         return frames.cpu().numpy(), told[0].numpy(), told[1].numpy()
 
     def _noise(self) -> Tensor | None:
@@ -147,5 +198,5 @@ class ImaginedEnvironment(ImaginedEpisodes):
             torch_stream(int(seed), "picture_noise", env, int(step))
             for env, (seed, step) in enumerate(zip(self._seeds, self._steps, strict=True))
         )
-        drawn = torch.stack([torch.randn(self._latents.shape[1:], generator=stream) for stream in streams])
+        drawn = torch.stack([torch.randn(self._start_latents.shape[1:], generator=stream) for stream in streams])
         return self.picture_noise * drawn.to(self.device)
