@@ -97,18 +97,31 @@ def decoder_rows() -> Rows:
         )
 
 
-def exploit_rows() -> Rows:
-    """One line per reading, over the seeds: shares of episodes, precision and recall of imagined success."""
-    studies = read("policy_rl_exploit_meter.json")["rows"]
-    for readings in zip(*(one["exploit_meter"] for one in studies), strict=True):
-        counted = {name: [round(one[f"{name}_success"] * one["episodes"]) for one in readings]
-                   for name in ("imagined", "replayed", "real")}
-        hits = [round(one["precision"] * n) for one, n in zip(readings, counted["imagined"], strict=True)]
-        n = sum(int(one["episodes"]) for one in readings)
+def exploiting_rows() -> Rows:
+    """One line per task and means against exploiting, over the seeds; differences are from the model as shipped."""
+    found = read("policy_rl_against_exploiting.json")["rows"]
+    for one in found:
+        (shipped,) = [other for other in found if (other["task"], other["settings"]) == (one["task"], "")]
+        real, usual = ([x for seed in arm["seeds"] for x in seed["success_after"]] for arm in (one, shipped))
+        imagined = [seed["imagined_after"] for seed in one["seeds"]]
+        last = [seed["exploit_meter"][-1] for seed in one["seeds"] if seed["exploit_meter"]]
+        calls = round(sum(reading["imagined_success"] * reading["episodes"] for reading in last))
         yield row(
-            int(readings[0]["update"]), *(percent(sum(each) / n) for each in counted.values()),
-            *(share_of(sum(hits), sum(counted[name])) for name in ("imagined", "replayed")),
+            one["task"], one["arm"], percent(mean(real)), points(usual, real) if one["settings"] else "",
+            percent(sum(rate["successes"] for rate in imagined) / sum(rate["episodes"] for rate in imagined)),
+            share_of(round(precision(last) * calls), calls) if last else "",
         )
+        if one["arm"] == "as shipped" and last:
+            by_update = zip(*(seed["exploit_meter"] for seed in one["seeds"]), strict=True)
+            yield ", ".join(percent(precision(list(readings))) for readings in by_update)
+        if verdicts := [verdict["accepted"] for seed in one["seeds"] for verdict in seed["refreshes"]]:
+            yield f"on {one['task']} {sum(verdicts)} of {len(verdicts)} refreshed models were taken"
+
+
+def precision(readings: list[Run]) -> float:
+    """Of the exploit meter, over the episodes of all readings."""
+    calls = [reading["imagined_success"] * reading["episodes"] for reading in readings]
+    return sum(n * reading["precision"] for n, reading in zip(calls, readings, strict=True)) / sum(calls)
 
 
 def more_updates_rows() -> Rows:
@@ -121,18 +134,10 @@ def more_updates_rows() -> Rows:
     yield f"seeds 0, 1 end at {longer} of 200, with 24 at {usual}"
 
 
-def refresh_rows() -> Rows:
-    run = read("policy_rl_model_refresh.json")
-    found = run["paired"]
-    yield interval(100 * found["difference"], 100 * found["low"], 100 * found["high"], 1)
-    yield f"ends at {run['rounds'][-1]['real']['successes']} of 200"
-
-
 def scenes_rows() -> Rows:
-    """One line per task: GRPO in the model over its seeds, also in the two splits that were not trained on, and PPO in
-    the simulator; then PPO in the model, and other settings."""
+    """One line per task: GRPO in the model over its seeds, also in the two splits that were not trained on, PPO in the
+    model and in the simulator; then other settings."""
     found = read("policy_rl_scenes.json")
-    by_ppo = list[str]()
     for task in dict.fromkeys(one["task"] for one in found["rows"]):
         mine, ppo, control = (
             [one for one in found["rows"] if (one["task"], one["model"], one["advantage"]) == (task, *way)]
@@ -142,10 +147,8 @@ def scenes_rows() -> Rows:
         yield row(
             task, counts(mine, "real_{}"), points(*outcomes(mine)), counts(unseen, "{}"),
             " → ".join(percent(mean(one[f"imagined_{when}"]["rate"] for one in mine)) for when in ("before", "after")),
-            counts(control, "real_{}") if control else "",
+            points(*outcomes(ppo)), points(*outcomes(control)),
         )
-        by_ppo.append(f"{task} {points(*outcomes(ppo))}")
-    yield ", ".join(by_ppo)
     for one in found["other_settings"]:
         yield f"{counts([one], 'real_{}')} with `{one['settings']}`"
     (one,) = found["all_tasks"]
@@ -239,12 +242,12 @@ def learning_rows() -> Rows:
 
 def long_learning_rows() -> Rows:
     found = read("video_rl_learning_long.json")["rows"]
+    ends = []
     for name in dict.fromkeys(sampler_of(one) for one in found):
-        courses = [one["evaluations"] for one in found if sampler_of(one) == name]
-        yield row(short(name), *(
-            f"{mean(one['obeyed'] for course in courses for one in course if one['iteration'] == buffer):.3f}"
-            for buffer in (0, 40, 80, 120, 160)
-        ))
+        last = [one["evaluations"][-1] for one in found if sampler_of(one) == name]
+        assert {one["iteration"] for one in last} == {160}
+        ends.append(f"{short(name)} {mean(one['obeyed'] for one in last):.3f}")
+    yield "; ".join(ends)
 
 
 def short(sampler: str) -> str:
@@ -607,7 +610,7 @@ def judge_rows() -> Rows:
 
 TABLES: dict[str, list[Callable[[], Rows]]] = {
     "policy_rl": [
-        study_rows, decoder_rows, exploit_rows, more_updates_rows, refresh_rows, scenes_rows, scenes_decoder_rows,
+        study_rows, decoder_rows, exploiting_rows, more_updates_rows, scenes_rows, scenes_decoder_rows,
     ],
     "video_rl": [
         diversity_rows, clip_rows, learning_rows, long_learning_rows, clip_learning_rows, cost_rows, ablation_rows,

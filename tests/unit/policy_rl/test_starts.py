@@ -10,6 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
 from wm_nodes.core.types import Episode
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES, TOOL, above_cube
@@ -131,6 +132,20 @@ def test_an_instruction_that_the_model_never_saw_is_one_clear_error(bag: Path, t
     config = load_config("cpu", {"task": "push_cube", "reward.dense_weight": 1.0})
     with pytest.raises(ValueError, match=f"^instruction '{OWN} 0': unknown words forward, 0; this model knows"):
         make_imagined_environment(config, MODEL, tmp_path / STARTS, num_envs=2, seed=0)
+
+
+def test_pictures_are_noisy_in_training_alone_and_a_second_model_is_always_asked() -> None:
+    section = "imagined_environment."
+    config = load_config("cpu", {f"{section}picture_noise": 0.1, f"{section}second_model": str(MODEL)})
+    trained, measured = (
+        make_imagined_environment(config, MODEL, MODEL / STARTS, num_envs=2, seed=0, training=training)
+        for training in (True, False)
+    )
+    assert (trained.picture_noise, measured.picture_noise) == (0.1, 0)
+    assert trained.second and measured.second and trained.second.sha256 == trained.models.sha256
+    wrong = load_config("cpu", {f"{section}second_model": "nowhere"})
+    with pytest.raises(ModelFolderError, match="nowhere"):
+        make_imagined_environment(wrong, MODEL, MODEL / STARTS, num_envs=2, seed=0)
 
 
 def test_an_episode_that_starts_in_the_middle_has_the_whole_step_limit(tmp_path: Path) -> None:
