@@ -115,7 +115,7 @@ def exploiting_rows() -> Rows:
             by_update = zip(*(seed["exploit_meter"] for seed in one["seeds"]), strict=True)
             yield ", ".join(percent(precision(list(readings))) for readings in by_update)
         if verdicts := [verdict["accepted"] for seed in one["seeds"] for verdict in seed["refreshes"]]:
-            yield f"on {one['task']} {sum(verdicts)} of {len(verdicts)} refreshed models were taken"
+            yield f"{sum(verdicts)} of {len(verdicts)} on {one['task']}"
 
 
 def precision(readings: list[Run]) -> float:
