@@ -49,6 +49,13 @@ def test_a_configuration_saved_before_sections_were_renamed_comes_back_equal(tmp
     assert load_config(str(tmp_path / "config.yaml")) == config
 
 
+def test_a_configuration_saved_with_a_setting_that_is_gone_comes_back_without_it(tmp_path: Path) -> None:
+    text = dump_config(load_config("smoke")).replace("own_starts: 128", "tolerance: 0.05")
+    assert "tolerance" in text
+    (tmp_path / "config.yaml").write_text(text)
+    assert load_config(str(tmp_path / "config.yaml")) == load_config("smoke")
+
+
 def test_a_renamed_section_is_refused_on_the_command_line_with_its_name_of_today() -> None:
     with pytest.raises(ConfigError, match="unknown setting 'gate', now called 'acceptance'"):
         load_config("smoke", {"gate.num_episodes": 5})

@@ -23,6 +23,8 @@ FREE = ("behaviours", "rewards")
 """Mappings without fixed keys, which are replaced as a whole."""
 FORMER_NAMES = {"gate": "acceptance", "rounds": "model_refresh"}
 """Sections of configurations saved before they were renamed."""
+GONE = {"model_refresh": ("tolerance",)}
+"""Settings by section that saved configurations may have and nothing reads any more."""
 EMBEDDED = "embedded"
 """JudgeConfig.kind of the judge in this process."""
 REWARDS = ("reference", "closeness", AGENT)
@@ -195,8 +197,12 @@ def _unknown(dotted: str, section: dict[str, Any], file: str = "") -> ConfigErro
 
 
 def _read(path: Traversable) -> dict[str, Any]:
-    """The settings in a file, sections that were renamed since by their names of today."""
-    return {FORMER_NAMES.get(name, name): values for name, values in read_yaml(path).items()}
+    """The settings in a file, sections that were renamed since by their names of today, without those that are gone."""
+    found = {FORMER_NAMES.get(name, name): values for name, values in read_yaml(path).items()}
+    for section, names in GONE.items():
+        if isinstance(found.get(section), dict):
+            found[section] = {name: value for name, value in found[section].items() if name not in names}
+    return found
 
 
 def read_yaml(path: Traversable) -> dict[str, Any]:
