@@ -120,18 +120,19 @@ def imagined(env: ManiSkillEnvironment, tmp_path_factory: pytest.TempPathFactory
 
 
 def test_each_imagined_episode_ends_by_the_done_signal_of_its_task(imagined: tuple[Path, Path]) -> None:
-    model, starts = imagined
+    folder, starts = imagined
     config = CONFIG.with_values(reward=CONFIG.reward.with_values(success_threshold=1.0))
-    env = make_imagined_environment(config, model, starts, num_envs=8, seed=0)
+    env = make_imagined_environment(config, folder, starts, num_envs=8, seed=0)
     signals = list[torch.Tensor]()
-    advance = env._action.advance
+    model = env._rollouts[0]._model
+    advance = model.advance
 
     def spy(*arguments: object) -> tuple[torch.Tensor, torch.Tensor]:
         latents, logits = advance(*arguments)  # type: ignore[arg-type]
         signals.append(done_signal(logits)[0])
         return latents, logits
 
-    env._action.advance = spy  # type: ignore[method-assign, assignment]
+    model.advance = spy  # type: ignore[method-assign, assignment]
     observation = env.reset(None, np.arange(8, dtype=np.uint64))
     tasks = observation.state[:, SPEC.tool_dim :].argmax(1)
     assert len(set(tasks.tolist())) > 2
