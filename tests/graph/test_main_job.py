@@ -62,7 +62,7 @@ def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_
     report = (run_dir / "report.html").read_text()
     assert "data:image/png;base64" in report and "Exploit meter: success of 3 episodes" in report
     assert json.loads((run_dir / "acceptance.json").read_text())["criteria"]
-    assert main(["rescore", summary["bag"]]) == 0, "the recorded rewards, evaluated again, are others"
+    assert main(["rescore", str(run_dir)]) == 0, "the recorded rewards, evaluated again, are others"
 
 
 def write_some_starts(path: Path) -> None:

@@ -1,7 +1,7 @@
 """Score a recording again, and say whether the scores are the recorded ones, bit by bit.
 
-    wm rescore runs/RUN              # the clips of a run of train-video-model, from their pictures
-    wm rescore runs/RUN/bags/BAG     # the rewards of a run of train-policy, from its pictures
+    wm rescore runs/RUN              # the clips of a run of train-video-model, or the rewards of one of train-policy
+    wm rescore runs/RUN/bags/BAG     # the rewards of another bag of train-policy
     wm rescore BAG --judge embedded  # the episodes of a recording with images, by the reward agent
 
 The judge's answers that the run kept (judge.keep_reads) are taken again, so that nobody is asked twice. With --reward
@@ -39,7 +39,7 @@ from wm_nodes.judge.service import READS, JudgeService, agent_scores, buffer_job
 from wm_nodes.policy_rl.rescoring import recorded_model, rescore_bag
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.console_table import make_table
-from wm_nodes.reports.summary import plain
+from wm_nodes.reports.summary import plain, read_summary
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers
@@ -52,7 +52,7 @@ SHOWN = 10
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", type=Path, help="run folder of train-video-model, or a bag of train-policy")
+    parser.add_argument("recording", type=Path, help="run folder, or a bag of train-policy")
     parser.add_argument(
         "--reward", choices=REWARDS,
         help="agent: a judge's verdicts; reference: how well clips follow their recordings; closeness: how alike they "
@@ -72,7 +72,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Return 0 where all that could be compared is equal, else 1."""
     prepare_torch()
-    bag: Path = arguments.recording
+    bag = _recording(arguments.recording)
     if bag.suffix != ".mcap" and not any(bag.glob("*.mcap")):
         equal, content, path = _rescore_clips(arguments)
     else:
@@ -83,6 +83,11 @@ def run(arguments: argparse.Namespace) -> int:
     if path is not None:
         write_atomic(path, (json.dumps(plain({"equal": equal, **content}), indent=1) + "\n").encode())
     return int(not equal)
+
+
+def _recording(path: Path) -> Path:
+    """The recording itself; of a run folder of train-policy, the bag of its training."""
+    return path / "bags" / Path(read_summary(path)["bag"]).name if (path / "policies").is_dir() else path
 
 
 def _rescore_rewards(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dict[str, Any]]:
