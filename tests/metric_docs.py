@@ -9,10 +9,10 @@ DOCUMENT = Path(wm_nodes.__file__).parents[1] / "docs" / "metrics.md"
 
 
 def documented(section: str) -> set[str]:
-    """The names in the first column under the heading that holds `section`."""
+    """The names before the colons of the list under the heading that holds `section`."""
     parts = re.split(r"^## ", DOCUMENT.read_text(), flags=re.M)
     (part,) = [part for part in parts if section in part.splitlines()[0]]
-    rows = [line.split("|")[1] for line in part.splitlines() if line.startswith("| `")]
+    rows = [line.split(": ")[0] for line in part.splitlines() if line.startswith("- `")]
     return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
 
 
