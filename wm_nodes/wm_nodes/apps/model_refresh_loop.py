@@ -23,8 +23,7 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import BoolArray
 from wm_nodes.policy_rl import model_refresh
-from wm_nodes.policy_rl.initial_policy import STARTS
-from wm_nodes.policy_rl.model_refresh import RefreshDecision, round_folder
+from wm_nodes.policy_rl.model_refresh import RefreshDecision, round_folder, round_starts
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain
 from wm_nodes.training.metrics import join_metrics
@@ -75,10 +74,9 @@ def round_start(job: RunContext, number: int, model_dir: Path, policy: Path) -> 
     start = TrainingStart(_folder(job, number), model_dir, policy, job.config, job.starts)
     if len(shares) == 1:
         return start
-    own_starts = number > 1 and job.config.model_refresh.own_starts > 0
     return replace(
         start, config=round_config(job.config, number, shares[number - 1]), label=f"round {number}",
-        starts=round_folder(job.run_dir, number - 1) / STARTS if own_starts else job.starts,
+        starts=round_starts(job.config, job.run_dir, number, job.starts),
     )
 
 

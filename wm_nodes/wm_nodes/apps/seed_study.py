@@ -33,8 +33,8 @@ from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.exploit_meter import ExploitMeter, make_exploit_meter
 from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment, models_of
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.initial_policy import STARTS, prepare_start
-from wm_nodes.policy_rl.model_refresh import refresh_round, round_folder
+from wm_nodes.policy_rl.initial_policy import prepare_start
+from wm_nodes.policy_rl.model_refresh import refresh_round, round_folder, round_starts
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
@@ -203,13 +203,13 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
 
 
 def _train_in_rounds(
-    policy: ImagePolicy, real: Environment, config: RunConfig, model_dir: Path, starts: Path, run_dir: Path
+    policy: ImagePolicy, real: Environment, config: RunConfig, model_dir: Path, first_frames: Path, run_dir: Path
 ) -> _Trained:
     """Train in place."""
-    shares, first_frames = split_updates(config.ppo.updates, config.model_refresh.num_rounds), starts
+    shares = split_updates(config.ppo.updates, config.model_refresh.num_rounds)
     trained = _Trained([], model_dir)
     for number, updates in enumerate(shares, 1):
-        part = round_config(config, number, updates)
+        part, starts = round_config(config, number, updates), round_starts(config, run_dir, number, first_frames)
         env = make_imagined_environment(
             part, model_dir, starts, num_envs=config.ppo.num_envs, seed=part.seed, training=True
         )
@@ -225,7 +225,6 @@ def _train_in_rounds(
         verdict = refresh_round(config, model_dir, weights, first_frames, run_dir, number)
         trained.refreshes.append(verdict.to_dict())
         trained.model_dir = model_dir = weights.with_name("model") if verdict.accepted else model_dir
-        starts = weights.with_name(STARTS) if config.model_refresh.own_starts else starts
     return trained
 
 

@@ -1,7 +1,5 @@
 """Refresh a world model on what the current policy does in the simulator, and keep the better of the two models.
 
-Shapes: E episodes.
-
 The action model goes on training on all rounds' policy episodes and on scripted ones (replay). Tokenizer, text model
 and probe stay as they are, byte for byte: policies are tied to the tokenizer.
 """
@@ -180,13 +178,11 @@ def compare_models(old: WorldModels, new: WorldModels, heldout: EpisodeArrays, c
         )
         for models in (old, new)
     )
-    names = {"tool error, cm": "tool_cm", "object error, cm": "object_cm"}
-    if not get_task(config.task).moves_object:
-        del names["object error, cm"]
     rows = []
-    for name, key in names.items():
-        _, low, high = bootstrap_mean(after[key] - before[key], seed=config.seed)
-        rows.append(ModelComparison(name, float(before[key].mean()), float(after[key].mean()), low, high, True))
+    for name in ("tool", "object") if get_task(config.task).moves_object else ("tool",):
+        old_cm, new_cm = before[f"{name}_cm"], after[f"{name}_cm"]
+        _, low, high = bootstrap_mean(new_cm - old_cm, seed=config.seed)
+        rows.append(ModelComparison(f"{name} error, cm", float(old_cm.mean()), float(new_cm.mean()), low, high, True))
     right = paired_difference(before["done_right"].tolist(), after["done_right"].tolist())
     old_share, new_share = (float(errors["done_right"].mean()) for errors in (before, after))
     rows.append(ModelComparison("done signal right", old_share, new_share, right.low, right.high, False))
@@ -196,6 +192,12 @@ def compare_models(old: WorldModels, new: WorldModels, heldout: EpisodeArrays, c
 def round_folder(run_dir: Path, number: int) -> Path:
     """Of round `number`, counted from 1, of a run with several."""
     return run_dir / "rounds" / str(number)
+
+
+def round_starts(config: RunConfig, run_dir: Path, number: int, first_frames: Path) -> Path:
+    """The starts file of round `number`: with frames of the policy's own episodes where the round before wrote some."""
+    own = number > 1 and config.model_refresh.own_starts > 0
+    return round_folder(run_dir, number - 1) / STARTS if own else first_frames
 
 
 def refresh_round(
