@@ -36,26 +36,68 @@ def test_positions_reach_the_hidden_layers_unprojected() -> None:
     assert (means[0] != means[1]).all()
 
 
-def test_logprob_entropy_and_kl_match_numbers_worked_by_hand() -> None:
-    unit = DiagonalGaussian(torch.zeros(1, 2), torch.zeros(2))
-    log_sqrt_2pi = 0.5 * math.log(2 * math.pi)
-    assert_close(unit.logprob(torch.tensor([[1.0, 0.0]])), torch.tensor([-0.5 - 2 * log_sqrt_2pi]))
-    assert_close(unit.entropy(), torch.tensor([2 * (0.5 + log_sqrt_2pi)]))
-    other = DiagonalGaussian(torch.tensor([[1.0, 0.0]]), torch.tensor([math.log(2), 0.0]))
-    assert_close(unit.kl(other), torch.tensor([math.log(2) + (1 + 1) / 8 - 0.5]))
-    assert_close(other.kl(unit), torch.tensor([-math.log(2) + (4 + 1) / 2 - 0.5]))
-    assert_close(unit.kl(unit), torch.zeros(1))
+def gaussians(*means_and_stds: tuple[float, float]) -> DiagonalGaussian:
+    """One sample whose dimensions have these means and standard deviations."""
+    means, stds = torch.tensor(means_and_stds).unbind(-1)
+    return DiagonalGaussian(means.unsqueeze(0), stds.log())
 
 
-def test_closed_forms_agree_with_torch_distributions() -> None:
+def test_the_likelihood_is_the_density_inside_and_the_mass_of_the_tail_at_a_limit() -> None:
+    unit, log_sqrt_2pi = gaussians((0.0, 1.0), (0.0, 1.0)), 0.5 * math.log(2 * math.pi)
+    beyond_one_std = math.log(0.15865525)
+    assert_close(unit.logprob(torch.tensor([[0.5, 0.0]])), torch.tensor([-0.125 - 2 * log_sqrt_2pi]))
+    assert_close(unit.logprob(torch.tensor([[1.0, 0.0]])), torch.tensor([beyond_one_std - log_sqrt_2pi]))
+    assert_close(unit.logprob(torch.tensor([[-1.0, 1.0]])), torch.tensor([2 * beyond_one_std]))
+    assert_close(gaussians((1.0, 0.05)).logprob(torch.tensor([[1.0]])), torch.tensor([math.log(0.5)]))
+
+
+def test_far_from_the_limits_closed_forms_are_those_of_torch_distributions() -> None:
     generator = torch.Generator().manual_seed(3)
-    means, stds = torch.randn(2, 6, 3, generator=generator), torch.rand(2, 3, generator=generator) + 0.1
-    actions = torch.randn(6, 3, generator=generator)
+    means, stds = 0.1 * torch.randn(2, 6, 3, generator=generator), 0.02 + 0.05 * torch.rand(2, 3, generator=generator)
+    actions = 0.2 * torch.randn(6, 3, generator=generator)
     ours = [DiagonalGaussian(means[i], stds[i].log()) for i in range(2)]
     theirs = [torch.distributions.Normal(means[i], stds[i].expand(6, 3)) for i in range(2)]
     assert_close(ours[0].logprob(actions), theirs[0].log_prob(actions).sum(-1))
     assert_close(ours[0].entropy(), theirs[0].entropy().sum(-1))
-    assert_close(ours[0].kl(ours[1]), torch.distributions.kl_divergence(theirs[0], theirs[1]).sum(-1))
+    divergence = torch.distributions.kl_divergence(theirs[0], theirs[1]).sum(-1)
+    assert_close(ours[0].kl(ours[1]), divergence, rtol=1e-4, atol=0.0)
+
+
+LIMITED = [((0.0, 0.5), (0.3, 0.4)), ((0.9, 0.4), (1.1, 0.3)), ((-1.3, 0.2), (-0.8, 0.3)), ((0.2, 2.0), (0.0, 1.5))]
+
+
+@pytest.mark.parametrize(("first", "second"), LIMITED)
+def test_entropy_and_kl_at_the_limits_are_the_means_over_executed_actions(
+    first: tuple[float, float], second: tuple[float, float]
+) -> None:
+    ours, other = gaussians(first), gaussians(second)
+    actions = ours.executed(torch.randn(400_000, 1, generator=torch.Generator().manual_seed(0)))
+    assert ((actions.abs() == 1).float().mean() > 0.01).item()
+    logprobs, others = (g.logprob(actions) for g in (ours, other))
+    assert_close(ours.entropy()[0], -logprobs.mean(), atol=0.01, rtol=0)
+    assert_close(ours.kl(other)[0], (logprobs - others).mean(), atol=0.01, rtol=0)
+    assert_close(ours.kl(ours), torch.zeros(1))
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.9, 1.2, -0.95, 2.0])
+@pytest.mark.parametrize("std", [0.05, 0.4])
+def test_the_score_of_executed_actions_has_mean_zero(mean: float, std: float) -> None:
+    """Else a constant advantage moves the policy: outwards where it fails, without bound."""
+    means = torch.full((200_000, 1), mean, dtype=torch.float64, requires_grad=True)
+    log_std = torch.tensor([math.log(std)], dtype=torch.float64, requires_grad=True)
+    gaussian = DiagonalGaussian(means, log_std)
+    noise = torch.randn(means.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    score, spread = torch.autograd.grad(gaussian.logprob(gaussian.executed(noise).detach()).sum(), [means, log_std])
+    assert abs(score.mean()) < 5 * score.std() / len(score) ** 0.5 + 1e-9
+    assert abs(spread / len(score)) < 0.02
+
+
+def test_likelihood_and_gradient_stay_finite_far_beyond_the_limits() -> None:
+    means = torch.tensor([[50.0, -50.0, 0.0]], requires_grad=True)
+    gaussian, narrow = (DiagonalGaussian(m, torch.full((3,), -4.0)) for m in (means, torch.zeros(1, 3)))
+    total = gaussian.logprob(torch.tensor([[-1.0, 1.0, 1.0]])) + gaussian.kl(narrow) + gaussian.entropy()
+    total.sum().backward()
+    assert torch.isfinite(total).all() and means.grad is not None and torch.isfinite(means.grad).all()
 
 
 def test_executed_action_is_the_clamped_sample() -> None:
@@ -64,7 +106,7 @@ def test_executed_action_is_the_clamped_sample() -> None:
     assert_close(gaussian.executed(None), torch.tensor([[0.5, -1.0]]))
 
 
-def test_acting_stores_the_density_at_the_executed_action() -> None:
+def test_acting_stores_the_likelihood_of_the_executed_action() -> None:
     policy = make_policy()
     output = policy.act(IMAGES, STATES, noise=np.full((5, 3), 40.0, np.float32))
     assert (output.actions == 1.0).all()

@@ -46,8 +46,9 @@ def grouped(**changes: Any) -> PpoConfig:
 
 
 def test_groups_learn_to_reach_without_a_critic() -> None:
-    policy, env = toy_policy(), ReachToy(36, 0)
-    learner = PpoLearner(policy, grouped(learning_rate=3e-3, kl_reference_weight=0.0, value_warmup_updates=9), seed=0)
+    policy, env = toy_policy(), ReachToy(108, 0)
+    settings = grouped(learning_rate=3e-3, kl_reference_weight=0.0, value_warmup_updates=9, minibatch_size=64)
+    learner = PpoLearner(policy, settings, seed=0)
     before, rates = weights(policy), []
     for version in range(1, 31):
         rollout = collect_rollout(env, policy, RuleReward(), 12, 0, version, envs_per_start=3)
@@ -98,12 +99,14 @@ def test_a_large_reference_weight_holds_the_policy_near_the_reference() -> None:
 
 def test_the_first_update_starts_at_the_acting_policy_and_at_the_reference() -> None:
     policy = toy_policy()
+    with torch.no_grad():
+        policy.log_std_A.fill_(-3.0)  # the limits are far
     metrics = PpoLearner(policy, toy_ppo(epochs=1, minibatch_size=10_000), seed=0).update(toy_rollout(policy))
     assert metrics.approx_kl == pytest.approx(0.0, abs=1e-6)
     assert metrics.kl_reference == pytest.approx(0.0, abs=1e-6)
     assert metrics.clip_fraction == 0.0
     assert metrics.loss_policy == pytest.approx(0.0, abs=1e-5), "normalised advantages have mean 0"
-    assert metrics.entropy == pytest.approx(3 * (-1.2 + 0.5 * math.log(2 * math.pi * math.e)), rel=1e-5)
+    assert metrics.entropy == pytest.approx(3 * (-3.0 + 0.5 * math.log(2 * math.pi * math.e)), rel=1e-5)
 
 
 def test_value_warmup_trains_the_critic_only() -> None:
@@ -122,6 +125,64 @@ def test_beyond_target_kl_the_update_ends_early() -> None:
     policy = toy_policy()
     learner = PpoLearner(policy, toy_ppo(epochs=8, learning_rate=0.05, target_kl=1e-4), seed=0)
     assert learner.update(toy_rollout(policy)).epochs < 8
+
+
+def test_a_step_beyond_target_kl_is_not_made() -> None:
+    """A rollout of quite another policy than the one that learns from it is read once, and moves nothing."""
+    policy, other = toy_policy(), toy_policy()
+    with torch.no_grad():
+        other.actor.output.bias.fill_(0.3)
+    before = weights(policy)
+    metrics = PpoLearner(policy, toy_ppo(target_kl=1e-6), seed=0).update(toy_rollout(other))
+    assert metrics.epochs == 0 and metrics.approx_kl > 1e-6
+    assert_equal(before, weights(policy))
+
+
+def test_the_standard_deviation_keeps_its_floor() -> None:
+    policy = toy_policy()
+    floor = float(policy.log_std_A.detach().max()) + 0.1
+    PpoLearner(policy, toy_ppo(min_log_std=floor), seed=0).update(toy_rollout(policy))
+    assert (policy.log_std_A >= floor).all()
+
+
+def test_a_policy_beyond_the_limits_learns_on_with_finite_weights() -> None:
+    """The mean of one action lies 0.2 beyond the limit, as a gripper's does after demonstrations."""
+    policy = toy_policy()
+    with torch.no_grad():
+        policy.log_std_A.fill_(-3.0)
+        policy.actor.output.bias[0] = 1.2
+    learner, env = PpoLearner(policy, toy_ppo(target_kl=0.03, kl_reference_weight=0.0), seed=0), ReachToy(8, 0)
+    for version in range(1, 101):
+        metrics = learner.update(collect_rollout(env, policy, RuleReward(), 8, 0, version))
+    assert metrics.kl_reference < 3 and metrics.grad_norm < 100
+
+
+@pytest.mark.parametrize("column", ["states_TN", "actions_TN"])
+def test_a_valid_transition_that_is_not_finite_is_refused(column: str) -> None:
+    policy = toy_policy()
+    rollout = toy_rollout(policy)
+    numbers = getattr(rollout, column).copy()
+    numbers[0, 0, 0] = np.nan
+    with pytest.raises(ValueError, match=r"a valid transition has a .* that is not finite"):
+        PpoLearner(policy, toy_ppo(), seed=0).update(replace(rollout, **{column: numbers}))
+
+
+@pytest.mark.parametrize("lost", [(4,), (1, 6), (0,)])
+def test_the_step_before_a_lost_one_bootstraps_from_what_it_reached(lost: tuple[int, ...]) -> None:
+    """A critic that says 5 everywhere is right where rewards are 0 and nothing is discounted."""
+    policy = toy_policy()
+    with torch.no_grad():
+        for parameter in policy.critic.parameters():
+            parameter.zero_()
+        policy.critic.output.bias.fill_(5.0)
+    rollout = toy_rollout(policy)
+    valid = np.ones_like(rollout.valid_TN)
+    valid[list(lost)] = False
+    none, steps = np.zeros_like(valid), np.where(valid, 0.0, np.nan).astype(np.float32)
+    values = np.where(valid, 5.0, 0.0).astype(np.float32)
+    whole = replace(rollout, rewards_TN=steps, values_TN=values, valid_TN=valid, terminated_TN=none, truncated_TN=none)
+    metrics = PpoLearner(policy, toy_ppo(gamma=1.0, epochs=1, minibatch_size=10_000), seed=0).update(whole)
+    assert metrics.loss_value < 1e-6
 
 
 def test_invalid_transitions_change_nothing_whatever_they_hold() -> None:

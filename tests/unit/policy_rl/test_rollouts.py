@@ -11,6 +11,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.rollouts import (
     TRAINING_SEED_LIMIT,
+    Convergence,
     action_noise,
     collect_rollout,
     reset_seeds,
@@ -99,22 +100,33 @@ def test_too_few_steps_are_refused() -> None:
         collect_rollout(ReachToy(2, 0), toy_policy(), RuleReward(), 0, 0, 1)
 
 
-def test_statistics_count_ended_episodes_only() -> None:
+def test_statistics_are_of_first_episodes_and_later_short_ones_do_not_count() -> None:
     base = toy_rollout(toy_policy(), steps=5)
     shape = (5, NUM_ENVS)
     valid, terminated, truncated = np.zeros(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool)
     rewards = np.full(shape, np.nan, np.float32)
     valid[:, 0], rewards[:, 0] = True, [1, 2, 0, 4, 8]
-    terminated[1, 0] = True
+    terminated[1, 0] = terminated[4, 0] = True
     valid[2, 0], rewards[2, 0] = False, np.nan
     valid[:3, 1], rewards[:3, 1], truncated[2, 1] = True, 0.5, True
+    valid[:, 2], rewards[:, 2] = True, 1.0
     found = rollout_statistics(
         replace(base, valid_TN=valid, rewards_TN=rewards, terminated_TN=terminated, truncated_TN=truncated)
     )
-    assert (found.episodes, found.successes, found.success_rate) == (2, 1, 0.5)
+    assert (found.episodes, found.successes, found.cut) == (2, 1, 1), "environment 0's second success is left out"
+    assert found.success_rate == pytest.approx(1 / 3), "environment 2 did not succeed in the time there was"
     assert found.mean_return == pytest.approx((3 + 1.5) / 2)
     assert found.mean_length == pytest.approx((2 + 3) / 2)
-    assert found.cut == 1, "environment 0 had begun another episode; environment 1 had not"
+
+
+def test_training_has_converged_after_enough_updates_in_a_row_without_a_failure() -> None:
+    base = toy_rollout(toy_policy(), steps=2)
+    ends = np.array([[False] * NUM_ENVS, [True] * NUM_ENVS])
+    won = replace(base, terminated_TN=ends, truncated_TN=~ends & False, valid_TN=np.ones_like(ends))
+    lost = replace(won, terminated_TN=ends & (np.arange(NUM_ENVS) > 0), truncated_TN=ends & (np.arange(NUM_ENVS) == 0))
+    convergence = Convergence(2)
+    assert [convergence.reached(rollout) for rollout in (won, lost, won, won)] == [False, False, False, True]
+    assert not any(Convergence(0).reached(won) for _ in range(3)), "0 is never"
 
 
 def test_statistics_without_an_ended_episode_are_missing_not_zero() -> None:

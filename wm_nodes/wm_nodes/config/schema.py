@@ -140,7 +140,8 @@ class WorldModelConfig(SettingsSection):
     """Folder of a sentence encoder (MiniLM, T5) in the layout of transformers that reads the instructions, any words;
     empty: a learned embedding of the words of the training instructions."""
     state_weight: NonNegativeFloat
-    """Weight of the auxiliary losses on simulator positions, of the predicted frame and of the model's own reading."""
+    """Weight of the auxiliary losses on simulator positions, of the predicted frame and of the model's own reading. 0:
+    no positions at all, also not in the losses of decoded_weight."""
     decoded_weight: NonNegativeFloat
     """Weight of the losses on predicted frames after decoding, and after encoding them again (0: off)."""
 
@@ -304,7 +305,13 @@ class PpoConfig(SettingsSection):
     """Weight of KL(policy || SFT policy), against exploiting the model."""
     max_grad_norm: PositiveFloat
     target_kl: NonNegativeFloat
-    """Stop the epochs of an update early beyond this approximate KL, nats; 0: never."""
+    """An update ends before the first minibatch whose approximate KL to the policy that acted is above it, nats; 0:
+    never."""
+    min_log_std: float = -20.0
+    """Floor of the policy's log standard deviation, normalised action units: a policy that stops exploring has ratios
+    without bound."""
+    converged_updates: NonNegativeInt = 0
+    """Training ends as converged after so many updates in a row in whose rollouts no episode failed; 0: never."""
     value_warmup_updates: NonNegativeInt
     """gae: first updates that train the critic only."""
 

@@ -13,6 +13,7 @@ from wm_nodes.config.schema import SftConfig
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.types import Episode, UInt8Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.recording.episode_arrays import check_finite
 
 EXPERT = "expert"
 
@@ -53,11 +54,12 @@ def train_sft(
     With one seed and one number of torch threads the result is bit-identical on a CPU.
 
     Raises:
-        ValueError: no demonstrations, or one that is not the expert's.
+        ValueError: no demonstrations, one that is not the expert's, or as check_finite.
     """
     others = {episode.behaviour for episode in demos} - {EXPERT}
     if not demos or others:
         raise ValueError(f"behaviour cloning needs {EXPERT} demonstrations, got {len(demos)} with {sorted(others)}")
+    check_finite(demos)
     steps = [int(demo.success.argmax()) if demo.success.any() else demo.num_steps for demo in demos]
     images, states, actions = (
         np.concatenate([getattr(demo, name)[:count] for demo, count in zip(demos, steps, strict=True)])

@@ -1,8 +1,8 @@
-"""Diagonal Gaussian over actions. Shapes: B samples, A action. RS-10d.
+"""Diagonal Gaussian over actions, censored at the limits. Shapes: B samples, A action. RS-10d.
 
-Actions are executed inside [-1, 1]. The sample is clamped first and the plain Gaussian density is taken at the clamped
-action, when acting and when learning alike; no tanh squashing, no mass at the limits. The ratio of two such densities
-at one executed action is what the policy gradient needs, and only the executed action has to be stored.
+Actions are executed inside [-1, 1]. What is drawn beyond a limit is executed at the limit, where the likelihood is the
+mass of the Gaussian's tail beyond it; inside it is the Gaussian's density. So the score of the executed action has mean
+0, as the policy gradient needs, and only the executed action has to be stored.
 """
 
 import math
@@ -10,13 +10,17 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.special import log_ndtr
 
+LIMIT = 1.0
+"""Actions are executed in [-LIMIT, LIMIT], normalised action units."""
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
 @dataclass(frozen=True)
 class DiagonalGaussian:
-    """mean_BA: (B, A). log_std_A: (A,), the same for every sample. Both in normalised action units."""
+    """mean_BA: (B, A), of the Gaussian, not of the executed actions. log_std_A: (A,), the same for every sample. Both
+    in normalised action units."""
 
     mean_BA: Tensor
     log_std_A: Tensor
@@ -24,24 +28,46 @@ class DiagonalGaussian:
     def executed(self, noise_BA: Tensor | None) -> Tensor:
         """Return the action to execute, (B, A) in [-1, 1]: clamp(mean + std noise), or clamp(mean) without noise."""
         actions_BA = self.mean_BA if noise_BA is None else self.mean_BA + self.log_std_A.exp() * noise_BA
-        return actions_BA.clamp(-1.0, 1.0)
+        return actions_BA.clamp(-LIMIT, LIMIT)
 
     def logprob(self, actions_BA: Tensor) -> Tensor:
-        """Return log N(action; mean, std^2) summed over A, nats, (B,)."""
+        """Return the log likelihood of executed actions summed over A, nats, (B,): log N(action; mean, std^2) inside
+        the limits, log Phi(-(1 -+ mean) / std) at them."""
         scaled_BA = (actions_BA - self.mean_BA) * torch.exp(-self.log_std_A)
-        return (-0.5 * scaled_BA.square() - self.log_std_A - _LOG_SQRT_2PI).sum(-1)
+        density_BA = -0.5 * scaled_BA.square() - self.log_std_A - _LOG_SQRT_2PI
+        tail_BA = torch.where(actions_BA > 0, self._log_above_BA, self._log_below_BA)
+        return torch.where(actions_BA.abs() >= LIMIT, tail_BA, density_BA).sum(-1)
 
     def entropy(self) -> Tensor:
-        """Return sum_a (log std_a + log sqrt(2 pi e)), nats, (B,); equal for all samples."""
-        return (self.log_std_A + 0.5 + _LOG_SQRT_2PI).sum().expand(self.mean_BA.shape[0])
+        """Return -sum_a E[log likelihood], nats, (B,), of the mass at both limits and the density between them."""
+        return -self._expected(self)
 
     def kl(self, other: "DiagonalGaussian") -> Tensor:
-        """Return KL(self || other) in closed form (RS-10d), nats, (B,).
+        """Return KL(self || other) of the executed actions in closed form (RS-10d), nats, (B,)."""
+        return self._expected(self) - self._expected(other)
 
-        sum_a log(s2 / s1) + (s1^2 + (m1 - m2)^2) / (2 s2^2) - 1/2
+    def _expected(self, other: "DiagonalGaussian") -> Tensor:
+        """E[log likelihood under `other`] of this policy's executed actions, (B,).
+
+        With z = (x - m) / s between a = (-1 - m) / s and b = (1 - m) / s: mass Z = Phi(b) - Phi(a), E[z] = phi(a) -
+        phi(b), E[z^2] = Z + a phi(a) - b phi(b).
         """
-        log_ratio_A = other.log_std_A - self.log_std_A
-        inverse_A = torch.exp(-other.log_std_A)
-        spread_A = 0.5 * torch.exp(-2 * log_ratio_A)
-        shift_BA = 0.5 * ((self.mean_BA - other.mean_BA) * inverse_A).square()
-        return (log_ratio_A + spread_A + shift_BA - 0.5).sum(-1)
+        low_BA, high_BA = ((limit - self.mean_BA) * torch.exp(-self.log_std_A) for limit in (-LIMIT, LIMIT))
+        phi_low_BA, phi_high_BA = (torch.exp(-0.5 * z.square() - _LOG_SQRT_2PI) for z in (low_BA, high_BA))
+        below_BA, above_BA = self._log_below_BA.exp(), self._log_above_BA.exp()
+        inside_BA = (1 - below_BA - above_BA).clamp(min=0)
+        first_BA = phi_low_BA - phi_high_BA
+        second_BA = (inside_BA + low_BA * phi_low_BA - high_BA * phi_high_BA).clamp(min=0)
+        scale_A = torch.exp(self.log_std_A - other.log_std_A)
+        shift_BA = (self.mean_BA - other.mean_BA) * torch.exp(-other.log_std_A)
+        squares_BA = scale_A.square() * second_BA + 2 * scale_A * shift_BA * first_BA + shift_BA.square() * inside_BA
+        tails_BA = below_BA * other._log_below_BA + above_BA * other._log_above_BA
+        return (tails_BA - inside_BA * (other.log_std_A + _LOG_SQRT_2PI) - 0.5 * squares_BA).sum(-1)
+
+    @property
+    def _log_below_BA(self) -> Tensor:
+        return log_ndtr((-LIMIT - self.mean_BA) * torch.exp(-self.log_std_A))
+
+    @property
+    def _log_above_BA(self) -> Tensor:
+        return log_ndtr((self.mean_BA - LIMIT) * torch.exp(-self.log_std_A))

@@ -35,7 +35,8 @@ SAME_START = 0.1
 
 @dataclass(frozen=True)
 class PpoMetrics:
-    """Means over the samples of the update's minibatches; see docs/metrics.md.
+    """Means over the samples of the update's minibatches, the one included that target_kl stopped at; see
+    docs/metrics.md.
 
     approx_kl, kl_reference, entropy: nats. epochs: passes made before target_kl stopped them (fractional).
     loss_value, explained_variance: NaN without a critic. groups_without_signal, episodes_without_return: see
@@ -143,7 +144,7 @@ class PpoLearner:
         samples = self._samples(tensors_of(rollout, self.policy) if isinstance(rollout, Rollout) else rollout)
         count = len(samples.actions)
         totals: dict[str, float] = {}
-        trained = 0
+        read = trained = 0
         groups = samples.groups
         policy_frozen = groups is None and self.updates < config.value_warmup_updates
         num_minibatches = max(1, round(count / config.minibatch_size))
@@ -156,16 +157,17 @@ class PpoLearner:
                 terms = self._minibatch(samples, index, policy_frozen)
                 for name, value in terms.items():
                     totals[name] = totals.get(name, 0.0) + value * len(index)
-                trained += len(index)
+                read += len(index)
                 stop = 0 < config.target_kl < terms["approx_kl"]
                 if stop:
                     break
+                trained += len(index)
             if stop:
                 break
         if not bool(torch.stack([torch.isfinite(parameter).all() for parameter in self.policy.parameters()]).all()):
             raise self._not_finite("weight")
         return PpoMetrics(
-            **{name: value / trained for name, value in totals.items()}, learning_rate=config.learning_rate,
+            **{name: value / read for name, value in totals.items()}, learning_rate=config.learning_rate,
             explained_variance=explained_variance(
                 samples.values, samples.returns, torch.ones_like(samples.values, dtype=torch.bool)
             ),
@@ -175,7 +177,8 @@ class PpoLearner:
         )
 
     def _minibatch(self, samples: _Samples, index: Tensor, policy_frozen: bool) -> dict[str, float]:
-        """One gradient step on the samples `index`, this rank computing its share; returns means over all of them."""
+        """One gradient step on the samples `index` unless their KL is above target_kl, this rank computing its share;
+        returns means over all of them."""
         config, own = self.config, self.ranks.share(index)
         features, states = samples.features[own], samples.states[own]
         distribution = self.policy.distribution(features, states)
@@ -210,7 +213,10 @@ class PpoLearner:
         finite = ("loss_policy", "entropy", "kl_reference", *(["loss_value"] if samples.groups is None else []))
         if not all(math.isfinite(means[name]) for name in finite):
             raise self._not_finite("loss")
-        self._optimizer.step()
+        if not 0 < config.target_kl < means["approx_kl"]:
+            self._optimizer.step()
+            with torch.no_grad():
+                self.policy.log_std_A.clamp_(min=config.min_log_std)
         return means | {"grad_norm": grad_norm}
 
     def _not_finite(self, what: str) -> FloatingPointError:
@@ -235,6 +241,9 @@ class PpoLearner:
                 f"{int(unknown.sum())} of {len(chosen)} valid transitions have no log_prob or value; PPO trains "
                 "on rollouts of a policy that publishes both"
             )
+        for name, column_TN in (("state", rollout.states_TN), ("action", rollout.actions_TN)):
+            if bool((valid_TN & ~torch.isfinite(column_TN).all(-1)).any()):
+                raise ValueError(f"a valid transition has a {name} that is not finite; mark it valid=False")
         if groups is None:
             advantages, returns = gae(
                 torch.where(valid_TN, rollout.rewards_TN, 0.0), rollout.values_TN, self._next_values(rollout),

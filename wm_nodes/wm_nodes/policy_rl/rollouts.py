@@ -28,10 +28,12 @@ class Canceled(Exception):
 
 @dataclass(frozen=True)
 class RolloutStatistics:
-    """Of the episodes that ended inside a rollout that began with a reset. NaN means without episodes.
+    """Of each environment's first episode, which began with the rollout. NaN means that none ended inside it.
 
-    successes: episodes that terminated (the environment's own done signal). mean_length: steps. cut: further episodes,
-    which the rollout's end cut short: in none of the other numbers.
+    A later episode has less time: it would be counted where it succeeds early, and not where it fails.
+
+    episodes: that ended inside the rollout; mean_return and mean_length (steps) are theirs. successes: of them, those
+    that terminated (the environment's own done signal). cut: that the rollout's end cut short.
     """
 
     episodes: int
@@ -42,7 +44,24 @@ class RolloutStatistics:
 
     @property
     def success_rate(self) -> float:
-        return self.successes / self.episodes if self.episodes else float("nan")
+        """Share of the first episodes that succeeded inside the rollout; those cut short did not."""
+        return self.successes / (self.episodes + self.cut) if self.episodes else float("nan")
+
+
+@dataclass
+class Convergence:
+    """Says when training has converged (ppo.converged_updates).
+
+    wanted: updates in a row in whose rollouts no episode fails; 0: never. unfailed: those up to the newest update.
+    """
+
+    wanted: int
+    unfailed: int = 0
+
+    def reached(self, rollout: Outcomes | TensorRollout) -> bool:
+        """Count the rollout of one more update; return whether training has converged."""
+        self.unfailed = self.unfailed + 1 if rollout_statistics(rollout).success_rate == 1.0 else 0
+        return 0 < self.wanted <= self.unfailed
 
 
 def reset_seeds(
@@ -148,29 +167,20 @@ def terminate_at_episode_end(rollout: Rollout) -> Rollout:
 
 
 def rollout_statistics(rollout: Outcomes | TensorRollout) -> RolloutStatistics:
-    """Return counts and means of the episodes that ended inside the rollout.
+    """Return counts and means of the first episodes of the rollout, see RolloutStatistics.
 
     The return of an episode with an invalid step in its middle leaves that step out.
     """
     if isinstance(rollout, TensorRollout):
         rollout = rollout.outcomes()
-    returns: list[float] = []
-    lengths: list[int] = []
-    successes = cut = 0
-    for n in range(rollout.valid_TN.shape[1]):
-        total, length = 0.0, 0
-        for t in range(rollout.valid_TN.shape[0]):
-            is_last = bool(rollout.terminated_TN[t, n] or rollout.truncated_TN[t, n])
-            if not rollout.valid_TN[t, n] and not is_last:
-                continue
-            length += 1
-            total += float(rollout.rewards_TN[t, n]) if rollout.valid_TN[t, n] else 0.0
-            if is_last:
-                returns.append(total)
-                lengths.append(length)
-                successes += int(rollout.terminated_TN[t, n])
-                total, length = 0.0, 0
-        cut += length > 0
-    if not returns:
+    ended_TN = rollout.terminated_TN | rollout.truncated_TN
+    ended_N = ended_TN.any(0)
+    first_TN = np.cumsum(ended_TN, 0) - ended_TN == 0
+    returns_N = np.where(first_TN & rollout.valid_TN, rollout.rewards_TN, 0.0).sum(0, dtype=np.float64)
+    lengths_N = (first_TN & (rollout.valid_TN | ended_TN)).sum(0)
+    successes, episodes = int((first_TN & rollout.terminated_TN).sum()), int(ended_N.sum())
+    cut = int((~ended_N & rollout.valid_TN.any(0)).sum())
+    if not episodes:
         return RolloutStatistics(0, 0, float("nan"), float("nan"), cut)
-    return RolloutStatistics(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)), cut)
+    mean_return, mean_length = (float(column[ended_N].mean()) for column in (returns_N, lengths_N))
+    return RolloutStatistics(episodes, successes, mean_return, mean_length, cut)

@@ -61,7 +61,8 @@ class TensorRollout:
     images: Tensor | None = None
 
     def needs_bootstrap(self) -> Tensor:
-        """Where (T, N) the value of the observation that the step reached is no other row's: at cuts and at the end."""
+        """Where (T, N) the value of the observation that a step reached is no other row's: at cuts, before a missing
+        step, and at the end."""
         return _needs_bootstrap(self.valid_TN, self.terminated_TN, self.truncated_TN)
 
     def outcomes(self) -> Outcomes:
@@ -102,6 +103,6 @@ def tensors_of(rollout: Rollout, policy: ImagePolicy) -> TensorRollout:
 
 
 def _needs_bootstrap(valid_TN: Tensor, terminated_TN: Tensor, truncated_TN: Tensor) -> Tensor:
-    cut = truncated_TN.clone()
-    cut[-1].fill_(True)
-    return valid_TN & ~terminated_TN & cut
+    next_lost_TN = torch.ones_like(valid_TN)
+    next_lost_TN[:-1] = ~valid_TN[1:]
+    return valid_TN & ~terminated_TN & (truncated_TN | next_lost_TN)

@@ -1,8 +1,6 @@
-"""Loop 1 on one screen: PPO or GRPO of a policy in an environment, in one process.
-
-The ROS graph is this loop with the environment, the policy, the reward and the learner in a process each, and gives the
-same weights bit for bit (tests/graph/test_training.py). `python -m wm_nodes.policy_rl.train` runs it: a policy that
-knows nothing learns to reach in the shipped world model, no simulator. `--device cuda`: rollouts never leave the GPU.
+"""Loop 1 on one screen: PPO or GRPO of a policy in an environment, in one process. The ROS graph is this loop with the
+environment, the policy, the reward and the learner in a process each, and gives the same weights bit for bit. `python
+-m wm_nodes.policy_rl.train [--device cuda]`: a policy learns to reach in the shipped world model, without a simulator.
 """
 
 import argparse
@@ -18,7 +16,7 @@ from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy, ma
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.ppo import PpoLearner, PpoMetrics
-from wm_nodes.policy_rl.rollouts import rollout_statistics
+from wm_nodes.policy_rl.rollouts import Convergence, rollout_statistics
 from wm_nodes.policy_rl.tensor_rollout import TensorRollout
 from wm_nodes.reward import RewardModel
 from wm_nodes.world_model import DeviceEnvironment
@@ -28,14 +26,16 @@ def train_policy(
     policy: ImagePolicy, env: Environment | DeviceEnvironment, reward: RewardModel, config: RunConfig,
     meter: ExploitMeter | None = None,
 ) -> Iterator[tuple[Rollout | TensorRollout, PpoMetrics]]:
-    """Train `policy` in place for ppo.updates updates or until `meter` stops it; yield rollout and metrics of each."""
+    """Train `policy` in place for ppo.updates updates, or until `meter` stops it or it converged; yield each update."""
     learner = PpoLearner(policy, config.ppo, seed=config.seed)
     collect = make_collector(env, policy, reward, config.ppo.envs_per_start)  # act, step, reward
     num_steps = config.ppo.num_steps * config.ppo.num_envs // env.spec.num_envs  # however many step at a time
-    versions = range(1, config.ppo.updates + 1)
+    versions, convergence = range(1, config.ppo.updates + 1), Convergence(config.ppo.converged_updates)
     for version in versions if meter is None else meter.watch(policy, versions):
         rollout = collect(num_steps, config.seed, version)
         yield rollout, learner.update(rollout)  # the policy is version + 1 from here on
+        if convergence.reached(rollout):
+            return
 
 
 def main(words: list[str] | None = None) -> None:
@@ -52,8 +52,8 @@ def main(words: list[str] | None = None) -> None:
     except (ValueError, OSError) as error:
         parser.error(str(error))
     for version, (rollout, metrics) in enumerate(train_policy(policy, env, reward, config), 1):
-        success = rollout_statistics(rollout).success_rate
-        print(f"version {version}: imagined success {success:.1%}, {metrics.kl_reference:.3f} nats from version 1")
+        rate, moved = rollout_statistics(rollout).success_rate, metrics.kl_reference
+        print(f"version {version}: imagined success {rate:.1%}, {moved:.3f} nats from version 1")
 
 
 if __name__ == "__main__":

@@ -60,7 +60,8 @@ class Learner(Protocol):
 
 @dataclass
 class Progress:
-    """Counts over the whole run folder. samples: valid transitions trained on."""
+    """Counts over the whole run folder. samples: valid transitions trained on. unfailed: updates in a row, up to the
+    newest, in whose rollouts no episode failed."""
 
     updates: int = 0
     version: int = 1
@@ -70,6 +71,7 @@ class Progress:
     dropped_stale: int = 0
     mean_return: float = math.nan
     success_rate: float = math.nan
+    unfailed: int = 0
 
 
 class PolicyTraining(TrainingRun):
@@ -140,6 +142,7 @@ class PolicyTraining(TrainingRun):
         progress.dropped_gap += dropped.gap
         progress.dropped_stale += dropped.stale
         progress.mean_return, progress.success_rate = statistics.mean_return, statistics.success_rate
+        progress.unfailed = progress.unfailed + 1 if statistics.success_rate == 1.0 else 0
         self.save()
         seconds = time.perf_counter() - began
         counts = {"episodes": float(statistics.episodes), "cut_episodes": float(statistics.cut)}

@@ -80,15 +80,29 @@ class EpisodeArrays:
         )
 
 
+def check_finite(episodes: Iterable[Episode]) -> None:
+    """Raise ValueError that names the first state or action of an episode that is not finite, before it trains."""
+    for episode in episodes:
+        for name in ("states", "actions"):
+            array = getattr(episode, name)
+            if not np.isfinite(array).all():
+                where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+                raise ValueError(
+                    f"episode {episode.episode_id} (task {episode.task}, seed {episode.seed}) has {array[where]} in "
+                    f"{name}{list(where)}; leave it out, or record it again"
+                )
+
+
 def stack_episodes(
     episodes: Iterable[Episode], tasks: Sequence[str], labels: TaskLabels = success, *, num_steps: int | None = None
 ) -> EpisodeArrays:
     """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides).
 
     Raises:
-        ValueError: no episodes, or episodes of different image, state or action sizes.
+        ValueError: no episodes, episodes of different image, state or action sizes, or as check_finite.
     """
     listed = list(episodes)
+    check_finite(listed)
     if not listed:
         raise ValueError("no episodes to train on; collect some first (data.num_episodes) or check the bag path")
     known = {task: get_task(task).parts if task in task_names() else () for task in {e.task for e in listed}}

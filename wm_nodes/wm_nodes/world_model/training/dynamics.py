@@ -109,7 +109,8 @@ def train_action_model(
 
     Loss (RS-4): world_model.latent_weight * latents + world_model.done_weight * done + world_model.state_weight *
     positions (those the model says, and those the tokenizer's frozen probe reads off the predicted latents) +
-    world_model.decoded_weight * decoded_losses. `model` continues from given weights (online rounds).
+    world_model.decoded_weight * decoded_losses, without recoded_state where state_weight is 0. `model` continues from
+    given weights (online rounds).
     """
     data = episodes if isinstance(episodes, LatentEpisodes) else tokenise_episodes(tokenizer, episodes)
     settings = config.world_model
@@ -152,7 +153,9 @@ def train_action_model(
             if settings.decoded_weight:
                 frames, images = shown
                 losses |= decoded_losses(terms, tokenizer, part, rows, frames, images, config)
-                decoded = losses["pixel"] + losses["recoded"] + losses["recoded_state"]
+                decoded = losses["pixel"] + losses["recoded"]
+                if settings.state_weight:
+                    decoded = decoded + losses["recoded_state"]
                 losses["loss"] = losses["loss"] + settings.decoded_weight * decoded
             return losses | {"rollout_steps": torch.tensor(float(steps))}
 
