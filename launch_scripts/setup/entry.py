@@ -143,7 +143,7 @@ def _alone(venv):
     """Hold a lock file, so that two starts at the same time set up once; commands started meanwhile hold it, too.
     SIGTERM then does what Ctrl-C does."""
     venv.parent.mkdir(parents=True, exist_ok=True)
-    with open(venv.parent / (venv.name + ".lock"), "w") as lock:
+    with open(venv.parent / (venv.name + ".lock"), "w", encoding="utf-8") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -37,11 +37,11 @@ def repair_cmake(share: Path, include: str, numpy_include: str) -> int:
     """Replace the include folders of the machine on which the wheels were built; return how many files changed."""
     repaired = 0
     for path in sorted(share.rglob("*.cmake")):
-        text = path.read_text(errors="surrogateescape")
+        text = path.read_text(encoding="utf-8", errors="surrogateescape")
         new = WHEEL_NUMPY.sub(lambda _: numpy_include, WHEEL_INCLUDE.sub(lambda _: include, text))
         if new != text:
             temporary = path.with_suffix(".tmp")  # not in place: a hard link into uv's cache, and never half a file
-            temporary.write_text(new, errors="surrogateescape")
+            temporary.write_text(new, encoding="utf-8", errors="surrogateescape")
             temporary.replace(path)
             repaired += 1
     return repaired
@@ -53,7 +53,9 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
     Raises SetupError with the compiler's last lines.
     """
     python, env = venv / "bin" / "python", isolated_environment(venv)
-    answer = subprocess.run([str(python), "-c", WHERE], capture_output=True, text=True, env=env, check=False)
+    answer = subprocess.run(
+        [str(python), "-c", WHERE], capture_output=True, encoding="utf-8", errors="replace", env=env, check=False
+    )
     if answer.returncode:
         begin(venv, "packages")
         raise SetupError(f"numpy is not importable in {venv}:\n{answer.stderr}\n  start again to install it anew")
@@ -105,13 +107,13 @@ def link_messages(venv: Path, installs: list[Path]) -> None:
             raise SetupError(f"{install} holds no Python modules; delete it and start again")
         found.append(f"{modules}\n")
     site = next((venv / "lib").glob("python3.*/site-packages"))
-    (site / "wm_workspace.pth").write_text("".join(found))
+    (site / "wm_workspace.pth").write_text("".join(found), encoding="utf-8")
 
 
 def _built_here(source: Path, build: Path, python: Path) -> bool:
     """True where an earlier build of these sources in this folder, with this Python, can be continued."""
     try:
-        cache = (build / "CMakeCache.txt").read_text(errors="replace")
+        cache = (build / "CMakeCache.txt").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return False
     return all(part in cache for part in (f"={source}\n", f"={build}\n", str(python)))

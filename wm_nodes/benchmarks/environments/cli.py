@@ -125,7 +125,7 @@ def _speed(arguments: argparse.Namespace, models: list[str]) -> None:
 def _kept_rows(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     if arguments.json is None or not arguments.json.is_file():
         return []
-    rows: list[dict[str, Any]] = json.loads(arguments.json.read_text())["rows"]
+    rows: list[dict[str, Any]] = json.loads(arguments.json.read_text(encoding="utf-8"))["rows"]
     return rows
 
 

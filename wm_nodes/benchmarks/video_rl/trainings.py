@@ -138,7 +138,7 @@ def finished(path: Path | None, trials: Sequence[SamplerTrial[Any]]) -> list[dic
     """The rows of an earlier call; a trial of this one that it ran by another plan is refused."""
     if path is None or not path.is_file():
         return []
-    rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
+    rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["rows"]
     if any("sampler" not in row for row in rows):
         raise ValueError(f"{path} is of an earlier version of this benchmark; take another file")
     plans = {trial.sampler.name: json.loads(json.dumps(asdict(trial.plan))) for trial in trials}

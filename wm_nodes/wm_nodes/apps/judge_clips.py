@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     if lines:
         settings = for_clips(settings, read_job(arguments.clips, lines[0]).clip.frames.shape)
     judge = JudgeService(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit, device=config.device)
-    with closing(judge), path.open("a+") as written:
+    with closing(judge), path.open("a+", encoding="utf-8") as written:
         asked = {"judge_id": judge.judge_ids[0], "rubric": judge.rubric.version}
         by = {**asked, "mode": settings.mode, "seed": config.seed}
         written.seek(0)

@@ -138,7 +138,7 @@ def _finish(
     """Measure a trained round, collect with its policy and refresh the model; the result as in summary.json."""
     marker = start.folder / RESULT
     if marker.is_file():
-        found: dict[str, Any] = json.loads(marker.read_text())
+        found: dict[str, Any] = json.loads(marker.read_text(encoding="utf-8"))
         return found
     policy = trained.policy(start.folder)
     measured = ("imagined_before", "imagined_after", "real_after")

@@ -156,7 +156,7 @@ def train_round(
     marker = start.folder / TRAINED
     if is_trained(start):
         job.stage(f"{start.label or 'training'} is done already ({marker})")
-        return TrainingResult(**json.loads(marker.read_text()))
+        return TrainingResult(**json.loads(marker.read_text(encoding="utf-8")))
     waiting = waiting or start_graph(job, start)
     with closing(waiting.runner) as runner:
         runner.activate(READY_S)
@@ -181,7 +181,7 @@ def train_round(
 
 def read_success(folder: Path, name: str) -> BoolArray:
     """A kept evaluation, (E,) in seed order. name: real_ or imagined_, then before or after."""
-    values = json.loads((folder / "evaluations" / f"{name}.json").read_text())
+    values = json.loads((folder / "evaluations" / f"{name}.json").read_text(encoding="utf-8"))
     return np.asarray(values["success"], bool)
 
 
@@ -208,7 +208,7 @@ def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path,
 def cached_success(path: Path, identity: Mapping[str, str], measure: Callable[[], BoolArray]) -> BoolArray:
     """Success of episodes, (E,), from `path` when it was measured on the same things, else measured and written."""
     if path.is_file():
-        values: dict[str, Any] = json.loads(path.read_text())
+        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         if values["identity"] == dict(identity):
             return np.asarray(values["success"], bool)
     success = measure()
@@ -264,5 +264,6 @@ def _train(operator: GraphClient, updates: int) -> str:
 
 def _progress(folder: Path) -> dict[str, Any]:
     """Counts of the learner's newest checkpoint, which is on disk before its version is announced."""
-    progress: dict[str, Any] = json.loads((folder / "checkpoints" / "learner.json").read_text())["progress"]
+    text = (folder / "checkpoints" / "learner.json").read_text(encoding="utf-8")
+    progress: dict[str, Any] = json.loads(text)["progress"]
     return progress

@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def read_results(folder: Path) -> list[dict[str, Any]]:
     path = folder / "results.jsonl"
-    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
     return [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
 
 
@@ -198,7 +198,7 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(config.device),
         "config": dump_config(config), "world_model_sha256": models_of(model_dir, config.device).sha256,
     }
-    with open(folder / "results.jsonl", "a") as file:
+    with open(folder / "results.jsonl", "a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 
 

@@ -237,7 +237,7 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
         models, heldout = load_model_folder(model_dir, compute_device(config.device)), load_arrays(bags, config)
         report = accept_world_model(models, heldout, config, *successes)
     path = job.run_dir / ACCEPTANCE
-    path.write_text(json.dumps(report.to_dict(), indent=1))
+    path.write_text(json.dumps(report.to_dict(), indent=1), encoding="utf-8")
     console.print(report.table())
     if not report.passed and not force:
         raise ModelNotAcceptedError(
@@ -249,5 +249,6 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
 
 def _read_acceptance(run_dir: Path) -> dict[str, Any]:
     path = run_dir / ACCEPTANCE
-    found: dict[str, Any] = json.loads((path if path.is_file() else run_dir / FORMER_ACCEPTANCE).read_text())
+    written = path if path.is_file() else run_dir / FORMER_ACCEPTANCE
+    found: dict[str, Any] = json.loads(written.read_text(encoding="utf-8"))
     return found

@@ -81,8 +81,8 @@ def prepare_graph(scenario: str, given: Mapping[str, str], python: str) -> Graph
     """
     command = [python, "-m", "wm_nodes.launching.arguments", scenario]
     done = subprocess.run(
-        command, input=json.dumps(dict(given)), env=graph_environment(python=python), capture_output=True, text=True,
-        check=False,
+        command, input=json.dumps(dict(given)), env=graph_environment(python=python), capture_output=True, check=False,
+        encoding="utf-8", errors="replace",
     )
     if done.returncode:
         text = (done.stderr.strip().splitlines() or ["no output"])[-1].removeprefix("error: ")

@@ -213,7 +213,7 @@ def restore(policy: ImagePolicy, learner: Learner, checkpoint: Path) -> Progress
         ValueError: a damaged file, or one of another architecture, algorithm or seed; names it.
     """
     try:
-        content = json.loads(checkpoint.read_text())
+        content = json.loads(checkpoint.read_text(encoding="utf-8"))
         load_weights(policy, (checkpoint.parent / content["weights"]).read_bytes(), sha256=content["sha256"])
         learner.load(checkpoint.parent / content["learner"])
         return Progress(**content["progress"])

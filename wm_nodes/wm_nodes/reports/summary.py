@@ -94,7 +94,7 @@ def read_summary(run_dir: Path) -> dict[str, Any]:
     path = Path(run_dir) / FILE_NAME
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: the run has not come to its end")
-    values: dict[str, Any] = json.loads(path.read_text())
+    values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return {"acceptance" if name == "gate" else name: value for name, value in values.items()}
 
 

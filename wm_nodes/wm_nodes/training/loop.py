@@ -130,7 +130,7 @@ class TrainingLoop:
         path = None if self.run_dir is None else self.run_dir / f"metrics_{self.name}.jsonl"
         if self.iteration == 0 or path is None or not path.exists():
             return {}
-        last = json.loads(path.read_text().splitlines()[-1])
+        last = json.loads(path.read_text(encoding="utf-8").splitlines()[-1])
         return {key: value for key, value in last.items() if key not in ("iteration", "seconds")}
 
     def _log(self, metrics: Mapping[str, float], seconds: float) -> None:
@@ -138,5 +138,5 @@ class TrainingLoop:
             return
         self.run_dir.mkdir(parents=True, exist_ok=True)
         line = {"iteration": self.iteration, "seconds": round(seconds, 2), **metrics}
-        with open(self.run_dir / f"metrics_{self.name}.jsonl", "a") as file:
+        with open(self.run_dir / f"metrics_{self.name}.jsonl", "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")

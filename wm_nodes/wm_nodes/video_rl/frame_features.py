@@ -119,7 +119,7 @@ def load_backbone(folder: Path, device: torch.device | str = "cpu") -> BackboneF
     if not isinstance(size, int):
         raise ValueError(f"{folder} holds a {model.config.model_type}, which takes no pictures; give a vision model")
     path = folder / "preprocessor_config.json"
-    settings = json.loads(path.read_text()) if path.is_file() else {}
+    settings = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     mean, std = settings.get("image_mean", IMAGENET_MEAN), settings.get("image_std", IMAGENET_STD)
     name = f"{model.config.model_type} of {folder.name}"
     return BackboneFeatures(model.to(device), size, tuple(mean), tuple(std), name)

@@ -61,7 +61,7 @@ def load_or_measure_scores(
 ) -> dict[str, list[float]]:
     """Return context_scores(): read from `path` where they are of the same weights, else measured and written there."""
     sha256 = pack_weights(folder.network).sha256
-    if path.is_file() and (saved := json.loads(path.read_text()))["sha256"] == sha256:
+    if path.is_file() and (saved := json.loads(path.read_text(encoding="utf-8")))["sha256"] == sha256:
         return dict(saved["scores"])
     scores = {name: values.tolist() for name, values in context_scores(folder, heldout, probe, config).items()}
     write_atomic(path, json.dumps({"sha256": sha256, "scores": scores}).encode())

@@ -213,7 +213,7 @@ def _load_or_train_segmenter(
         write_atomic(path, save({name: tensor.half() for name, tensor in model.state_dict().items()}))
     segmenter = Segmenter()
     segmenter.load_state_dict({name: tensor.float() for name, tensor in load_file(path).items()})
-    story = json.loads(path.with_suffix(".json").read_text())
+    story = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     return segmenter.eval().requires_grad_(False).to(device), story
 
 
