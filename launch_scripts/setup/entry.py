@@ -24,6 +24,8 @@ REQUIREMENTS = ROOT / "requirements"
 MESSAGES = ROOT / "msgs_schema"
 PACKAGE = ROOT / "wm_nodes"
 WORKSPACE = ROOT / "ros2_ws"
+SOURCES = "wm_setup_sources"
+"""File beside the built messages: the fingerprint of what they were built from, which comes along in a copy."""
 MISSING = ":missing"
 """Suffix of the renderer's stamp where this user may not install system packages."""
 
@@ -59,14 +61,15 @@ def ensure():
 
 
 def pending(venv):
-    """Return the steps that are to be done, in order: packages, messages, wm_nodes, renderer."""
+    """Return the steps that are to be done, in order: place, packages, messages, wm_nodes, renderer."""
     from setup.messages import lacks_tf
 
     stamp, wanted = read_stamp(stamp_file(venv)), _wanted(venv)
-    built = WORKSPACE / "install" / "wm_msgs" / "share" / "wm_msgs" / "package.xml"
+    install = WORKSPACE / "install" / "wm_msgs"
+    built = (install / "share" / "wm_msgs" / "package.xml").exists() and (install / SOURCES).is_file()
     present = {
         "packages": (venv / "bin" / "python").exists(),
-        "messages": built.exists() and not lacks_tf(venv),
+        "messages": built and (install / SOURCES).read_text("utf-8") == wanted["messages"] and not lacks_tf(venv),
     }
     done = {step: stamp.get(step, "").split(":")[0] for step in wanted}
     return [step for step in wanted if not present.get(step, True) or done[step] != wanted[step]]
@@ -75,26 +78,31 @@ def pending(venv):
 def _wanted(venv):
     from setup.messages import message_sources
 
-    packages = fingerprint(REQUIREMENTS.glob("*.txt"), str(venv), python_version(venv))
+    packages = fingerprint(REQUIREMENTS.glob("*.txt"), python_version(venv))
     build_files = [PACKAGE / name for name in ("setup.py", "setup.cfg", "pyproject.toml")]
     return {
+        "place": fingerprint([], str(ROOT), str(venv)),
         "packages": packages,
-        "messages": fingerprint(message_sources(MESSAGES), packages, str(ROOT)),
-        "wm_nodes": fingerprint(build_files, packages, str(ROOT)),
+        "messages": fingerprint(message_sources(MESSAGES), packages),
+        "wm_nodes": fingerprint(build_files, packages),
         "renderer": fingerprint([ROOT / "launch_scripts" / "setup" / "system.py"]),
     }
 
 
 def _set_up(venv):
-    from setup import messages, packages, system
+    from setup import messages, packages, place, system
 
     steps = pending(venv)
     if not steps:
         return
-    log, done = venv.parent / (venv.name + "_setup.log"), {}
-    say(f"setting up {', '.join(steps)}; output of the commands is in {log}")
+    log, done, before = venv.parent / (venv.name + "_setup.log"), {}, place.former(venv, ROOT)
+    if left := [step for step in steps if step != "place"]:
+        say(f"setting up {', '.join(left)}; output of the commands is in {log}")
     if "packages" in steps:
         packages.create_venv(venv, log)
+    if before and before != place.present(venv, ROOT):
+        say(f"this checkout or its environment was in another folder: writing {ROOT} into {venv}")
+        place.settle(venv, ROOT, log, before)
     wanted = _wanted(venv)
     if "renderer" in steps or "packages" in steps:
         ready = system.install(system.current_plan(), log)
@@ -107,8 +115,11 @@ def _set_up(venv):
     for step, action in actions.items():
         if step in steps:
             action()
+            if step == "messages":
+                (WORKSPACE / "install" / "wm_msgs" / SOURCES).write_text(wanted[step], encoding="utf-8")
             finish(venv, {**done, step: wanted[step]})
-    finish(venv, done)
+    place.settle(venv, ROOT, log)
+    finish(venv, {**done, "place": wanted["place"], **place.present(venv, ROOT)})
     say("done")
 
 
