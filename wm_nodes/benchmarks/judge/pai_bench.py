@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from benchmarks.judge.comparisons import pai_bench as pai
 from benchmarks.judge.comparisons.chat import ChatComparison
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_json, add_seed
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.types import ClipRef
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from tqdm import tqdm
 
 from benchmarks.video_rl import plots, tables
 from benchmarks.video_rl.judged import JudgedContexts
@@ -39,6 +38,7 @@ from wm_nodes.config.load import judge_or_embedded, load_config, load_video_conf
 from wm_nodes.config.schema import AGENT, SimulationConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.service import clip_fps
 from wm_nodes.training.weights import load_weights, pack_weights
 from wm_nodes.video_model import RolloutBuffer

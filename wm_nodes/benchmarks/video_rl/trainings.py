@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import torch
 from pydantic import TypeAdapter
-from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
 from benchmarks.video_rl.comparison import MEASURES, SamplerComparison, compare_samplers
@@ -20,6 +19,7 @@ from benchmarks.video_rl.sources import TASK
 from benchmarks.video_rl.trials import Plan, SamplerTrial
 from wm_nodes.apps.options import add_device, add_json, positive, prepare_torch
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.progress import tqdm
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder
 

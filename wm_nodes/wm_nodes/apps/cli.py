@@ -6,6 +6,7 @@ docstring is the text of `wm VERB --help`. Only the chosen module is imported.
 
 import argparse
 import difflib
+import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -92,6 +93,8 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
     """
     kind, _, experiment = name.partition(" ")
     file = (experiment or kind).replace("-", "_")
+    if not sys.stderr.isatty():
+        os.environ.setdefault("TQDM_DISABLE", "1")  # bars of libraries; ours are lines then
     try:
         module = import_module(f"wm_nodes.apps.{file}" if kind != "benchmark" else f"{BENCHMARKS}.{file}.cli")
     except ModuleNotFoundError as error:

@@ -19,10 +19,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from tqdm import tqdm
-
 from wm_nodes.apps.options import add_device, add_json, add_judge, device_settings, judge_settings
 from wm_nodes.config.load import judge_or_embedded, load_config
+from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import for_clips

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from tqdm import tqdm
 
 from wm_nodes.config.load import dump_config
 from wm_nodes.config.saved import with_device
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.model_folder import files_sha256
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import wilson_interval
 from wm_nodes.core.types import BoolArray
 from wm_nodes.launching import arguments as launch_arguments

@@ -16,7 +16,6 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
-from tqdm import tqdm
 
 from wm_nodes.apps.model_refresh_loop import round_config, split_updates
 from wm_nodes.apps.options import add_preset, add_threads, prepare_torch, settings
@@ -26,6 +25,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.device import compute_device
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.record import acceptance_plan, collect_plan

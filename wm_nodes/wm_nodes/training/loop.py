@@ -12,8 +12,8 @@ from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
+from wm_nodes.core.progress import tqdm
 from wm_nodes.training import checkpoint
 
 CHECKPOINT_PERIOD_S = 240.0

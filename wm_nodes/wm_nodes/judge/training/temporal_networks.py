@@ -16,10 +16,10 @@ import torch
 import torch.nn.functional as F
 from safetensors.torch import load_file, save
 from torch import Tensor
-from tqdm import tqdm
 
 from wm_nodes.core.device import CPU_DEVICE
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.types import FloatArray
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow

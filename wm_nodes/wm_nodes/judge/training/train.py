@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save
-from tqdm import tqdm
 
 import wm_nodes.judge.evidence
 from wm_nodes.core.device import CPU_DEVICE
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.types import FloatArray
 from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC
 from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestRow, Part, to_bytes
