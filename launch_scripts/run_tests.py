@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from setup import system
-from setup.entry import ensure
+from setup.entry import ensure, interruptible
 
 ROOT = Path(__file__).resolve().parents[1]
 FAILED, CRASHED = (Path(".pytest_cache/v") / name for name in ("cache/lastfailed", "wm/crashed"))
@@ -104,4 +104,5 @@ if __name__ == "__main__":
     if {"-h", "--help"} & {*sys.argv[1:]}:
         raise SystemExit(print(__doc__.rstrip()))
     ensure()
-    raise SystemExit(main(sys.argv[1:]))
+    with interruptible():
+        raise SystemExit(main(sys.argv[1:]))

@@ -26,6 +26,7 @@ PACKAGE = ROOT / "wm_nodes"
 WORKSPACE = ROOT / "ros2_ws"
 SOURCES = "wm_setup_sources"
 """File beside the built messages: the fingerprint of what they were built from, which comes along in a copy."""
+HELP = ("-h", "--help")
 MISSING = ":missing"
 """Suffix of the renderer's stamp where this user may not install system packages."""
 
@@ -35,11 +36,15 @@ def venv_folder():
     return Path(os.environ.get("WM_VENV") or ROOT / ".venv").expanduser().absolute()
 
 
-def ensure():
+def ensure(argv=None):
     """Return when the running Python is the virtual environment's and holds all that is needed; else make it so.
 
-    Ends the process with one message when that is impossible.
+    Ends the process with one message when that is impossible. Where the arguments ask for help, nothing is set up, and
+    what the standard library can import of wm_nodes is found in this checkout.
     """
+    if {*HELP} & {*(sys.argv[1:] if argv is None else argv)}:
+        sys.path.insert(0, str(PACKAGE))
+        return
     if not interpreter.supported(sys.version_info):
         other = interpreter.find_supported()
         if other is None:
@@ -48,6 +53,7 @@ def ensure():
         os.execv(other, [other, *sys.argv])
     venv = venv_folder()
     with _one_line():
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # a Ctrl-C of meanwhile counts from here on
         if pending(venv):
             with _alone(venv):
                 _set_up(venv)
@@ -57,7 +63,32 @@ def ensure():
         python = str(venv / "bin" / "python")
         sys.stdout.flush()
         sys.stderr.flush()
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # it would be a traceback while Python starts
         os.execve(python, [python, *sys.orig_argv[1:]], isolated_environment(venv))
+
+
+def launch(scenario):
+    """Start the graph of a launch file, or show its arguments, for which nothing is set up. Return the exit code."""
+    if {*HELP, "-s", "--show-args"} & {*sys.argv[1:]}:
+        ensure(HELP)
+        from wm_nodes.launching.scenarios import describe_arguments
+
+        print(describe_arguments(scenario))
+        return 0
+    ensure()
+    with interruptible():
+        from wm_nodes.launching.runner import main
+    return main(scenario)
+
+
+@contextmanager
+def interruptible(text="interrupted"):
+    """End the process with one line at Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(text, file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def pending(venv):
@@ -138,15 +169,13 @@ def _recheck_renderer(venv):
 def _one_line():
     """End the process with one line where the set-up cannot go on or is interrupted."""
     try:
-        yield
+        with interruptible("interrupted; start again to continue where the set-up stopped"):
+            yield
     except SetupError as error:
         raise SystemExit(f"error: {error}") from None
     except OSError as error:
         where = "" if error.filename else f" in {venv_folder().parent}"
         raise SystemExit(f"error: {error}{where}; remedy that, then start again to continue") from None
-    except KeyboardInterrupt:
-        print("interrupted; start again to continue where the set-up stopped", file=sys.stderr)
-        raise SystemExit(130) from None
 
 
 @contextmanager

@@ -57,7 +57,6 @@ def settle(venv: Path, root: Path, log: Path, before: Mapping[str, str] | None =
     names = {os.fsencode(name): os.fsencode(new_name) for old, new in [*pairs, (root, root), (venv, venv)]
              for name, new_name in ((str(old), str(new)), (old.as_uri(), new.as_uri()))}
     if moved:
-        _rewrite_activation(venv, log)
         for build in (workspace / "build" / "wm_msgs", venv / TF / "build" / TF):
             shutil.rmtree(build, ignore_errors=True)  # CMake goes on only where it began
     longest_first = b"|".join(re.escape(name) for name in sorted(names, key=len, reverse=True))
@@ -73,9 +72,12 @@ def settle(venv: Path, root: Path, log: Path, before: Mapping[str, str] | None =
             new = MOVABLE + new[first.end():]
         if new != data:
             replace_file(file, new)
-    link_messages(venv, root, [install for install in installs if install.exists()])
+    whole = [install for install in installs if (install / "share" / install.name / "package.xml").exists()]
+    link_messages(venv, root, whole)
     for file in site.glob("__editable__.wm_nodes-*.pth"):
         replace_file(file, os.fsencode(f"{written_in(site, root / 'wm_nodes', root)}\n"))
+    if moved:
+        _rewrite_activation(venv, log)  # the last, as former() may read it
 
 
 def _files(scripts: Path, site: Path, folders: Iterable[Path]) -> Iterator[Path]:

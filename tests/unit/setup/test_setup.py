@@ -306,7 +306,7 @@ def test_installed_package_brings_every_data_file(repository: Path, tmp_path: Pa
     done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     built = tmp_path / "build" / "lib"
-    kinds = {".yaml", ".xml", ".json", ".safetensors", ".py", ".typed"}
+    kinds = {".yaml", ".xml", ".json", ".safetensors", ".py", ".txt", ".typed"}
     files = [path for path in (source / "wm_nodes").rglob("*") if path.suffix in kinds]
     absent = [str(path.relative_to(source)) for path in files if not (built / path.relative_to(source)).exists()]
     assert not absent
