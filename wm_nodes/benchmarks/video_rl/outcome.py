@@ -40,7 +40,7 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.service import clip_fps
-from wm_nodes.training.weights import load_weights, pack_weights
+from wm_nodes.training.weights import load_weights_file, pack_weights
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
@@ -212,7 +212,7 @@ def measure_weights(arguments: argparse.Namespace, weights: Path | None, seed: i
     folder = load_video_folder(arguments.video_model, arguments.device)
     config = load_video_config("outcome", {"seed": seed})
     if weights is not None:
-        load_weights(folder.network, weights.read_bytes())
+        load_weights_file(folder.network, weights)
     frames = ClipGenerator(folder, by.heldout, config).evaluate(by.heldout, config.evaluation.num_steps)
     positions, given = by.probe.read(frames), folder.clip["num_conditioning"]
     metrics = measure_clips(frames, positions, by.heldout, by.probe, by.reader, by.limits, by.simulation, given)

@@ -91,7 +91,13 @@ def run(arguments: argparse.Namespace) -> None:
 
 def read_results(folder: Path) -> list[dict[str, Any]]:
     path = folder / "results.jsonl"
-    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.exists() else [], 1):
+        try:
+            rows.append(json.loads(line))
+        except ValueError as error:
+            text = f"{path}, line {number} is cut short ({error}); delete the line to do its run again"
+            raise ValueError(text) from None
     return [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
 
 

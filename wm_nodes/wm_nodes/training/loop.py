@@ -8,6 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -130,8 +131,10 @@ class TrainingLoop:
         path = None if self.run_dir is None else self.run_dir / f"metrics_{self.name}.jsonl"
         if self.iteration == 0 or path is None or not path.exists():
             return {}
-        last = json.loads(path.read_text(encoding="utf-8").splitlines()[-1])
-        return {key: value for key, value in last.items() if key not in ("iteration", "seconds")}
+        for line in reversed(path.read_text(encoding="utf-8").splitlines()):
+            with suppress(ValueError):  # a killed process may have left half a line
+                return {key: value for key, value in json.loads(line).items() if key not in ("iteration", "seconds")}
+        return {}
 
     def _log(self, metrics: Mapping[str, float], seconds: float) -> None:
         if self.run_dir is None:
