@@ -46,9 +46,9 @@ NODES = "from setuptools import setup\nsetup(name='wm_nodes', version='1.0', pac
 class SmallCheckout:
     """The folder, its environment, and how its set-up is started and interrupted."""
 
-    def __init__(self, folder: Path, repository: Path) -> None:
-        self.root = folder / "checkout"
-        self.venv, self.log = folder / "own", folder / "own_setup.log"
+    def __init__(self, folder: Path, repository: Path, *, root: str = "checkout", venv: str = "own") -> None:
+        self.root = folder / root
+        self.venv, self.log = folder / venv, folder / f"{venv}_setup.log"
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(repository / "launch_scripts" / "setup", self.root / "launch_scripts" / "setup", ignore=ignored)
         for name, text in {
@@ -73,6 +73,12 @@ class SmallCheckout:
             "WM_VENV": str(self.venv), "UV_CACHE_DIR": str(folder / "cache"), "UV_OFFLINE": "1", "UV_NO_CONFIG": "1",
             "PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(wheels), "PIP_NO_CACHE_DIR": "1",
         }
+
+    def go_to(self, root: Path) -> None:
+        """The checkout, with its environment inside, has been moved or copied to `root`."""
+        self.venv = root / self.venv.relative_to(self.root)
+        self.log, self.root = self.venv.with_name(self.log.name), root
+        self.environment["WM_VENV"] = str(self.venv)
 
     def _write_wheels(self, folder: Path) -> None:
         site, uv = sysconfig.get_paths()["purelib"], Path(sysconfig.get_paths()["scripts"]) / "uv"

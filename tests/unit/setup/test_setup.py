@@ -25,9 +25,12 @@ def test_cmake_repair_replaces_the_wheel_builders_folders_and_nothing_else(tmp_p
     healthy = tmp_path / "fine.cmake"
     healthy.write_text("set(dirs /usr/include)\n")
     before = healthy.stat().st_mtime_ns
+    listing = tmp_path / "rosidl_adapt_interfaces.cmake"
+    listing.write_text('  file(STRINGS "${idl_output}" idl_tuples)\n')
     cached = tmp_path / "cached"
     cached.hardlink_to(broken)
-    assert messages.repair_cmake(tmp_path, "/py/include", "/np/include") == 1
+    assert messages.repair_cmake(tmp_path, "/py/include", "/np/include") == 2
+    assert listing.read_text() == '  file(STRINGS "${idl_output}" idl_tuples ENCODING UTF-8)\n', "paths with an umlaut"
     assert "/opt/python/cp312" in cached.read_text(), "what other environments are installed from stays as it is"
     assert broken.read_text() == 'set(dirs "/py/include;/np/include;/opt/python/other")\n'
     assert healthy.stat().st_mtime_ns == before
