@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from setup import system
-from setup.entry import ensure
+from setup.entry import ensure, interruptible
 
 ROOT = Path(__file__).resolve().parents[1]
 FAILED, CRASHED = (Path(".pytest_cache/v") / name for name in ("cache/lastfailed", "wm/crashed"))
@@ -66,7 +66,7 @@ def forget():
 def repeated():
     """Run the tests that failed once more, without neighbours, if all are of graphs and few. Return pytest's code."""
     files = (ROOT / FAILED, ROOT / CRASHED)
-    failed, crashed = (list(json.loads(file.read_text())) if file.exists() else [] for file in files)
+    failed, crashed = (list(json.loads(file.read_text(encoding="utf-8"))) if file.exists() else [] for file in files)
     tests = sorted({*failed, *crashed})
     few = len(tests) <= MOST_AGAIN and len(crashed) <= MOST_CRASHES
     if not tests or not few or not all(test.startswith("tests/graph/") for test in tests):
@@ -83,7 +83,9 @@ def _pytest(arguments):
 
 def _passes(name, command):
     start = time.monotonic()
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=_environment())
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, encoding="utf-8", errors="replace", check=False, env=_environment()
+    )
     print(f"{name}: {'passed' if done.returncode == 0 else 'FAILED'} ({time.monotonic() - start:.0f} s)", flush=True)
     if done.returncode:
         print(done.stdout + done.stderr, flush=True)
@@ -102,4 +104,5 @@ if __name__ == "__main__":
     if {"-h", "--help"} & {*sys.argv[1:]}:
         raise SystemExit(print(__doc__.rstrip()))
     ensure()
-    raise SystemExit(main(sys.argv[1:]))
+    with interruptible():
+        raise SystemExit(main(sys.argv[1:]))

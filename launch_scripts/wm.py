@@ -9,7 +9,8 @@ import sys
 from setup.entry import ensure
 
 if __name__ == "__main__":
-    ensure()
+    words = sys.argv[1:] or ["--help"]
+    ensure(words)
     from wm_nodes.apps.cli import main
 
-    raise SystemExit(main(sys.argv[1:], "python3 launch_scripts/wm.py"))
+    raise SystemExit(main(words, "python3 launch_scripts/wm.py"))

@@ -8,9 +8,6 @@ def generate_launch_description():
 
 
 if __name__ == "__main__":
-    from setup.entry import ensure
+    from setup.entry import launch
 
-    ensure()
-    from wm_nodes.launching.runner import main
-
-    raise SystemExit(main("world_model_rl"))
+    raise SystemExit(launch("world_model_rl"))

@@ -23,5 +23,5 @@ def write_clips(folder: Path, **changed: Any) -> list[dict[str, Any]]:
         {"file": "b.npy", "instruction": task.instruction, "clip_id": "mine", "fps": 10, "reference": "start.png",
          "sha256": second.sha256, **changed},
     ]
-    (folder / "clips.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (folder / "clips.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
     return lines

@@ -10,7 +10,7 @@ DOCUMENT = Path(wm_nodes.__file__).parents[1] / "docs" / "metrics.md"
 
 def documented(section: str) -> set[str]:
     """The names before the colons of the list under the heading that holds `section`."""
-    parts = re.split(r"^## ", DOCUMENT.read_text(), flags=re.M)
+    parts = re.split(r"^## ", DOCUMENT.read_text(encoding="utf-8"), flags=re.M)
     (part,) = [part for part in parts if section in part.splitlines()[0]]
     rows = [line.split(": ")[0] for line in part.splitlines() if line.startswith("- `")]
     return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}

@@ -11,7 +11,7 @@ def write_package(folder: Path, name: str, **files: str) -> None:
     """files: module -> source."""
     (folder / name).mkdir()
     for module, text in {"__init__": "", **files}.items():
-        (folder / name / f"{module}.py").write_text(text)
+        (folder / name / f"{module}.py").write_text(text, encoding="utf-8")
 
 
 @contextmanager

@@ -27,7 +27,7 @@ def start_holder(folder: Path, gate: Path | None = None) -> subprocess.Popen[str
     """A process that takes the folder, when the gate is there, says "held" or why not, and ends with its stdin."""
     command = [sys.executable, "-c", HOLD, str(folder), *([str(gate)] if gate else [])]
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, encoding="utf-8")
 
 
 @contextmanager

@@ -92,7 +92,7 @@ def transformers_serve(model: Path) -> Iterator[str]:
         "--port", str(port), "--device", "cpu", "--dtype", "float32",
     ]
     settings = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HUB_CACHE": str(hub), "OMP_NUM_THREADS": "1"}
-    with log.open("w") as out:
+    with log.open("w", encoding="utf-8") as out:
         server = subprocess.Popen(command, env=settings, stdout=out, stderr=out)
     try:
         for _ in range(START_S):
@@ -104,9 +104,9 @@ def transformers_serve(model: Path) -> Iterator[str]:
                     break
                 time.sleep(1)
         else:
-            raise TimeoutError(f"transformers serve is not up after {START_S} s:\n{log.read_text()[-2000:]}")
+            raise TimeoutError(f"transformers serve is not up after {START_S} s:\n{log.read_text('utf-8')[-2000:]}")
         if server.poll() is not None:
-            raise RuntimeError(f"transformers serve ended with {server.returncode}:\n{log.read_text()[-2000:]}")
+            raise RuntimeError(f"transformers serve ended with {server.returncode}:\n{log.read_text('utf-8')[-2000:]}")
         yield f"http://127.0.0.1:{port}/v1"
     finally:
         server.send_signal(signal.SIGINT)

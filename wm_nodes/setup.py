@@ -7,6 +7,9 @@ NODES = (
     "video_model", "clip_evaluator", "video_learner",
 )
 
+KINDS = ("xml", "yaml", "json", "css", "js", "safetensors", "txt")
+"""Of data files."""
+
 setup(
     name="wm_nodes",
     version="0.1.0",
@@ -14,7 +17,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["wm_nodes", "wm_nodes.*"]),
-    package_data={"": ["py.typed", "**/*.xml", "**/*.yaml", "**/*.json", "**/*.css", "**/*.js", "**/*.safetensors"]},
+    package_data={"": ["py.typed", *(f"**/*.{kind}" for kind in KINDS)]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/wm_nodes"]),
         ("share/wm_nodes", ["package.xml"]),

@@ -29,7 +29,9 @@ def say(text: str) -> None:
 def output_of(command: list[str], env: dict[str, str] | None = None) -> str:
     """What a command prints; nothing where it does not exist, fails, or takes more than 30 s."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, env=env, timeout=30, check=False)
+        done = subprocess.run(
+            command, capture_output=True, encoding="utf-8", errors="replace", env=env, timeout=30, check=False
+        )
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return "" if done.returncode else done.stdout
@@ -95,7 +97,7 @@ def _group_lives(group: int) -> bool:
     """True where a process of a group has not ended; one that nobody has waited for has."""
     for file in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
-            state, _, its = file.read_text().rpartition(")")[2].split()[:3]
+            state, _, its = file.read_text(encoding="utf-8").rpartition(")")[2].split()[:3]
             if int(its) == group and state != "Z":
                 return True
     return False

@@ -24,6 +24,9 @@ REQUIREMENTS = ROOT / "requirements"
 MESSAGES = ROOT / "msgs_schema"
 PACKAGE = ROOT / "wm_nodes"
 WORKSPACE = ROOT / "ros2_ws"
+SOURCES = "wm_setup_sources"
+"""File beside the built messages: the fingerprint of what they were built from, which comes along in a copy."""
+HELP = ("-h", "--help")
 MISSING = ":missing"
 """Suffix of the renderer's stamp where this user may not install system packages."""
 
@@ -33,11 +36,15 @@ def venv_folder():
     return Path(os.environ.get("WM_VENV") or ROOT / ".venv").expanduser().absolute()
 
 
-def ensure():
+def ensure(argv=None):
     """Return when the running Python is the virtual environment's and holds all that is needed; else make it so.
 
-    Ends the process with one message when that is impossible.
+    Ends the process with one message when that is impossible. Where the arguments ask for help, nothing is set up, and
+    what the standard library can import of wm_nodes is found in this checkout.
     """
+    if {*HELP} & {*(sys.argv[1:] if argv is None else argv)}:
+        sys.path.insert(0, str(PACKAGE))
+        return
     if not interpreter.supported(sys.version_info):
         other = interpreter.find_supported()
         if other is None:
@@ -46,6 +53,7 @@ def ensure():
         os.execv(other, [other, *sys.argv])
     venv = venv_folder()
     with _one_line():
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # a Ctrl-C of meanwhile counts from here on
         if pending(venv):
             with _alone(venv):
                 _set_up(venv)
@@ -55,18 +63,44 @@ def ensure():
         python = str(venv / "bin" / "python")
         sys.stdout.flush()
         sys.stderr.flush()
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # it would be a traceback while Python starts
         os.execve(python, [python, *sys.orig_argv[1:]], isolated_environment(venv))
 
 
+def launch(scenario):
+    """Start the graph of a launch file, or show its arguments, for which nothing is set up. Return the exit code."""
+    if {*HELP, "-s", "--show-args"} & {*sys.argv[1:]}:
+        ensure(HELP)
+        from wm_nodes.launching.scenarios import describe_arguments
+
+        print(describe_arguments(scenario))
+        return 0
+    ensure()
+    with interruptible():
+        from wm_nodes.launching.runner import main
+    return main(scenario)
+
+
+@contextmanager
+def interruptible(text="interrupted"):
+    """End the process with one line at Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(text, file=sys.stderr)
+        raise SystemExit(130) from None
+
+
 def pending(venv):
-    """Return the steps that are to be done, in order: packages, messages, wm_nodes, renderer."""
+    """Return the steps that are to be done, in order: place, packages, messages, wm_nodes, renderer."""
     from setup.messages import lacks_tf
 
     stamp, wanted = read_stamp(stamp_file(venv)), _wanted(venv)
-    built = WORKSPACE / "install" / "wm_msgs" / "share" / "wm_msgs" / "package.xml"
+    install = WORKSPACE / "install" / "wm_msgs"
+    built = (install / "share" / "wm_msgs" / "package.xml").exists() and (install / SOURCES).is_file()
     present = {
         "packages": (venv / "bin" / "python").exists(),
-        "messages": built.exists() and not lacks_tf(venv),
+        "messages": built and (install / SOURCES).read_text("utf-8") == wanted["messages"] and not lacks_tf(venv),
     }
     done = {step: stamp.get(step, "").split(":")[0] for step in wanted}
     return [step for step in wanted if not present.get(step, True) or done[step] != wanted[step]]
@@ -75,26 +109,31 @@ def pending(venv):
 def _wanted(venv):
     from setup.messages import message_sources
 
-    packages = fingerprint(REQUIREMENTS.glob("*.txt"), str(venv), python_version(venv))
+    packages = fingerprint(REQUIREMENTS.glob("*.txt"), python_version(venv))
     build_files = [PACKAGE / name for name in ("setup.py", "setup.cfg", "pyproject.toml")]
     return {
+        "place": fingerprint([], str(ROOT), str(venv)),
         "packages": packages,
-        "messages": fingerprint(message_sources(MESSAGES), packages, str(ROOT)),
-        "wm_nodes": fingerprint(build_files, packages, str(ROOT)),
+        "messages": fingerprint(message_sources(MESSAGES), packages),
+        "wm_nodes": fingerprint(build_files, packages),
         "renderer": fingerprint([ROOT / "launch_scripts" / "setup" / "system.py"]),
     }
 
 
 def _set_up(venv):
-    from setup import messages, packages, system
+    from setup import messages, packages, place, system
 
     steps = pending(venv)
     if not steps:
         return
-    log, done = venv.parent / (venv.name + "_setup.log"), {}
-    say(f"setting up {', '.join(steps)}; output of the commands is in {log}")
+    log, done, before = venv.parent / (venv.name + "_setup.log"), {}, place.former(venv, ROOT)
+    if left := [step for step in steps if step != "place"]:
+        say(f"setting up {', '.join(left)}; output of the commands is in {log}")
     if "packages" in steps:
         packages.create_venv(venv, log)
+    if before and before != place.present(venv, ROOT):
+        say(f"this checkout or its environment was in another folder: writing {ROOT} into {venv}")
+        place.settle(venv, ROOT, log, before)
     wanted = _wanted(venv)
     if "renderer" in steps or "packages" in steps:
         ready = system.install(system.current_plan(), log)
@@ -107,8 +146,11 @@ def _set_up(venv):
     for step, action in actions.items():
         if step in steps:
             action()
+            if step == "messages":
+                (WORKSPACE / "install" / "wm_msgs" / SOURCES).write_text(wanted[step], encoding="utf-8")
             finish(venv, {**done, step: wanted[step]})
-    finish(venv, done)
+    place.settle(venv, ROOT, log)
+    finish(venv, {**done, "place": wanted["place"], **place.present(venv, ROOT)})
     say("done")
 
 
@@ -127,15 +169,13 @@ def _recheck_renderer(venv):
 def _one_line():
     """End the process with one line where the set-up cannot go on or is interrupted."""
     try:
-        yield
+        with interruptible("interrupted; start again to continue where the set-up stopped"):
+            yield
     except SetupError as error:
         raise SystemExit(f"error: {error}") from None
     except OSError as error:
         where = "" if error.filename else f" in {venv_folder().parent}"
         raise SystemExit(f"error: {error}{where}; remedy that, then start again to continue") from None
-    except KeyboardInterrupt:
-        print("interrupted; start again to continue where the set-up stopped", file=sys.stderr)
-        raise SystemExit(130) from None
 
 
 @contextmanager
@@ -143,7 +183,7 @@ def _alone(venv):
     """Hold a lock file, so that two starts at the same time set up once; commands started meanwhile hold it, too.
     SIGTERM then does what Ctrl-C does."""
     venv.parent.mkdir(parents=True, exist_ok=True)
-    with open(venv.parent / (venv.name + ".lock"), "w") as lock:
+    with open(venv.parent / (venv.name + ".lock"), "w", encoding="utf-8") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

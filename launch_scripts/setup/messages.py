@@ -20,6 +20,10 @@ workspace, where it would hide ROS 2's own from those who source that."""
 FIND_TF = f"from {TF}.msg import TFMessage; print(TFMessage)"
 
 
+IDL_FILES = 'file(STRINGS "${idl_output}" idl_tuples'
+"""CMake reads paths with an umlaut only where it is told the encoding."""
+
+
 def message_sources(msgs: Path) -> list[Path]:
     """Every file that decides what the build produces."""
     kinds, packages = ("msg", "srv", "action"), (msgs, msgs / TF)
@@ -37,14 +41,21 @@ def repair_cmake(share: Path, include: str, numpy_include: str) -> int:
     """Replace the include folders of the machine on which the wheels were built; return how many files changed."""
     repaired = 0
     for path in sorted(share.rglob("*.cmake")):
-        text = path.read_text(errors="surrogateescape")
+        text = os.fsdecode(path.read_bytes())
         new = WHEEL_NUMPY.sub(lambda _: numpy_include, WHEEL_INCLUDE.sub(lambda _: include, text))
+        new = new.replace(f"{IDL_FILES})", f"{IDL_FILES} ENCODING UTF-8)")
         if new != text:
-            temporary = path.with_suffix(".tmp")  # not in place: a hard link into uv's cache, and never half a file
-            temporary.write_text(new, errors="surrogateescape")
-            temporary.replace(path)
+            replace_file(path, os.fsencode(new))
             repaired += 1
     return repaired
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a file anew: not in place, as it may be a hard link into uv's cache, and never half of it."""
+    temporary = path.with_suffix(".tmp")
+    temporary.write_bytes(data)
+    shutil.copymode(path, temporary)
+    temporary.replace(path)
 
 
 def build_messages(venv: Path, workspace: Path, log: Path) -> None:
@@ -53,7 +64,9 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
     Raises SetupError with the compiler's last lines.
     """
     python, env = venv / "bin" / "python", isolated_environment(venv)
-    answer = subprocess.run([str(python), "-c", WHERE], capture_output=True, text=True, env=env, check=False)
+    answer = subprocess.run(
+        [str(python), "-c", WHERE], capture_output=True, encoding="utf-8", errors="replace", env=env, check=False
+    )
     if answer.returncode:
         begin(venv, "packages")
         raise SetupError(f"numpy is not importable in {venv}:\n{answer.stderr}\n  start again to install it anew")
@@ -72,6 +85,7 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
     for name in ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"):
         env[name] = str(venv)
     env.pop("COLCON_PREFIX_PATH", None)
+    env["PYTHONUTF8"] = "1"  # the generators read and write as the locale says
     env["MAKEFLAGS"] = f"-j{os.cpu_count() or 1}"
     cmake = ["-DCMAKE_BUILD_TYPE=Release", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={python}"]
     for name, base in bases.items():
@@ -87,37 +101,39 @@ def build_messages(venv: Path, workspace: Path, log: Path) -> None:
         command += ["--build-base", str(build.parent), "--install-base", str(install.parent)]
         command += ["--event-handlers", "console_direct+", "--cmake-args", *cmake]
         run(command, log=log, why=f"building {name}", env=env, cwd=workspace)
-    link_messages(venv, [base / "install" / name for name, base in bases.items()])
+    link_messages(venv, workspace.parent, [base / "install" / name for name, base in bases.items()])
 
 
-def link_messages(venv: Path, installs: list[Path]) -> None:
+def link_messages(venv: Path, root: Path, installs: list[Path]) -> None:
     """Make packages part of the virtual environment, to be imported without sourcing: the wheels' loader looks for
     libraries in <venv>/lib and for packages in <venv>/share; a .pth file names the Python modules."""
-    found = []
+    site, found = next((venv / "lib").glob("python3.*/site-packages")), []
     for install in installs:
-        for library in sorted((install / "lib").glob("lib*.so")):
-            _link(venv / "lib" / library.name, library)
-        _link(venv / "share" / install.name, install / "share" / install.name)
-        for marker in sorted((install / "share" / "ament_index" / "resource_index").glob(f"*/{install.name}")):
-            _link(venv / "share" / "ament_index" / "resource_index" / marker.parent.name / install.name, marker)
+        links = {venv / "lib" / library.name: library for library in sorted((install / "lib").glob("lib*.so"))}
+        links[venv / "share" / install.name] = install / "share" / install.name
+        index = Path("share", "ament_index", "resource_index")
+        for marker in sorted((install / index).glob(f"*/{install.name}")):
+            links[venv / index / marker.parent.name / install.name] = marker
+        for link, target in links.items():
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.unlink(missing_ok=True)
+            link.symlink_to(written_in(link.parent, target, root))
         modules = next((install / "lib").glob("python3.*/site-packages"), None)
         if modules is None:
             raise SetupError(f"{install} holds no Python modules; delete it and start again")
-        found.append(f"{modules}\n")
-    site = next((venv / "lib").glob("python3.*/site-packages"))
-    (site / "wm_workspace.pth").write_text("".join(found))
+        found.append(f"{written_in(site, modules, root)}\n")
+    (site / "wm_workspace.pth").write_bytes(os.fsencode("".join(found)))  # Python reads it as it does file names
+
+
+def written_in(folder: Path, target: Path, root: Path) -> str:
+    """How a link or .pth file in `folder` names `target`: without the checkout's own folder where both are in it."""
+    return os.path.relpath(target, folder) if root in folder.parents and root in target.parents else str(target)
 
 
 def _built_here(source: Path, build: Path, python: Path) -> bool:
     """True where an earlier build of these sources in this folder, with this Python, can be continued."""
     try:
-        cache = (build / "CMakeCache.txt").read_text(errors="replace")
+        cache = (build / "CMakeCache.txt").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return False
     return all(part in cache for part in (f"={source}\n", f"={build}\n", str(python)))
-
-
-def _link(link: Path, target: Path) -> None:
-    link.parent.mkdir(parents=True, exist_ok=True)
-    link.unlink(missing_ok=True)
-    link.symlink_to(target)

@@ -105,7 +105,7 @@ def _remove_torn(venv: Path) -> None:
     """Remove the records of packages that an interrupted installation left unfinished, which uv fails on or trusts."""
     for folder in venv.glob("lib/python3.*/site-packages/*.dist-info"):
         record = folder / "RECORD"
-        if not record.exists() or not record.read_text(errors="replace").endswith("\n"):
+        if not record.exists() or not record.read_text(encoding="utf-8", errors="replace").endswith("\n"):
             shutil.rmtree(folder)
 
 

@@ -27,7 +27,7 @@ def fingerprint(files: Iterable[Path], *extra: str) -> str:
 def python_version(venv: Path) -> str:
     """Version of the Python in a virtual environment; of the running one where there is none yet."""
     try:
-        lines = (venv / "pyvenv.cfg").read_text().splitlines()
+        lines = (venv / "pyvenv.cfg").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.python_version()
     values = {key.strip(): value.strip() for key, _, value in (line.partition("=") for line in lines)}
@@ -53,7 +53,7 @@ def finish(venv: Path, done: dict[str, str]) -> None:
 def read_stamp(path: Path) -> dict[str, str]:
     """Return step -> fingerprint; empty where there is no readable stamp."""
     try:
-        values = json.loads(path.read_text())
+        values = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return {str(k): str(v) for k, v in values.items()} if isinstance(values, dict) else {}
@@ -62,5 +62,5 @@ def read_stamp(path: Path) -> dict[str, str]:
 def write_stamp(path: Path, stamp: dict[str, str]) -> None:
     """Replace the stamp in one go, so that an interrupted set-up leaves the old one."""
     temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps({**stamp, "python": sys.executable}, indent=1, sort_keys=True))
+    temporary.write_text(json.dumps({**stamp, "python": sys.executable}, indent=1, sort_keys=True), encoding="utf-8")
     temporary.replace(path)

@@ -92,12 +92,13 @@ def backports_source(sources: list[AptSource], codename: str) -> str:
 def read_sources(root: Path = Path("/etc/apt")) -> list[AptSource]:
     files = [root / "sources.list", *sorted((root / "sources.list.d").glob("*.list"))]
     files += sorted((root / "sources.list.d").glob("*.sources"))
-    return [source for file in files if file.is_file() for source in parse_sources(file.read_text(errors="replace"))]
+    texts = [file.read_text(encoding="utf-8", errors="replace") for file in files if file.is_file()]
+    return [source for text in texts for source in parse_sources(text)]
 
 
 def read_os_release(path: Path = Path("/etc/os-release")) -> dict[str, str]:
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except OSError:
         return {}
     return {key: value.strip('"') for key, _, value in (line.partition("=") for line in lines)}

@@ -35,7 +35,7 @@ def pytest_runtest_makereport(
     if report.failed:
         for graph in Graph.started:
             for log in sorted(graph.folder.glob("*.log")):
-                tail = log.read_text(errors="replace").splitlines()[-LOG_LINES:]
+                tail = log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_LINES:]
                 report.sections.append((f"{graph.folder.name}/{log.name}", "\n".join(tail)))
     if call.when == "teardown":
         Graph.started[:] = [graph for graph in Graph.started if graph.running]

@@ -50,7 +50,7 @@ def own_domain() -> Iterator[int]:
     """A ROS domain that no other test process holds; the lock ends with the process, however it ends."""
     for domain in DOMAINS:
         with contextlib.ExitStack() as stack:
-            file = stack.enter_context(open(f"/tmp/wm_test_domain_{domain}.lock", "w"))
+            file = stack.enter_context(open(f"/tmp/wm_test_domain_{domain}.lock", "w", encoding="utf-8"))
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -203,7 +203,7 @@ class Graph:
         self._launcher: tuple[str, ...] | None = None if forks else ()
         folder.mkdir(parents=True, exist_ok=True)
         self.config = config or load_config("smoke")
-        (folder / "config.yaml").write_text(dump_config(self.config))
+        (folder / "config.yaml").write_text(dump_config(self.config), encoding="utf-8")
         self.processes: dict[str, subprocess.Popen[bytes] | ForkedNode] = {}
         self._logs: list[IO[bytes]] = []
         Graph.started.append(self)
@@ -262,7 +262,7 @@ class Graph:
         return self.folder / f"{name.strip('/').replace('/', '_')}.log"
 
     def log(self, name: str) -> str:
-        return self.log_path(name).read_text()
+        return self.log_path(name).read_text(encoding="utf-8")
 
     def kill(self, name: str) -> None:
         """kill -9 and reap."""
@@ -321,12 +321,12 @@ class Graph:
 
 def thread_names(pid: int) -> list[str]:
     """Of a process, as the system knows them: Fast DDS names its threads by what they serve."""
-    return [path.read_text().strip() for path in Path(f"/proc/{pid}/task").glob("*/comm")]
+    return [path.read_text(encoding="utf-8").strip() for path in Path(f"/proc/{pid}/task").glob("*/comm")]
 
 
 def removed_ports(pid: int) -> list[str]:
     """Ports of Fast DDS that a process still has in its memory, and whose files are gone."""
-    return re.findall(r"/dev/shm/(fastrtps_port\d+) \(deleted\)", Path(f"/proc/{pid}/maps").read_text())
+    return re.findall(r"/dev/shm/(fastrtps_port\d+) \(deleted\)", Path(f"/proc/{pid}/maps").read_text(encoding="utf-8"))
 
 
 def shm_files() -> set[str]:

@@ -21,10 +21,13 @@ def launched(scenario: str, given: Sequence[str], log: Path) -> Iterator[None]:
             [sys.executable, "-c", PROGRAM, scenario, *given], stdout=output, stderr=output, env=os.environ.copy()
         )
         try:
-            wait_until("the graph", lambda: starter.poll() is not None or "ready; Ctrl-C stops" in log.read_text(), 120)
-            assert starter.poll() is None, log.read_text()
+            wait_until(
+                "the graph",
+                lambda: starter.poll() is not None or "ready; Ctrl-C stops" in log.read_text(encoding="utf-8"), 120,
+            )
+            assert starter.poll() is None, log.read_text(encoding="utf-8")
             yield
         finally:
             starter.send_signal(signal.SIGINT)
             code = starter.wait(60)
-    assert code == 0, log.read_text()
+    assert code == 0, log.read_text(encoding="utf-8")

@@ -11,7 +11,7 @@ def processes() -> list[str]:
 def mapped(process: str) -> set[str]:
     """Paths below /dev/shm that a process (its number, or "self") has mapped, removed ones, too; none once it ended."""
     try:
-        lines = Path("/proc", process, "maps").read_text().splitlines()
+        lines = Path("/proc", process, "maps").read_text(encoding="utf-8").splitlines()
     except OSError:
         return set()
     return {line.split()[5] for line in lines if "/dev/shm/" in line}

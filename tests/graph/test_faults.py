@@ -186,7 +186,7 @@ def test_a_cut_checkpoint_ends_the_learner_with_one_line_that_names_it(graph: Gr
     file.write_text('{"progress": {')
     assert graph.start_learner().wait(60) == 1
     log = graph.log("/wm/learner")
-    assert f"checkpoint {file} does not fit: " in log and "begin anew in another run_dir" in log
+    assert f"{file} cannot be read" in log and "put a copy of it back, or begin anew in another run folder" in log
     assert "Traceback" not in log
 
 

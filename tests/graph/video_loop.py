@@ -137,7 +137,7 @@ class VideoLoop:
         self.graph, self.probe, self.config = graph, probe, config
         self.bag = write_contexts(graph.folder / "contexts")
         self.model = make_video_folder(graph.folder / "video_model", load_clips([self.bag], STRIDE), config)
-        (graph.folder / "video_config.yaml").write_text(dump_config(config))
+        (graph.folder / "video_config.yaml").write_text(dump_config(config), encoding="utf-8")
         self.local = LocalLoop(config, self.model, self.bag, lag)
         self.links = probe.links()
 

@@ -164,3 +164,31 @@ def test_the_list_of_verbs_is_there_at_once_and_the_scripts_start_the_command(re
     for name in ("wm", "online_rl"):
         assert "wm_nodes.apps.cli import" in (repository / "launch_scripts" / f"{name}.py").read_text()
     assert '"wm = wm_nodes.apps.cli:main"' in (repository / "wm_nodes" / "setup.py").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["-m", "wm_nodes.apps.cli", "recover-bag", "nothing-here"], 2, "error: no .mcap file at nothing-here; "),
+        (["-m", "wm_nodes.apps.cli", "retrain", "--help"], 0, "usage: python -m wm_nodes.apps.cli retrain [-h]"),
+        (["-m", "wm_nodes.apps.train_policy", "--seed", "1"], 2, "error: wm_nodes.apps.train_policy is not started by "
+                                                                "itself; type: wm train-policy\n"),
+        (["-mwm_nodes.apps.options"], 2, "error: wm_nodes.apps.options is not started by itself; type: wm --help\n"),
+    ],
+)
+def test_a_module_of_a_verb_works_with_python_m_or_says_what_to_type(
+    words: list[str], code: int, said: str, tmp_path: Path
+) -> None:
+    done = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode == code and (done.stderr + done.stdout).startswith(said), done
+
+
+def test_ctrl_c_while_a_verb_is_imported_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(name: str) -> ModuleType:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "import_module", interrupted)
+    assert cli.main(["collect"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"

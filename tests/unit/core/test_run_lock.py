@@ -167,3 +167,25 @@ def test_a_lock_file_that_a_person_deleted_is_no_trouble(tmp_path: Path) -> None
     (tmp_path / NAME).write_text(json.dumps(asdict(with_other)))
     lock.release()
     assert held_by(tmp_path) == with_other
+
+
+def test_new_folders_of_one_name_are_as_many_as_processes_begin_them_at_once(tmp_path: Path) -> None:
+    wanted, names = tmp_path / "runs" / "20260101-000000-push", ["", "-2", "-3", "-4"]
+    code = f"""
+import sys; from pathlib import Path; from wm_nodes.core.run_lock import RunLock
+with RunLock(Path({str(wanted)!r}), new=True) as lock:
+    print(lock.folder, flush=True)
+    (lock.folder / "config.yaml").touch()
+    sys.stdin.read()
+"""
+    pipe = subprocess.PIPE
+    racers = [subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe) for _ in range(RACERS)]
+    folders = sorted(Path(os.fsdecode(racer.stdout.readline()).strip()) for racer in racers if racer.stdout)
+    assert folders == [Path(f"{wanted}{name}") for name in names[:RACERS]]
+    assert all(refusal(folder) for folder in folders)
+    for racer in racers:
+        racer.communicate()
+        assert racer.returncode == 0
+    with RunLock(wanted, new=True) as lock:
+        assert lock.folder == Path(f"{wanted}-{RACERS + 1}")
+    assert not lock.folder.exists(), "nobody wrote into it"

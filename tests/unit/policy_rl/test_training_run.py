@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -112,3 +113,18 @@ def test_a_run_that_begins_anew_replaces_the_old_ones_checkpoint_and_no_other_fi
     (tmp_path / "checkpoints" / "learner.json").write_text("mine")
     with pytest.raises(ValueError, match="is no checkpoint of a learner"):
         start(tmp_path, resume=False)
+
+
+@pytest.mark.parametrize("suffix", [".json", "_000001.safetensors", "_000001.learner"])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.98])
+def test_a_file_cut_short_is_named_with_the_remedy(suffix: str, share: float, tmp_path: Path) -> None:
+    training = start(tmp_path)
+    advance(training)
+    training.save()
+    file = tmp_path / "checkpoints" / f"learner{suffix}"
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(ValueError, match=re.escape(str(file))) as refused:
+        start(tmp_path)
+    text = str(refused.value)
+    assert "put a copy of it back, or begin anew" in text and "configuration" not in text and "\n" not in text

@@ -46,9 +46,9 @@ NODES = "from setuptools import setup\nsetup(name='wm_nodes', version='1.0', pac
 class SmallCheckout:
     """The folder, its environment, and how its set-up is started and interrupted."""
 
-    def __init__(self, folder: Path, repository: Path) -> None:
-        self.root = folder / "checkout"
-        self.venv, self.log = folder / "own", folder / "own_setup.log"
+    def __init__(self, folder: Path, repository: Path, *, root: str = "checkout", venv: str = "own") -> None:
+        self.root = folder / root
+        self.venv, self.log = folder / venv, folder / f"{venv}_setup.log"
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(repository / "launch_scripts" / "setup", self.root / "launch_scripts" / "setup", ignore=ignored)
         for name, text in {
@@ -61,7 +61,7 @@ class SmallCheckout:
             "wm_nodes/pyproject.toml": "[build-system]\nrequires = ['setuptools']\n",
         }.items():
             (self.root / name).parent.mkdir(parents=True, exist_ok=True)
-            (self.root / name).write_text(text)
+            (self.root / name).write_text(text, encoding="utf-8")
         (self.root / "ros2_ws" / "src").mkdir(parents=True)
         (self.root / "ros2_ws" / "src" / "wm_msgs").symlink_to("../../msgs_schema")
         wheels = folder / "wheels"
@@ -73,6 +73,12 @@ class SmallCheckout:
             "WM_VENV": str(self.venv), "UV_CACHE_DIR": str(folder / "cache"), "UV_OFFLINE": "1", "UV_NO_CONFIG": "1",
             "PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(wheels), "PIP_NO_CACHE_DIR": "1",
         }
+
+    def go_to(self, root: Path) -> None:
+        """The checkout, with its environment inside, has been moved or copied to `root`."""
+        self.venv = root / self.venv.relative_to(self.root)
+        self.log, self.root = self.venv.with_name(self.log.name), root
+        self.environment["WM_VENV"] = str(self.venv)
 
     def _write_wheels(self, folder: Path) -> None:
         site, uv = sysconfig.get_paths()["purelib"], Path(sysconfig.get_paths()["scripts"]) / "uv"
@@ -92,8 +98,8 @@ class SmallCheckout:
         command = [sys.executable, str(self.root / "launch_scripts" / "setup")]
         limited = ["prlimit", f"--fsize={limit}", *command] if limit else command
         return subprocess.Popen(
-            limited, env=self.environment, cwd=self.root, text=True, start_new_session=True, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            limited, env=self.environment, cwd=self.root, encoding="utf-8", start_new_session=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored in background jobs
         )
 
@@ -101,7 +107,7 @@ class SmallCheckout:
         """Set up without interruption; return what the set-up says. It ends by importing four packages."""
         child = self.start()
         out, err = child.communicate(timeout=120)
-        assert child.returncode == 0 and "wm_nodes 1 on Python" in out, (out, err, self.log.read_text()[-3000:])
+        assert child.returncode == 0 and "wm_nodes 1 on Python" in out, (out, err, self.log.read_text("utf-8")[-3000:])
         assert f"{self.venv}/lib" in out and f"{self.root}/ros2_ws/install" in out
         assert self.tf2_msgs().is_file()
         return err
@@ -109,8 +115,8 @@ class SmallCheckout:
     def tf2_msgs(self) -> Path:
         """The module from which the environment imports TFMessage."""
         command = [self.venv / "bin" / "python", "-c", "import tf2_msgs.msg as m; print(m.TFMessage and m.__file__)"]
-        done = subprocess.run(command, cwd=self.venv, env=self.environment, capture_output=True, text=True, check=True)
-        return Path(done.stdout.strip())
+        done = subprocess.run(command, cwd=self.venv, env=self.environment, capture_output=True, check=True)
+        return Path(os.fsdecode(done.stdout).strip())
 
     def interrupt(self, word: str, delay_s: float, how: str) -> tuple[int, str]:
         """Start; `delay_s` after a command with `word` in it has begun, interrupt; return (exit code, what was said).
@@ -147,7 +153,7 @@ class SmallCheckout:
             return False
 
     def locked(self) -> bool:
-        with self.venv.with_name(self.venv.name + ".lock").open("w") as lock:
+        with self.venv.with_name(self.venv.name + ".lock").open("w", encoding="utf-8") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

@@ -25,9 +25,12 @@ def test_cmake_repair_replaces_the_wheel_builders_folders_and_nothing_else(tmp_p
     healthy = tmp_path / "fine.cmake"
     healthy.write_text("set(dirs /usr/include)\n")
     before = healthy.stat().st_mtime_ns
+    listing = tmp_path / "rosidl_adapt_interfaces.cmake"
+    listing.write_text('  file(STRINGS "${idl_output}" idl_tuples)\n')
     cached = tmp_path / "cached"
     cached.hardlink_to(broken)
-    assert messages.repair_cmake(tmp_path, "/py/include", "/np/include") == 1
+    assert messages.repair_cmake(tmp_path, "/py/include", "/np/include") == 2
+    assert listing.read_text() == '  file(STRINGS "${idl_output}" idl_tuples ENCODING UTF-8)\n', "paths with an umlaut"
     assert "/opt/python/cp312" in cached.read_text(), "what other environments are installed from stays as it is"
     assert broken.read_text() == 'set(dirs "/py/include;/np/include;/opt/python/other")\n'
     assert healthy.stat().st_mtime_ns == before
@@ -106,6 +109,7 @@ def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(entry, "WORKSPACE", root / "ros2_ws")
     venv = root / ".venv"
     stamp.write_stamp(venv / "wm_setup_stamp.json", entry._wanted(venv))
+    (root / "ros2_ws/install/wm_msgs" / entry.SOURCES).write_text(entry._wanted(venv)["messages"])
     assert entry.pending(venv) == []
     return root
 
@@ -305,7 +309,7 @@ def test_installed_package_brings_every_data_file(repository: Path, tmp_path: Pa
     done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     built = tmp_path / "build" / "lib"
-    kinds = {".yaml", ".xml", ".json", ".safetensors", ".py", ".typed"}
+    kinds = {".yaml", ".xml", ".json", ".safetensors", ".py", ".txt", ".typed"}
     files = [path for path in (source / "wm_nodes").rglob("*") if path.suffix in kinds]
     absent = [str(path.relative_to(source)) for path in files if not (built / path.relative_to(source)).exists()]
     assert not absent

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from tqdm import tqdm
 
 from benchmarks.environments.policies import (
     SIMULATOR,
@@ -25,6 +24,7 @@ from wm_nodes.config.load import load_config, preset_names
 from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import compute_device
+from wm_nodes.core.progress import tqdm
 from wm_nodes.reports.console_table import make_table
 
 console = Console()
@@ -125,7 +125,7 @@ def _speed(arguments: argparse.Namespace, models: list[str]) -> None:
 def _kept_rows(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     if arguments.json is None or not arguments.json.is_file():
         return []
-    rows: list[dict[str, Any]] = json.loads(arguments.json.read_text())["rows"]
+    rows: list[dict[str, Any]] = json.loads(arguments.json.read_text(encoding="utf-8"))["rows"]
     return rows
 
 

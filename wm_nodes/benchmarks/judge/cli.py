@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from tqdm import tqdm
 
 from benchmarks.judge import fault_visibility, hacking, imagined_vs_real, metrics, pai_bench, speed, tables
 from benchmarks.judge.compared import PROTOCOLS, ComparedRow, answer_file, compared, comparison_table, num_answers
@@ -25,6 +24,7 @@ from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_device, add_json, add_seed
 from wm_nodes.config.load import load_config
 from wm_nodes.core.device import CPU
+from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Stage, TaskSpec

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
+from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestRow, Part
 from wm_nodes.judge.dataset.edits.recipes import RECIPES, SEEN_LEVELS
 from wm_nodes.judge.dataset.set_files import load_frames

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_device, add_json
@@ -27,6 +26,7 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.core.device import CPU, compute_device
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.types import BoolArray
 from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.judge.agent.machine import RewardAgent

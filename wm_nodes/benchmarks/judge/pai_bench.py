@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from benchmarks.judge.comparisons import pai_bench as pai
 from benchmarks.judge.comparisons.chat import ChatComparison
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_json, add_seed
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.types import ClipRef
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint
@@ -127,7 +127,8 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         raise ValueError("nothing to measure: give --questions with a server, --subject or --background")
     metrics = quality(videos, arguments.images, backbones)
     if arguments.metrics is not None:
-        metrics |= {name: float(value) for name, value in json.loads(arguments.metrics.read_text()).items()}
+        text = arguments.metrics.read_text(encoding="utf-8")
+        metrics |= {name: float(value) for name, value in json.loads(text).items()}
     results: dict[str, Any] = {
         "videos": len(videos), "model": arguments.model, "backbones": {k: b.name for k, b in backbones.items()},
         "scores": dict(metrics), "missing": sorted(set(pai.QUALITY) - set(metrics)),

@@ -51,7 +51,7 @@ def read_evaluations(folder: Path) -> list[TestSplitEvaluation]:
     Raises:
         ValueError: a line that cannot be read; the file must not be edited.
     """
-    published = [TestSplitEvaluation(**entry) for entry in json.loads(PUBLISHED.read_text())]
+    published = [TestSplitEvaluation(**entry) for entry in json.loads(PUBLISHED.read_text(encoding="utf-8"))]
     return [*published, *(entry for entry in _read_log(folder) if entry not in published)]
 
 
@@ -60,7 +60,7 @@ def _read_log(folder: Path) -> list[TestSplitEvaluation]:
     if not path.is_file():
         return []
     try:
-        return [TestSplitEvaluation(**json.loads(line)) for line in path.read_text().splitlines()]
+        return [TestSplitEvaluation(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path} cannot be read: {error}; restore it, or build the set again") from error
 

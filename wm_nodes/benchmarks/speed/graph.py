@@ -29,7 +29,7 @@ def measure_graph(config: RunConfig, effort: Effort, folder: Path, model: Path, 
     from wm_nodes.nodes.environment.remote_environment import remote_environments
 
     config_file = folder / "config.yaml"
-    config_file.write_text(dump_config(config))
+    config_file.write_text(dump_config(config), encoding="utf-8")
     common: dict[str, ParameterValue] = {
         "config_file": str(config_file), "run_dir": str(folder), "num_envs": GRAPH_ENVS, "seed": config.seed,
     }

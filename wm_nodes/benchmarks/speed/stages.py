@@ -94,7 +94,7 @@ def restart_peak() -> float:
     """Give freed memory back, start the kernel's peak anew, and return the present level, MiB; NaN where it cannot."""
     try:
         ctypes.CDLL(None).malloc_trim(0)
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")
     except (AttributeError, OSError):
         return float("nan")
     return memory_mib("VmRSS")
@@ -103,7 +103,7 @@ def restart_peak() -> float:
 def memory_mib(name: str, file: str = "/proc/self/status") -> float:
     """A level of this process, e.g. VmRSS, or of another file of the kernel; NaN where there is none."""
     try:
-        lines = Path(file).read_text().splitlines()
+        lines = Path(file).read_text(encoding="utf-8").splitlines()
     except OSError:
         return float("nan")
     return next((int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{name}:")), float("nan"))

@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
 from benchmarks.video_rl import closed_loop, diversity, outcome, plots, samplers, tables
@@ -31,6 +30,7 @@ from wm_nodes.config.load import load_config, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.files import file_sha256, write_atomic
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
 from wm_nodes.training.weights import pack_weights

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from tqdm import tqdm
 
 from benchmarks.video_rl import plots, tables
 from benchmarks.video_rl.judged import JudgedContexts
@@ -39,8 +38,9 @@ from wm_nodes.config.load import judge_or_embedded, load_config, load_video_conf
 from wm_nodes.config.schema import AGENT, SimulationConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.service import clip_fps
-from wm_nodes.training.weights import load_weights, pack_weights
+from wm_nodes.training.weights import load_weights_file, pack_weights
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
@@ -212,7 +212,7 @@ def measure_weights(arguments: argparse.Namespace, weights: Path | None, seed: i
     folder = load_video_folder(arguments.video_model, arguments.device)
     config = load_video_config("outcome", {"seed": seed})
     if weights is not None:
-        load_weights(folder.network, weights.read_bytes())
+        load_weights_file(folder.network, weights)
     frames = ClipGenerator(folder, by.heldout, config).evaluate(by.heldout, config.evaluation.num_steps)
     positions, given = by.probe.read(frames), folder.clip["num_conditioning"]
     metrics = measure_clips(frames, positions, by.heldout, by.probe, by.reader, by.limits, by.simulation, given)

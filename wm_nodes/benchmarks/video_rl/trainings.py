@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import torch
 from pydantic import TypeAdapter
-from tqdm import tqdm
 
 from benchmarks.speed.results import write_results
 from benchmarks.video_rl.comparison import MEASURES, SamplerComparison, compare_samplers
@@ -20,6 +19,7 @@ from benchmarks.video_rl.sources import TASK
 from benchmarks.video_rl.trials import Plan, SamplerTrial
 from wm_nodes.apps.options import add_device, add_json, positive, prepare_torch
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.progress import tqdm
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder
 
@@ -138,7 +138,7 @@ def finished(path: Path | None, trials: Sequence[SamplerTrial[Any]]) -> list[dic
     """The rows of an earlier call; a trial of this one that it ran by another plan is refused."""
     if path is None or not path.is_file():
         return []
-    rows: list[dict[str, Any]] = json.loads(path.read_text())["rows"]
+    rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["rows"]
     if any("sampler" not in row for row in rows):
         raise ValueError(f"{path} is of an earlier version of this benchmark; take another file")
     plans = {trial.sampler.name: json.loads(json.dumps(asdict(trial.plan))) for trial in trials}

@@ -12,10 +12,10 @@ from pathlib import Path
 from statistics import fmean
 
 from rich.console import Console
-from tqdm import tqdm
 
 from wm_nodes.apps.options import add_json, add_seed
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.audit.adoption import MARGIN, Registry, compare, decide
 from wm_nodes.judge.audit.agreement import join_labels, report, table

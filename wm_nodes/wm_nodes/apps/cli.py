@@ -1,17 +1,22 @@
 """The command `wm VERB ...`: the table of verbs, and one style of errors and exit codes for all of them.
 
 The module of a verb has `add_options(parser)` and `run(arguments)`, which returns an exit code, or None for 0; its
-docstring is the text of `wm VERB --help`. Only the chosen module is imported.
+docstring is the text of `wm VERB --help`. Only the chosen module is imported, and for --help none (see apps/help).
 """
+
+from __future__ import annotations
 
 import argparse
 import difflib
+import io
+import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import NoReturn
 
+from wm_nodes.apps.help import asked_page
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 
 DONE, DIFFERENT, ERROR, NOT_ACCEPTED, INTERRUPTED = 0, 1, 2, 3, 130
@@ -23,6 +28,7 @@ EXPECTED = (RunError, ValueError, OSError, ImportError, FloatingPointError)
 """Errors whose text says what to do; anything else is a fault of this program and shows its traceback."""
 BENCHMARKS = "benchmarks"
 """Package beside this one in the repository, not installed with it."""
+NO_BENCHMARKS = "the benchmarks come with the repository and are not installed; start launch_scripts/wm.py there"
 
 
 GROUPS = {
@@ -90,32 +96,51 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
     Raises:
         SystemExit: after --help, and where the verb has no such option.
     """
-    kind, _, experiment = name.partition(" ")
-    file = (experiment or kind).replace("-", "_")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal may lack a character; no reason to end
+    if (page := asked_page(name, argv, program)) is not None:
+        print(page, end="")
+        raise SystemExit(DONE)
+    if not sys.stderr.isatty():
+        os.environ.setdefault("TQDM_DISABLE", "1")  # bars of libraries; ours are lines then
+    arguments = argparse.Namespace()
     try:
-        module = import_module(f"wm_nodes.apps.{file}" if kind != "benchmark" else f"{BENCHMARKS}.{file}.cli")
-    except ModuleNotFoundError as error:
-        if error.name != BENCHMARKS:
-            raise
-        return _fail("the benchmarks come with the repository and are not installed; start launch_scripts/wm.py there")
-    parser = Parser(
-        prog=program, description=module.__doc__, epilog=EXIT_CODES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    module.add_options(parser)
-    arguments = parser.parse_args(argv, argparse.Namespace(run=getattr(module, "run", None)))
-    arguments.command = shlex.join([*program.split(), *argv])
-    run: Callable[[argparse.Namespace], int | None] = arguments.run
-    try:
+        arguments = parser_of(name, program).parse_args(argv)
+        arguments.command = shlex.join([*program.split(), *argv])
+        run: Callable[[argparse.Namespace], int | None] = arguments.run
         return run(arguments) or DONE
     except ModelNotAcceptedError as refusal:
         return _fail(str(refusal), NOT_ACCEPTED)
+    except ModuleNotFoundError as error:
+        return _fail(NO_BENCHMARKS if error.name == BENCHMARKS else str(error))
     except EXPECTED as error:
         return _fail(str(error))
     except KeyboardInterrupt:
         resume = "; name the run folder with --run-dir to go on" if "run_dir" in arguments else ""
         print(f"interrupted{resume}", file=sys.stderr)
         return INTERRUPTED
+
+
+def parser_of(name: str, program: str) -> Parser:
+    """The parser of a verb, which imports its module. Its arguments' `run` does the verb."""
+    kind, _, experiment = name.partition(" ")
+    file = (experiment or kind).replace("-", "_")
+    module = import_module(f"wm_nodes.apps.{file}" if kind != "benchmark" else f"{BENCHMARKS}.{file}.cli")
+    parser = Parser(
+        prog=program, description=module.__doc__, epilog=EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=getattr(module, "run", None))
+    module.add_options(parser)
+    return parser
+
+
+def refuse_module(name: str) -> NoReturn:
+    """End the process, as `python -m` with the module of a verb would do nothing."""
+    verb = name.rpartition(".")[2].replace("_", "-")
+    typed = f"wm {verb}" if verb in VERBS else "wm --help"
+    raise SystemExit(_fail(f"{name} is not started by itself; type: {typed}"))
 
 
 def overview(program: str, names: Sequence[str] = ()) -> str:
@@ -131,3 +156,7 @@ def overview(program: str, names: Sequence[str] = ()) -> str:
 def _fail(text: str, code: int = ERROR) -> int:
     print("error:", " ".join(text.splitlines()), file=sys.stderr)
     return code
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(program="python -m wm_nodes.apps.cli"))

@@ -19,10 +19,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from tqdm import tqdm
-
 from wm_nodes.apps.options import add_device, add_json, add_judge, device_settings, judge_settings
 from wm_nodes.config.load import judge_or_embedded, load_config
+from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import for_clips
@@ -53,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     if lines:
         settings = for_clips(settings, read_job(arguments.clips, lines[0]).clip.frames.shape)
     judge = JudgeService(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit, device=config.device)
-    with closing(judge), path.open("a+") as written:
+    with closing(judge), path.open("a+", encoding="utf-8") as written:
         asked = {"judge_id": judge.judge_ids[0], "rubric": judge.rubric.version}
         by = {**asked, "mode": settings.mode, "seed": config.seed}
         written.seek(0)

@@ -20,6 +20,7 @@ from wm_nodes.apps import policy_run
 from wm_nodes.apps.policy_run import RunContext, TrainingResult, TrainingStart, WaitingGraph, console, read_success
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import AGAIN, read_json
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import BoolArray
 from wm_nodes.policy_rl import model_refresh
@@ -138,8 +139,7 @@ def _finish(
     """Measure a trained round, collect with its policy and refresh the model; the result as in summary.json."""
     marker = start.folder / RESULT
     if marker.is_file():
-        found: dict[str, Any] = json.loads(marker.read_text())
-        return found
+        return read_json(marker, AGAIN)
     policy = trained.policy(start.folder)
     measured = ("imagined_before", "imagined_after", "real_after")
     before, imagined, real = (policy_run.success_rate(read_success(start.folder, name)) for name in measured)

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
-from tqdm import tqdm
 
 from wm_nodes.apps.options import add_device
 from wm_nodes.config.load import named_pack
 from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.training.normal_ranges import Row, bands_of, clip_rows, count_outside
 from wm_nodes.recording import read_episodes

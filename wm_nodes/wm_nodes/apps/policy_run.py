@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from tqdm import tqdm
 
 from wm_nodes.config.load import dump_config
 from wm_nodes.config.saved import with_device
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
-from wm_nodes.core.model_folder import files_sha256
+from wm_nodes.core.model_folder import AGAIN, files_sha256, read_json
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import wilson_interval
 from wm_nodes.core.types import BoolArray
 from wm_nodes.launching import arguments as launch_arguments
@@ -33,6 +33,7 @@ from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment,
 from wm_nodes.policy_rl.initial_policy import num_starts
 from wm_nodes.policy_rl.training_run import POLICY_FILES
 from wm_nodes.reports.summary import SuccessRate
+from wm_nodes.training.checkpoint import RESTORE
 from wm_nodes.video_model.folder import read_video_manifest
 
 READY_S = 120.0
@@ -156,7 +157,7 @@ def train_round(
     marker = start.folder / TRAINED
     if is_trained(start):
         job.stage(f"{start.label or 'training'} is done already ({marker})")
-        return TrainingResult(**json.loads(marker.read_text()))
+        return TrainingResult(**read_json(marker, AGAIN))
     waiting = waiting or start_graph(job, start)
     with closing(waiting.runner) as runner:
         runner.activate(READY_S)
@@ -181,7 +182,7 @@ def train_round(
 
 def read_success(folder: Path, name: str) -> BoolArray:
     """A kept evaluation, (E,) in seed order. name: real_ or imagined_, then before or after."""
-    values = json.loads((folder / "evaluations" / f"{name}.json").read_text())
+    values = read_json(folder / "evaluations" / f"{name}.json", AGAIN)
     return np.asarray(values["success"], bool)
 
 
@@ -208,7 +209,7 @@ def imagined_success(job: RunContext, folder: Path, label: str, model_dir: Path,
 def cached_success(path: Path, identity: Mapping[str, str], measure: Callable[[], BoolArray]) -> BoolArray:
     """Success of episodes, (E,), from `path` when it was measured on the same things, else measured and written."""
     if path.is_file():
-        values: dict[str, Any] = json.loads(path.read_text())
+        values = read_json(path, AGAIN)
         if values["identity"] == dict(identity):
             return np.asarray(values["success"], bool)
     success = measure()
@@ -264,5 +265,5 @@ def _train(operator: GraphClient, updates: int) -> str:
 
 def _progress(folder: Path) -> dict[str, Any]:
     """Counts of the learner's newest checkpoint, which is on disk before its version is announced."""
-    progress: dict[str, Any] = json.loads((folder / "checkpoints" / "learner.json").read_text())["progress"]
+    progress: dict[str, Any] = read_json(folder / "checkpoints" / "learner.json", RESTORE)["progress"]
     return progress

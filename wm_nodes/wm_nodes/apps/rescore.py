@@ -19,7 +19,6 @@ from typing import Any
 
 from rich.table import Table
 from torch import Tensor
-from tqdm import tqdm
 
 from wm_nodes.apps.options import add_device, add_json, add_judge, device_settings, judge_settings, prepare_torch
 from wm_nodes.apps.policy_run import console
@@ -29,6 +28,7 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import for_clips

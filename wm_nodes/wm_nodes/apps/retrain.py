@@ -10,8 +10,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from wm_nodes.apps.options import add_device, add_run_dir, add_set, add_tensorboard, prepare_torch, settings
 from wm_nodes.apps.policy_run import Stages
 from wm_nodes.apps.run_options import open_run
@@ -20,6 +18,7 @@ from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
+from wm_nodes.core.progress import tqdm
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl import recorded_buffers

@@ -84,8 +84,9 @@ def open_run(
             _fill(arguments, given, {}, defaults)
             config = load(getattr(arguments, "preset", ""), dict(settings))
             check(config)
-            run_dir = run_dir or Path("runs", f"{time.strftime('%Y%m%d-%H%M%S')}-{name(config)}").absolute()
-            stack.enter_context(RunLock(run_dir))
+            if not run_dir:
+                new = Path("runs", f"{time.strftime('%Y%m%d-%H%M%S')}-{name(config)}").absolute()
+                run_dir = stack.enter_context(RunLock(new, new=True)).folder
         kept = {"verb": verb, **{option: getattr(arguments, option) for option in given}}
         if not (run_dir / CONFIG).exists():
             data = dump_config(config).encode()

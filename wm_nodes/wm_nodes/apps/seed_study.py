@@ -16,7 +16,6 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
-from tqdm import tqdm
 
 from wm_nodes.apps.model_refresh_loop import round_config, split_updates
 from wm_nodes.apps.options import add_preset, add_threads, prepare_torch, settings
@@ -26,6 +25,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.device import compute_device
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.record import acceptance_plan, collect_plan
@@ -91,7 +91,13 @@ def run(arguments: argparse.Namespace) -> None:
 
 def read_results(folder: Path) -> list[dict[str, Any]]:
     path = folder / "results.jsonl"
-    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.exists() else [], 1):
+        try:
+            rows.append(json.loads(line))
+        except ValueError as error:
+            text = f"{path}, line {number} is cut short ({error}); delete the line to do its run again"
+            raise ValueError(text) from None
     return [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
 
 
@@ -198,7 +204,7 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(config.device),
         "config": dump_config(config), "world_model_sha256": models_of(model_dir, config.device).sha256,
     }
-    with open(folder / "results.jsonl", "a") as file:
+    with open(folder / "results.jsonl", "a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 
 

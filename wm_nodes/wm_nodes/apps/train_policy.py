@@ -26,7 +26,7 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import part_of, parts_of, task_names
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.errors import ModelNotAcceptedError
-from wm_nodes.core.model_folder import MANIFEST
+from wm_nodes.core.model_folder import AGAIN, MANIFEST, read_json
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
 from wm_nodes.environments.record import HELDOUT_SEEDS, acceptance_plan, collect_plan
@@ -237,7 +237,7 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
         models, heldout = load_model_folder(model_dir, compute_device(config.device)), load_arrays(bags, config)
         report = accept_world_model(models, heldout, config, *successes)
     path = job.run_dir / ACCEPTANCE
-    path.write_text(json.dumps(report.to_dict(), indent=1))
+    path.write_text(json.dumps(report.to_dict(), indent=1), encoding="utf-8")
     console.print(report.table())
     if not report.passed and not force:
         raise ModelNotAcceptedError(
@@ -249,5 +249,4 @@ def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, r
 
 def _read_acceptance(run_dir: Path) -> dict[str, Any]:
     path = run_dir / ACCEPTANCE
-    found: dict[str, Any] = json.loads((path if path.is_file() else run_dir / FORMER_ACCEPTANCE).read_text())
-    return found
+    return read_json(path if path.is_file() else run_dir / FORMER_ACCEPTANCE, AGAIN)

@@ -14,8 +14,6 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from wm_nodes.apps import options
 from wm_nodes.apps.policy_run import READY_S, Stages
 from wm_nodes.apps.run_options import open_run
@@ -33,6 +31,7 @@ from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
+from wm_nodes.core.progress import tqdm
 from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
 from wm_nodes.judge.backends.factory import check_clips, check_judge
 from wm_nodes.launching import arguments as launch_arguments

@@ -19,7 +19,7 @@ from wm_nodes.reports.html import Picture
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import write_summary
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
-from wm_nodes.training.weights import load_weights
+from wm_nodes.training.weights import load_weights_file
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.pretraining import BEFORE
@@ -46,7 +46,7 @@ def conclude(
     base_folder, trained = (load_video_folder(base, compute_device(config.device)) for _ in range(2))
     uri = evaluated_uri(version, config)
     if version:
-        load_weights(trained.network, (run_dir / uri).read_bytes())
+        load_weights_file(trained.network, run_dir / uri)
     before = load_or_measure_scores(run_dir / BEFORE, base_folder, heldout, probe, config)
     after = load_or_measure_scores(run_dir / AFTER, trained, heldout, probe, config)
     watched = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []

@@ -54,7 +54,7 @@ SCENES = {
 def splits() -> dict[str, tuple[str, ...]]:
     """Names of the scenes by split: train, ood_object (objects that are nowhere else) and ood_combo (objects,
     containers and tables of train in combinations that are not)."""
-    text = resources.files("wm_nodes.config").joinpath("scenes.json").read_text()
+    text = resources.files("wm_nodes.config").joinpath("scenes.json").read_text(encoding="utf-8")
     return {split: tuple(names) for split, names in json.loads(text).items()}
 
 

@@ -9,6 +9,8 @@ from typing import Any
 from wm_nodes.core.files import write_atomic
 
 MANIFEST = "manifest.json"
+AGAIN = "delete it, and the same command makes it again"
+"""A remedy for a damaged file."""
 
 
 class ModelFolderError(ValueError):

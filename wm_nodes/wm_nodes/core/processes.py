@@ -12,7 +12,7 @@ LEAST_SHARE = 0.1
 def stat_fields(pid: int) -> list[str]:
     """The fields of /proc/<pid>/stat from the third, the state, on; [] where there is no such process."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
     except OSError:
         return []
 

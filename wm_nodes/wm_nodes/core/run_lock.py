@@ -6,6 +6,7 @@ learner started by hand beside it does not. Standard library only: `ros2 launch`
 
 import atexit
 import fcntl
+import itertools
 import json
 import os
 import socket
@@ -52,10 +53,11 @@ class RunLock:
 
     Args:
         say: told, in one line, where the lock of a process that is gone is taken over.
+        new: the folder must be a new one: -2, -3 and so on is put behind its name where there is one already.
     """
 
-    def __init__(self, folder: Path, say: Callable[[str], object] | None = None) -> None:
-        self.folder, self.path = folder, folder / NAME
+    def __init__(self, folder: Path, say: Callable[[str], object] | None = None, *, new: bool = False) -> None:
+        self.folder, self.path, self._new = folder, folder / NAME, new
         self._say = say or (lambda text: print(text, file=sys.stderr, flush=True))
         self._held: Holder | None = None
         self._made = False
@@ -66,7 +68,10 @@ class RunLock:
         Raises:
             RunFolderInUseError: it is held, or held on another host, which cannot be asked.
         """
-        self._made = not self.folder.exists()
+        self._made = self._new or not self.folder.exists()
+        if self._new:
+            self.folder = _make_new(self.folder)
+            self.path = self.folder / NAME
         self.folder.mkdir(parents=True, exist_ok=True)
         while True:
             with _opened(self.path) as file:
@@ -118,6 +123,16 @@ class RunLock:
             raise RunFolderInUseError(
                 f"run folder {self.folder} is in use by {holder}; stop it, or give another run_dir"
             )
+
+
+def _make_new(folder: Path) -> Path:
+    """Make a folder that no other process has made, and return it."""
+    for number in itertools.count(1):
+        free = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
+        with suppress(FileExistsError):
+            free.mkdir(parents=True)
+            break
+    return free
 
 
 @contextmanager

@@ -100,8 +100,8 @@ def keep_plan(plan: CollectionPlan, folder: Path) -> None:
         ValueError: the folder was begun with another plan; more episodes are none, but for a short last bag.
     """
     path, text = folder / PLAN, json.dumps({**vars(plan), "simulation": plan.simulation.model_dump()}, default=str)
-    if path.exists() and path.read_text() != text:
-        kept, now = json.loads(path.read_text()), json.loads(text)
+    if path.exists() and path.read_text(encoding="utf-8") != text:
+        kept, now = json.loads(path.read_text(encoding="utf-8")), json.loads(text)
         others = [name for name in now if now[name] != kept.get(name)]
         count, wanted = kept.get("num_episodes", 0), plan.num_episodes
         if others != ["num_episodes"] or wanted < count:

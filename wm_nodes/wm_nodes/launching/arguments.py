@@ -163,8 +163,8 @@ def prepare(
         graph = compose(graph, str(Path(values["run_dir"]) / "composed.params.yaml"))
         for node in graph.nodes:
             if node.inside:
-                Path(node.parameter_file).write_text(node.carried_parameters())
-    (Path(values["run_dir"]) / "graph.json").write_text(graph.to_json())
+                Path(node.parameter_file).write_text(node.carried_parameters(), encoding="utf-8")
+    (Path(values["run_dir"]) / "graph.json").write_text(graph.to_json(), encoding="utf-8")
     keep_arguments(scenario, given if kept is None else kept, Path(values["run_dir"]))
     return graph, values
 

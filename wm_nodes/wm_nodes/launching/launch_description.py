@@ -62,10 +62,10 @@ def _start(scenario: str, context: Any, names: Iterable[str]) -> list[Any]:
     known = {argument.name for argument in argument_table(scenario)}
     given = {name: LaunchConfiguration(name).perform(context) for name in sorted(known.intersection(names))}
     parse_arguments(scenario, given)
-    run_dir = run_folder(scenario, given)
-    RunLock(run_dir).acquire()  # until this process ends
+    lock_of_run = RunLock(run_folder(scenario, given), new=not given.get("run_dir"))
+    lock_of_run.acquire()  # until this process ends
     python = interpreter(given)
-    graph = prepare_graph(scenario, {**given, "run_dir": str(run_dir)}, python)
+    graph = prepare_graph(scenario, {**given, "run_dir": str(lock_of_run.folder)}, python)
     domain = int(graph_environment(graph.environment, python=python)["ROS_DOMAIN_ID"])
     lock = DomainLock(domain, f"graph {graph.name!r}")
     lock.acquire()
@@ -81,8 +81,8 @@ def prepare_graph(scenario: str, given: Mapping[str, str], python: str) -> Graph
     """
     command = [python, "-m", "wm_nodes.launching.arguments", scenario]
     done = subprocess.run(
-        command, input=json.dumps(dict(given)), env=graph_environment(python=python), capture_output=True, text=True,
-        check=False,
+        command, input=json.dumps(dict(given)), env=graph_environment(python=python), capture_output=True, check=False,
+        encoding="utf-8", errors="replace",
     )
     if done.returncode:
         text = (done.stderr.strip().splitlines() or ["no output"])[-1].removeprefix("error: ")

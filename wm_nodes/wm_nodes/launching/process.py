@@ -70,7 +70,8 @@ class NodeProcess:
             raise
         finally:
             os.close(output)
-        self._pump = threading.Thread(target=self._read, args=(os.fdopen(reader, errors="replace"),), daemon=True)
+        lines = os.fdopen(reader, encoding="utf-8", errors="replace")
+        self._pump = threading.Thread(target=self._read, args=(lines,), daemon=True)
         self._pump.start()
         threading.Thread(target=self._reap, args=(wait,), daemon=True).start()
 
@@ -122,7 +123,7 @@ class NodeProcess:
     def _read(self, stream: TextIO) -> None:
         with ExitStack() as stack:
             stack.enter_context(stream)
-            sink = stack.enter_context(self._file.open("a")) if self._file is not None else None
+            sink = stack.enter_context(self._file.open("a", encoding="utf-8")) if self._file is not None else None
             for line in stream:
                 self._lines.append(line)
                 if sink is not None:

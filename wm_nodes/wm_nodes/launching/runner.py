@@ -279,9 +279,9 @@ def main(scenario: str, argv: Sequence[str] | None = None) -> int:
     try:
         parse_arguments(scenario, given)
         run_dir = run_folder(scenario, given)
-        with RunLock(run_dir, say=_print):
-            graph, values = launch_arguments.begin(scenario, {**given, "run_dir": str(run_dir)})
-            return run(graph, run_dir, interpreter(values))
+        with RunLock(run_dir, say=_print, new=not given.get("run_dir")) as lock:
+            graph, values = launch_arguments.begin(scenario, {**given, "run_dir": str(lock.folder)})
+            return run(graph, lock.folder, interpreter(values))
     except (GraphError, DomainInUseError, ValueError, OSError, NotReadyError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -212,7 +212,7 @@ class RecorderNode(ManagedNode):
     def _note_in_index(self, path: Path, messages: int, lost: int) -> None:
         """run_dir/bags.json lists every completed bag of the run."""
         index = self.run_dir / "bags.json"
-        rows = json.loads(index.read_text()) if index.is_file() else []
+        rows = json.loads(index.read_text(encoding="utf-8")) if index.is_file() else []
         uri = str(path.relative_to(self.run_dir)) if path.is_relative_to(self.run_dir) else str(path)
         rows.append({"bag": uri, "messages": messages, "lost": lost})
         write_atomic(index, json.dumps(rows, indent=1).encode())

@@ -19,7 +19,7 @@ from wm_nodes.core.types import FloatArray, Observation, UInt8Array
 from wm_nodes.environments.maniskill.cameras import hand_over, table_top_cameras
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.reward import EncoderDistance, EndogenousReward
-from wm_nodes.training.weights import load_weights
+from wm_nodes.training.weights import load_weights_file
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
 from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader
 from wm_nodes.video_model.video_environment import VideoEnvironment, check_steppable
@@ -74,7 +74,7 @@ def load_policy(config: RunConfig, model_dir: Path, weights: Path) -> ImagePolic
         ValueError: the weights belong to another architecture or to another tokenizer.
     """
     policy = make_policy(config, model_dir)
-    metadata = load_weights(policy, Path(weights).read_bytes())
+    metadata = load_weights_file(policy, Path(weights))
     sha256 = metadata.get("tokenizer_sha256", "")
     if sha256 and sha256 != policy.encoder.sha256:
         raise ValueError(f"{weights} was trained on another tokenizer (sha256 {sha256[:12]}) than {model_dir} holds")

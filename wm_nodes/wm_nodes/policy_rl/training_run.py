@@ -3,6 +3,7 @@
 Versions: run_dir/policies/policy_<version>.safetensors, from 1.
 """
 
+import hashlib
 import json
 import math
 import os
@@ -18,12 +19,14 @@ import numpy as np
 import torch.distributed
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import read_json
 from wm_nodes.core.named_files import CHECKPOINT, read_regular
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.rollouts import Canceled, rollout_statistics, terminate_at_episode_end
 from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.training.checkpoint import RESTORE, DamagedFileError
 from wm_nodes.training.ranks import Ranks, broadcast_rollout
 from wm_nodes.training.run_folder import TrainingRun, VersionFiles
 from wm_nodes.training.weights import PackedWeights, load_weights, pack_weights
@@ -215,11 +218,17 @@ def restore(policy: ImagePolicy, learner: Learner, checkpoint: Path) -> Progress
     Raises:
         ValueError: a damaged file, or one of another architecture, algorithm or seed; names it.
     """
+    content = read_json(checkpoint, RESTORE)
     try:
-        content = json.loads(checkpoint.read_text())
-        load_weights(policy, (checkpoint.parent / content["weights"]).read_bytes(), sha256=content["sha256"])
+        weights = checkpoint.parent / content["weights"]
+        data = weights.read_bytes()
+        if hashlib.sha256(data).hexdigest() != content["sha256"]:
+            raise DamagedFileError(f"{weights} is not the file that {checkpoint} names (sha256 differs); {RESTORE}")
+        load_weights(policy, data)
         learner.load(checkpoint.parent / content["learner"])
         return Progress(**content["progress"])
+    except DamagedFileError:
+        raise
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"checkpoint {checkpoint} does not fit: {error}; go on with the configuration it was made by, or begin "

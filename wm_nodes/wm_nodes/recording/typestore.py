@@ -33,7 +33,8 @@ def message_folder() -> Path:
 @lru_cache(maxsize=1)
 def message_texts() -> dict[str, str]:
     """Full type name to the .msg text as written, comments included."""
-    return {f"{PACKAGE}/msg/{path.stem}": path.read_text() for path in sorted(message_folder().glob("*.msg"))}
+    files = sorted(message_folder().glob("*.msg"))
+    return {f"{PACKAGE}/msg/{path.stem}": path.read_text(encoding="utf-8") for path in files}
 
 
 @lru_cache(maxsize=1)

@@ -37,7 +37,7 @@ def machine_facts(device: str = CPU) -> dict[str, str]:
 def _field(path: str, name: str, separator: str = ":") -> str:
     """The first `name: value` of a text file, "" where there is none."""
     try:
-        lines = Path(path).read_text(errors="replace").splitlines()
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return ""
     values = (line.split(separator, 1)[1].strip() for line in lines if line.split(separator)[0].strip() == name)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import AGAIN, read_json
 from wm_nodes.training.metrics import read_metrics
 
 FILE_NAME = "summary.json"
@@ -94,7 +95,7 @@ def read_summary(run_dir: Path) -> dict[str, Any]:
     path = Path(run_dir) / FILE_NAME
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: the run has not come to its end")
-    values: dict[str, Any] = json.loads(path.read_text())
+    values = read_json(path, AGAIN)
     return {"acceptance" if name == "gate" else name: value for name, value in values.items()}
 
 

@@ -6,10 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
 from wm_nodes.core.files import write_atomic
+
+RESTORE = "put a copy of it back, or begin anew in another run folder"
+
+
+class DamagedFileError(ValueError):
+    """A file that is cut short or holds something else; names it and the remedy."""
 
 
 def write_checkpoint(path: Path, sections: Mapping[str, Mapping[str, Tensor]], metadata: Mapping[str, str]) -> None:
@@ -21,10 +28,18 @@ def write_checkpoint(path: Path, sections: Mapping[str, Mapping[str, Tensor]], m
     write_atomic(path, save(tensors, dict(metadata)))
 
 
-def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return (tensors, metadata) of write_checkpoint(). Raises OSError, or SafetensorError for a damaged file."""
+def read_checkpoint(path: Path, remedy: str = RESTORE) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return (tensors, metadata) of write_checkpoint(). Raises OSError, or DamagedFileError, which ends with remedy."""
     data = path.read_bytes()
-    return load(data), metadata_of(data)
+    try:
+        return load(data), metadata_of(data)
+    except (SafetensorError, ValueError) as error:
+        raise _damaged(path, error, remedy) from None
+
+
+def read_tensors(path: Path, remedy: str) -> dict[str, Tensor]:
+    """The tensors of a safetensors file. Raises as read_checkpoint()."""
+    return read_checkpoint(path, remedy)[0]
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -55,7 +70,15 @@ def metadata_of(data: bytes) -> dict[str, str]:
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """The metadata of a safetensors file, without reading its tensors."""
+    """The metadata of a safetensors file, without reading its tensors. Raises as read_checkpoint()."""
     with open(path, "rb") as file:
         size = file.read(8)
-        return metadata_of(size + file.read(int.from_bytes(size, "little")))
+        try:
+            return metadata_of(size + file.read(int.from_bytes(size, "little")))
+        except (ValueError, OverflowError, MemoryError) as error:
+            raise _damaged(path, error, RESTORE) from None
+
+
+def _damaged(path: Path, error: Exception, remedy: str) -> DamagedFileError:
+    size = path.stat().st_size
+    return DamagedFileError(f"{path} is damaged or cut short, no safetensors file ({size} bytes: {error}); {remedy}")

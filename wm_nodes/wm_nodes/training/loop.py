@@ -8,12 +8,13 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
+from wm_nodes.core.progress import tqdm
 from wm_nodes.training import checkpoint
 
 CHECKPOINT_PERIOD_S = 240.0
@@ -130,13 +131,15 @@ class TrainingLoop:
         path = None if self.run_dir is None else self.run_dir / f"metrics_{self.name}.jsonl"
         if self.iteration == 0 or path is None or not path.exists():
             return {}
-        last = json.loads(path.read_text().splitlines()[-1])
-        return {key: value for key, value in last.items() if key not in ("iteration", "seconds")}
+        for line in reversed(path.read_text(encoding="utf-8").splitlines()):
+            with suppress(ValueError):  # a killed process may have left half a line
+                return {key: value for key, value in json.loads(line).items() if key not in ("iteration", "seconds")}
+        return {}
 
     def _log(self, metrics: Mapping[str, float], seconds: float) -> None:
         if self.run_dir is None:
             return
         self.run_dir.mkdir(parents=True, exist_ok=True)
         line = {"iteration": self.iteration, "seconds": round(seconds, 2), **metrics}
-        with open(self.run_dir / f"metrics_{self.name}.jsonl", "a") as file:
+        with open(self.run_dir / f"metrics_{self.name}.jsonl", "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")

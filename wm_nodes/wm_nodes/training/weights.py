@@ -80,6 +80,15 @@ def load_weights(module: nn.Module, data: bytes, *, sha256: str | None = None) -
     return metadata
 
 
+def load_weights_file(module: nn.Module, path: Path) -> dict[str, str]:
+    """load_weights() of a file, which errors name. Raises OSError, too."""
+    data = path.read_bytes()
+    try:
+        return load_weights(module, data)
+    except WeightsError as error:
+        raise WeightsError(f"{path}: {error}") from None
+
+
 def save_weights(module: nn.Module, path: Path, metadata: Mapping[str, str] | None = None) -> PackedWeights:
     """Write the weights to `path` atomically and return them."""
     packed = pack_weights(module, metadata)

@@ -3,7 +3,6 @@
 Shapes: N frames, H W 3 image, D features. A backbone comes from a local folder; nothing is downloaded.
 """
 
-import json
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from wm_nodes.core.device import device_of
+from wm_nodes.core.model_folder import read_json
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.video_model.adapters.packages import package
 from wm_nodes.world_model import Tokenizer
@@ -119,7 +119,7 @@ def load_backbone(folder: Path, device: torch.device | str = "cpu") -> BackboneF
     if not isinstance(size, int):
         raise ValueError(f"{folder} holds a {model.config.model_type}, which takes no pictures; give a vision model")
     path = folder / "preprocessor_config.json"
-    settings = json.loads(path.read_text()) if path.is_file() else {}
+    settings = read_json(path, "copy the whole folder again") if path.is_file() else {}
     mean, std = settings.get("image_mean", IMAGENET_MEAN), settings.get("image_std", IMAGENET_STD)
     name = f"{model.config.model_type} of {folder.name}"
     return BackboneFeatures(model.to(device), size, tuple(mean), tuple(std), name)

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 
@@ -327,7 +326,7 @@ class GrpoLearner:
         try:
             tensors, metadata = checkpoint.read_checkpoint(path)
             header = json.loads(metadata["grpo"])
-        except (SafetensorError, KeyError, ValueError) as error:
+        except (KeyError, ValueError) as error:
             raise WeightsError(f"{path} is no complete checkpoint of GRPO ({error}); use a new run folder") from error
         if header["seed"] != self.seed:
             raise ValueError(f"{path} has seed {header['seed']}, this run has {self.seed}; use a new run folder")

@@ -17,7 +17,7 @@ from wm_nodes.config.shipped import PRETRAINED
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.core.seeding import stream_seed, torch_stream
-from wm_nodes.training.weights import check_same_layout, unpack_weights
+from wm_nodes.training.weights import load_weights_file
 from wm_nodes.video_model import (
     Condition,
     NetworkSettings,
@@ -244,7 +244,5 @@ def opacity_at(centres: Tensor, radius: float = RADIUS, side: int = SIDE) -> Ten
 def load_base(path: Path | None = None, device: torch.device | str = "cpu") -> VideoNetwork:
     """The base model on `device`: the one at `path`, or the shipped one."""
     model = VideoNetwork(NETWORK)
-    tensors, _ = unpack_weights((path or BASE).read_bytes())
-    check_same_layout(model.state_dict(), tensors, what=str(path or BASE))
-    model.load_state_dict(tensors)
+    load_weights_file(model, path or BASE)
     return model.to(device).eval()

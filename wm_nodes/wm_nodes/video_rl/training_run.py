@@ -17,7 +17,7 @@ from pathlib import Path
 
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import device_of, explain_memory
-from wm_nodes.training.checkpoint import read_metadata
+from wm_nodes.training.checkpoint import RESTORE, DamagedFileError, read_metadata
 from wm_nodes.training.metrics import MetricsWriter, read_metrics
 from wm_nodes.training.ranks import Ranks, broadcast_bytes
 from wm_nodes.training.run_folder import TrainingRun, VersionFiles
@@ -38,12 +38,19 @@ def evaluated_uri(version: int, config: VideoRlConfig) -> str:
 
 
 def progress(run_dir: Path) -> tuple[int, int]:
-    """Return version and number of buffers trained on, from the learner's checkpoint; (0, 0) where there is none."""
+    """Return version and number of buffers trained on, from the learner's checkpoint; (0, 0) where there is none.
+
+    Raises:
+        DamagedFileError: it is cut short; names it.
+    """
     path = run_dir / CHECKPOINT
     if not path.is_file():
         return 0, 0
-    header = json.loads(read_metadata(path)["grpo"])
-    return int(header["version"]), int(header["iteration"])
+    try:
+        header = json.loads(read_metadata(path)["grpo"])
+        return int(header["version"]), int(header["iteration"])
+    except KeyError as error:
+        raise DamagedFileError(f"{path} is no checkpoint of GRPO (no {error}); {RESTORE}") from None
 
 
 class VideoRun(TrainingRun):

@@ -13,6 +13,7 @@ from torch import Tensor
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import device_of
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import AGAIN, read_json
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder
@@ -61,7 +62,7 @@ def load_or_measure_scores(
 ) -> dict[str, list[float]]:
     """Return context_scores(): read from `path` where they are of the same weights, else measured and written there."""
     sha256 = pack_weights(folder.network).sha256
-    if path.is_file() and (saved := json.loads(path.read_text()))["sha256"] == sha256:
+    if path.is_file() and (saved := read_json(path, AGAIN))["sha256"] == sha256:
         return dict(saved["scores"])
     scores = {name: values.tolist() for name, values in context_scores(folder, heldout, probe, config).items()}
     write_atomic(path, json.dumps({"sha256": sha256, "scores": scores}).encode())

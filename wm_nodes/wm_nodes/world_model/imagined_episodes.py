@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file
 from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
@@ -26,8 +25,10 @@ from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.training.checkpoint import read_tensors
 from wm_nodes.world_model.text import instruction_for
 
+STARTS_REMEDY = "copy the model folder again; one in a run folder is written again after it was deleted"
 INSTRUCTIONS = "instructions"
 """Key of a starts file, see pack_instructions."""
 
@@ -38,7 +39,7 @@ def load_starts(path: Path, task: str = "") -> tuple[UInt8Array, FloatArray]:
     Raises:
         ValueError: no such file, or none of its starts is in that scene.
     """
-    tensors = load_file(path)
+    tensors = read_tensors(path, STARTS_REMEDY)
     missing = {"images", "states"} - tensors.keys()
     if missing or not len(tensors["images"]):
         raise ValueError(f"{path} is no starts file: it must hold images and states of at least one first frame")
@@ -59,7 +60,7 @@ def load_start_instructions(path: Path, spec: EnvironmentSpec) -> list[str]:
     Raises:
         ValueError: as load_starts.
     """
-    tensors = load_file(path)
+    tensors = read_tensors(path, STARTS_REMEDY)
     rows = _rows(path, tensors, spec.task)
     if INSTRUCTIONS not in tensors:
         return [spec.instruction] * len(rows)
@@ -101,7 +102,7 @@ def join_starts(*paths: Path) -> dict[str, Tensor]:
     Raises:
         ValueError: a file without instructions.
     """
-    files = [load_file(path) for path in paths]
+    files = [read_tensors(path, STARTS_REMEDY) for path in paths]
     for path, tensors in zip(paths, files, strict=True):
         if INSTRUCTIONS not in tensors:
             raise ValueError(f"{path} has no instructions; delete it to have it written again")
@@ -116,7 +117,7 @@ def load_start_seeds(path: Path, task: str = "") -> UInt64Array:
     Raises:
         ValueError: a file without them: of an older version, or of frames in the middle of an episode.
     """
-    tensors = load_file(path)
+    tensors = read_tensors(path, STARTS_REMEDY)
     if "seeds" not in tensors:
         raise ValueError(f"{path} holds no reset seeds of first frames; delete it to have it written again, with "
                          "data.start_frames first")

@@ -106,11 +106,11 @@ def load_video_reward(folder: Path) -> VideoReward:
         if not (folder / name).is_file():
             raise ValueError(f"{folder} has no {name}; see wm_nodes/benchmarks/judge/comparisons/video_reward.py")
     transformers = optional_package("transformers", needed_by="VideoAlign's weights need", requirements="video.txt")
-    prompt = (folder / "prompt.txt").read_text()
+    prompt = (folder / "prompt.txt").read_text(encoding="utf-8")
     wanted = ("{text_prompt}", *REWARD_TOKENS)
     if missing := [part for part in wanted if prompt.count(part) != 1]:
         raise ValueError(f"{folder / 'prompt.txt'} must hold {', '.join(missing)} once; copy the detailed template")
-    scales = json.loads((folder / "model_config.json").read_text()).get("inference_config") or {}
+    scales = json.loads((folder / "model_config.json").read_text(encoding="utf-8")).get("inference_config") or {}
     if lost := [f"{n}_{part}" for n in DIMENSIONS for part in ("mean", "std") if f"{n}_{part}" not in scales]:
         raise ValueError(f"{folder / 'model_config.json'} lacks {', '.join(lost)} in inference_config")
     head = _head(folder)
@@ -163,7 +163,7 @@ def fit_size(height: int, width: int, pictures: VideoPatches) -> tuple[int, int]
 
 
 def _pictures(folder: Path) -> VideoPatches:
-    settings = json.loads((folder / "preprocessor_config.json").read_text())
+    settings = json.loads((folder / "preprocessor_config.json").read_text(encoding="utf-8"))
     size = settings.get("size") or {}
     return VideoPatches(
         settings.get("patch_size", 14), settings.get("merge_size", 2), settings.get("temporal_patch_size", 2),

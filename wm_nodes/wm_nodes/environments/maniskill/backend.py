@@ -58,8 +58,8 @@ def shaders_without_table() -> Path | None:
     """Return a folder with the packs `common` and `minimal` as installed, less the table; made once per version of them
     in the user's cache folder. None where that cannot be written, or the shaders are not those that we know."""
     try:
-        texts = {path.relative_to(SHADERS): _without_table(path.read_text()) for pack in ("common", "minimal")
-                 for path in sorted((SHADERS / pack).iterdir())}
+        texts = {path.relative_to(SHADERS): _without_table(path.read_text(encoding="utf-8"))
+                 for pack in ("common", "minimal") for path in sorted((SHADERS / pack).iterdir())}
         if any("BRDFLUT" in text for text in texts.values()):
             return None
         version = hashlib.sha256("".join(f"{name}\n{text}" for name, text in texts.items()).encode()).hexdigest()
@@ -68,7 +68,7 @@ def shaders_without_table() -> Path | None:
         for name, text in texts.items():
             if not (folder / name).exists():
                 write_atomic(folder / name, text.encode())
-        as_made = all((folder / name).read_text() == text for name, text in texts.items())
+        as_made = all((folder / name).read_text(encoding="utf-8") == text for name, text in texts.items())
     except (OSError, RuntimeError):  # RuntimeError: the user has no home
         return None
     return folder if as_made else None

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode, FloatArray, Observation
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment

@@ -199,7 +199,7 @@ def redact(value: Any) -> tuple[Any, list[str]]:
 
 def lock_folder(folder: Path) -> IO[str]:
     """Hold the folder's lock until the returned file is closed. Raises AuditError: another process holds it."""
-    file = open(folder / LOCK_NAME, "a+")  # noqa: SIM115  (closing it is giving the lock back)
+    file = open(folder / LOCK_NAME, "a+", encoding="utf-8")  # noqa: SIM115  (closing it is giving the lock back)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

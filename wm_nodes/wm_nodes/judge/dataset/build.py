@@ -12,12 +12,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from wm_nodes.config.load import default_task
 from wm_nodes.config.schema import SimulationConfig
 from wm_nodes.config.tasks import clip_rules, get_task
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.table_top import CUBE_HALF_SIZE_M

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.statistics import auroc, balanced_accuracy, expected_calibration_error, recall_at, wilson_of_share
 from wm_nodes.core.types import BoolArray, FloatArray

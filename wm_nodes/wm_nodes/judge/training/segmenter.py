@@ -11,9 +11,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from tqdm import trange
 
 from wm_nodes.core.device import CPU_DEVICE
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
@@ -68,7 +68,7 @@ def train_segmenter(
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, total_steps=num_steps, pct_start=0.1)
     generator, weights = torch_stream(seed, "segmenter_batches"), torch.tensor(CLASS_WEIGHTS).to(device)
     pictures, labels = torch.from_numpy(images), torch.from_numpy(masks)
-    steps = trange(num_steps, desc="segmenter", disable=not progress)
+    steps = tqdm(range(num_steps), desc="segmenter", disable=not progress)
     for _ in steps:
         chosen = torch.randint(len(pictures), (BATCH,), generator=generator)
         shown, meant = pictures[chosen].to(device), labels[chosen].to(device)

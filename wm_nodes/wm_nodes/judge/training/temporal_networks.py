@@ -14,18 +14,20 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import Tensor
-from tqdm import tqdm
 
 from wm_nodes.core.device import CPU_DEVICE
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import AGAIN
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.types import FloatArray
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.evidence import sequence
 from wm_nodes.judge.evidence.sequence import READS, RIGHTWARD, ObjectSequence, TemporalNetwork, readings
 from wm_nodes.judge.training.heads import LAST_FAIL, UNKNOWN, Levels, true_levels
+from wm_nodes.training.checkpoint import read_tensors
 from wm_nodes.world_model.precision import compute_context
 
 FOLDS = 2
@@ -95,7 +97,7 @@ def _load_or_train_reader(
         reader = train_temporal_network(data, trained, epochs=epochs, seed=seed, progress=progress, device=device)
         write_atomic(path, save(dict(reader.state_dict())))
     reader = TemporalNetwork().eval().requires_grad_(False)
-    reader.load_state_dict(load_file(path))
+    reader.load_state_dict(read_tensors(path, AGAIN))
     return reader.to(device)
 
 

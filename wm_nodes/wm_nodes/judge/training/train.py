@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save
-from tqdm import tqdm
+from safetensors.torch import save
 
 import wm_nodes.judge.evidence
 from wm_nodes.core.device import CPU_DEVICE
 from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import AGAIN, read_json
+from wm_nodes.core.progress import tqdm
 from wm_nodes.core.types import FloatArray
 from wm_nodes.judge.dataset.edits.clips import COMPONENTS, TC
 from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestRow, Part, to_bytes
@@ -36,6 +37,7 @@ from wm_nodes.judge.training.data import load_sets, rows_of, set_clips
 from wm_nodes.judge.training.heads import TARGETS, Examples, conformal_limits, fit_all, fit_familiarity, measure_target
 from wm_nodes.judge.training.segmenter import overlaps, segmentation_data, train_segmenter
 from wm_nodes.judge.training.temporal_networks import cross_fit, temporal_data
+from wm_nodes.training.checkpoint import read_tensors
 
 SEGMENTER = "segmenter.safetensors"
 Sets = Sequence[tuple[Path, Manifest]]
@@ -212,8 +214,8 @@ def _load_or_train_segmenter(
         write_atomic(path.with_suffix(".json"), (json.dumps(story, indent=1) + "\n").encode())
         write_atomic(path, save({name: tensor.half() for name, tensor in model.state_dict().items()}))
     segmenter = Segmenter()
-    segmenter.load_state_dict({name: tensor.float() for name, tensor in load_file(path).items()})
-    story = json.loads(path.with_suffix(".json").read_text())
+    segmenter.load_state_dict({name: tensor.float() for name, tensor in read_tensors(path, AGAIN).items()})
+    story = read_json(path.with_suffix(".json"), AGAIN)
     return segmenter.eval().requires_grad_(False).to(device), story
 
 

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file
 
+from wm_nodes.training.checkpoint import read_tensors
 from wm_nodes.video_model.adapters.packages import package
 from wm_nodes.video_model.adapters.velocity import PublicVelocity, tuner_layers
 
@@ -75,7 +75,7 @@ def _copy_exactly(transformer: Any, folder: Path) -> None:
     """Write the file's float32 values again: diffusers loads them in the dtype of the base weights."""
     parameters = {name.replace(".default.", "."): p for name, p in transformer.named_parameters() if "lora_" in name}
     for path in sorted(folder.glob("*.safetensors")):
-        for name, tensor in load_file(path).items():
+        for name, tensor in read_tensors(path, "copy the adapter's folder again").items():
             parameters[name].copy_(tensor)
 
 

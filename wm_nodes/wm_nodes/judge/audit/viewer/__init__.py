@@ -57,7 +57,7 @@ def write_view(
 def page(title: str, data: Mapping[str, Any]) -> str:
     """The page. data: JSON values; what the script reads."""
     folder = resources.files("wm_nodes.judge.audit.viewer")
-    style, script = ((folder / name).read_text() for name in ("viewer.css", "viewer.js"))
+    style, script = ((folder / name).read_text(encoding="utf-8") for name in ("viewer.css", "viewer.js"))
     policy = (
         f"default-src 'none'; img-src 'self' file:; style-src {_source_expression(style)}; "
         f"script-src {_source_expression(script)}; base-uri 'none'; form-action 'none'"
