@@ -92,7 +92,7 @@ def test_every_node_module_and_its_ros2_run_name_exist(
 def test_nodes_get_only_parameters_that_they_declare(scenario: str, given: dict[str, str]) -> None:
     """Nodes refuse unknown parameters; the declared names are read from the node's source."""
     graph, _ = launch_arguments.prepare(scenario, of(scenario, given))
-    common = {"config_file", "run_dir", "allowed_dirs", "autostart", "executor", "use_sim_time"}
+    common = {"config_file", "run_dir", "allowed_dirs", "autostart", "executor", "memory_limit_gib", "use_sim_time"}
     for node in graph.nodes:
         spec = importlib.util.find_spec(node.module)
         assert spec is not None and spec.origin is not None

@@ -42,7 +42,7 @@ def memory_bytes(root: Path = Path("/")) -> int:
     """The memory of this machine, or of the container (cgroup) where that has less. root: of /proc and /sys."""
     sizes = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     groups = {""}
-    for line in _read(root / "proc/self/cgroup").splitlines():
+    for line in _read(root / "proc/self/cgroup").split():
         number, controllers, group = line.split(":", 2)
         if number == "0" or "memory" in controllers.split(","):
             groups |= {str(folder).strip("/") for folder in (Path(group), *Path(group).parents)}
