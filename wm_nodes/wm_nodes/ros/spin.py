@@ -35,6 +35,9 @@ NO_MEMORY = "dropped what asked for more memory than there is, or than memory_li
 LOG_PERIOD_S = 60.0
 _LOGGER = get_logger("spin")
 
+ANSWER_S = 0.3
+"""Time for the results of the goals that the end cuts short to leave."""
+
 SETTLE_S = 2.0
 """Longest time that nodes which still take messages may hold up the end."""
 
@@ -174,6 +177,13 @@ def _limit_memory(nodes: list[Any]) -> None:
         nodes[0].get_logger().info(f"holds at most {limit_gib:.1f} GiB of data (memory_limit_gib)")
 
 
+def _answer_goals(executor: Executor, nodes: list[Any]) -> None:
+    """End the goals at work and send their results: a client cannot see that its server is gone."""
+    if any([node.end_goals() for node in nodes]):
+        until_s = time.monotonic() + ANSWER_S
+        spin(executor, until=lambda: time.monotonic() > until_s)
+
+
 def _settle(executor: Executor, nodes: list[Any]) -> None:
     began_s = time.monotonic()
     spin(
@@ -187,8 +197,8 @@ def _settle(executor: Executor, nodes: list[Any]) -> None:
 def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = None) -> int:
     """Create nodes, start them, spin until a signal, stop them, shut down. Return the exit code.
 
-    Each node is an rclpy node with start() -> bool, settled() and stop(), as ros.lifecycle.ManagedNode is. After the
-    signal it spins until all nodes are settled, for at most SETTLE_S. The first node's `executor` parameter chooses the
+    Each node is a ros.lifecycle.ManagedNode. After the signal it answers the goals at work, and spins until all nodes are
+    settled, for at most SETTLE_S. The first node's `executor` parameter chooses the
     executor. A start that fails gives exit code 1 after one line of error; an exception out of a callback gives it
     after its trace, and the nodes still stop in order.
     """
@@ -208,6 +218,7 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
             with _mark_failed(nodes):
                 if stopped.interrupt(lambda: all(node.start() for node in nodes)):
                     spin(executor, until=lambda: stopped() or any(node.failed for node in nodes))
+                    _answer_goals(executor, nodes)
                     _settle(executor, nodes)
             for node in reversed(nodes):
                 with _mark_failed([node]):
