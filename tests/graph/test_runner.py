@@ -14,6 +14,7 @@ import pytest
 from graph.harness import removed_ports
 
 from wm_nodes.launching import readiness
+from wm_nodes.launching import runner as launching_runner
 from wm_nodes.launching.domain_lock import DomainInUseError
 from wm_nodes.launching.graph import Graph, NodeSpec
 from wm_nodes.launching.readiness import NotReadyError
@@ -107,6 +108,26 @@ def test_killed_node_can_be_restarted_and_its_end_is_no_failure(ros_domain: int,
             warnings.warn(f"a started once more: {error}; {removed} removed", stacklevel=2)
             runner.restart("a")
             runner.wait_ready(30)
+
+
+@pytest.mark.parametrize("forks", [True, False])
+@pytest.mark.kills
+def test_a_node_that_is_to_respawn_comes_back_and_one_that_ends_at_once_does_not(
+    ros_domain: int, forks: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launching_runner, "LEAST_LIFE_S", 2.0)
+    nodes = [replace(tiny(name), respawn=True) for name in "ab"]
+    log = io.StringIO()
+    with Runner(graph(*nodes, forks=forks), log=log) as runner:
+        runner.wait_ready(30)
+        time.sleep(2.0)
+        first = runner.pid("a")
+        os.kill(first, signal.SIGKILL)
+        assert runner.wait(timeout_s=15, until=lambda: runner.pid("a") != first) == 0
+        assert runner.pid("a") != first and runner.failure() is None
+        assert "required node wm/a was ended by SIGKILL" in log.getvalue() and "starting it again" in log.getvalue()
+        os.kill(runner.pid("a"), signal.SIGKILL)
+        assert runner.wait(timeout_s=30) == 128 + signal.SIGKILL
 
 
 @pytest.mark.kills

@@ -86,6 +86,7 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("autostart", "true", "Nodes activate themselves; false: a lifecycle manager does", TRUTHS),
     LaunchArgument("use_sim_time", "false", "Nodes take their time from /clock", TRUTHS),
     LaunchArgument("log_level", "info", "Least severity that nodes log", ("debug", "info", "warn", "error")),
+    LaunchArgument("respawn", "false", "A node that ends by itself is started again; false: the graph ends", TRUTHS),
     LaunchArgument("memory_limit_gib", "-1", "Data that each node may hold; 0: no limit; -1: an eighth of the memory, at "
                    "least 3, and no limit where the node computes on a GPU"),
     LaunchArgument("compose", "false", "All nodes in one process: fewer copies, one interpreter", TRUTHS),
@@ -101,7 +102,7 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
 _BY_NAME = {argument.name: argument for argument in ARGUMENTS}
 _COMMON = (
     "preset", "task", "config_file", "run_dir", "allowed_dirs", "namespace", "executor", "autostart", "use_sim_time",
-    "log_level", "memory_limit_gib", "compose", "domain_id", "discovery_range", "python", "params_file",
+    "log_level", "respawn", "memory_limit_gib", "compose", "domain_id", "discovery_range", "python", "params_file",
 )
 
 
@@ -172,7 +173,8 @@ def _node(
     values = {**common, **parameters}
     return NodeSpec(
         f"wm_nodes.nodes.{module or f'{name}_node'}", name, namespace, values, ranks=ranks,
-        log_level=arguments["log_level"], extra_parameters=arguments["params_file"],
+        respawn=arguments["respawn"] == "true", log_level=arguments["log_level"],
+        extra_parameters=arguments["params_file"],
     )
 
 

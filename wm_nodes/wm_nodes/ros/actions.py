@@ -175,6 +175,8 @@ class WorkerAction:
         except Exception as error:
             self._node.get_logger().error(traceback.format_exc())
             text = f"{type(error).__name__}: {error}"
+            if isinstance(error, MemoryError) or "allocate memory" in text:
+                text += "; a larger memory_limit_gib allows more"
             self._node.say_failed_goal(f"{self._name} failed: {text}")
             result, state = self._end_early(reasons.FAILED, text), "abort"
         self._conclude(goal_handle, work, result, state)

@@ -172,9 +172,7 @@ def _limit_memory(nodes: list[Any]) -> None:
     device, file = "auto", Path(str(nodes[0].get_parameter("config_file").value))
     with suppress(ConfigError):  # which configure tells
         device = str(read_yaml(file).get("device", device)) if file.is_file() else device
-    given_gib = float(nodes[0].get_parameter("memory_limit_gib").value)
-    if limit_gib := limit_memory(given_gib, len(nodes), device):
-        nodes[0].get_logger().info(f"holds at most {limit_gib:.1f} GiB of data (memory_limit_gib)")
+    limit_memory(float(nodes[0].get_parameter("memory_limit_gib").value), len(nodes), device)
 
 
 def _answer_goals(executor: Executor, nodes: list[Any]) -> None:
