@@ -11,6 +11,6 @@ if __name__ == "__main__":
     from setup.entry import ensure
 
     ensure()
-    from wm_nodes.launching.runner import main
+    from wm_nodes.launching.start import start
 
-    raise SystemExit(main("judge_clips"))
+    raise SystemExit(start("judge_clips"))

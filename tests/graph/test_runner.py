@@ -201,6 +201,32 @@ def test_ctrl_c_ends_all_nodes_and_the_starter_with_code_0(ros_domain: int, tmp_
     assert process.wait(timeout=30) == 0, "".join(lines)
 
 
+START = "from wm_nodes.launching.start import start; print('begun', flush=True); sys.exit(start('online_training'))"
+VERB = (
+    "from wm_nodes.apps.cli import run_verb; print('begun', flush=True); "
+    "sys.exit(run_verb('train-policy', sys.argv[1:], 'wm'))"
+)
+
+
+@pytest.mark.parametrize("moment_s", [0.0, 0.2, 0.5, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize(
+    ("program", "given"), [(START, ["preset:=smoke", "run_dir:={}"]), (VERB, ["--preset", "smoke", "--run-dir", "{}"])]
+)
+def test_ctrl_c_in_the_first_seconds_of_a_start_ends_it_with_one_line_and_code_130(
+    ros_domain: int, tmp_path: Path, program: str, given: list[str], moment_s: float
+) -> None:
+    command = [sys.executable, "-c", f"import sys; {program}", *(word.format(tmp_path / "run") for word in given)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    assert process.stdout is not None and process.stdout.readline() == "begun\n"
+    time.sleep(moment_s)
+    os.killpg(process.pid, signal.SIGINT)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 130 and said.count("interrupted") == 1 and "Traceback" not in said, said
+    assert "interrupted" in said.splitlines()[-1]
+
+
 @pytest.mark.kills
 def test_nodes_do_not_outlive_a_killed_starter(ros_domain: int, tmp_path: Path) -> None:
     script = tmp_path / "start.py"

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import NoReturn
 
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
+from wm_nodes.core.interrupts import leaving_when_interrupted
 
 DONE, DIFFERENT, ERROR, NOT_ACCEPTED, INTERRUPTED = 0, 1, 2, 3, 130
 EXIT_CODES = (
@@ -93,7 +94,8 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
     kind, _, experiment = name.partition(" ")
     file = (experiment or kind).replace("-", "_")
     try:
-        module = import_module(f"wm_nodes.apps.{file}" if kind != "benchmark" else f"{BENCHMARKS}.{file}.cli")
+        with leaving_when_interrupted():
+            module = import_module(f"wm_nodes.apps.{file}" if kind != "benchmark" else f"{BENCHMARKS}.{file}.cli")
     except ModuleNotFoundError as error:
         if error.name != BENCHMARKS:
             raise

@@ -299,15 +299,19 @@ def main(scenario: str, argv: Sequence[str] | None = None) -> int:
 
 
 def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: float = 120.0) -> int:
-    """Run a graph until Ctrl-C, SIGTERM, or the end of a required node.
+    """Run a graph until Ctrl-C or SIGTERM (exit code 0; 130 before it is ready), or the end of a required node.
 
     Raises:
         RunFolderInUseError: another process writes into run_dir. DomainInUseError, NotReadyError: as the Runner.
+        KeyboardInterrupt: while the processes were made.
     """
     received: list[int] = []
+    starting = True
 
     def note(number: int, _frame: FrameType | None) -> None:
         received.append(number)
+        if starting and len(received) == 1:
+            raise KeyboardInterrupt
 
     previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     reach = graph.environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -318,13 +322,17 @@ def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: floa
             RunLock(run_dir, say=_print),
             Runner(graph, log_dir=run_dir / "logs", python=python) as runner,
         ):
+            starting = False
             print(f"[runner] {len(graph.nodes)} processes, domain {runner.domain}, run folder {run_dir}", flush=True)
             try:
                 wait_ready(graph.nodes, domain=runner.domain, timeout_s=ready_s, check=lambda: _raise(runner, received))
-            except (NodeDiedError, KeyboardInterrupt) as error:
-                print(f"[runner] {error or 'interrupted'}; stopping", flush=True)
+            except NodeDiedError as error:
+                print(f"[runner] {error}; stopping", flush=True)
                 failure = runner.failure()
-                return failure[0] if failure else 0
+                return failure[0] if failure else 1
+            except KeyboardInterrupt:
+                print("[runner] interrupted; stopping", flush=True)
+                return 128 + signal.SIGINT
             print("[runner] ready; Ctrl-C stops", flush=True)
             return runner.wait(until=lambda: bool(received))
     finally:
