@@ -11,18 +11,17 @@ import pytest
 import yaml
 from graph import toy
 from graph.harness import Graph, Probe, wait_until
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from recording_graph import NUM_ENVS, write
 from recording_graph import Graph as Recorded
 from recording_samples import make_spec
 
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
-
 from wm_msgs.action import Evaluate, Replay, Train
 from wm_nodes.launching.graph_client import GraphClient
 from wm_nodes.launching.scenarios import ENVIRONMENT_TOPICS, GRAPH_TOPICS
-from wm_nodes.ros.wire import PeerLost
 from wm_nodes.recording import BagReport, read_episodes, read_rollouts, recover
+from wm_nodes.ros.wire import PeerLost
 from wm_nodes.training.weights import save_weights
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
@@ -165,7 +164,7 @@ def test_a_client_of_a_killed_learner_gets_an_error(
         training = pool.submit(client.train, 100000, updates.append)
         wait_until("an update", lambda: updates, 60)
         graph.kill("/wm/learner")
-        with pytest.raises(PeerLost, match="/wm/learner (is silent|was stopped or restarted)"):
+        with pytest.raises(PeerLost, match=r"/wm/learner (is silent|was stopped or restarted)"):
             training.result(15.0)
 
 

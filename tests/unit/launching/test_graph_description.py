@@ -289,7 +289,8 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
     with holder(Path(values["run_dir"])), pytest.raises(RunFolderInUseError, match=r"is in use by process \d+ on"):
         start.named["function"](Context({**defaults, **values}))
     nodes = start.named["function"](Context({**defaults, **values}))
-    assert set(read_arguments(Path(values["run_dir"]))[scenario]) == set(values) - {"run_dir", "domain_id", "compose", "respawn"}
+    kept = set(values) - {"run_dir", "domain_id", "compose", "respawn"}
+    assert set(read_arguments(Path(values["run_dir"]))[scenario]) == kept
     (lock,) = launch_face.LOCKS
     with pytest.raises(DomainInUseError, match=r"ROS domain 7 is already in use .*domain_id:=8"):
         start.named["function"](Context({**defaults, **values}))

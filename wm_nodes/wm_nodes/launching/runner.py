@@ -169,10 +169,10 @@ class Runner:
     def respawn(self) -> None:
         """Start again what has ended by itself RESPAWN_S ago and is to come back; wait() does so."""
         for label, process in self._processes.items():
-            if label not in self._expected and _comes_back(process):
-                if time.monotonic() - (process.ended_at or 0.0) > RESPAWN_S:
-                    self._say(f"{process.exit_summary()}; starting it again")
-                    self._start(label)
+            rested = time.monotonic() - (process.ended_at or 0.0) > RESPAWN_S
+            if rested and label not in self._expected and _comes_back(process):
+                self._say(f"{process.exit_summary()}; starting it again")
+                self._start(label)
 
     def kill(self, name: str, number: int = signal.SIGKILL) -> None:
         """Send a signal to a node's process group; its end is then no failure of the graph."""

@@ -87,8 +87,8 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("use_sim_time", "false", "Nodes take their time from /clock", TRUTHS),
     LaunchArgument("log_level", "info", "Least severity that nodes log", ("debug", "info", "warn", "error")),
     LaunchArgument("respawn", "false", "A node that ends by itself is started again; false: the graph ends", TRUTHS),
-    LaunchArgument("memory_limit_gib", "-1", "Data that each node may hold; 0: no limit; -1: an eighth of the memory, at "
-                   "least 3, and no limit where the node computes on a GPU"),
+    LaunchArgument("memory_limit_gib", "-1", "Data that each node may hold; 0: no limit; -1: an eighth of the memory, "
+                   "at least 3, and no limit where the node computes on a GPU"),
     LaunchArgument("compose", "false", "All nodes in one process: fewer copies, one interpreter", TRUTHS),
     LaunchArgument("domain_id", "", "ROS domain, 0 to 101; empty: $ROS_DOMAIN_ID, else 0"),
     LaunchArgument(

@@ -232,7 +232,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def end_goals(self) -> bool:
         """Answer the goals at work, as the process is about to end; return whether there are any."""
-        return any([action.end("shut down") for action in self.actions])
+        ended = [action.end("shut down") for action in self.actions]
+        return any(ended)
 
     def stop(self) -> None:
         """Go from any state to finalized; tell the peers that this is no loss."""

@@ -20,7 +20,6 @@ from rclpy.signals import SignalHandlerOptions
 
 from wm_nodes.core.named_files import NamedFiles
 
-
 PEER_TIMEOUT_S = 3.0
 
 
@@ -81,8 +80,8 @@ COMMON = (
     Param("autostart", True, "Configure and activate at start, without a lifecycle manager", read_only=True),
     Param("executor", "events", "Which rclpy executor spins the node", read_only=True,
           choices=("events", "single", "multi")),
-    Param("memory_limit_gib", -1.0, "Data that the node's process may hold; 0: no limit; -1: an eighth of the memory of "
-          "machine or container, at least 3, and no limit where the node computes on a GPU", "GiB", read_only=True,
+    Param("memory_limit_gib", -1.0, "Data that the node's process may hold; 0: no limit; -1: an eighth of the memory "
+          "of machine or container, at least 3, and no limit where the node computes on a GPU", "GiB", read_only=True,
           minimum=-1.0, maximum=1e6),
     Param("peer_timeout_s", PEER_TIMEOUT_S, "A node of the graph that is silent for longer is reported as lost", "s",
           minimum=1.0, maximum=60.0),

@@ -177,7 +177,8 @@ def _limit_memory(nodes: list[Any]) -> None:
 
 def _answer_goals(executor: Executor, nodes: list[Any]) -> None:
     """End the goals at work and send their results: a client cannot see that its server is gone."""
-    if any([node.end_goals() for node in nodes]):
+    ended = [node.end_goals() for node in nodes]
+    if any(ended):
         until_s = time.monotonic() + ANSWER_S
         spin(executor, until=lambda: time.monotonic() > until_s)
 
@@ -195,10 +196,10 @@ def _settle(executor: Executor, nodes: list[Any]) -> None:
 def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = None) -> int:
     """Create nodes, start them, spin until a signal, stop them, shut down. Return the exit code.
 
-    Each node is a ros.lifecycle.ManagedNode. After the signal it answers the goals at work, and spins until all nodes are
-    settled, for at most SETTLE_S. The first node's `executor` parameter chooses the
-    executor. A start that fails gives exit code 1 after one line of error; an exception out of a callback gives it
-    after its trace, and the nodes still stop in order.
+    Each node is a ros.lifecycle.ManagedNode. After the signal it answers the goals at work, and spins until all nodes
+    are settled, for at most SETTLE_S. The first node's `executor` parameter chooses the executor.
+    A start that fails gives exit code 1 after one line of error; an exception out of a callback gives it after its
+    trace, and the nodes still stop in order.
     """
     keep_freed_memory()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
