@@ -77,8 +77,8 @@ def launch(scenario):
         return 0
     ensure()
     with interruptible():
-        from wm_nodes.launching.runner import main
-    return main(scenario)
+        from wm_nodes.launching.start import start
+    return start(scenario)
 
 
 @contextmanager

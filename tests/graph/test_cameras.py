@@ -129,7 +129,11 @@ def test_an_environment_that_says_nothing_of_its_cameras_has_no_such_topics_and_
     graph: Graph, probe: Probe
 ) -> None:
     graph.start_environment(num_envs=N)
-    Client(probe).reset()
+    images = probe.listen("env/image")
+    client = Client(probe)
+    wait_until("matching", lambda: client.probe.node.count_publishers("/wm/env/image"))
+    client.reset()
+    assert wait_until("an image", lambda: images)[0].header.frame_id == "wm_base"
     assert not [name for name, _ in probe.node.get_topic_names_and_types() if "/env/camera/" in name]
     assert graph.log("/wm/environment").count("the attribute `cameras` (wm_nodes/core/cameras.py)") == 1
 
@@ -182,7 +186,9 @@ print(json.dumps({**heard, "type": [offered.topic_type, str(offered.topic_type_h
 """
 
 
-def test_tf_has_the_frames_in_the_type_that_ros_2_itself_has(graph: Graph) -> None:
+def test_tf_has_the_frames_in_the_type_that_ros_2_itself_has_and_that_of_the_mosaic(
+    graph: Graph, probe: Probe
+) -> None:
     graph.start_environment("toy:make_environment_with_cameras", num_envs=N, mode="asynchronous")
     done = subprocess.run(
         [sys.executable, "-c", LISTENER], env=graph.environment(), capture_output=True, text=True, timeout=100,
@@ -192,6 +198,8 @@ def test_tf_has_the_frames_in_the_type_that_ros_2_itself_has(graph: Graph) -> No
     heard = json.loads(done.stdout)
     assert heard["/tf_static"] == [["wm_base", "wm_camera_top_optical", pytest.approx(0.6)]]
     assert [frames[:2] for frames in heard["/tf"]] == [["wm_base", "wm_camera_hand_optical"]]
+    images = probe.listen("env/image")
+    assert wait_until("an image", lambda: images)[0].header.frame_id == heard["/tf_static"][0][1]
     assert heard["type"] == ["tf2_msgs/msg/TFMessage", HASH]
 
 

@@ -4,19 +4,24 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 import yaml
 from graph import toy
 from graph.harness import Graph, Probe, wait_until
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from recording_graph import NUM_ENVS, write
 from recording_graph import Graph as Recorded
 from recording_samples import make_spec
 
 from wm_msgs.action import Evaluate, Replay, Train
+from wm_nodes.launching.graph_client import GraphClient
 from wm_nodes.launching.scenarios import ENVIRONMENT_TOPICS, GRAPH_TOPICS
 from wm_nodes.recording import BagReport, read_episodes, read_rollouts, recover
+from wm_nodes.ros.wire import PeerLost
 from wm_nodes.training.weights import save_weights
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
@@ -31,6 +36,11 @@ def start_recorder(graph: Graph) -> Any:
 
 def active(probe: Probe, *names: str) -> None:
     wait_until(f"active {names}", lambda: all(probe.value(name, "state") == "active" for name in names), 60)
+
+
+def slow_replay() -> SetParameters.Request:
+    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=0.01)
+    return SetParameters.Request(parameters=[Parameter(name="replay_rate", value=value)])
 
 
 def evaluate(probe: Probe, episodes: int, timeout_s: float = 60.0) -> Any:
@@ -123,6 +133,52 @@ def test_a_killed_player_plays_again(graph: Graph, probe: Probe) -> None:
     active(probe, "/wm/player")
     result = probe.finish(probe.send(client, Replay.Goal(bag_uri="bag", rate=1000.0)))
     assert result.termination_reason == Replay.Result.FINISHED, result.message
+
+
+@pytest.mark.kills
+def test_a_training_from_a_player_that_is_killed_ends_with_its_name(graph: Graph, probe: Probe) -> None:
+    recorded = Recorded(make_spec(num_envs=NUM_ENVS))
+    recorded.rollout(1, 20)
+    write(graph.folder / "bag", recorded)
+    graph.start_learner()
+    graph.start("player", start_paused=False)
+    active(probe, "/wm/player", "/wm/learner")
+    time.sleep(1.0)  # two heartbeats
+    graph_goal = Train.Goal(updates=1, from_replay=True, bag_uris=["bag"])
+    probe.call(SetParameters, "learner/set_parameters", slow_replay())
+    handle = probe.send(probe.action(Train, "train"), graph_goal)
+    time.sleep(2.0)
+    graph.kill("/wm/player")
+    result = probe.finish(handle, 15.0)
+    assert result.termination_reason == Train.Result.PEER_LOST and "/wm/player is silent" in result.message
+
+
+@pytest.mark.kills
+def test_a_client_of_a_killed_learner_gets_an_error(
+    graph: Graph, probe: Probe, domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph.start_training_nodes()
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    updates = list[Any]()
+    with GraphClient() as client, ThreadPoolExecutor(1) as pool:
+        training = pool.submit(client.train, 100000, updates.append)
+        wait_until("an update", lambda: updates, 60)
+        graph.kill("/wm/learner")
+        with pytest.raises(PeerLost, match=r"/wm/learner (is silent|was stopped or restarted)"):
+            training.result(15.0)
+
+
+@pytest.mark.parametrize("learner", [{}, {"learner_factory": "toy:make_stuck_learner"}])
+def test_a_learner_that_is_told_to_end_answers_its_goals_client_also_where_it_is_stuck(
+    graph: Graph, probe: Probe, learner: dict[str, str]
+) -> None:
+    graph.start_training_nodes(**learner)
+    updates = list[Any]()
+    handle = probe.send(probe.action(Train, "train"), Train.Goal(updates=100000), updates.append)
+    wait_until("work", lambda: updates or "stuck" in graph.log("/wm/learner"), 60)
+    graph.processes["/wm/learner"].terminate()
+    result = probe.finish(handle, 6.0)
+    assert (result.termination_reason, result.message) == (Train.Result.DEACTIVATED, "shut down")
 
 
 @pytest.mark.kills

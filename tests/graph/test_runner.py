@@ -14,6 +14,7 @@ import pytest
 from graph.harness import removed_ports
 
 from wm_nodes.launching import readiness
+from wm_nodes.launching import runner as launching_runner
 from wm_nodes.launching.domain_lock import DomainInUseError
 from wm_nodes.launching.graph import Graph, NodeSpec
 from wm_nodes.launching.readiness import NotReadyError
@@ -109,6 +110,26 @@ def test_killed_node_can_be_restarted_and_its_end_is_no_failure(ros_domain: int,
             runner.wait_ready(30)
 
 
+@pytest.mark.parametrize("forks", [True, False])
+@pytest.mark.kills
+def test_a_node_that_is_to_respawn_comes_back_and_one_that_ends_at_once_does_not(
+    ros_domain: int, forks: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launching_runner, "LEAST_LIFE_S", 2.0)
+    nodes = [replace(tiny(name), respawn=True) for name in "ab"]
+    log = io.StringIO()
+    with Runner(graph(*nodes, forks=forks), log=log) as runner:
+        runner.wait_ready(30)
+        time.sleep(2.0)
+        first = runner.pid("a")
+        os.kill(first, signal.SIGKILL)
+        assert runner.wait(timeout_s=15, until=lambda: runner.pid("a") != first) == 0
+        assert runner.pid("a") != first and runner.failure() is None
+        assert "required node wm/a was ended by SIGKILL" in log.getvalue() and "starting it again" in log.getvalue()
+        os.kill(runner.pid("a"), signal.SIGKILL)
+        assert runner.wait(timeout_s=30) == 128 + signal.SIGKILL
+
+
 @pytest.mark.kills
 def test_node_that_ignores_sigint_and_sigterm_is_killed_in_the_end(ros_domain: int) -> None:
     with Runner(graph(tiny("a", stubborn=True)), log=None) as runner:
@@ -178,6 +199,32 @@ def test_ctrl_c_ends_all_nodes_and_the_starter_with_code_0(ros_domain: int, tmp_
     os.killpg(process.pid, signal.SIGINT)
     process.stdout.read()
     assert process.wait(timeout=30) == 0, "".join(lines)
+
+
+START = "from wm_nodes.launching.start import start; print('begun', flush=True); sys.exit(start('online_training'))"
+VERB = (
+    "from wm_nodes.apps.cli import run_verb; print('begun', flush=True); "
+    "sys.exit(run_verb('train-policy', sys.argv[1:], 'wm'))"
+)
+
+
+@pytest.mark.parametrize("moment_s", [0.0, 0.2, 0.5, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize(
+    ("program", "given"), [(START, ["preset:=smoke", "run_dir:={}"]), (VERB, ["--preset", "smoke", "--run-dir", "{}"])]
+)
+def test_ctrl_c_in_the_first_seconds_of_a_start_ends_it_with_one_line_and_code_130(
+    ros_domain: int, tmp_path: Path, program: str, given: list[str], moment_s: float
+) -> None:
+    command = [sys.executable, "-c", f"import sys; {program}", *(word.format(tmp_path / "run") for word in given)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    assert process.stdout is not None and process.stdout.readline() == "begun\n"
+    time.sleep(moment_s)
+    os.killpg(process.pid, signal.SIGINT)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 130 and said.count("interrupted") == 1 and "Traceback" not in said, said
+    assert "interrupted" in said.splitlines()[-1]
 
 
 @pytest.mark.kills

@@ -16,12 +16,14 @@ from wm_nodes.core.cameras import CameraModel, Matrix, intrinsics, look_at
 from wm_nodes.core.specs import SOURCE_SIMULATOR, EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.nodes.factories import make_learner
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reward import RuleReward
 from wm_nodes.training.weights import pack_weights, unpack_weights
 
 SIDE_PX = 16
+STUCK_S = 12.0
 SLOW_S = 0.3
 """One inference of make_slow_policy."""
 GOAL_M = np.array([0.6, 0.0, 0.1], np.float32)
@@ -234,3 +236,16 @@ def make_slow_policy(config: RunConfig) -> ImagePolicy:
 
     policy.act = act_slowly  # type: ignore[method-assign]
     return policy
+
+
+def make_stuck_learner(policy: ImagePolicy, config: RunConfig) -> Any:
+    """A learner whose update hears nobody for STUCK_S, as on a crowded machine."""
+    learner = make_learner(policy, config)
+
+    def update(rollout: Any, **_more: Any) -> Any:
+        print("stuck", flush=True)
+        time.sleep(STUCK_S)
+        raise RuntimeError("nobody waits for this")
+
+    learner.update = update  # type: ignore[method-assign]
+    return learner

@@ -32,7 +32,7 @@ from wm_nodes.ros.middleware import PROFILE
 from wm_nodes.world_model import load_starts
 
 FILES: list[tuple[str, dict[str, str]]] = [
-    *((scenario, {}) for scenario in SCENARIOS), ("online_training", {"compose": "true"}),
+    *((scenario, {}) for scenario in SCENARIOS), ("online_training", {"compose": "true", "respawn": "true"}),
 ]
 """Every launch file as it starts by default, and the one whose nodes may share a process."""
 
@@ -92,7 +92,7 @@ def test_every_node_module_and_its_ros2_run_name_exist(
 def test_nodes_get_only_parameters_that_they_declare(scenario: str, given: dict[str, str]) -> None:
     """Nodes refuse unknown parameters; the declared names are read from the node's source."""
     graph, _ = launch_arguments.prepare(scenario, of(scenario, given))
-    common = {"config_file", "run_dir", "allowed_dirs", "autostart", "executor", "use_sim_time"}
+    common = {"config_file", "run_dir", "allowed_dirs", "autostart", "executor", "memory_limit_gib", "use_sim_time"}
     for node in graph.nodes:
         spec = importlib.util.find_spec(node.module)
         assert spec is not None and spec.origin is not None
@@ -289,7 +289,8 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
     with holder(Path(values["run_dir"])), pytest.raises(RunFolderInUseError, match=r"is in use by process \d+ on"):
         start.named["function"](Context({**defaults, **values}))
     nodes = start.named["function"](Context({**defaults, **values}))
-    assert set(read_arguments(Path(values["run_dir"]))[scenario]) == set(values) - {"run_dir", "domain_id", "compose"}
+    kept = set(values) - {"run_dir", "domain_id", "compose", "respawn"}
+    assert set(read_arguments(Path(values["run_dir"]))[scenario]) == kept
     (lock,) = launch_face.LOCKS
     with pytest.raises(DomainInUseError, match=r"ROS domain 7 is already in use .*domain_id:=8"):
         start.named["function"](Context({**defaults, **values}))
@@ -308,7 +309,8 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
         else:
             assert action.named["name"] == node.name
             assert action.named["parameters"] == ([dict(node.parameters)] if node.parameters else [])
-        assert ("on_exit" in action.named) == node.required
+        assert ("on_exit" in action.named) == (not node.respawn) and node.required
+        assert action.named.get("respawn", False) == node.respawn == (values.get("respawn") == "true")
         assert action.named["additional_env"]["ROS_DOMAIN_ID"] == str(runner.domain) == "7"
 
 

@@ -79,6 +79,16 @@ def test_a_video_model_is_stepped_where_it_is_named_as_the_backend(given: dict[s
             launch_arguments.prepare(scenario, {**chosen, "video_model_dir": ""})
 
 
+def test_every_node_of_every_way_to_start_has_the_limit_of_its_memory(given: dict[str, str]) -> None:
+    for more, limit in (({}, -1.0), ({"memory_limit_gib": "2.5"}, 2.5), ({"memory_limit_gib": "0"}, 0.0)):
+        for compose in ("false", "true"):
+            graph, _ = launch_arguments.prepare("online_training", {**given, **more, "compose": compose})
+            nodes = [node for process in graph.nodes for node in process.carried()]
+            assert {node.parameters["memory_limit_gib"] for node in nodes} == {limit}
+    with pytest.raises(GraphError, match="memory_limit_gib must be a number, got 'much'"):
+        launch_arguments.prepare("evaluate", {**given, "memory_limit_gib": "much"})
+
+
 def test_plug_ins_and_a_parameter_file_reach_the_nodes(given: dict[str, str], tmp_path: Path) -> None:
     file = tmp_path / "more.yaml"
     file.write_text("/**:\n  ros__parameters:\n    peer_timeout_s: 9.0\n")
@@ -93,6 +103,9 @@ def test_plug_ins_and_a_parameter_file_reach_the_nodes(given: dict[str, str], tm
     assert all(node.ros_arguments()[-2:] == ["--params-file", str(file)] for node in graph.nodes)
     graph, _ = launch_arguments.prepare("evaluate", {**given, "initial_policy": "/weights.safetensors"})
     assert graph.node("evaluation").parameters["initial_policy"] == "/weights.safetensors"
+    for scenario, more in (("online_training", {}), ("replay_offline", {"bag_uri": str(tmp_path)})):
+        graph, _ = launch_arguments.prepare(scenario, {**given, **more, "learner_factory": "mine:learner"})
+        assert graph.node("learner").parameters["learner_factory"] == "mine:learner"
     with pytest.raises(GraphError, match="needs backend_factory"):
         launch_arguments.prepare("rollout_record", {**given, "backend": "factory"})
     with pytest.raises(GraphError, match=r"params_file '/no\.yaml' does not exist"):

@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from wm_nodes.apps.help import asked_page
 from wm_nodes.core.errors import ModelNotAcceptedError, RunError
+from wm_nodes.core.interrupts import leaving_when_interrupted
 
 DONE, DIFFERENT, ERROR, NOT_ACCEPTED, INTERRUPTED = 0, 1, 2, 3, 130
 EXIT_CODES = (
@@ -126,7 +127,8 @@ def parser_of(name: str, program: str) -> Parser:
     """The parser of a verb, which imports its module. Its arguments' `run` does the verb."""
     kind, _, experiment = name.partition(" ")
     file = (experiment or kind).replace("-", "_")
-    module = import_module(f"wm_nodes.apps.{file}" if kind != "benchmark" else f"{BENCHMARKS}.{file}.cli")
+    with leaving_when_interrupted():
+        module = import_module(f"wm_nodes.apps.{file}" if kind != "benchmark" else f"{BENCHMARKS}.{file}.cli")
     parser = Parser(
         prog=program, description=module.__doc__, epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -9,6 +9,8 @@ from typing import Any
 ParameterValue = bool | int | float | str | list[str]
 COMPOSABLE = ("environment", "policy", "reward_evaluator", "learner", "recorder", "evaluation")
 """Nodes that wm_nodes.nodes.compose can carry."""
+RESPAWN_S = 2.0
+"""From the end of a node that is started again to its start."""
 
 
 class GraphError(ValueError):
@@ -19,7 +21,8 @@ class GraphError(ValueError):
 class NodeSpec:
     """One node.
 
-    namespace: absolute, e.g. /wm. required: its end ends the graph. lifecycle: ready when active, else when visible.
+    namespace: absolute, e.g. /wm. required: its end ends the graph, but with respawn it is started again.
+    lifecycle: ready when active, else when visible.
     ranks: processes under torchrun; rank 0 is the node. environment: variables on top of the graph's.
     """
 
@@ -28,6 +31,7 @@ class NodeSpec:
     namespace: str = "/wm"
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
     required: bool = True
+    respawn: bool = False
     lifecycle: bool = True
     ranks: int = 1
     log_level: str = "info"
@@ -132,7 +136,7 @@ def compose(graph: Graph, parameter_file: str) -> Graph:
     if len(inside) < 2:
         return graph
     composed = NodeSpec(
-        "wm_nodes.nodes.compose", "composed", namespace, log_level=inside[0].log_level,
+        "wm_nodes.nodes.compose", "composed", namespace, respawn=inside[0].respawn, log_level=inside[0].log_level,
         arguments=tuple(node.name for node in inside), inside=tuple(inside), parameter_file=parameter_file,
         extra_parameters=inside[0].extra_parameters,
     )

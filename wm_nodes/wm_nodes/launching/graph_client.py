@@ -8,13 +8,18 @@ from typing import Any
 import numpy as np
 import rclpy
 from rclpy.action import ActionClient
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from wm_msgs.action import Evaluate, Train, TrainVideo
+from wm_msgs.msg import RunState
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.types import BoolArray
-from wm_nodes.ros.clients import run_goal
+from wm_nodes.ros.clients import run_goal, same_process
+from wm_nodes.ros.liveliness import HEARTBEAT_S, PeerWatch, activities_here
+from wm_nodes.ros.params import PEER_TIMEOUT_S
+from wm_nodes.ros.qos import topic
 from wm_nodes.ros.spin import make_executor, spin
 
 ACCEPT_S = 30.0
@@ -48,6 +53,10 @@ class GraphClient:
         self._stop = threading.Event()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node("operator", namespace=namespace)
+        self._peers = PeerWatch("", PEER_TIMEOUT_S, activities_here())
+        row = topic("run/state")
+        self._node.create_subscription(row.type, row.name, self._note_peer, row.reader_qos)
+        self._node.create_timer(HEARTBEAT_S, self._peers.check, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._train = ActionClient(self._node, Train, "train")
         self._evaluate = ActionClient(self._node, Evaluate, "evaluate")
         self._train_video = ActionClient(self._node, TrainVideo, "video/train")
@@ -63,13 +72,13 @@ class GraphClient:
         """Play `episodes` with the newest weights (or those of policy_uri).
 
         Raises:
-            GoalFailed: the evaluation ended early. PeerLost: no evaluation node.
+            GoalFailed: the evaluation ended early. PeerLost: no evaluation node, or it ended meanwhile.
         """
         goal = Evaluate.Goal(
             episodes=episodes, seed=seed, deterministic=deterministic, behaviour=label, policy_uri=policy_uri
         )
         result = self._run(
-            self._evaluate, goal, lambda m: on_progress(m.feedback.episodes_done, m.feedback.success_rate)
+            self._evaluate, "evaluation", goal, lambda m: on_progress(m.feedback.episodes_done, m.feedback.success_rate)
         )
         return EvaluationOutcome(
             np.asarray(result.success, bool), result.success_low, result.success_high, result.mean_length,
@@ -81,19 +90,20 @@ class GraphClient:
         Train.Feedback messages.
 
         Raises:
-            GoalFailed: the training ended early. PeerLost: no learner.
+            GoalFailed: the training ended early. PeerLost: no learner, or it ended meanwhile.
         """
         goal, ends = Train.Goal(updates=updates), (Train.Result.FINISHED, Train.Result.LIMIT)
-        return self._run(self._train, goal, lambda message: on_progress(message.feedback), ends)
+        return self._run(self._train, "learner", goal, lambda message: on_progress(message.feedback), ends)
 
     def train_video(self, iterations: int, on_progress: Callable[[Any], None] = lambda feedback: None) -> int:
         """Post-train the video model on so many buffers; on_progress gets TrainVideo.Feedback. Return the new version.
 
         Raises:
-            GoalFailed: the training ended early. PeerLost: no learner.
+            GoalFailed: the training ended early. PeerLost: no learner, or it ended meanwhile.
         """
         goal = TrainVideo.Goal(iterations=iterations)
-        return int(self._run(self._train_video, goal, lambda message: on_progress(message.feedback)).policy_version)
+        result = self._run(self._train_video, "learner", goal, lambda message: on_progress(message.feedback))
+        return int(result.policy_version)
 
     def close(self) -> None:
         self._stop.set()
@@ -103,15 +113,21 @@ class GraphClient:
         rclpy.try_shutdown()
 
     def _run(
-        self, client: ActionClient, goal: Any, on_feedback: Callable[[Any], None], ends: Sequence[int] = (0,)
+        self, client: ActionClient, server: str, goal: Any, on_feedback: Callable[[Any], None],
+        ends: Sequence[int] = (0,),
     ) -> Any:
-        """ends: the reasons that are no failure; 0 is FINISHED in every action."""
-        result = run_goal(
-            client, goal, accept_s=ACCEPT_S, check=self._alive, alive=lambda: None, on_feedback=on_feedback
-        )
+        """server: the node. ends: the reasons that are no failure; 0 is FINISHED in every action."""
+        alive = same_process(self._peers, f"{self._node.get_namespace().rstrip('/')}/{server}")
+        result = run_goal(client, goal, accept_s=ACCEPT_S, check=self._alive, alive=alive, on_feedback=on_feedback)
         if result.termination_reason not in ends:
             raise GoalFailed(result.message or f"the goal ended with reason {result.termination_reason}")
         return result
+
+    def _note_peer(self, message: RunState) -> None:
+        if message.state in (RunState.FINISHED, RunState.FAILED):
+            self._peers.left(message.node)
+        else:
+            self._peers.heard(message.node, identity=message.detail)
 
     def __enter__(self) -> "GraphClient":
         return self

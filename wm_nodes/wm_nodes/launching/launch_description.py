@@ -14,7 +14,7 @@ from typing import Any
 from wm_nodes.core.run_lock import RunLock
 from wm_nodes.launching.domain_lock import DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
-from wm_nodes.launching.graph import Graph, NodeSpec
+from wm_nodes.launching.graph import RESPAWN_S, Graph, NodeSpec
 from wm_nodes.launching.scenarios import argument_table, parse_arguments, run_folder
 
 LOCKS: list[DomainLock] = []
@@ -92,7 +92,7 @@ def prepare_graph(scenario: str, given: Mapping[str, str], python: str) -> Graph
 
 
 def node_actions(graph: Graph, python: str) -> list[Any]:
-    """One launch_ros Node per NodeSpec; the end of a required one shuts the launch down."""
+    """One launch_ros Node per NodeSpec; the end of a required one shuts the launch down, or starts it again."""
     environment = graph_environment(graph.environment, python=python)
     return [_action(node, python, {**environment, **node.environment}) for node in graph.nodes]
 
@@ -108,5 +108,6 @@ def _action(node: NodeSpec, python: str, environment: dict[str, str]) -> Any:
     return Node(
         executable=python, arguments=node.program(), namespace=node.namespace,
         ros_arguments=["--log-level", node.log_level, *by_node], additional_env=environment, output="screen", **named,
-        **({"on_exit": Shutdown(reason=f"{node.label} ended")} if node.required else {}),
+        **({"on_exit": Shutdown(reason=f"{node.label} ended")} if node.required and not node.respawn else {}),
+        **({"respawn": True, "respawn_delay": RESPAWN_S} if node.respawn else {}),
     )

@@ -27,6 +27,7 @@ class NodeProcess:
     ) -> None:
         self.spec = spec
         self.command = [python, *spec.program(), *spec.ros_arguments()]
+        self.started_at = 0.0
         self.ended_at: float | None = None
         """time.monotonic() of the end, or None while it runs."""
         self._env = {**env, **spec.environment}
@@ -60,7 +61,7 @@ class NodeProcess:
         """Start the process, in an interpreter of its own where no fork server answers; the calling thread must live as
         long as the process is to live.
         """
-        self.ended_at = None
+        self.started_at, self.ended_at = time.monotonic(), None
         self._ended.clear()
         reader, output = os.pipe()
         try:

@@ -22,7 +22,7 @@ from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.domain_lock import DomainInUseError, DomainLock
 from wm_nodes.launching.environment import graph_environment, interpreter
 from wm_nodes.launching.fork_server import ForkServer
-from wm_nodes.launching.graph import Graph, GraphError, NodeSpec
+from wm_nodes.launching.graph import RESPAWN_S, Graph, GraphError, NodeSpec
 from wm_nodes.launching.process import NodeProcess
 from wm_nodes.launching.readiness import NotReadyError, activate, wait_ready
 from wm_nodes.launching.scenarios import describe_arguments, parse_arguments, run_folder
@@ -31,6 +31,7 @@ from wm_nodes.ros.middleware import PROFILE, PROFILE_VARIABLE, SEGMENT_BYTES
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 LAST_OUTPUT_S = 0.2
 """Until what a node wrote before its answer has come through its pipe."""
+LEAST_LIFE_S = 10.0
 GRACE_S = 5.0
 """Time for an orderly end after SIGINT, and again after SIGTERM."""
 
@@ -143,6 +144,7 @@ class Runner:
         ended = [
             process for label, process in self._processes.items()
             if process.spec.required and process.ended_at is not None and label not in self._expected
+            and not _comes_back(process)
         ]
         if not ended:
             return None
@@ -158,10 +160,19 @@ class Runner:
             if failure is not None:
                 self._say(failure[1])
                 return failure[0]
-            if not any(process.running for process in self._processes.values()):
+            self.respawn()
+            if not any(process.running or _comes_back(process) for process in self._processes.values()):
                 return 0
             time.sleep(0.1)
         return 0
+
+    def respawn(self) -> None:
+        """Start again what has ended by itself RESPAWN_S ago and is to come back; wait() does so."""
+        for label, process in self._processes.items():
+            rested = time.monotonic() - (process.ended_at or 0.0) > RESPAWN_S
+            if rested and label not in self._expected and _comes_back(process):
+                self._say(f"{process.exit_summary()}; starting it again")
+                self._start(label)
 
     def kill(self, name: str, number: int = signal.SIGKILL) -> None:
         """Send a signal to a node's process group; its end is then no failure of the graph."""
@@ -288,15 +299,19 @@ def main(scenario: str, argv: Sequence[str] | None = None) -> int:
 
 
 def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: float = 120.0) -> int:
-    """Run a graph until Ctrl-C, SIGTERM, or the end of a required node.
+    """Run a graph until Ctrl-C or SIGTERM (exit code 0; 130 before it is ready), or the end of a required node.
 
     Raises:
         RunFolderInUseError: another process writes into run_dir. DomainInUseError, NotReadyError: as the Runner.
+        KeyboardInterrupt: while the processes were made.
     """
     received: list[int] = []
+    starting = True
 
     def note(number: int, _frame: FrameType | None) -> None:
         received.append(number)
+        if starting and len(received) == 1:
+            raise KeyboardInterrupt
 
     previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     reach = graph.environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -307,13 +322,17 @@ def run(graph: Graph, run_dir: Path, python: str = sys.executable, ready_s: floa
             RunLock(run_dir, say=_print),
             Runner(graph, log_dir=run_dir / "logs", python=python) as runner,
         ):
+            starting = False
             print(f"[runner] {len(graph.nodes)} processes, domain {runner.domain}, run folder {run_dir}", flush=True)
             try:
                 wait_ready(graph.nodes, domain=runner.domain, timeout_s=ready_s, check=lambda: _raise(runner, received))
-            except (NodeDiedError, KeyboardInterrupt) as error:
-                print(f"[runner] {error or 'interrupted'}; stopping", flush=True)
+            except NodeDiedError as error:
+                print(f"[runner] {error}; stopping", flush=True)
                 failure = runner.failure()
-                return failure[0] if failure else 0
+                return failure[0] if failure else 1
+            except KeyboardInterrupt:
+                print("[runner] interrupted; stopping", flush=True)
+                return 128 + signal.SIGINT
             print("[runner] ready; Ctrl-C stops", flush=True)
             return runner.wait(until=lambda: bool(received))
     finally:
@@ -340,6 +359,12 @@ def preloaded(graph: Graph) -> list[str]:
 def _can_fork(node: NodeSpec) -> bool:
     """Whether the node can fork: torchrun starts its own processes, and variables may count from the first moment."""
     return node.ranks == 1 and not node.environment
+
+
+def _comes_back(process: NodeProcess) -> bool:
+    """Whether an ended node is to be started again: one that ended in its first LEAST_LIFE_S would end so again."""
+    ended_at = process.ended_at
+    return process.spec.respawn and ended_at is not None and ended_at - process.started_at > LEAST_LIFE_S
 
 
 def _domain(env: Mapping[str, str]) -> int:

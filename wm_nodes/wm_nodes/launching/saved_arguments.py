@@ -29,7 +29,7 @@ SETTINGS = (*PRESETS, "config_file", "task", *JUDGE)
 """Arguments that the saved configuration stands for."""
 NOT_KEPT = (
     "run_dir", "allowed_dirs", "domain_id", "discovery_range", "python", "log_level", "executor", "autostart",
-    "use_sim_time", "compose",
+    "use_sim_time", "respawn", "memory_limit_gib", "compose",
 )
 """Of one start, not of the run."""
 FREE = ("namespace", "params_file", "record", "bag_uri", "rate", "train", "keep_buffers", "tensorboard")

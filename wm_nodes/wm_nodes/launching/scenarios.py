@@ -62,6 +62,7 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("backend_factory", "", "module:callable(config, num_envs, seed) -> Environment (backend factory)"),
     LaunchArgument("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir"),
     LaunchArgument("reward_factory", "", "module:callable(config) -> RewardModel instead of `reward`"),
+    LaunchArgument("learner_factory", "", "module:callable(policy, config) -> Learner instead of PPO"),
     LaunchArgument("params_file", "", "ROS parameter file (YAML) for all nodes; it wins over the other arguments"),
     LaunchArgument("mode", "lockstep", "Who keeps time: the policy's steps, or the environment's clock",
                    ("lockstep", "asynchronous")),
@@ -85,6 +86,9 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("autostart", "true", "Nodes activate themselves; false: a lifecycle manager does", TRUTHS),
     LaunchArgument("use_sim_time", "false", "Nodes take their time from /clock", TRUTHS),
     LaunchArgument("log_level", "info", "Least severity that nodes log", ("debug", "info", "warn", "error")),
+    LaunchArgument("respawn", "false", "A node that ends by itself is started again; false: the graph ends", TRUTHS),
+    LaunchArgument("memory_limit_gib", "-1", "Data that each node may hold; 0: no limit; -1: an eighth of the memory, "
+                   "at least 3, and no limit where the node computes on a GPU"),
     LaunchArgument("compose", "false", "All nodes in one process: fewer copies, one interpreter", TRUTHS),
     LaunchArgument("domain_id", "", "ROS domain, 0 to 101; empty: $ROS_DOMAIN_ID, else 0"),
     LaunchArgument(
@@ -98,7 +102,7 @@ ARGUMENTS: tuple[LaunchArgument, ...] = (
 _BY_NAME = {argument.name: argument for argument in ARGUMENTS}
 _COMMON = (
     "preset", "task", "config_file", "run_dir", "allowed_dirs", "namespace", "executor", "autostart", "use_sim_time",
-    "log_level", "compose", "domain_id", "discovery_range", "python", "params_file",
+    "log_level", "respawn", "memory_limit_gib", "compose", "domain_id", "discovery_range", "python", "params_file",
 )
 
 
@@ -161,6 +165,7 @@ def _node(
         "run_dir": arguments["run_dir"],
         "autostart": arguments["autostart"] == "true",
         "executor": arguments["executor"],
+        "memory_limit_gib": float(_number(arguments, "memory_limit_gib", -1, 1e6)),
         "use_sim_time": arguments["use_sim_time"] == "true",
     }
     if allowed := [folder for folder in arguments["allowed_dirs"].split(":") if folder]:
@@ -168,7 +173,8 @@ def _node(
     values = {**common, **parameters}
     return NodeSpec(
         f"wm_nodes.nodes.{module or f'{name}_node'}", name, namespace, values, ranks=ranks,
-        log_level=arguments["log_level"], extra_parameters=arguments["params_file"],
+        respawn=arguments["respawn"] == "true", log_level=arguments["log_level"],
+        extra_parameters=arguments["params_file"],
     )
 
 
@@ -232,7 +238,7 @@ def _rollout_nodes(arguments: Mapping[str, str], backend: str, consumers: tuple[
 
 def _online_training(arguments: Mapping[str, str]) -> Graph:
     ranks = _integer(arguments, "learner_ranks", 1, 1024)
-    learner = _weights(arguments)
+    learner = _weights(arguments) | {"learner_factory": arguments["learner_factory"]}
     if arguments["backend"] in IMAGINED:
         learner["starts_file"] = arguments["first_frames_file"] or arguments["starts_file"]
     if arguments["backend"] == "video_model":
@@ -254,7 +260,8 @@ def _replay_offline(arguments: Mapping[str, str]) -> Graph:
     rate = _number(arguments, "rate", 1e-3, 1e6)
     trains = arguments["train"] == "true"
     player = _node(arguments, "player", {"bag_uri": arguments["bag_uri"], "play_at_start": not trains, "rate": rate})
-    learner = {**_weights(arguments), "replay_rate": rate, "replay_at_start": arguments["bag_uri"] if trains else ""}
+    source = {"replay_rate": rate, "replay_at_start": arguments["bag_uri"] if trains else ""}
+    learner = {**_weights(arguments), "learner_factory": arguments["learner_factory"], **source}
     return Graph("replay_offline", (player, _node(arguments, "learner", learner)))
 
 
@@ -305,7 +312,7 @@ _JUDGE = ("judge", "judge_model", "judge_key_env", "rubric")
 _TRAINING = (
     *_COMMON, "model_dir", "starts_file", "first_frames_file", "initial_policy", "backend", "video_model_dir",
     "reward", "num_envs", "simulator_envs", "simulator", "seed", "learner_ranks", "record", "bag_uri",
-    "backend_factory", "policy_factory", "reward_factory", *_JUDGE,
+    "backend_factory", "policy_factory", "learner_factory", "reward_factory", *_JUDGE,
 )
 _ROLLOUT = (
     "model_dir", "starts_file", "initial_policy", "backend", "video_model_dir", "mode", "reward", "num_envs", "seed",
@@ -320,7 +327,7 @@ SCENARIOS: dict[str, Scenario] = {
                  _online_training),
         Scenario("rollout_record", "Let a policy act and record it", (*_COMMON, *_ROLLOUT), _rollout_record),
         Scenario("replay_offline", "Play a bag; the learner trains from what is played",
-                 (*_COMMON, "model_dir", "initial_policy", "policy_factory", "bag_uri", "rate",
+                 (*_COMMON, "model_dir", "initial_policy", "policy_factory", "learner_factory", "bag_uri", "rate",
                   "train"), _replay_offline),
         Scenario("evaluate", "Measure a policy in the simulator", _EVALUATE, _evaluate),
         Scenario("world_model_rl", "Post-train the video model by GRPO on clips that it samples",

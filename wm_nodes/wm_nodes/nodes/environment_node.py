@@ -148,6 +148,7 @@ class EnvironmentNode(ManagedNode):
 
     def image(self, images: UInt8Array, stamp_ns: int) -> None:
         message = convert.mosaic_msg(images, stamp_ns, self._spec)
+        message.header.frame_id = self._cameras.mosaic_frame_id
         self._shown = message
         self._send(lambda: self._images.publish(message))
         self._send(lambda: self._show(images, message))

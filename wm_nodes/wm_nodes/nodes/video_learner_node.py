@@ -158,6 +158,8 @@ class VideoLearnerNode(TrainingNode):
             result = run_goal(client, goal, accept_s=float(self.param("accept_timeout_s")), check=check, alive=alive)
         except PeerLost as error:
             raise PeerLost(str(error) if name in str(error) else f"{name}: {error}") from None
+        if result.termination_reason == type(result).DEACTIVATED:
+            raise PeerLost(f"{name} was stopped: {result.message}")
         if result.termination_reason != type(result).FINISHED:
             raise ValueError(f"{name}: {result.message or f'ended with reason {result.termination_reason}'}")
         return result

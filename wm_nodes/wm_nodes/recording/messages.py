@@ -15,7 +15,7 @@ from wm_nodes.recording.layout import Tiles
 from wm_nodes.recording.typestore import typestore
 
 NS_PER_S = 1_000_000_000
-BASE_FRAME, CAMERA_FRAME = "wm_base", "wm_camera_optical"
+BASE_FRAME = "wm_base"
 
 KIND_START, KIND_END = 0, 1
 OUTCOME_UNKNOWN, OUTCOME_SUCCESS, OUTCOME_FAILURE = 0, 1, 2
@@ -51,7 +51,7 @@ def image_message(mosaic: UInt8Array, time_ns: int, *, encoding: str = "rgb8") -
     """sensor_msgs/Image of an uint8 (H, W, 3) mosaic."""
     height, width, channels = mosaic.shape
     return message_type("sensor_msgs/msg/Image")(
-        header=header(time_ns, CAMERA_FRAME), height=height, width=width, encoding=encoding, is_bigendian=0,
+        header=header(time_ns, BASE_FRAME), height=height, width=width, encoding=encoding, is_bigendian=0,
         step=width * channels, data=np.ascontiguousarray(mosaic).reshape(-1),
     )
 

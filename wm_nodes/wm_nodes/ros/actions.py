@@ -21,6 +21,9 @@ from wm_nodes.ros.worker import Work, WorkerNode
 
 RESULTS_KEPT_S = 120
 """How long the result of an ended goal can be asked for."""
+ABANDON_S = 3.0
+"""A goal whose work has not ended so long after its node was told to end is answered all the same; the starter kills a
+node after 10 s."""
 
 
 class _Guarded:
@@ -79,13 +82,16 @@ class WorkerAction:
         self._lock = threading.Lock()
         self._work: Work | None = None
         self._goal_id = b""
+        self._goal_handle: Any = None
         self._thread: threading.Thread | None = None
+        self._ending = ""
         self._server = _ThreadedServer(
             node, action_type, name, execute_callback=lambda goal: None,
             goal_callback=lambda request: GoalResponse.ACCEPT, cancel_callback=self._on_cancel,
             result_timeout=RESULTS_KEPT_S,
         )
         self._server.begin = self._begin
+        node.actions.append(self)
         node.own(self.destroy)
 
     @property
@@ -100,8 +106,21 @@ class WorkerAction:
         if thread is not None and thread is not threading.current_thread():
             thread.join(wait_s)
 
+    def end(self, reason: str) -> bool:
+        """Answer the running goal, as the process is about to end; return whether there was one. The answer leaves when
+        the executor spins again."""
+        with self._lock:
+            self._ending, goal_handle, work = reason, self._goal_handle, self._work
+        self.stop(reason, ABANDON_S)
+        if work is None:
+            return False
+        self._thread = None
+        self._conclude(goal_handle, work, self._end_early(self._type.Result.DEACTIVATED, reason), "abort")
+        return True
+
     def destroy(self) -> None:
         self.stop("deactivated")
+        self._node.actions.remove(self)
         self._server.destroy()
 
     def _on_cancel(self, goal_handle: ServerGoalHandle) -> CancelResponse:
@@ -117,11 +136,14 @@ class WorkerAction:
                 self._refuse(goal_handle, refusal)
                 return
             work = Work(goal_handle.request, goal_handle.publish_feedback, threading.Event())
-            self._work, self._goal_id = work, bytes(goal_handle.goal_id.uuid)
+            self._work, self._goal_handle = work, goal_handle
+            self._goal_id = bytes(goal_handle.goal_id.uuid)
         self._thread = threading.Thread(target=self._thread_main, args=(goal_handle, work), name=self._name)
         self._thread.start()
 
     def _refusal(self) -> str:
+        if self._ending:
+            return f"the node is {self._ending}"
         if not self._node.active:
             return "the node is not active; activate it first"
         return "another goal is running; cancel it or wait" if self._work is not None else ""
@@ -153,8 +175,18 @@ class WorkerAction:
         except Exception as error:
             self._node.get_logger().error(traceback.format_exc())
             text = f"{type(error).__name__}: {error}"
+            if isinstance(error, MemoryError) or "allocate memory" in text:
+                text += "; a larger memory_limit_gib allows more"
             self._node.say_failed_goal(f"{self._name} failed: {text}")
             result, state = self._end_early(reasons.FAILED, text), "abort"
+        self._conclude(goal_handle, work, result, state)
+
+    def _conclude(self, goal_handle: ServerGoalHandle, work: Work, result: Any, state: str) -> None:
+        """Answer a goal, once."""
+        with self._lock:
+            if self._work is not work:
+                return
+            self._work = None
 
         def conclude(handle: ServerGoalHandle) -> Any:
             if state == "canceled" and not handle.is_cancel_requested:
@@ -165,5 +197,4 @@ class WorkerAction:
                 getattr(handle, state)()
             return result
 
-        self._work = None
         self._server.finish(goal_handle, conclude)

@@ -30,7 +30,7 @@ from wm_nodes.core.named_files import OutsideFolders
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.recording.layout import Tiles
-from wm_nodes.recording.messages import BASE_FRAME, CAMERA_FRAME, NS_PER_S, spec_fields, spec_of, stamp_ns
+from wm_nodes.recording.messages import BASE_FRAME, NS_PER_S, spec_fields, spec_of, stamp_ns
 from wm_nodes.ros.wire import EpisodeNote, Goals, Rewards, TimedAction, Transition, WireError
 
 if TYPE_CHECKING:  # a player needs no torch
@@ -120,7 +120,7 @@ def image_msg(mosaic: UInt8Array, stamp_ns: int, encoding: str = "rgb8") -> Imag
     """uint8 (H, W, 3) to sensor_msgs/Image."""
     height, width, channels = mosaic.shape
     message = Image(height=height, width=width, encoding=encoding, is_bigendian=0, step=width * channels)
-    message.header = header(stamp_ns, CAMERA_FRAME)
+    message.header = header(stamp_ns)
     message.data = to_field(mosaic)
     return message
 

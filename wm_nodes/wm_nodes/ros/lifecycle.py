@@ -57,6 +57,8 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self.failed = False
         """True: the process should end with a non-zero exit code."""
         self._active = False
+        self.actions: list[Any] = []
+        """The ros.actions.WorkerActions that it serves."""
         self._entities: list[Callable[[], object]] = []
         self._trackers: dict[str, GapTracker] = {}
         self._introspected: list[Any] = []
@@ -227,6 +229,11 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     def is_settled(self, stop_s: float) -> bool:
         """Whether all that was sent to this node before the stop, at time.monotonic() `stop_s`, has been taken."""
         return True
+
+    def end_goals(self) -> bool:
+        """Answer the goals at work, as the process is about to end; return whether there are any."""
+        ended = [action.end("shut down") for action in self.actions]
+        return any(ended)
 
     def stop(self) -> None:
         """Go from any state to finalized; tell the peers that this is no loss."""

@@ -118,9 +118,10 @@ class Heartbeat:
     """
 
     def __init__(self, node: Any) -> None:
-        self._node, self._activities = node, ActivityWatch()
+        self._node = node
         self._name = node.get_fully_qualified_name()
         self._identity = f"process {os.getpid()} on {socket.gethostname()} since {time.time():.6f}"
+        self._activity = activities_here()
         self.peers = PeerWatch(self._name, float(node.param("peer_timeout_s")), self._activity)
         row = topic("run/state")
         self._publisher = node.create_publisher(RunState, row.name, row.qos)
@@ -198,15 +199,21 @@ class Heartbeat:
             "namespace (-r __ns:=...) or ROS_DOMAIN_ID"
         )
 
-    def _activity(self, identity: str) -> Activity | None:
-        """What the process of an identity does, where it is one of this host."""
-        match = re.fullmatch(r"process (\d{1,9}) on (\S+) since \S+", identity)
-        return self._activities.look(int(match[1])) if match and match[2] == socket.gethostname() else None
-
     def _reason(self, name: str) -> str:
         identity = self.peers.identity(name)
         activity = self._activity(identity)
         return f"; {identity.partition(' on ')[0]} {activity.value}" if activity is not None else ""
+
+
+def activities_here() -> Callable[[str], Activity | None]:
+    """A function that tells what the process of an identity does, where it is one of this host."""
+    activities = ActivityWatch()
+
+    def look(identity: str) -> Activity | None:
+        match = re.fullmatch(r"process (\d{1,9}) on (\S+) since \S+", identity)
+        return activities.look(int(match[1])) if match and match[2] == socket.gethostname() else None
+
+    return look
 
 
 def start_time(identity: str) -> float:

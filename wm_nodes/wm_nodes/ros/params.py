@@ -20,6 +20,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from wm_nodes.core.named_files import NamedFiles
 
+PEER_TIMEOUT_S = 3.0
+
 
 class ParameterError(ValueError):
     """A parameter that does not exist, or a value outside its range."""
@@ -78,7 +80,10 @@ COMMON = (
     Param("autostart", True, "Configure and activate at start, without a lifecycle manager", read_only=True),
     Param("executor", "events", "Which rclpy executor spins the node", read_only=True,
           choices=("events", "single", "multi")),
-    Param("peer_timeout_s", 3.0, "A node of the graph that is silent for longer is reported as lost", "s",
+    Param("memory_limit_gib", -1.0, "Data that the node's process may hold; 0: no limit; -1: an eighth of the memory "
+          "of machine or container, at least 3, and no limit where the node computes on a GPU", "GiB", read_only=True,
+          minimum=-1.0, maximum=1e6),
+    Param("peer_timeout_s", PEER_TIMEOUT_S, "A node of the graph that is silent for longer is reported as lost", "s",
           minimum=1.0, maximum=60.0),
     Param("service_introspection", "off", "Publish the node's service calls on <service>/_service_event",
           choices=("off", "metadata", "contents")),

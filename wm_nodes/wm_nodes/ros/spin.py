@@ -10,7 +10,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
@@ -18,22 +18,68 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from wm_nodes.config.load import read_yaml
+from wm_nodes.config.load import ConfigError, read_yaml
 from wm_nodes.core.allocator import keep_freed_memory
+from wm_nodes.core.memory_limit import limit_memory
 from wm_nodes.ros.middleware import set_node_defaults
 
 EXECUTORS = ("events", "single", "multi")
 SPIN_ONCE_S = 0.1
 """Longest wait inside one spin_once; a signal is seen after at most this long."""
 
+NO_MEMORY = "dropped what asked for more memory than there is, or than memory_limit_gib allows"
+LOG_PERIOD_S = 60.0
+_LOGGER = get_logger("spin")
+
+ANSWER_S = 0.3
+"""Time for the results of the goals that the end cuts short to leave."""
+
 SETTLE_S = 2.0
 """Longest time that nodes which still take messages may hold up the end."""
 
 SWITCH_INTERVAL_S = 0.0005
 """Python's thread switch interval: ten times shorter than the default, so that a busy worker delays callbacks less."""
+
+
+class _Dropping:
+    """Executors in Python that drop what there is no memory for. rclpy's own would never serve its sender again: an
+    error while they take something leaves the service, client or subscription marked as being at work.
+    """
+
+    def _take_service(self, service: Any) -> Any:
+        with _dropping():
+            return super()._take_service(service)  # type: ignore[misc]
+
+    def _take_client(self, client: Any) -> Any:
+        with _dropping():
+            return super()._take_client(client)  # type: ignore[misc]
+
+    def _take_subscription(self, subscription: Any) -> Any:
+        with _dropping():
+            return super()._take_subscription(subscription)  # type: ignore[misc]
+
+
+class _SingleThreaded(_Dropping, SingleThreadedExecutor):  # type: ignore[misc]
+    """The single-threaded executor."""
+
+
+class _MultiThreaded(_Dropping, MultiThreadedExecutor):  # type: ignore[misc]
+    """The multi-threaded executor."""
+
+
+@contextmanager
+def _dropping() -> Iterator[None]:
+    """Log a lack of memory, once a minute, and go on: what a request claims to hold is made before any callback."""
+    try:
+        yield
+    except (MemoryError, SystemError) as error:
+        if not isinstance(error, MemoryError) and not isinstance(error.__cause__, MemoryError):
+            raise
+        _LOGGER.error(NO_MEMORY, throttle_duration_sec=LOG_PERIOD_S)
 
 
 def make_executor(kind: str) -> Executor:
@@ -45,7 +91,7 @@ def make_executor(kind: str) -> Executor:
     if kind not in EXECUTORS:
         raise ValueError(f"executor must be one of {', '.join(EXECUTORS)}, got {kind!r}")
     if kind == "multi":
-        return MultiThreadedExecutor(num_threads=2)
+        return _MultiThreaded(num_threads=2)
     if kind == "events":
         try:
             from rclpy.experimental import EventsExecutor
@@ -53,14 +99,15 @@ def make_executor(kind: str) -> Executor:
             return EventsExecutor()
         except ImportError:
             logging.getLogger(__name__).warning("this rclpy has no EventsExecutor; using the single-threaded executor")
-    return SingleThreadedExecutor()
+    return _SingleThreaded()
 
 
 def spin(executor: Executor, until: Callable[[], bool]) -> None:
-    """Spin until `until()` is true or the context is shut down."""
+    """Spin until `until()` is true or the context is shut down. A message for which there is no memory is dropped."""
     try:
         while rclpy.ok() and not until():
-            executor.spin_once(timeout_sec=SPIN_ONCE_S)
+            with _dropping():
+                executor.spin_once(timeout_sec=SPIN_ONCE_S)
     except ExternalShutdownException:
         return
 
@@ -118,6 +165,24 @@ def _mark_failed(nodes: list[Any]) -> Iterator[None]:
         nodes[0].get_logger().fatal(f"unexpected error; stopping\n{traceback.format_exc()}")
 
 
+def _limit_memory(nodes: list[Any]) -> None:
+    """As the first node's parameter says, and before anybody asks: 48 bytes can claim to be a list of gigabytes."""
+    if not nodes[0].has_parameter("memory_limit_gib"):
+        return
+    device, file = "auto", Path(str(nodes[0].get_parameter("config_file").value))
+    with suppress(ConfigError):  # which configure tells
+        device = str(read_yaml(file).get("device", device)) if file.is_file() else device
+    limit_memory(float(nodes[0].get_parameter("memory_limit_gib").value), len(nodes), device)
+
+
+def _answer_goals(executor: Executor, nodes: list[Any]) -> None:
+    """End the goals at work and send their results: a client cannot see that its server is gone."""
+    ended = [node.end_goals() for node in nodes]
+    if any(ended):
+        until_s = time.monotonic() + ANSWER_S
+        spin(executor, until=lambda: time.monotonic() > until_s)
+
+
 def _settle(executor: Executor, nodes: list[Any]) -> None:
     began_s = time.monotonic()
     spin(
@@ -131,10 +196,10 @@ def _settle(executor: Executor, nodes: list[Any]) -> None:
 def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = None) -> int:
     """Create nodes, start them, spin until a signal, stop them, shut down. Return the exit code.
 
-    Each node is an rclpy node with start() -> bool, settled() and stop(), as ros.lifecycle.ManagedNode is. After the
-    signal it spins until all nodes are settled, for at most SETTLE_S. The first node's `executor` parameter chooses the
-    executor. A start that fails gives exit code 1 after one line of error; an exception out of a callback gives it
-    after its trace, and the nodes still stop in order.
+    Each node is a ros.lifecycle.ManagedNode. After the signal it answers the goals at work, and spins until all nodes
+    are settled, for at most SETTLE_S. The first node's `executor` parameter chooses the executor.
+    A start that fails gives exit code 1 after one line of error; an exception out of a callback gives it after its
+    trace, and the nodes still stop in order.
     """
     keep_freed_memory()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -145,12 +210,14 @@ def run_nodes(make_nodes: Callable[[], Iterable[Any]], args: list[str] | None = 
         init(args)
         with stop_on_signals() as stopped:
             nodes = list(make_nodes())
+            _limit_memory(nodes)
             executor = make_executor(executor_kind(nodes[0]))
             for node in nodes:
                 executor.add_node(node)
             with _mark_failed(nodes):
                 if stopped.interrupt(lambda: all(node.start() for node in nodes)):
                     spin(executor, until=lambda: stopped() or any(node.failed for node in nodes))
+                    _answer_goals(executor, nodes)
                     _settle(executor, nodes)
             for node in reversed(nodes):
                 with _mark_failed([node]):

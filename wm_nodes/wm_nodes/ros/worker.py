@@ -13,6 +13,8 @@ class WorkerNode(Protocol):
     """A node whose work runs in a thread; ros.lifecycle.ManagedNode is one."""
 
     diagnostics: Diagnostics
+    actions: list[Any]
+    """The WorkerActions that it serves."""
 
     @property
     def active(self) -> bool: ...

@@ -8,6 +8,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from wm_nodes.core.cameras import CameraModel, quaternion
 from wm_nodes.core.types import Environment, UInt8Array
+from wm_nodes.recording.messages import BASE_FRAME
 from wm_nodes.ros import convert
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.qos import TOPICS
@@ -94,6 +95,11 @@ class CameraTopics:
             self._tf = node.publish_unnumbered("/tf")
             if static:
                 node.publish_unnumbered("/tf_static").publish(message(transforms=static))
+
+    @property
+    def mosaic_frame_id(self) -> str:
+        """The frame of env/image, which is in the TF: that of the first camera, and without cameras the base."""
+        return next((outlets.frame_id for outlets in self._outlets.values()), BASE_FRAME)
 
     def show(self, images: UInt8Array, mosaic: Image) -> None:
         """Publish what is due. images: uint8 (N, H, W, 3); mosaic: the env/image message of the same observation."""

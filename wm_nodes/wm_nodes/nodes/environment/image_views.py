@@ -8,7 +8,6 @@ import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
 
 from wm_nodes.core.types import UInt8Array
-from wm_nodes.recording.messages import CAMERA_FRAME
 from wm_nodes.ros import convert
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
@@ -26,12 +25,13 @@ PARAMS = (
 )
 
 
-def jpeg_msg(mosaic: UInt8Array, stamp_ns: int, quality: int) -> CompressedImage:
-    """uint8 (H, W, 3), RGB, to a JPEG (quality 1 to 100) as image_transport's compressed plug-in would name it."""
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(mosaic, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+def jpeg_msg(mosaic: Image, quality: int) -> CompressedImage:
+    """An rgb8 image as a JPEG (quality 1 to 100), named as image_transport's compressed plug-in would."""
+    pixels = np.frombuffer(mosaic.data, np.uint8).reshape(mosaic.height, mosaic.width, 3)
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise ValueError(f"cannot encode an image of shape {mosaic.shape} as JPEG")
-    message = CompressedImage(header=convert.header(stamp_ns, CAMERA_FRAME), format="rgb8; jpeg compressed bgr8")
+        raise ValueError(f"cannot encode an image of shape {pixels.shape} as JPEG")
+    message = CompressedImage(header=mosaic.header, format="rgb8; jpeg compressed bgr8")
     message.data = convert.to_field(data)
     return message
 
@@ -48,17 +48,16 @@ class ImageViews:
 
     def show(self, images: UInt8Array, mosaic: Image) -> None:
         """Publish what is due. images: uint8 (N, H, W, 3); mosaic: the env/image message of the same observation."""
-        stamp_ns = convert.time_ns(mosaic.header.stamp)
         if self._view.get_subscription_count():
             shown = int(self._param("view_env"))
             if 0 <= shown < len(images) and self._due("view"):
-                self._view.publish(convert.image_msg(images[shown], stamp_ns, mosaic.encoding))
+                message = convert.image_msg(images[shown], 0, mosaic.encoding)
+                message.header = mosaic.header
+                self._view.publish(message)
         when = self._param("compressed")
         wanted = when == "always" or (when == "subscribed" and self._compressed.get_subscription_count())
         if wanted and self._due("compressed"):
-            pixels = np.frombuffer(mosaic.data, np.uint8).reshape(mosaic.height, mosaic.width, 3)
-            quality = int(self._param("compressed_quality"))
-            self._compressed.publish(jpeg_msg(pixels, stamp_ns, quality))
+            self._compressed.publish(jpeg_msg(mosaic, int(self._param("compressed_quality"))))
 
     def _due(self, what: str) -> bool:
         now = time.monotonic()

@@ -94,7 +94,8 @@ class LiveRollouts:
         goal = RolloutAction.Goal(
             policy_version=version, steps=self._num_steps, seed=self._seed, reset=True, behaviour="policy"
         )
-        same_policy = same_process(node.peers, f"{node.get_namespace().rstrip('/')}/policy")
+        policy = f"{node.get_namespace().rstrip('/')}/policy"
+        same_policy = same_process(node.peers, policy)
 
         def alive() -> None:
             self._check_peers()
@@ -106,7 +107,7 @@ class LiveRollouts:
         if result.termination_reason == RolloutAction.Result.FAILED:
             raise WireError(ErrorCode.INTERNAL, f"the policy node failed: {result.message}")
         if result.termination_reason != RolloutAction.Result.FINISHED:
-            raise PeerLost(result.message or "the rollout was cut short")
+            raise PeerLost(f"{policy} cut the rollout short: {result.message}")
         span = (result.env_session, result.first_step_id, result.last_step_id)
         deadline = time.monotonic() + float(node.param("join_timeout_s"))
         while missing := self._assembler.missing(*span):
@@ -228,12 +229,13 @@ class ReplayedRollouts:
             if self._closed.is_set():
                 raise PeerLost("training has ended")
 
+        alive = same_process(self._node.peers, f"{self._node.get_namespace().rstrip('/')}/player")
         try:
             for uri in uris:
                 goal = Replay.Goal(
                     bag_uri=uri, rate=float(self._node.param("replay_rate")), publish_clock=True, topics=list(REPLAYED)
                 )
-                result = run_goal(client, goal, accept_s=10.0, check=check, alive=lambda: None)
+                result = run_goal(client, goal, accept_s=10.0, check=check, alive=alive)
                 if result.termination_reason != Replay.Result.FINISHED:
                     raise WireError(ErrorCode.IO_ERROR, f"the player ended: {result.message}")
         except Exception as error:  # raised again by next()
