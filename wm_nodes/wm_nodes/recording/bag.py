@@ -10,7 +10,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
-from rosbags.rosbag2.metadata import parse_qos
 
 from wm_nodes.config.load import read_yaml
 from wm_nodes.core.specs import EnvironmentSpec
@@ -242,7 +241,7 @@ def _connections(information: Mapping[str, Any], files: Sequence[storage.BagFile
         Connection(
             0, row["name"], row["type"], MessageDefinition(MessageDefinitionFormat.NONE, ""),
             row.get("type_description_hash") or "", 0,
-            ConnectionExtRosbag2(row["serialization_format"], parse_qos(row.get("offered_qos_profiles") or [])), None,
+            ConnectionExtRosbag2(row["serialization_format"], storage.qos_of(row.get("offered_qos_profiles"))), None,
         )
         for row in rows
     )

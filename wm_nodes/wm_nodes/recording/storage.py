@@ -17,7 +17,8 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, MessageIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
-from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat, Qos
+from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
@@ -253,11 +254,17 @@ def mcap_connection(channel: Channel, schema: Schema | None) -> Connection:
         id=channel.id, topic=channel.topic, msgtype=schema.name if schema is not None else "",
         msgdef=MessageDefinition(formats.get(encoding, MessageDefinitionFormat.NONE), text),
         digest=channel.metadata.get("topic_type_hash", ""), msgcount=0,
-        ext=ConnectionExtRosbag2(
-            channel.message_encoding, parse_qos(channel.metadata.get("offered_qos_profiles", ""))
-        ),
+        ext=ConnectionExtRosbag2(channel.message_encoding, qos_of(channel.metadata.get("offered_qos_profiles"))),
         owner=None,
     )
+
+
+def qos_of(profiles: Any) -> list[Qos]:
+    """Recorded QoS profiles, as YAML text or as what it says; none where they cannot be understood."""
+    try:
+        return parse_qos(profiles or [])
+    except (ReaderError, KeyError, TypeError, AttributeError):
+        return []
 
 
 def goes_back(values: Sequence[int]) -> bool:

@@ -78,7 +78,7 @@ def recorded_hash(connection: Connection) -> str:
 
 def other_type(connection: Connection) -> str:
     """How the type of a recorded topic differs from ours; "" where it is the same, or not known to be another."""
-    if connection.msgtype not in typestore().fielddefs:
+    if not is_known(connection.msgtype):
         return ""
     recorded, ours = recorded_hash(connection), type_hash(connection.msgtype)
     return f"another {connection.msgtype} ({recorded}, ours is {ours})" if recorded not in ("", ours) else ""
@@ -99,6 +99,10 @@ def message_definition(msgtype: str) -> str:
     return _SEPARATOR.join(section if section.endswith("\n") else section + "\n" for section in sections)
 
 
+def is_known(msgtype: str) -> bool:
+    return msgtype in typestore().fielddefs
+
+
 def _check_known(msgtype: str) -> None:
-    if msgtype not in typestore().fielddefs:
+    if not is_known(msgtype):
         raise BagError(f"unknown message type {msgtype!r}; known: ROS 2 Jazzy's common interfaces and {PACKAGE}")
