@@ -165,9 +165,10 @@ class Playback:
             tick(start_ns)
             publish(name, data)
         damaged: list[str] = []
-        for name, time_ns, data in bag.messages(self._names, start_ns=start_ns, damaged=damaged):
+        messages = bag.messages(self._names, start_ns=start_ns, damaged=damaged)
+        for number, (name, time_ns, data) in enumerate(messages):
             self._note_damage(damaged, say)
-            self._follow_clock(time_ns, say)
+            self._follow_clock(time_ns, say, is_start=number == 0 and bag.in_file_order)
             if not self._wait_for(time_ns, tick, check, say):
                 return False
             tick(time_ns)
@@ -201,14 +202,16 @@ class Playback:
                 say(f"bag {self._path} is damaged, and this part is left out: {part}")
         damaged.clear()
 
-    def _follow_clock(self, time_ns: int, say: Say) -> None:
+    def _follow_clock(self, time_ns: int, say: Say, *, is_start: bool) -> None:
         """Go on at once with a message before which the recorder's clock was set back, or forward by days."""
         with self._condition:
             gap_s = (time_ns - self._position_ns) / NS_PER_S
-            if self._seek_ns is not None or -STEP_S <= gap_s < GAP_S:
+            if self._seek_ns is not None or (-STEP_S <= gap_s < GAP_S and not is_start):
                 return
             self._anchor, self._position_ns = (time.monotonic(), time_ns), time_ns
-        say(f"the bag's time goes {'on' if gap_s > 0 else 'back'} by {abs(gap_s):.0f} s here, which is not waited for")
+        if not is_start:
+            way = "on" if gap_s > 0 else "back"
+            say(f"the bag's time goes {way} by {abs(gap_s):.0f} s here, which is not waited for")
 
     def _take_seek(self) -> int:
         with self._condition:
