@@ -99,7 +99,7 @@ def test_a_recording_whose_clock_was_set_back_is_played_in_the_order_it_was_made
     assert published == [(name, data) for name, _, data in messages]
     assert len(said) == 1 and "goes back by 3600 s" in said[0]
     assert time.monotonic() - began < 10
-    assert played(Playback(tmp_path / "bag", rate=1e6, start_offset_s=3599.5))[0] == published
+    assert played(Playback(tmp_path / "bag", rate=1e6, start_offset_s=1.0))[0] == published
 
 
 LATCHED, KEPT, VOLATILE = topics.LATCHED, topics.VERSIONS, topics.METRICS

@@ -42,6 +42,9 @@ NOT_PLAYED = ("/run/state", "/flow/credit", "/clock", "/diagnostics")
 MATCH_S = 1.0
 """Time for subscribers to find fresh publishers before the first message, s."""
 
+RELEASE_S = 2.0
+"""How long the executor may hold on to a destroyed publisher, whose topic has its type until then, s."""
+
 LINKS_S = 5.0
 """How long at most the first message waits for nodes of the graph that have not found each other (ros.links), s."""
 
@@ -168,8 +171,16 @@ class PlayerNode(ManagedNode):
         if self._offered.get(name) == (kind, qos):
             return
         if name in self._outlets:
+            del self._offered[name]
             self.destroy_publisher(self._outlets.pop(name))
-        self._outlets[name], self._offered[name] = self.create_publisher(kind, name, qos), (kind, qos)
+        deadline = time.monotonic() + RELEASE_S
+        while name not in self._outlets:
+            try:
+                self._outlets[name], self._offered[name] = self.create_publisher(kind, name, qos), (kind, qos)
+            except RuntimeError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.02)
 
     def _play(self, playback: Playback, request: Replay.Goal, work: Work | None) -> None:
         last_feedback = 0.0
