@@ -227,7 +227,8 @@ def test_a_recovered_bag_of_ours_keeps_our_comments_and_hashes(tmp_path: Path) -
 
 def test_an_mcap_file_without_chunks_or_index_is_read_in_the_order_of_time(tmp_path: Path) -> None:
     texts = [m.serialize(m.message_type("std_msgs/msg/String")(data=str(number))) for number in range(5)]
-    for number, options in enumerate(({"use_chunking": False}, {"index_types": IndexType.NONE}, {"use_statistics": False})):
+    without = {"use_chunking": False}, {"index_types": IndexType.NONE}, {"use_statistics": False}
+    for number, options in enumerate(without):
         path = tmp_path / f"{number}.mcap"
         with path.open("wb") as stream:
             writer = McapWriter(stream, **options)  # type: ignore[arg-type]

@@ -80,7 +80,7 @@ def test_a_long_wait_is_said_once_and_ends_by_a_seek(tmp_path: Path) -> None:
     threading.Timer(0.3, playback.seek, (601.0,)).start()
     published, said = played(playback)
     assert [data for _, data in published] == [text(0), text(2)]
-    assert said == ["the next message is at 600.000 s of the bag, due in 300 s; seek to go on sooner"]
+    assert said == ["the next message is at 600.000 s of the bag, due in 300 s; seek to go on now"]
 
 
 def test_a_recording_whose_clock_was_set_back_is_played_in_the_order_it_was_made(tmp_path: Path) -> None:
@@ -115,7 +115,8 @@ def latched_bag(path: Path) -> Path:
             for name in ("/spec", "/version", "/chatter"):
                 writer.write(name, text(number), NOW_NS + number * 10**9)
             if number < 3:
-                writer.write("/tf_static", m.serialize(m.message_type(TRANSFORMS)(transforms=[])), NOW_NS + number * 10**9)
+                none = m.serialize(m.message_type(TRANSFORMS)(transforms=[]))
+                writer.write("/tf_static", none, NOW_NS + number * 10**9)
     return path
 
 
@@ -124,7 +125,9 @@ def test_a_start_within_a_bag_gives_the_latched_messages_of_before_it_first(tmp_
     playback = Playback(path, rate=100.0, start_offset_s=3.5)
     published, _ = played(playback)
     before, after = published[:6], published[6:]
-    assert [name for name, _ in before] == [f"/{name}" for name in "tf_static tf_static version tf_static spec version".split()]
+    assert [name for name, _ in before] == [
+        "/tf_static", "/tf_static", "/version", "/tf_static", "/spec", "/version"
+    ]
     assert [data for name, data in before if name == "/version"] == [text(2), text(3)]
     assert ("/spec", text(3)) in before
     assert after == [(name, text(number)) for number in (4, 5) for name in ("/spec", "/version", "/chatter")]

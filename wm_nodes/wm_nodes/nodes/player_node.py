@@ -153,7 +153,7 @@ class PlayerNode(ManagedNode):
             connections = list(bag.connections)
         problems = {c.topic: problem for c in connections if (problem := _problem(c))}
         if asked := [f"{name}: {problems[name]}" for name in names if name in problems]:
-            raise BagError(f"bag {path} cannot be played on {'; '.join(asked)}; name other topics in the goal's `topics`")
+            raise BagError(f"bag {path} cannot be played on {'; '.join(asked)}; name others in the goal's `topics`")
         if names:
             return names
         wanted = {c.topic for c in connections if not c.topic.endswith(NOT_PLAYED)}
@@ -209,10 +209,8 @@ class PlayerNode(ManagedNode):
         finally:
             self._playback = None
         if playback.damaged:
-            raise BagError(
-                f"bag {request.bag_uri or self.param('bag_uri')} is damaged: {'; '.join(playback.damaged)}; all else was "
-                f"played, {playback.messages} messages"
-            )
+            parts, name = "; ".join(playback.damaged), request.bag_uri or self.param("bag_uri")
+            raise BagError(f"bag {name} is damaged: {parts}; all else was played, {playback.messages} messages")
 
     def _say(self, text: str) -> None:
         self.get_logger().warning(text)

@@ -248,6 +248,7 @@ def _connections(information: Mapping[str, Any], files: Sequence[storage.BagFile
     for connection in chain(announced, *(file.connections for file in files)):
         known = found.setdefault((connection.topic, connection.msgtype), connection)
         if known is not connection:
+            assert isinstance(known.ext, ConnectionExtRosbag2)
             found[connection.topic, connection.msgtype] = known._replace(
                 msgcount=known.msgcount + connection.msgcount, digest=known.digest or connection.digest,
                 msgdef=connection.msgdef if known.msgdef.format is MessageDefinitionFormat.NONE else known.msgdef,

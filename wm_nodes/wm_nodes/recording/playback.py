@@ -62,7 +62,8 @@ class Playback:
                 recorded = ", ".join(sorted(c.topic for c in bag.connections))
                 raise BagError(f"bag {path} has no topic {', '.join(missing)}; it holds {recorded}")
             if loop and not any(bag.count(name) for name in self.topics):
-                raise BagError(f"bag {path} has no message on {', '.join(self.topics) or 'any topic'} to play in a loop")
+                names = sorted(self.topics) or ["any topic"]
+                raise BagError(f"bag {path} has no message on {', '.join(names)} to play in a loop")
         self._condition = threading.Condition()
         self._paused, self._steps, self._stopped = paused, 0, False
         self._seek_ns: int | None = None
@@ -253,7 +254,7 @@ class Playback:
                 position_ns = self._position_ns
             if wait_s > LONG_WAIT_S and not is_said:
                 is_said = True
-                say(f"the next message is at {position_s:.3f} s of the bag, due in {wait_s:.0f} s; seek to go on sooner")
+                say(f"the next message is at {position_s:.3f} s of the bag, due in {wait_s:.0f} s; seek to go on now")
             tick(position_ns)
 
 

@@ -78,7 +78,7 @@ class RawBagWriter:
         return self._stream.tell() if self._stream is not None and not self._stream.closed else 0
 
     def add_topic(self, name: str, msgtype: str, qos: Sequence[Qos] = ()) -> None:
-        """Announce a topic (absolute name) of a type that we know. Announcing it again with the same type does nothing."""
+        """Announce a topic (absolute name) of a type that we know; again with the same type does nothing."""
         if self._is_new(name, msgtype):
             text = message_definition(msgtype)
             self._announce(TopicInfo(name, msgtype, type_hash(msgtype), tuple(qos)), "ros2msg", text)

@@ -14,11 +14,10 @@ from mcap.records import Channel, Message, Metadata, Schema
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import ReaderError
 
+from wm_nodes.recording import storage
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.raw import PARTIAL_SUFFIX, START_RECORD, RawBagWriter
-from wm_nodes.recording.storage import (
-    SUFFIXES, Note, Sqlite3File, is_sqlite3, mcap_connection, plain_message, scan_mcap, unpacked,
-)
+from wm_nodes.recording.storage import Note
 
 
 @dataclass(frozen=True)
@@ -50,18 +49,18 @@ def recover(path: Path, *, output: Path | None = None) -> RecoverReport:
         BagError: nothing to read at `path`, no complete message in it, or `output` exists.
     """
     path = Path(path)
-    found = (file for file in path.iterdir() if file.name.endswith(SUFFIXES)) if path.is_dir() else (path,)
+    found = (file for file in path.iterdir() if file.name.endswith(storage.SUFFIXES)) if path.is_dir() else (path,)
     files = sorted(found, key=_file_number)
     if not files or not files[0].is_file():
-        raise BagError(f"no .mcap file at {path}, and no .db3 file; give the .partial folder, a bag folder or one of its files")
+        raise BagError(f"no .mcap file at {path}, nor a .db3 file; give the .partial folder, a bag folder or a file")
     target = output if output is not None else _default_output(path)
     damaged: list[str] = []
     writer = RawBagWriter(target, custom={"wm.recovered_from": str(path)})
     try:
         with TemporaryDirectory(prefix="wm_bag_") as scratch:
             for file in files:
-                plain = unpacked(file, Path(scratch), damaged.append)
-                (_copy_rows if is_sqlite3(plain) else _copy_records)(plain, writer, damaged.append)
+                plain = storage.unpacked(file, Path(scratch), damaged.append)
+                (_copy_rows if storage.is_sqlite3(plain) else _copy_records)(plain, writer, damaged.append)
         if not writer.messages:
             raise BagError(f"{path} holds no complete message; nothing to recover ({'; '.join(damaged) or 'empty'})")
     except BaseException:
@@ -76,22 +75,23 @@ def recover(path: Path, *, output: Path | None = None) -> RecoverReport:
 def _copy_records(file: Path, writer: RawBagWriter, note: Note) -> None:
     schemas: dict[int, Schema] = {}
     names: dict[int, str] = {}
-    for record in scan_mcap(file, note):
+    for record in storage.scan_mcap(file, note):
         if isinstance(record, Metadata) and record.name == START_RECORD:
             for key, value in record.metadata.items():
                 writer.custom.setdefault(key, value)
         elif isinstance(record, Schema):
             schemas[record.id] = record
         elif isinstance(record, Channel):
-            if _copy_topic(mcap_connection(record, schemas.get(record.schema_id)), writer, note):
+            if _copy_topic(storage.mcap_connection(record, schemas.get(record.schema_id)), writer, note):
                 names[record.id] = record.topic
         elif isinstance(record, Message) and record.channel_id in names:
-            writer.write(names[record.channel_id], plain_message(record.data), record.log_time, record.publish_time)
+            data = storage.plain_message(record.data)
+            writer.write(names[record.channel_id], data, record.log_time, record.publish_time)
 
 
 def _copy_rows(file: Path, writer: RawBagWriter, note: Note) -> None:
     try:
-        with closing(Sqlite3File(file)) as opened:
+        with closing(storage.Sqlite3File(file)) as opened:
             names = [c.topic for c in opened.connections if _copy_topic(c, writer, note)]
             for topic, time_ns, data in opened.in_file(names, note):
                 writer.write(topic, data, time_ns)

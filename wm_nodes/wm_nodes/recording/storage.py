@@ -1,5 +1,5 @@
-"""The files of a bag, whoever wrote them: MCAP or sqlite3, plain or compressed by zstd. What a file is and what it holds
-is read from the file itself, since metadata.yaml may say less (after a re-indexing) or something else."""
+"""The files of a bag, whoever wrote them: MCAP or sqlite3, plain or compressed by zstd. What a file is and holds is
+read from the file itself, since metadata.yaml may say less (after a re-indexing) or something else."""
 
 import heapq
 import struct
@@ -191,10 +191,8 @@ BagFile = McapFile | Sqlite3File
 
 
 def open_file(path: Path, scratch: Path, note: Note) -> BagFile:
-    """Open a file of a bag by what it begins with. scratch: an existing folder, into which a compressed one is unpacked.
-
-    Raises what the reader of the format raises for a damaged file.
-    """
+    """Open a file of a bag by what it begins with. scratch: a folder, into which a compressed one is unpacked.
+    Raises what the reader of the format raises for a damaged file."""
     path = unpacked(path, scratch, note)
     if is_sqlite3(path):
         return Sqlite3File(path)

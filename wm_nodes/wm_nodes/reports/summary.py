@@ -39,10 +39,11 @@ class Summary:
 
     real_, imagined_: success before and after training, in the simulator and in the world model.
     imagined_steps_per_s: environment steps of the training in the world model, per second of training.
-    bag: path of the recorded training, in the file relative to the run folder. paired, imagined_paired: after minus before on the same seeds, with the keys
-        difference, low and high (and more); empty where not measured.
-    acceptance: AcceptanceReport.to_dict(). samples: environment steps trained on. minutes: of the whole run.
-    command: as typed. machine: facts by name.
+    bag: path of the recorded training, in the file relative to the run folder.
+    paired, imagined_paired: after minus before on the same seeds, with the keys difference, low and high (and more);
+        empty where not measured.
+    acceptance: AcceptanceReport.to_dict(). samples: environment steps trained on. minutes: of the whole run,
+    as first done. command: as typed. machine: facts by name.
     exploit_meter: one mapping for each reading, in order: step (updates made before it) and the numbers of
         policy_rl.exploit_meter.ExploitReading.metrics(). stopped: why training ended before all updates, by round.
     by_task: of a task whose every episode is one of several, the real success of each: successes_before and _after,
@@ -78,8 +79,8 @@ class Summary:
 
 
 def write_summary(run_dir: Path, summary: Any) -> Path:
-    """Write <run_dir>/summary.json, complete or not at all, unless it says the same already. A number that is not finite
-    becomes null; a bag in the run folder is named from there, so that the folder can be moved."""
+    """Write <run_dir>/summary.json, complete or not at all, unless it says so already; a number that is not finite
+    becomes null, and a bag in the run folder is named from there, so that the folder can be moved."""
     path, values = Path(run_dir) / FILE_NAME, _values(summary)
     bag, folder = Path(summary.bag).absolute(), Path(run_dir).absolute()
     if summary.bag and bag.is_relative_to(folder):
