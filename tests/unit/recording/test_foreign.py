@@ -10,15 +10,15 @@ import yaml
 from mcap.writer import IndexType
 from mcap.writer import Writer as McapWriter
 from recording_graph import NUM_ENVS, Graph, assert_same_rollout, write
-from recording_samples import assert_same_episode, make_episode, make_spec
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from recording_samples import add, assert_same_episode, foreign_copy, make_episode, make_spec
+from rosbags.rosbag2 import CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from wm_nodes.recording import Bag, BagError, BagReport, EpisodeBagWriter, RawBagWriter, read_episodes, recover
 from wm_nodes.recording import messages as m
 from wm_nodes.recording.bag import is_bag
 from wm_nodes.recording.rollouts import read_rollouts
-from wm_nodes.recording.typestore import message_definition, typestore
+from wm_nodes.recording.typestore import message_definition
 
 FORMATS = [
     (plugin, mode) for plugin in StoragePlugin for mode in CompressionMode
@@ -33,23 +33,6 @@ def own_bag(path: Path, count: int = 4) -> Path:
         for index in range(count):
             writer.write(make_episode(spec, index))
     return path
-
-
-def foreign_copy(
-    source: Path, path: Path, plugin: StoragePlugin = StoragePlugin.MCAP, mode: CompressionMode = CompressionMode.NONE
-) -> Path:
-    """The bag as rosbags' writer writes it: its texts of the definitions have none of our comments."""
-    writer = Writer(path, version=9, storage_plugin=plugin)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    with Bag(source) as bag, writer:
-        topics = {c.topic: add(writer, c.topic, c.msgtype, list(c.ext.offered_qos_profiles)) for c in bag.connections}
-        for topic, time_ns, data in bag.messages():
-            writer.write(topics[topic], time_ns, data)
-    return path
-
-
-def add(writer: Writer, topic: str, msgtype: str, qos: Any = ()) -> Any:
-    return writer.add_connection(topic, msgtype, typestore=typestore(), offered_qos_profiles=qos)
 
 
 def timed_copy(source: Path, path: Path, time_of: Callable[[int, int], int]) -> Path:
