@@ -1,13 +1,17 @@
-"""Episodes and specs for the recording tests: small, random, every field different from its default."""
+"""Episodes, specs and foreign bags for the recording tests: small, random, every field different from its default."""
 
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Episode
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
+from wm_nodes.recording.bag import Bag
+from wm_nodes.recording.typestore import typestore
 
 
 def make_spec(num_envs: int = 1, height: int = 8, width: int = 12, **changes: Any) -> EnvironmentSpec:
@@ -66,3 +70,20 @@ def assert_same_episode(found: Episode, expected: Episode) -> None:
             np.testing.assert_array_equal(ours, theirs, err_msg=field.name)
         else:
             assert ours == theirs, field.name
+
+
+def foreign_copy(
+    source: Path, path: Path, plugin: StoragePlugin = StoragePlugin.MCAP, mode: CompressionMode = CompressionMode.NONE
+) -> Path:
+    """The bag as rosbags' writer writes it: its texts of the definitions have none of our comments."""
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with Bag(source) as bag, writer:
+        topics = {c.topic: add(writer, c.topic, c.msgtype, list(c.ext.offered_qos_profiles)) for c in bag.connections}
+        for topic, time_ns, data in bag.messages():
+            writer.write(topics[topic], time_ns, data)
+    return path
+
+
+def add(writer: Writer, topic: str, msgtype: str, qos: Any = ()) -> Any:
+    return writer.add_connection(topic, msgtype, typestore=typestore(), offered_qos_profiles=qos)

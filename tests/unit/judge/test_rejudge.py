@@ -11,7 +11,8 @@ import pytest
 from judge_server import PickyServer
 from numpy.typing import NDArray
 from recording_graph import NUM_ENVS, Graph, write
-from recording_samples import make_spec
+from recording_samples import foreign_copy, make_spec
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import default_judge
@@ -101,5 +102,9 @@ def test_the_command_writes_a_line_per_episode_and_names_what_is_wrong(
     lines = json.loads(rows.read_text())["episodes"]
     assert lines and all(line["status"] == "OK" and 0 < line["reward"] <= 1 for line in lines)
     assert f"{len(lines)} episodes judged ({len(lines)} OK)" in said and "0 recorded lock-steps" in said
+    for plugin, mode in ((StoragePlugin.SQLITE3, CompressionMode.NONE), (StoragePlugin.MCAP, CompressionMode.FILE)):
+        foreign = foreign_copy(bag, tmp_path / plugin.name, plugin, mode)
+        assert main(["rescore", str(foreign), *given[1:]]) == 0, capsys.readouterr().err
+        assert f"{len(lines)} episodes judged ({len(lines)} OK)" in capsys.readouterr().out
     assert main(["rescore", str(bag), "--judge-model", "judge"]) == 2 and "needs a judge" in capsys.readouterr().err
     assert main(["rescore", str(tmp_path / "none"), *given[1:]]) == 2 and "none" in capsys.readouterr().err

@@ -16,7 +16,15 @@ from wm_nodes.reports.curves import Panel, curves, read_series
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture, write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.summary import SuccessRate, Summary, read_readings, read_summary, write_summary
+from wm_nodes.reports.summary import (
+    FILE_NAME,
+    SuccessRate,
+    Summary,
+    as_first_made,
+    read_readings,
+    read_summary,
+    write_summary,
+)
 from wm_nodes.reports.tables import (
     EXPLOIT_COLUMNS,
     exploit_rows,
@@ -42,6 +50,15 @@ SUMMARY = Summary(
             {"name": "recall", "value": None, "threshold": 0.6, "rule": ">=", "passed": False, "remedy": "more data"},
         ],
     },
+)
+
+
+SAME = ScoreChange(0.5, 0.5, 0.0, -0.1, 0.1, "")
+CLIPS = ClipSummary(
+    "push_cube", "smoke", 3, iterations=6, version=12, weights="averaged", contexts=48, evaluations=3,
+    scores=dict.fromkeys(TITLES, SAME) | {"tracking": ScoreChange(0.5, 0.6, 0.1, 0.05, 0.15, "better")},
+    hacked=[{"step": 6, "reward_slope": 0.1, "slopes": {"scenery": -0.2}, "text": "scenery gets <worse>"}],
+    bag="/runs/b/bags/x", machine={"processor": "P & Q"},
 )
 
 
@@ -208,6 +225,35 @@ def test_a_summary_from_before_acceptance_had_its_name_reads_like_one_of_today(t
     assert read_summary(tmp_path) == now and now["acceptance"]["criteria"]
 
 
+def test_a_summary_names_its_bag_from_the_run_folder_which_can_be_moved(tmp_path: Path) -> None:
+    bag = tmp_path / "run" / "bags" / "training_120000"
+    bag.mkdir(parents=True)
+    path = write_summary(tmp_path / "run", replace(SUMMARY, bag=str(bag)))
+    assert json.loads(path.read_text())["bag"] == "bags/training_120000" and str(tmp_path) not in path.read_text()
+    assert read_summary(tmp_path / "run")["bag"] == str(bag)
+    moved = (tmp_path / "run").rename(tmp_path / "moved")
+    assert read_summary(moved)["bag"] == str(moved / "bags" / "training_120000")
+    (moved / FILE_NAME).write_text((moved / FILE_NAME).read_text().replace('"bags/', f'"{tmp_path}/run/bags/'))
+    assert read_summary(moved)["bag"] == str(moved / "bags" / "training_120000"), "an older one, moved"
+
+
+@pytest.mark.parametrize("summary", [SUMMARY, CLIPS], ids=["loop 1", "loop 2"])
+def test_a_finished_run_that_is_run_again_keeps_its_summary(tmp_path: Path, summary: Summary | ClipSummary) -> None:
+    bag = tmp_path / "run" / "bags" / "training"
+    bag.mkdir(parents=True)
+    summary = replace(summary, bag=str(bag), minutes=12.0)
+    path = write_summary(tmp_path / "run", summary)
+    written = path.read_bytes(), path.stat().st_mtime_ns
+    again = as_first_made(tmp_path / "run", replace(summary, minutes=0.2, command="again", machine={"processor": "Q"}))
+    write_summary(tmp_path / "run", again)
+    assert again == summary and (path.read_bytes(), path.stat().st_mtime_ns) == written
+    other = replace(summary, seed=4, minutes=0.3, command="other")
+    assert as_first_made(tmp_path / "run", other) == other, "other results are of the newest call"
+    assert as_first_made(tmp_path / "new", other) == other
+    moved = (tmp_path / "run").rename(tmp_path / "moved")
+    assert as_first_made(moved, replace(summary, minutes=0.2)) == replace(summary, bag=str(moved / "bags" / "training"))
+
+
 def test_an_unfinished_run_has_no_summary_and_the_error_says_so(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"summary.json does not exist: the run has not come to its end"):
         read_summary(tmp_path)
@@ -247,15 +293,6 @@ def test_a_report_of_a_missing_picture_is_refused_by_name(tmp_path: Path) -> Non
     with pytest.raises(FileNotFoundError, match=r"gone.png"):
         write_report(tmp_path, SUMMARY, [Picture("Strip", "", tmp_path / "gone.png")])
     assert not (tmp_path / "report.html").exists()
-
-
-SAME = ScoreChange(0.5, 0.5, 0.0, -0.1, 0.1, "")
-CLIPS = ClipSummary(
-    "push_cube", "smoke", 3, iterations=6, version=12, weights="averaged", contexts=48, evaluations=3,
-    scores=dict.fromkeys(TITLES, SAME) | {"tracking": ScoreChange(0.5, 0.6, 0.1, 0.05, 0.15, "better")},
-    hacked=[{"step": 6, "reward_slope": 0.1, "slopes": {"scenery": -0.2}, "text": "scenery gets <worse>"}],
-    bag="/runs/b/bags/x", machine={"processor": "P & Q"},
-)
 
 
 def test_the_report_of_loop_2_shows_scores_alarms_and_how_to_do_it_again(tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.rejudge import judge_bag
 from wm_nodes.judge.service import READS, JudgeService, agent_scores, buffer_jobs, clip_fps
 from wm_nodes.policy_rl.rescoring import recorded_model, rescore_bag
+from wm_nodes.recording.bag import is_bag
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.reports.summary import plain, read_summary
@@ -73,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Return 0 where all that could be compared is equal, else 1."""
     prepare_torch()
     bag = _recording(arguments.recording)
-    if bag.suffix != ".mcap" and not any(bag.glob("*.mcap")):
+    if not is_bag(bag):
         equal, content, path = _rescore_clips(arguments)
     else:
         path = arguments.json
@@ -87,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _recording(path: Path) -> Path:
     """The recording itself; of a run folder of train-policy, the bag of its training."""
-    return path / "bags" / Path(read_summary(path)["bag"]).name if (path / "policies").is_dir() else path
+    return Path(read_summary(path)["bag"]) if (path / "policies").is_dir() else path
 
 
 def _rescore_rewards(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dict[str, Any]]:

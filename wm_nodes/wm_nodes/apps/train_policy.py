@@ -39,7 +39,7 @@ from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_f
 from wm_nodes.policy_rl.pretraining import load_arrays, make_model
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.summary import Summary, read_readings, write_summary
+from wm_nodes.reports.summary import Summary, as_first_made, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.folder import read_world_manifest
@@ -126,7 +126,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         if config.exploit_meter.every:
             _check_meter(config, starts, stage)
         found = run_rounds(job, model_dir, weak, partial(_judge, job, model_dir, arguments.force), waiting)
-    summary = Summary(
+    summary = as_first_made(run_dir, Summary(
         task=config.task, preset=arguments.preset, seed=config.seed,
         real_before=success_rate(found.real_before), real_after=success_rate(found.real_after),
         imagined_before=success_rate(found.imagined_before), imagined_after=success_rate(found.imagined_after),
@@ -138,7 +138,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
         exploit_meter=read_readings(run_dir), stopped=found.stopped,
         by_task=_by_task(config, found.real_before, found.real_after),
         judge=judge_name(episode_judge(config)) if arguments.reward == AGENT else "",
-    )
+    ))
     write_summary(run_dir, summary)
     policy = load_policy(config, found.model_dir, found.policy)
     pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT_SEEDS)

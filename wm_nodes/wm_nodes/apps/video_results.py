@@ -17,7 +17,7 @@ from wm_nodes.reports.curves import curves
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.summary import write_summary
+from wm_nodes.reports.summary import as_first_made, write_summary
 from wm_nodes.training.metrics import FILE_NAME, read_metrics
 from wm_nodes.training.weights import load_weights_file
 from wm_nodes.video_model.clips import Clips
@@ -50,7 +50,7 @@ def conclude(
     before = load_or_measure_scores(run_dir / BEFORE, base_folder, heldout, probe, config)
     after = load_or_measure_scores(run_dir / AFTER, trained, heldout, probe, config)
     watched = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []
-    summary = ClipSummary(
+    summary = as_first_made(run_dir, ClipSummary(
         task=config.task, preset=preset, seed=config.seed, iterations=iterations, version=version,
         weights="averaged" if config.grpo.ema_decay > 0 else "last", contexts=len(before["success"]),
         scores={
@@ -63,7 +63,7 @@ def conclude(
             for line in watched if (alarms := alarms_of(line))
         ],
         bag=bag, minutes=minutes, command=command, machine=machine_facts(config.device), date=time.strftime("%Y-%m-%d"),
-    )
+    ))
     path = write_summary(run_dir, summary)
     generators = [ClipGenerator(folder, heldout, config) for folder in (base_folder, trained)]
     strips = _strips(config, run_dir, heldout, generators)
@@ -77,7 +77,7 @@ def conclude(
     console.print(scores_table(summary))
     for alarm in summary.hacked:
         console.print(f"[bold yellow]reward hacking[/] after {alarm['step']} buffers: {alarm['text']}", highlight=False)
-    console.print(f"report   {report}\nsummary  {path}\nbag      {bag}", highlight=False)
+    console.print(f"report   {report}\nsummary  {path}\nbag      {summary.bag}", highlight=False)
 
 
 def score_change(name: str, before: Sequence[float], after: Sequence[float], seed: int) -> ScoreChange:

@@ -5,10 +5,14 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+from rclpy.exceptions import NameValidationException
 from rclpy.publisher import Publisher
-from rosbags.interfaces import ConnectionExtRosbag2
+from rclpy.qos import QoSProfile
+from rclpy.validate_full_topic_name import validate_full_topic_name
+from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -19,6 +23,7 @@ from wm_nodes.nodes.recorder.qos import message_class, offered_qos
 from wm_nodes.recording import Bag, BagError
 from wm_nodes.recording.cdr import session_and_seq
 from wm_nodes.recording.playback import Playback
+from wm_nodes.recording.typestore import other_type
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.convert import time_msg
@@ -36,6 +41,9 @@ NOT_PLAYED = ("/run/state", "/flow/credit", "/clock", "/diagnostics")
 
 MATCH_S = 1.0
 """Time for subscribers to find fresh publishers before the first message, s."""
+
+RELEASE_S = 2.0
+"""How long the executor may hold on to a destroyed publisher, whose topic has its type until then, s."""
 
 LINKS_S = 5.0
 """How long at most the first message waits for nodes of the graph that have not found each other (ros.links), s."""
@@ -62,6 +70,7 @@ class PlayerNode(ManagedNode):
         self._playback: Playback | None = None
         self._thread: threading.Thread | None = None
         self._outlets: dict[str, Publisher] = {}
+        self._offered: dict[str, tuple[type[Any], QoSProfile]] = {}  # of the outlets; a next bag may have others
         self._lock = threading.Lock()
 
     def configure(self) -> None:
@@ -99,7 +108,7 @@ class PlayerNode(ManagedNode):
     def cleanup(self) -> None:
         for publisher in self._outlets.values():
             self.destroy_publisher(publisher)
-        self._outlets = {}
+        self._outlets, self._offered = {}, {}
 
     def update_diagnostics(self) -> None:
         playback = self._playback
@@ -121,24 +130,57 @@ class PlayerNode(ManagedNode):
         with self._lock:
             if self._playback is not None:
                 raise BagError("another bag is being played; cancel that goal or wait")
-            if not names:
-                with Bag(path) as bag:
-                    names = [c.topic for c in bag.connections if not c.topic.endswith(NOT_PLAYED)]
             playback = Playback(
-                path, names=names, rate=request.rate, start_offset_s=request.start_offset, loop=request.loop,
-                paused=bool(self.param("start_paused")),
+                path, names=self._playable(path, names), rate=request.rate, start_offset_s=request.start_offset,
+                loop=request.loop, paused=bool(self.param("start_paused")),
             )
             self._playback = playback
         try:
             for name, connection in playback.topics.items():
-                if name not in self._outlets:
-                    assert isinstance(connection.ext, ConnectionExtRosbag2)
-                    qos = offered_qos(list(connection.ext.offered_qos_profiles))
-                    self._outlets[name] = self.create_publisher(message_class(connection.msgtype), name, qos)
-        except ValueError:
+                self._make_outlet(name, connection)
+        except BaseException:
             self._playback = None
             raise
         return playback
+
+    def _playable(self, path: Path, names: list[str]) -> list[str]:
+        """The named topics, or all of the bag that can be played; those left out are said and counted.
+
+        Raises:
+            BagError: a named topic cannot be played, or none can.
+        """
+        with Bag(path) as bag:
+            connections = list(bag.connections)
+        problems = {c.topic: problem for c in connections if (problem := _problem(c))}
+        if asked := [f"{name}: {problems[name]}" for name in names if name in problems]:
+            raise BagError(f"bag {path} cannot be played on {'; '.join(asked)}; name others in the goal's `topics`")
+        if names:
+            return names
+        wanted = {c.topic for c in connections if not c.topic.endswith(NOT_PLAYED)}
+        left_out = [f"{name}: {problems[name]}" for name in sorted(wanted & problems.keys())]
+        if left_out and wanted <= problems.keys():
+            raise BagError(f"bag {path} has no topic that can be played: {'; '.join(left_out)}")
+        for text in left_out:
+            self.get_logger().warning(f"not played: {text}")
+            self.diagnostics.count("left_out_topics", text=f"not played: {text}")
+        return sorted(wanted - problems.keys())
+
+    def _make_outlet(self, name: str, connection: Connection) -> None:
+        assert isinstance(connection.ext, ConnectionExtRosbag2)
+        kind, qos = message_class(connection.msgtype), offered_qos(list(connection.ext.offered_qos_profiles))
+        if self._offered.get(name) == (kind, qos):
+            return
+        if name in self._outlets:
+            del self._offered[name]
+            self.destroy_publisher(self._outlets.pop(name))
+        deadline = time.monotonic() + RELEASE_S
+        while name not in self._outlets:
+            try:
+                self._outlets[name], self._offered[name] = self.create_publisher(kind, name, qos), (kind, qos)
+            except RuntimeError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.02)
 
     def _play(self, playback: Playback, request: Replay.Goal, work: Work | None) -> None:
         last_feedback = 0.0
@@ -163,9 +205,16 @@ class PlayerNode(ManagedNode):
 
         try:
             self._await_readers(playback, check)
-            playback.run(publish, tick, check)
+            playback.run(publish, tick, check, self._say)
         finally:
             self._playback = None
+        if playback.damaged:
+            parts, name = "; ".join(playback.damaged), request.bag_uri or self.param("bag_uri")
+            raise BagError(f"bag {name} is damaged: {parts}; all else was played, {playback.messages} messages")
+
+    def _say(self, text: str) -> None:
+        self.get_logger().warning(text)
+        self.diagnostics.count("playback_warnings", text=text)
 
     def _await_readers(self, playback: Playback, check: Callable[[], None]) -> None:
         """Wait until the outlets' subscribers have found them; a paused player lets the user wait instead."""
@@ -249,6 +298,21 @@ class PlayerNode(ManagedNode):
             response.error_code, response.message = ErrorCode.OUT_OF_RANGE, str(error)
             self.diagnostics.count("refused_requests", text=f"player request refused: {error}")
         return response
+
+
+def _problem(connection: Connection) -> str:
+    """Why a recorded topic cannot be played; "" where it can."""
+    assert isinstance(connection.ext, ConnectionExtRosbag2)
+    if connection.ext.serialization_format != "cdr":
+        return f"its messages are {connection.ext.serialization_format or 'of no known format'}, and cdr is published"
+    if difference := other_type(connection):
+        return f"it was recorded with {difference}"
+    try:
+        message_class(connection.msgtype)
+        validate_full_topic_name(connection.topic)
+    except (ValueError, NameValidationException) as error:
+        return str(error).replace("\n", " ")
+    return ""
 
 
 def main() -> None:

@@ -85,7 +85,6 @@ class LockSteps:
     """
 
     def __init__(self, bag: Bag, *, namespace: str | None = None, reward_name: str | None = None) -> None:
-        bag.check_types()
         self.bag = bag
         self.namespace = bag.namespace(namespace)
         self.spec, self.tiles = bag.spec(self.namespace)
@@ -93,6 +92,7 @@ class LockSteps:
         self.lost = 0
         self._reward_name = reward_name
         self._names = {topics.absolute(self.namespace, topic): topic for topic in topics.ALL_TOPICS}
+        bag.check_types(self._names)
         self._counts = {topic: bag.count(name) for name, topic in self._names.items()}
         if not self._counts[topics.IMAGES]:
             raise BagError(

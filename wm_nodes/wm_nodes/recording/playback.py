@@ -2,17 +2,35 @@
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability, QosHistory
 
 from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
 
 NS_PER_S = 1_000_000_000
 CLOCK_PERIOD_S = 0.025
-"""The clock ticks at least this often while playing, s of wall time."""
+"""The clock ticks at least this often while playing, s of wall time; a loop begins again at most this often."""
 
+GAP_S = 86_400
+"""Recorded time that is not waited for: in a gap of a day the recorder's clock was set, s."""
+
+STEP_S = 0.1
+"""How far messages may be out of order before the recorder's clock was set back (ntpd sets it from 0.128 s on), s."""
+
+LONG_WAIT_S = 5.0
+"""A wait for the next message that is announced, s of wall time."""
+
+STATIC_TRANSFORMS = "/tf_static"
 Publish = Callable[[str, bytes], None]
+Say = Callable[[str], None]
+
+
+def _say_nothing(text: str) -> None:
+    """Where nobody wants to hear."""
 
 
 class Playback:
@@ -23,8 +41,12 @@ class Playback:
         rate: recorded seconds per second, > 0.
         start_offset_s: where to begin, s from the first message.
 
+    damaged: parts of the bag that could not be read and were left out. messages: published so far; latched ones of
+    before the position that playing began at, which are published first, are not counted.
+
     Raises:
-        BagError: an unusable bag, a topic it does not hold, or a rate or offset out of range.
+        BagError: an unusable bag, a topic it does not hold, no message to play in a loop, or a rate or offset out of
+            range.
     """
 
     def __init__(
@@ -39,6 +61,9 @@ class Playback:
             if missing:
                 recorded = ", ".join(sorted(c.topic for c in bag.connections))
                 raise BagError(f"bag {path} has no topic {', '.join(missing)}; it holds {recorded}")
+            if loop and not any(bag.count(name) for name in self.topics):
+                names = sorted(self.topics) or ["any topic"]
+                raise BagError(f"bag {path} has no message on {', '.join(names)} to play in a loop")
         self._condition = threading.Condition()
         self._paused, self._steps, self._stopped = paused, 0, False
         self._seek_ns: int | None = None
@@ -46,6 +71,7 @@ class Playback:
         self._anchor: tuple[float, int] = (time.monotonic(), self.start_ns)
         self._position_ns = self.start_ns
         self.messages = 0
+        self.damaged: list[str] = []
         self.set_rate(rate)
         self.seek(start_offset_s)
 
@@ -107,32 +133,44 @@ class Playback:
             self._stopped = True
             self._condition.notify_all()
 
-    def run(self, publish: Publish, tick: Callable[[int], None], check: Callable[[], None] = lambda: None) -> None:
+    def run(
+        self, publish: Publish, tick: Callable[[int], None], check: Callable[[], None] = lambda: None,
+        say: Say = _say_nothing,
+    ) -> None:
         """Play to the end, or until stop(), or until check() raises.
 
         Args:
             publish: gets (absolute topic, CDR bytes).
             tick: gets the bag's time, ns, before each message and every CLOCK_PERIOD_S.
             check: called many times a second.
+            say: gets a sentence for each damaged part, long wait and jump of the recorder's clock.
         """
         try:
             with Bag(self._path) as bag:
                 while not self._stopped:
                     start_ns = self._take_seek()
-                    ended = self._play_from(bag, start_ns, publish, tick, check)
-                    if ended and not self._loop:
+                    ended = self._play_from(bag, start_ns, publish, tick, check, say)
+                    if ended and not (self._loop and (self.messages or start_ns > self.start_ns)):
                         return
                     if ended:
-                        self._restart()
+                        self._restart(check)
         finally:
             self.stop()
 
     def _play_from(
-        self, bag: Bag, start_ns: int, publish: Publish, tick: Callable[[int], None], check: Callable[[], None]
+        self, bag: Bag, start_ns: int, publish: Publish, tick: Callable[[int], None], check: Callable[[], None],
+        say: Say,
     ) -> bool:
         """Return True at the end of the bag, False when another position was asked for or playing was stopped."""
-        for name, time_ns, data in bag.messages(self._names, start_ns=start_ns):
-            if not self._wait_for(time_ns, tick, check):
+        for name, data in self._latched_before(bag, start_ns, check):
+            tick(start_ns)
+            publish(name, data)
+        damaged: list[str] = []
+        messages = bag.messages(self._names, start_ns=start_ns, damaged=damaged)
+        for number, (name, time_ns, data) in enumerate(messages):
+            self._note_damage(damaged, say)
+            self._follow_clock(time_ns, say, is_start=number == 0 and bag.in_file_order)
+            if not self._wait_for(time_ns, tick, check, say):
                 return False
             tick(time_ns)
             publish(name, data)
@@ -141,7 +179,40 @@ class Playback:
                 self._steps = max(0, self._steps - 1)
                 self._position_ns = time_ns
                 self._condition.notify_all()
+        self._note_damage(damaged, say)
         return True
+
+    def _latched_before(self, bag: Bag, start_ns: int, check: Callable[[], None]) -> Iterator[tuple[str, bytes]]:
+        """What a reader that came at start_ns would have got of the latched topics, in the order of the recording."""
+        kept = {name: deque[tuple[int, bytes]](maxlen=_depth(topic)) for name, topic in self.topics.items()}
+        kept = {name: queue for name, queue in kept.items() if queue.maxlen != 0 and bag.count(name)}
+        if start_ns <= self.start_ns or not kept:
+            return
+        for number, (name, time_ns, data) in enumerate(bag.messages(kept, damaged=[])):
+            check()
+            if time_ns >= start_ns:
+                break
+            kept[name].append((number, data))
+        for _, name, data in sorted((number, name, data) for name, queue in kept.items() for number, data in queue):
+            yield name, data
+
+    def _note_damage(self, damaged: list[str], say: Say) -> None:
+        for part in damaged:
+            if part not in self.damaged:
+                self.damaged.append(part)
+                say(f"bag {self._path} is damaged, and this part is left out: {part}")
+        damaged.clear()
+
+    def _follow_clock(self, time_ns: int, say: Say, *, is_start: bool) -> None:
+        """Go on at once with a message before which the recorder's clock was set back, or forward by days."""
+        with self._condition:
+            gap_s = (time_ns - self._position_ns) / NS_PER_S
+            if self._seek_ns is not None or (-STEP_S <= gap_s < GAP_S and not is_start):
+                return
+            self._anchor, self._position_ns = (time.monotonic(), time_ns), time_ns
+        if not is_start:
+            way = "on" if gap_s > 0 else "back"
+            say(f"the bag's time goes {way} by {abs(gap_s):.0f} s here, which is not waited for")
 
     def _take_seek(self) -> int:
         with self._condition:
@@ -150,13 +221,16 @@ class Playback:
             self._anchor = time.monotonic(), start_ns
             return start_ns
 
-    def _restart(self) -> None:
+    def _restart(self, check: Callable[[], None]) -> None:
+        check()
         with self._condition:
+            self._condition.wait_for(lambda: self._stopped or self._seek_ns is not None, CLOCK_PERIOD_S)
             if self._seek_ns is None:
                 self._seek_ns = self.start_ns
 
-    def _wait_for(self, time_ns: int, tick: Callable[[int], None], check: Callable[[], None]) -> bool:
+    def _wait_for(self, time_ns: int, tick: Callable[[int], None], check: Callable[[], None], say: Say) -> bool:
         """Wait until a message is due; False: play from elsewhere, or not at all."""
+        is_said = False
         while True:
             check()
             with self._condition:
@@ -169,11 +243,27 @@ class Playback:
                 now_ns = began_ns + round((time.monotonic() - began_s) * self._rate * NS_PER_S)
                 if self._paused or now_ns >= time_ns:
                     return True
-                self._condition.wait(min(CLOCK_PERIOD_S, (time_ns - now_ns) / NS_PER_S / self._rate))
+                wait_s = (time_ns - now_ns) / NS_PER_S / self._rate
+                position_s = (time_ns - self.start_ns) / NS_PER_S
+                self._condition.wait(min(CLOCK_PERIOD_S, wait_s))
                 if self._paused or self._seek_ns is not None:
                     continue
                 began_s, began_ns = self._anchor
                 now_ns = began_ns + round((time.monotonic() - began_s) * self._rate * NS_PER_S)
                 self._position_ns = min(time_ns, max(self._position_ns, now_ns))
                 position_ns = self._position_ns
+            if wait_s > LONG_WAIT_S and not is_said:
+                is_said = True
+                say(f"the next message is at {position_s:.3f} s of the bag, due in {wait_s:.0f} s; seek to go on now")
             tick(position_ns)
+
+
+def _depth(topic: Connection) -> int | None:
+    """How many messages of a topic its recorded publishers keep for readers that come later; None: all."""
+    assert isinstance(topic.ext, ConnectionExtRosbag2)
+    latched = [qos for qos in topic.ext.offered_qos_profiles if qos.durability is QosDurability.TRANSIENT_LOCAL]
+    if latched and topic.topic.endswith(STATIC_TRANSFORMS):
+        return None  # they add up, from however many publishers
+    if any(qos.history is QosHistory.KEEP_ALL for qos in latched):
+        return None
+    return sum(max(qos.depth, 1) for qos in latched)

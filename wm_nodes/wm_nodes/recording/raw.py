@@ -8,11 +8,11 @@ from io import BufferedWriter
 from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
-from rosbags.interfaces import Qos
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat, Qos
 
 from wm_nodes.recording.errors import BagError, RecordingError
 from wm_nodes.recording.metadata import FileInfo, TopicInfo, metadata_text, qos_text
-from wm_nodes.recording.typestore import message_definition, type_hash
+from wm_nodes.recording.typestore import is_known, message_definition, recorded_hash, type_hash
 
 PARTIAL_SUFFIX = ".partial"
 START_RECORD = "wm.start"
@@ -51,6 +51,7 @@ class RawBagWriter:
         self.files: list[FileInfo] = []
         self._topics: dict[str, TopicInfo] = {}
         self._channels: dict[str, int] = {}
+        self._definitions: dict[str, tuple[str, str]] = {}  # by type: encoding and text
         self._chunk_bytes, self._flush_s = chunk_bytes, flush_s
         self._split_bytes, self._split_s, self._clock = split_bytes, split_s, clock
         self._writer: Writer | None = None
@@ -77,14 +78,40 @@ class RawBagWriter:
         return self._stream.tell() if self._stream is not None and not self._stream.closed else 0
 
     def add_topic(self, name: str, msgtype: str, qos: Sequence[Qos] = ()) -> None:
-        """Announce a topic (absolute name). Announcing it again with the same type does nothing."""
-        known = self._topics.get(name)
-        if known is not None:
-            if known.msgtype != msgtype:
-                raise BagError(f"topic {name} is recorded as {known.msgtype}; it cannot also be {msgtype}")
+        """Announce a topic (absolute name) of a type that we know; again with the same type does nothing."""
+        if self._is_new(name, msgtype):
+            text = message_definition(msgtype)
+            self._announce(TopicInfo(name, msgtype, type_hash(msgtype), tuple(qos)), "ros2msg", text)
+
+    def copy_topic(self, recorded: Connection) -> None:
+        """Announce a topic of another bag, of whichever type, with its definition as it is there."""
+        if not self._is_new(recorded.topic, recorded.msgtype):
             return
-        self._topics[name] = TopicInfo(name, msgtype, type_hash(msgtype), tuple(qos))
-        self._register(self._topics[name])
+        assert isinstance(recorded.ext, ConnectionExtRosbag2)
+        if recorded.ext.serialization_format != "cdr":
+            raise BagError(
+                f"topic {recorded.topic} holds {recorded.ext.serialization_format} messages; rosbag2 bags hold cdr"
+            )
+        qos, definition = tuple(recorded.ext.offered_qos_profiles), recorded.msgdef
+        if definition.format is MessageDefinitionFormat.NONE and is_known(recorded.msgtype):
+            self.add_topic(recorded.topic, recorded.msgtype, qos)
+            return
+        encoding = {MessageDefinitionFormat.IDL: "ros2idl", MessageDefinitionFormat.MSG: "ros2msg"}
+        self._announce(
+            TopicInfo(recorded.topic, recorded.msgtype, recorded_hash(recorded), qos),
+            encoding.get(definition.format, ""), definition.data,
+        )
+
+    def _is_new(self, name: str, msgtype: str) -> bool:
+        known = self._topics.get(name)
+        if known is not None and known.msgtype != msgtype:
+            raise BagError(f"topic {name} is recorded as {known.msgtype}; it cannot also be {msgtype}")
+        return known is None
+
+    def _announce(self, topic: TopicInfo, encoding: str, definition: str) -> None:
+        self._definitions.setdefault(topic.msgtype, (encoding, definition))
+        self._topics[topic.name] = topic
+        self._register(topic)
 
     def write(self, topic: str, data: bytes | memoryview, time_ns: int, publish_ns: int | None = None) -> None:
         """Write one serialised message. time_ns: when it was received; publish_ns: when sent, if known."""
@@ -198,8 +225,8 @@ class RawBagWriter:
     def _register(self, topic: TopicInfo) -> None:
         writer = self._open_writer()
         if topic.msgtype not in self._schemas:
-            text = message_definition(topic.msgtype).encode()
-            self._schemas[topic.msgtype] = writer.register_schema(topic.msgtype, "ros2msg", text)
+            encoding, text = self._definitions[topic.msgtype]
+            self._schemas[topic.msgtype] = writer.register_schema(topic.msgtype, encoding, text.encode())
         metadata = {"offered_qos_profiles": qos_text(topic.qos), "topic_type_hash": topic.type_hash}
         self._channels[topic.name] = writer.register_channel(topic.name, "cdr", self._schemas[topic.msgtype], metadata)
 

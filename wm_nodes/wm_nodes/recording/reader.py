@@ -54,7 +54,6 @@ class _Builder:
 def read_spec(path: Path, *, namespace: str | None = None) -> EnvironmentSpec:
     """Return the spec of the recorded environment. num_envs is 1 in bags of EpisodeBagWriter."""
     with Bag(path) as bag:
-        bag.check_types()
         return bag.spec(bag.namespace(namespace))[0]
 
 

@@ -4,7 +4,8 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from wm_nodes.recording.errors import BagError
@@ -56,6 +57,35 @@ def type_hash(msgtype: str) -> str:
 
 
 @lru_cache(maxsize=256)
+def _definition_hash(msgtype: str, text: str, is_idl: bool) -> str:
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_idl(text) if is_idl else get_types_from_msg(text, msgtype))
+        return store.hash_rihs01(msgtype)
+    except Exception:  # whatever a parser makes of a foreign text
+        return ""
+
+
+def recorded_hash(connection: Connection) -> str:
+    """The RIHS01 hash of a recorded topic's type: as its writer says, else of the recorded definition, which may differ
+    from ours in comments and order; "" where the bag tells neither."""
+    if connection.digest:
+        return connection.digest
+    definition = connection.msgdef
+    if definition.format is MessageDefinitionFormat.NONE:
+        return ""
+    return _definition_hash(connection.msgtype, definition.data, definition.format is MessageDefinitionFormat.IDL)
+
+
+def other_type(connection: Connection) -> str:
+    """How the type of a recorded topic differs from ours; "" where it is the same, or not known to be another."""
+    if not is_known(connection.msgtype):
+        return ""
+    recorded, ours = recorded_hash(connection), type_hash(connection.msgtype)
+    return f"another {connection.msgtype} ({recorded}, ours is {ours})" if recorded not in ("", ours) else ""
+
+
+@lru_cache(maxsize=256)
 def message_definition(msgtype: str) -> str:
     """The text to embed in a bag: the type, then every type it needs; ours with their comments (units, order)."""
     _check_known(msgtype)
@@ -70,6 +100,10 @@ def message_definition(msgtype: str) -> str:
     return _SEPARATOR.join(section if section.endswith("\n") else section + "\n" for section in sections)
 
 
+def is_known(msgtype: str) -> bool:
+    return msgtype in typestore().fielddefs
+
+
 def _check_known(msgtype: str) -> None:
-    if msgtype not in typestore().fielddefs:
+    if not is_known(msgtype):
         raise BagError(f"unknown message type {msgtype!r}; known: ROS 2 Jazzy's common interfaces and {PACKAGE}")

@@ -40,7 +40,8 @@ class ClipSummary:
     scores: by name. contexts: held-out ones behind each. iterations: buffers trained on. version: optimizer steps.
     weights: which ones were measured after, "averaged" or "last". evaluations: held-out ones made while training.
     hacked: evaluations with an alarm of DD-2: step (buffers trained on), reward_slope, slopes by score, text.
-    bag: newest recording. minutes: of this call. command: as typed. machine: facts by name. date: year-month-day.
+    bag: newest recording. minutes, command (as typed), machine (facts by name), date (year-month-day): of the call that
+        made the results.
     """
 
     task: str

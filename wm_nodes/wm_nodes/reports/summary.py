@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,8 @@ from wm_nodes.core.model_folder import AGAIN, read_json
 from wm_nodes.training.metrics import read_metrics
 
 FILE_NAME = "summary.json"
+OF_THE_CALL = ("minutes", "command", "machine", "date")
+"""What a summary says of the call that made the results, not of them."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +40,11 @@ class Summary:
 
     real_, imagined_: success before and after training, in the simulator and in the world model.
     imagined_steps_per_s: environment steps of the training in the world model, per second of training.
-    bag: path of the recorded training. paired, imagined_paired: after minus before on the same seeds, with the keys
-        difference, low and high (and more); empty where not measured.
-    acceptance: AcceptanceReport.to_dict(). samples: environment steps trained on. minutes: of the whole run.
-    command: as typed. machine: facts by name.
+    bag: path of the recorded training, in the file relative to the run folder.
+    paired, imagined_paired: after minus before on the same seeds, with the keys difference, low and high (and more);
+        empty where not measured.
+    acceptance: AcceptanceReport.to_dict(). samples: environment steps trained on. minutes: of the whole run,
+    as first done. command: as typed. machine: facts by name.
     exploit_meter: one mapping for each reading, in order: step (updates made before it) and the numbers of
         policy_rl.exploit_meter.ExploitReading.metrics(). stopped: why training ended before all updates, by round.
     by_task: of a task whose every episode is one of several, the real success of each: successes_before and _after,
@@ -77,17 +80,21 @@ class Summary:
 
 
 def write_summary(run_dir: Path, summary: Any) -> Path:
-    """Write <run_dir>/summary.json, complete or not at all; a number that is not finite becomes null."""
-    path, values = Path(run_dir) / FILE_NAME, plain(asdict(summary))
-    for name, value in vars(summary).items():
-        if isinstance(value, SuccessRate):
-            values[name]["rate"] = value.rate
-    write_atomic(path, (json.dumps(values, indent=1, allow_nan=False) + "\n").encode())
+    """Write <run_dir>/summary.json, complete or not at all, unless it says so already; a number that is not finite
+    becomes null, and a bag in the run folder is named from there, so that the folder can be moved."""
+    path, values = Path(run_dir) / FILE_NAME, _values(summary)
+    bag, folder = Path(summary.bag).absolute(), Path(run_dir).absolute()
+    if summary.bag and bag.is_relative_to(folder):
+        values["bag"] = str(bag.relative_to(folder))
+    data = (json.dumps(values, indent=1, allow_nan=False) + "\n").encode()
+    if not (path.is_file() and path.read_bytes() == data):
+        write_atomic(path, data)
     return path
 
 
 def read_summary(run_dir: Path) -> dict[str, Any]:
-    """The values of <run_dir>/summary.json; `acceptance` is called gate in older ones.
+    """The values of <run_dir>/summary.json, with the path of the bag as bag_path() says; `acceptance` is called gate in
+    older ones.
 
     Raises:
         FileNotFoundError: the run has not ended; names the file.
@@ -96,7 +103,36 @@ def read_summary(run_dir: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: the run has not come to its end")
     values = read_json(path, AGAIN)
+    values["bag"] = bag_path(run_dir, values.get("bag", ""))
     return {"acceptance" if name == "gate" else name: value for name, value in values.items()}
+
+
+def as_first_made(run_dir: Path, summary: Any) -> Any:
+    """The summary of a run that was done before and gave the same results: with the duration, command, machine and date
+    of the call that made them. Of another run: as it is. In both, the bag as bag_path() says."""
+    summary = replace(summary, bag=bag_path(run_dir, summary.bag))
+    if not (Path(run_dir) / FILE_NAME).is_file():
+        return summary
+    kept, values = read_summary(run_dir), _values(summary)
+    call = {name: kept[name] for name in OF_THE_CALL if name in kept and name in values}
+    if kept != {**values, **call}:
+        return summary
+    return replace(summary, **{name: math.nan if value is None else value for name, value in call.items()})
+
+
+def bag_path(run_dir: Path, bag: str) -> str:
+    """The path of a run's bag, which may be relative to the run folder; where that was moved since, the bag of the same
+    name in it. "" without a bag."""
+    path, moved = Path(run_dir, bag), Path(run_dir) / "bags" / Path(bag).name
+    return str((moved if not path.exists() and moved.exists() else path).absolute()) if bag else ""
+
+
+def _values(summary: Any) -> dict[str, Any]:
+    values: dict[str, Any] = plain(asdict(summary))
+    for name, value in vars(summary).items():
+        if isinstance(value, SuccessRate):
+            values[name]["rate"] = value.rate
+    return values
 
 
 def read_readings(run_dir: Path) -> list[dict[str, Any]]:

@@ -146,7 +146,7 @@ def read_clips(bag: Path, *, pictures: bool = False) -> Iterator[RecordedClips]:
     wanted = (topics.CLIPS, topics.CLIP_SCORES, *((topics.CLIP_IMAGES,) if pictures else ()))
     rows = {topics.absolute(topics.DEFAULT_NAMESPACE, topic): topic for topic in wanted}
     with Bag(bag) as opened:
-        opened.check_types()
+        opened.check_types([*rows, topics.absolute(topics.DEFAULT_NAMESPACE, topics.VERDICT)])
         verdicts = _read_verdicts(opened)
         for name in rows:
             if not opened.count(name):

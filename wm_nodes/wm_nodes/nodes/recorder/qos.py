@@ -25,7 +25,8 @@ def recorded_qos(profile: QoSProfile) -> Qos:
 
 
 def offered_qos(recorded: list[Qos]) -> QoSProfile:
-    """What to publish a recorded topic with; reliable keep-all where the bag says nothing.
+    """What to publish a recorded topic with; reliable keep-all where the bag says nothing. One publisher stands in for
+    all that were recorded, and keeps as much as they did.
 
     Liveliness leases are left out: the player does not stand in for the node that gave the promise.
     """
@@ -37,7 +38,8 @@ def offered_qos(recorded: list[Qos]) -> QoSProfile:
         return kind[name] if name not in ("UNKNOWN", "SYSTEM_DEFAULT", "BEST_AVAILABLE") else fallback
 
     return QoSProfile(
-        history=known(HistoryPolicy, first.history.name, HistoryPolicy.KEEP_ALL), depth=first.depth,
+        history=known(HistoryPolicy, first.history.name, HistoryPolicy.KEEP_ALL),
+        depth=sum(qos.depth for qos in recorded),
         reliability=known(ReliabilityPolicy, first.reliability.name, ReliabilityPolicy.RELIABLE),
         durability=known(DurabilityPolicy, first.durability.name, DurabilityPolicy.VOLATILE),
         liveliness=LivelinessPolicy.AUTOMATIC,
@@ -50,9 +52,10 @@ def message_class(msgtype: str) -> type[Any]:
     Raises:
         ValueError: its package is not installed.
     """
-    package, kind, name = msgtype.split("/")
+    package = msgtype.partition("/")[0]
     try:
+        package, kind, name = msgtype.split("/")
         message_type: type[Any] = getattr(importlib.import_module(f"{package}.{kind}"), name)
-    except (ImportError, AttributeError):
+    except (ImportError, AttributeError, ValueError):
         raise ValueError(f"message type {msgtype} is not installed; install or build {package}") from None
     return message_type
