@@ -305,6 +305,9 @@ class VideoRlConfig(SettingsSection):
     """Simulator episodes to train the video model on and to draw contexts from."""
     context_episodes: PositiveInt
     """Those of a run whose video model is the shipped one."""
+    clip_steps: NonNegativeInt
+    """Recorded steps of a clip: longer episodes are cut there, shorter ones left out. 0: the episodes have one length;
+    others are refused."""
     rewards: dict[str, float]
     """Weight of each reward: a score against the recording (video_rl/reference_reward.py), of which `closeness`,
     `ssim`, `perceptual`, `psnr_db`, `scenery` need no simulator state; or `agent`, which needs a judge. Several are

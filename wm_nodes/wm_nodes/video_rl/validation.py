@@ -76,7 +76,8 @@ def validation_scores(
     Raises:
         BagError: an unusable bag. ValueError: model_dir has no position probe.
     """
-    clips, probe = load_clips(bags, folder.clip["stride"]), load_probe(model_dir, device_of(folder.network))
+    clips = load_clips(bags, folder.clip["stride"], config.clip_steps)
+    probe = load_probe(model_dir, device_of(folder.network))
 
     def scores() -> dict[str, float]:
         values = context_scores(folder, clips, probe, config)
