@@ -86,6 +86,9 @@ class VideoEvaluationConfig(SettingsSection):
     """Buffers between two evaluations of the learner; 0: none."""
     window: Annotated[int, Field(ge=3)]
     """Newest evaluations over which training reward and held-out scores are compared, against reward hacking."""
+    executions: NonNegativeInt
+    """Held-out clips whose tool path is followed in the simulator before and after training, about 0.1 s each; 0: none.
+    """
 
 
 class WindowConfig(SettingsSection):

@@ -99,7 +99,8 @@ class RolloutBuffer:
                 f"{staleness} is outside 0 to {max_staleness}; sample again, or raise grpo.max_staleness"
             )
         rows = {f"rollout.{name}": getattr(self.rollout, name) for name in _ROWS}
-        for name, values in (rows | {f"condition.{name}": value for name, value in vars(self.condition).items()}).items():
+        rows |= {f"condition.{name}": values for name, values in vars(self.condition).items()}
+        for name, values in rows.items():
             if values is not None and not bool(torch.isfinite(values).all()):
                 video = int((~torch.isfinite(values)).flatten(1).any(1).nonzero()[0])
                 raise RolloutBufferError(f"video {video} of the buffer has a value in {name} that is no number; "
