@@ -32,7 +32,9 @@ UNREWARDED = (
     "executed_success", "executed_object_cm", "reader_success", "object_permanence", "impossible_tool_steps",
     "ghost_motion", "scenery_change",
 )
-"""What no reward can weigh; see docs/metrics.md."""
+"""What no reward can weigh. executed_success, executed_object_cm: of the clip's tool path in the simulator: whether the
+task is done, and how far the object ends from where the clip shows it. reader_success: whether the other reader sees the
+task done. The others: see ClipFaults."""
 EXECUTED = UNREWARDED[:2]
 SAME_SCENE = 2e-3
 """Most by which a state after a reset may differ from the recorded one, m."""
