@@ -319,7 +319,7 @@ def test_the_embedded_judge_that_reads_once_trains_what_the_one_that_votes_train
 
 
 def executed_rows() -> Rows:
-    """Executed success after, by seed, paid by the judge and by the probe, and the difference of their means (Welch)."""
+    """Executed success after, by seed, paid by the judge and by the probe; the difference of their means (Welch)."""
     rows = read("video_rl_outcome.json")["rows"] + read("video_rl_outcome_judge.json")["rows"]
     judge, probe = (
         [one["measured_after"]["executed_success"] for one in sorted(rows, key=lambda one: one["seed"])

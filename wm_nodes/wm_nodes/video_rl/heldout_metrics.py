@@ -33,8 +33,8 @@ UNREWARDED = (
     "ghost_motion", "scenery_change",
 )
 """What no reward can weigh. executed_success, executed_object_cm: of the clip's tool path in the simulator: whether the
-task is done, and how far the object ends from where the clip shows it. reader_success: whether the other reader sees the
-task done. The others: see ClipFaults."""
+task is done, and how far the object ends from where the clip shows it. reader_success: whether the other reader sees it
+done. The others: see ClipFaults."""
 EXECUTED = UNREWARDED[:2]
 SAME_SCENE = 2e-3
 """Most by which a state after a reset may differ from the recorded one, m."""
@@ -93,7 +93,8 @@ def load_or_measure_unrewarded(
         (before, missing), (after, missing_after) = (_measure(model, heldout, by, config) for model in models)
         missing |= missing_after
         known = [name for name in UNREWARDED if name not in missing]
-        found = Unrewarded(*({name: some[name].tolist() for name in known} for some in (before, after)), missing)
+        first, last = ({name: some[name].tolist() for name in known} for some in (before, after))
+        found = Unrewarded(first, last, missing)
     except ValueError as error:
         found = Unrewarded({}, {}, dict.fromkeys(UNREWARDED, str(error)))
     write_atomic(path, json.dumps({"of": of, "found": asdict(found)}).encode())
