@@ -148,7 +148,7 @@ def test_every_metric_is_in_the_document_and_tensorboard_has_them_too(run_dir: P
 def test_the_report_holds_table_pictures_command_and_settings(run_dir: Path) -> None:
     text = (run_dir / "report.html").read_text()
     assert text.count("data:image/png;base64") == 4
-    for part in ("object error, cm", "averaged weights", "No alarm in 2 held-out evaluations", "wm.py retrain",
+    for part in ("object error, cm", "averaged weights", "Not watched: 2 held-out evaluations", "wm.py retrain",
                  "ema_decay: 0.5", "rescore"):
         assert part in text
 

@@ -125,7 +125,7 @@ def test_arms_cost_the_same_network_calls() -> None:
     samplers = {sampler.name: sampler for sampler in closed_loop_samplers()}
     calls = {name: calls_of_buffer(arm_config(sampler)) for name, sampler in samplers.items()}
     assert calls["CPS 0.4"] == {"history": 32, "sampling": 256, "training": 288}
-    nft = calls.pop("NFT, ODE")
+    nft = calls.pop("signed FM, ODE")
     assert nft == {**calls["CPS 0.4"], "training": 384}, "the old weights are called, too"
     assert all(one == calls["CPS 0.4"] for one in calls.values()), calls
     config = arm_config(samplers["CPS 0.4"])

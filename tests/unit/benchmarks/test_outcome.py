@@ -11,7 +11,7 @@ from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
 
-ARMS = ["CPS 0.4", "NFT, ODE", "CPS 0.4, judge robot"]
+ARMS = ["CPS 0.4", "signed FM, ODE", "CPS 0.4, judge robot"]
 
 
 def rows_of(path: Path) -> list[dict[str, Any]]:
@@ -38,7 +38,7 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
         assert row["measured_before"] == first[0]["measured_before"], "all arms begin with the same model"
     assert first[0]["plan"]["rewards"] == [["outcome", 1.0]] and first[2]["plan"]["rewards"] == [["agent", 1.0]]
     assert {file.name for file in kept.iterdir()} == {
-        "CPS_0.4_0.safetensors", "NFT_ODE_0.safetensors", "CPS_0.4_judge_robot_0.safetensors"
+        "CPS_0.4_0.safetensors", "signed_FM_ODE_0.safetensors", "CPS_0.4_judge_robot_0.safetensors"
     }
     assert len({file.read_bytes() for file in kept.iterdir()}) == 3, "two arms are the same training"
     assert (tmp_path / "found_proxy.png").is_file()

@@ -4,7 +4,7 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from statistics import mean, median
+from statistics import mean, median, variance
 from typing import Any
 
 import pytest
@@ -223,7 +223,7 @@ def learning_rows() -> Rows:
     measures = (("reward", 3), ("obeyed", 3), ("mass", 2), ("background", 4))
     for name in (
         "CPS 0.46, shared", "CPS 0.6, shared", "DynDiff 0.6 gated, rms, cps, shared", "CPS 0.6, window",
-        "DynDiff 0.6 gated, rms, cps, window", "NFT, ODE",
+        "DynDiff 0.6 gated, rms, cps, window", "signed FM, ODE",
     ):
         trained = [one for one in found["rows"] if sampler_of(one) == name]
         gained = (paired_interval([course[-1] for course in gains(trained, key)]) for key, _ in measures)
@@ -280,11 +280,11 @@ def outcome_rows() -> Rows:
 
 OUTCOME_ARMS = (
     "CPS 0.4", "DynDiff 0.54 gated, rms", "CPS 0.4, window", "DynDiff 0.54 gated, rms, window", "DynDiff 0.6 gated",
-    "NFT, ODE",
+    "signed FM, ODE",
 )
 JUDGE_ARMS = tuple(
     f"CPS 0.4, judge {rubric}"
-    for rubric in ("robot", "robot_no_physics", "robot_no_planning", "robot_single_read", "robot_open_gates")
+    for rubric in ("robot", "robot_no_physics", "robot_no_planning", "robot_open_gates")
 )
 HELDOUT_METRICS = (
     ("executed_success", 3), ("executed_object_cm", 1), ("reader_success", 3), ("object_permanence", 3),
@@ -299,7 +299,7 @@ def interval_of(found: Difference, digits: int) -> str:
 def heldout_metric_rows() -> Rows:
     """One line per arm: mean before, and change, of metrics that nothing was trained on."""
     rows = read("video_rl_outcome.json")["rows"] + read("video_rl_outcome_judge.json")["rows"]
-    for name in ("CPS 0.4", "DynDiff 0.54 gated, rms", "NFT, ODE", *JUDGE_ARMS[:2]):
+    for name in ("CPS 0.4", "DynDiff 0.54 gated, rms", "signed FM, ODE", *JUDGE_ARMS[:2]):
         mine = [one for one in rows if one["sampler"] == name and "measured_after" in one]
         cells = [str(len(mine))]
         for metric, digits in HELDOUT_METRICS:
@@ -307,6 +307,31 @@ def heldout_metric_rows() -> Rows:
             changed = paired_interval([later - first for first, later in zip(before, after, strict=True)])
             cells.append(f"{mean(before):.{digits}f} {interval_of(changed, digits)}")
         yield row(name, *cells)
+
+
+def test_the_embedded_judge_that_reads_once_trains_what_the_one_that_votes_trains() -> None:
+    rows = read("video_rl_outcome_judge.json")["rows"]
+    once, voted = (
+        {one["seed"]: one["evaluations"] for one in rows if one["sampler"] == f"CPS 0.4, judge {rubric}"}
+        for rubric in ("robot_single_read", "robot")
+    )
+    assert len(once) == 3 and all(once[seed] == voted[seed] for seed in once)
+
+
+def executed_rows() -> Rows:
+    """Executed success after, by seed, paid by the judge and by the probe; the difference of their means (Welch)."""
+    rows = read("video_rl_outcome.json")["rows"] + read("video_rl_outcome_judge.json")["rows"]
+    judge, probe = (
+        [one["measured_after"]["executed_success"] for one in sorted(rows, key=lambda one: one["seed"])
+         if one["sampler"] == name] for name in ("CPS 0.4, judge robot", "CPS 0.4")
+    )
+    yield f"judge {', '.join(f'{v:.2f}' for v in judge)}; probe {', '.join(f'{v:.2f}' for v in probe)}."
+    change, (a, b) = mean(judge) - mean(probe), (variance(some) / len(some) for some in (judge, probe))
+    freedom = (a + b) ** 2 / (a**2 / (len(judge) - 1) + b**2 / (len(probe) - 1))
+    assert int(freedom) == 15
+    half = 2.131 * (a + b) ** 0.5  # 97.5 % quantile of Student's t for 15 degrees of freedom
+    first = mean(judge) - mean(probe[: len(judge)])
+    yield f"{interval(change, change - half, change + half, 3)} (Welch); on the first six alone {first:+.3f}"
 
 
 def closed_loop_rows() -> Rows:
@@ -360,7 +385,8 @@ def model_pair_rows() -> Rows:
     ):
         pair = paired_difference(*([won for seed in seeds for won in after[model, seed]] for model in (base, better)))
         changed = interval(100 * pair.difference, 100 * pair.low, 100 * pair.high, 1)
-        yield row(f"{better} - {base}", pair.episodes, changed)
+        by_seed = paired_interval([100 * (mean(after[better, seed]) - mean(after[base, seed])) for seed in seeds])
+        yield row(f"{better} - {base}", pair.episodes, changed, interval_of(by_seed, 1))
 
 
 def clip_learning_rows() -> Rows:
@@ -617,7 +643,8 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         resolution_rows, hacking_rows,
     ],
     "video_tasks": [
-        outcome_rows, heldout_metric_rows, closed_loop_rows, horizon_rows, trained_in_rows, model_pair_rows,
+        outcome_rows, heldout_metric_rows, executed_rows, closed_loop_rows, horizon_rows, trained_in_rows,
+        model_pair_rows,
     ],
     "judge": [
         table_rows, pattern_rows, conformal_rows, stacked_rows, efficiency_rows, judge_hacking_rows, control_rows,

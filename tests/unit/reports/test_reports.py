@@ -1,5 +1,6 @@
 """What a run leaves for people: pictures, tables, report.html and summary.json."""
 
+import io
 import json
 import re
 from contextlib import closing
@@ -10,8 +11,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
-from wm_nodes.reports.clip_report import TITLES, ClipSummary, ScoreChange, clip_panels, clip_verdict, write_clip_report
+from wm_nodes.reports.clip_report import (
+    TITLES,
+    UNREWARDED_TITLES,
+    ClipSummary,
+    ScoreChange,
+    clip_panels,
+    clip_verdict,
+    scores_table,
+    write_clip_report,
+)
 from wm_nodes.reports.curves import Panel, curves, read_series
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture, write_report
@@ -35,6 +46,7 @@ from wm_nodes.reports.tables import (
     verdict,
 )
 from wm_nodes.training.metrics import MetricsWriter
+from wm_nodes.video_rl.heldout_metrics import UNREWARDED
 
 PAIRED = {"difference": 0.25, "low": 0.157, "high": 0.348, "gained": 79, "lost": 28}
 SUMMARY = Summary(
@@ -56,6 +68,7 @@ SUMMARY = Summary(
 SAME = ScoreChange(0.5, 0.5, 0.0, -0.1, 0.1, "")
 CLIPS = ClipSummary(
     "push_cube", "smoke", 3, iterations=6, version=12, weights="averaged", contexts=48, evaluations=3,
+    watched=("success", "outcome"),
     scores=dict.fromkeys(TITLES, SAME) | {"tracking": ScoreChange(0.5, 0.6, 0.1, 0.05, 0.15, "better")},
     hacked=[{"step": 6, "reward_slope": 0.1, "slopes": {"scenery": -0.2}, "text": "scenery gets <worse>"}],
     bag="/runs/b/bags/x", machine={"processor": "P & Q"},
@@ -309,8 +322,24 @@ def test_the_report_of_loop_2_shows_scores_alarms_and_how_to_do_it_again(tmp_pat
     values = read_summary(tmp_path)
     assert values["scores"]["tracking"]["after"] == 0.6 and values["minutes"] is None
     quiet = write_clip_report(tmp_path, replace(CLIPS, hacked=())).read_text()
-    assert "No alarm in 3 held-out evaluations" in quiet
-    assert "Not watched" in write_clip_report(tmp_path, replace(CLIPS, hacked=(), evaluations=0)).read_text()
+    assert "No alarm in 3 held-out evaluations of task done at the end, outcome score" in quiet
+
+
+def test_what_was_not_looked_at_is_not_measured_and_never_an_empty_list(tmp_path: Path) -> None:
+    change = replace(SAME, before=0.25, after=0.125, verdict="worse")
+    missing = {"reader_success": "no <reader>"}
+    some = replace(CLIPS, hacked=None, unrewarded={"executed_success": change}, executed=24, not_measured=missing)
+    text = write_clip_report(tmp_path, some).read_text()
+    terminal = io.StringIO()
+    Console(file=terminal, width=240).print(scores_table(some))
+    for told in (text.replace("&lt;", "<").replace("&gt;", ">"), terminal.getvalue()):
+        assert "executed: task done (n = 24)" in told and "0.1250" in told
+        assert told.count("not measured") == 2 and "no <reader>" in told
+        assert "Worse: executed: task done. Not measured: task done, other reader" in told
+    assert "Not watched: 3 held-out evaluations while training are fewer than the alarm compares" in text
+    write_summary(tmp_path, some)
+    assert read_summary(tmp_path)["hacked"] is None and read_summary(tmp_path)["not_measured"] == missing
+    assert set(UNREWARDED_TITLES) == set(UNREWARDED)
 
 
 def test_scores_that_got_better_and_worse_are_named_apart() -> None:

@@ -1,6 +1,7 @@
 """Clips, codec, scores, settings and folder of the video model."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,10 @@ from wm_nodes.config.load import VIDEO, ConfigError, dump_config, load_video_con
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
-from wm_nodes.recording import EpisodeBagWriter
-from wm_nodes.recording.episode_arrays import EpisodeArrays
+from wm_nodes.recording import EpisodeBagWriter, read_episodes
+from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.video_model import NetworkSettings, RolloutSettings, VideoNetwork
-from wm_nodes.video_model.clips import Clips, cut_clips, load_clips
+from wm_nodes.video_model.clips import Clips, checked, cut_clips, load_clips
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
@@ -183,6 +184,54 @@ def test_without_simulator_state_pictures_are_scored_and_all_else_is_unknown(tmp
     assert mix_rewards(found, weights).tolist() == [1.0]
     plain = all_scores(clips.frames, clips, blind, codec, 1, {"tracking": 1.0})  # type: ignore[arg-type]
     assert found.keys() - plain.keys() == set(PICTURE_SCORES)
+
+
+def written(folder: Path, *lengths: int, **changes: Any) -> Path:
+    """A bag of episodes of so many steps; changes: of the last one."""
+    spec = make_spec()
+    with EpisodeBagWriter(folder / "bag", spec, run_id="lengths", start_ns=1) as bag:
+        for index, steps in enumerate(lengths):
+            bag.write(make_episode(spec, index, steps, **(changes if index == len(lengths) - 1 else {})))
+    return folder / "bag"
+
+
+def test_episodes_of_unequal_length_are_refused_or_cut_and_no_clip_shows_a_frame_that_was_not_recorded(
+    tmp_path: Path,
+) -> None:
+    bag = written(tmp_path, 8, 1, 2, 5)
+    with pytest.raises(ValueError, match=r"episodes of 1 to 8 steps are no clips of one length; set clip_steps"):
+        load_clips([bag], 1)
+    with pytest.raises(ValueError, match="no episode has 10 steps, the longest 8"):
+        load_clips([bag], 2, 10)
+    clips, recorded = load_clips([bag], 2, 4), list(read_episodes(bag))
+    assert (len(clips), clips.seeds) == (2, (1000, 1003))
+    for row, episode in enumerate((recorded[0], recorded[3])):
+        np.testing.assert_array_equal(clips.frames[row], episode.images[:5:2])
+        np.testing.assert_array_equal(clips.actions[row].flatten(), episode.actions[:4].flatten())
+        np.testing.assert_array_equal(clips.ground_truth[row], episode.ground_truth[:5:2])
+    padded = stack_episodes(recorded, ["push_cube"])
+    with pytest.raises(ValueError, match="an episode of 1 steps is padded to 8"):
+        cut_clips(padded, 1)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_simulator_state_that_is_no_number_in_some_frames_is_refused_by_its_place(
+    value: float, tmp_path: Path
+) -> None:
+    truth = make_episode(make_spec(), 1, 4).ground_truth
+    truth[3, 2] = value
+    with pytest.raises(ValueError, match=rf"bag: episode 1: ground_truth\[3, 2\] is {value}; record the episode again"):
+        load_clips([written(tmp_path, 4, 4, ground_truth=truth)], 2)
+    truth[:, 2] = np.nan
+    clips = load_clips([written(tmp_path / "unknown", 4, 4, ground_truth=truth)], 2)
+    assert np.isnan(clips.ground_truth[1, :, 2]).all(), "a value that nobody knows is no fault"
+
+
+def test_an_action_that_is_no_number_is_refused_by_its_place() -> None:
+    episode = make_episode(make_spec(), 7, 4)
+    episode.actions[2, 1] = np.nan
+    with pytest.raises(ValueError, match=r"there/bag: episode 7: actions\[2, 1\] is nan"):
+        checked(episode, Path("there/bag"))
 
 
 def test_rewards_are_mixed_by_weight_and_an_unknown_one_is_named() -> None:

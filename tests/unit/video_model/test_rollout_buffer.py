@@ -275,6 +275,15 @@ def test_a_buffer_that_is_too_old_or_from_the_future_is_refused(
     buffer.check(settings, made + limit, limit)
 
 
+@pytest.mark.parametrize("name", ["latents", "states", "zeta"])
+def test_a_buffer_with_a_value_that_is_no_number_is_refused_by_video_and_name(name: str) -> None:
+    settings = toy_rollout_settings()
+    buffer = toy_buffer(Analytic(swirl), settings)
+    getattr(buffer.rollout, name)[1].view(-1)[3] = torch.nan
+    with pytest.raises(RolloutBufferError, match=f"video 1 of the buffer has a value in rollout.{name}"):
+        buffer.check(settings, 0, 0)
+
+
 # rewards and parts
 
 

@@ -1,14 +1,33 @@
 """Metrics that are never trained on, all at once."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import torch
 
-from wm_nodes.config.load import load_config
+from wm_nodes.config.load import load_config, load_video_config
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
-from wm_nodes.video_model.clips import Clips
-from wm_nodes.video_model.success_reader import SuccessReader
+from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
+from wm_nodes.video_model import NetworkSettings, VideoNetwork
+from wm_nodes.video_model.clips import Clips, load_clips
+from wm_nodes.video_model.codec import PatchCodec
+from wm_nodes.video_model.folder import load_video_folder, save_video_folder
+from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader, reader_of, save_success_reader
 from wm_nodes.video_rl.clip_faults import FaultLimits
-from wm_nodes.video_rl.heldout_metrics import fit_tool_correction, measure_clips
+from wm_nodes.video_rl.heldout_metrics import (
+    EXECUTED,
+    UNREWARDED,
+    Unrewarded,
+    Yardstick,
+    fit_tool_correction,
+    load_or_measure_unrewarded,
+    make_yardstick,
+    measure_clips,
+)
+from wm_nodes.video_rl.reference_reward import load_probe
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
 from wm_nodes.world_model.validation.open_loop import TOOL
@@ -28,11 +47,57 @@ def test_every_metric_of_a_clip_is_a_number_and_the_other_reader_looks_at_the_la
     clips = Clips(frames, torch.zeros(3, 3, 6), truth, ("",) * 3, "push_cube")
     reader = SuccessReader(64, 128)
     reader.threshold = float(np.median(reader.read(frames[:, -1])))
-    simulation, limits = load_config("cpu").simulation, FaultLimits(0.15, 6)
     probe = PositionProbe(64, 128)
-    found = measure_clips(frames, probe.read(frames), clips, probe, reader, limits, simulation, 1)
+    by = Yardstick(probe, reader, load_config("cpu").simulation, FaultLimits(0.15, 6), np.eye(4, 3))
+    found = measure_clips(frames, probe.read(frames), clips, by, 1)
     assert {"success", "ghost_motion", "object_permanence", "reader_success"} <= found.keys()
     for values in found.values():
         assert values.shape == (3,) and values.dtype == torch.float64 and torch.isfinite(values).all()
     np.testing.assert_allclose(found["reader_probability"], reader.read(frames[:, -1]), atol=1e-6)
     assert found["reader_success"].sum() == 2
+
+
+def test_both_models_of_a_run_are_measured_in_the_simulator_and_by_the_other_reader(tmp_path: Path) -> None:
+    scene = load_config("cpu", {"task": "push_cube", "data.num_workers": 1})
+    (bag,) = collect_plan(scripted_plan(scene, 3, HELDOUT_SEEDS), scene, tmp_path / "bags")
+    config = load_video_config("outcome", {"evaluation.contexts": 3, "evaluation.executions": 2})
+    world = shipped_model("push_cube")
+    folder = load_video_folder(world / "video_model_outcome")
+    other = load_video_folder(world / "video_model_outcome")
+    torch.nn.init.zeros_(list(other.network.parameters())[-1])
+    heldout, made = load_clips([bag], 2), list[Yardstick]()
+
+    def yardstick() -> Yardstick:
+        reader = reader_of(world / "video_model", "push_cube", world)
+        made.append(make_yardstick(folder.codec, heldout, load_probe(world), reader, scene.simulation))
+        return made[-1]
+
+    def measure(name: str, clips: Clips, config: VideoRlConfig = config) -> Unrewarded:
+        return load_or_measure_unrewarded(tmp_path / name, (folder, other), clips, config, yardstick)
+
+    found = measure("a.json", heldout)
+    assert found.before.keys() == found.after.keys() == set(UNREWARDED) and not found.missing
+    assert {name: len(values) for name, values in found.after.items()} == {
+        name: 2 if name in EXECUTED else 3 for name in UNREWARDED
+    }
+    assert found.before != found.after
+    assert measure("a.json", heldout) == found and len(made) == 1, "what was measured is kept"
+    moved = measure("b.json", replace(heldout, seeds=(7, 8, 9)))
+    assert moved.missing == dict.fromkeys(EXECUTED, "the simulator's scene of reset seed 7 is not the recording's")
+    assert moved.before["reader_success"] == found.before["reader_success"]
+    none = measure("c.json", heldout, config.with_values(evaluation=config.evaluation.with_values(executions=0)))
+    assert none.missing == dict.fromkeys(EXECUTED, "evaluation.executions is 0")
+    heldout = replace(heldout, ground_truth=np.full_like(heldout.ground_truth, np.nan))
+    assert measure("d.json", heldout).missing.keys() == set(UNREWARDED)
+
+
+def test_a_model_of_another_codec_has_no_reader_but_its_own(tmp_path: Path) -> None:
+    world, codec = shipped_model("push_cube"), PatchCodec(4, 6)
+    network = VideoNetwork(NetworkSettings(6, 3, 4, 16, 2))
+    save_video_folder(tmp_path, codec, network, {"stride": 2, "num_conditioning": 1}, {})
+    assert reader_of(tmp_path, "push_cube", world) is None
+    save_success_reader(tmp_path, SuccessReader(64, 128, 0.25), "push_cube", {})
+    own, shared = (reader_of(folder, "push_cube", world) for folder in (tmp_path, world / "video_model"))
+    same_stride = load_success_reader(world / "video_model_outcome", "push_cube")
+    assert own is not None and own.threshold == 0.25
+    assert shared is not None and shared.threshold == same_stride.threshold

@@ -59,7 +59,8 @@ def test_an_error_that_grows_while_the_reward_rises_is_named_with_both_slopes() 
     assert "reward rises by 0.1 per evaluation while held-out scores get worse: object_cm by 1;" in alarm_text([alarm])
     assert not find_hacked_now(lines(rising, object_cm=[7.0, 6.0, 5.0], tracking=[0.1, 0.2, 0.3]), window=3)
     assert not find_hacked_now(lines(rising[::-1], object_cm=[5.0, 6.0, 7.0]), window=3)
-    assert not find_hacked_now(lines(rising[:2], object_cm=[5.0, 6.0]), window=3)
+    assert find_hacked_now(lines(rising[:2], object_cm=[5.0, 6.0]), window=3) is None, "nothing was looked at"
+    assert find_hacked_now(lines(rising, object_cm=[7.0, 6.0, 5.0]), window=3) == []
 
 
 def test_the_object_that_moves_too_far_is_as_wrong_as_the_one_that_stays() -> None:
@@ -112,7 +113,7 @@ def test_held_out_scores_are_written_every_so_many_buffers_and_the_alarm_with_th
     train(run, [5, 6])
     run.close()
     written_lines = read_metrics(tmp_path, "heldout")
-    assert [(line["step"], line["hacked"]) for line in written_lines] == [(2, 0.0), (4, 0.0), (6, 1.0)]
+    assert [(line["step"], line.get("hacked")) for line in written_lines] == [(2, None), (4, None), (6, 1.0)]
     last = written_lines[-1]
     assert last["reward"] is None and last["reward_slope"] == pytest.approx(2.0)
     assert run.hacked == alarms_of(last) and run.hacked[0].metric == "tracking"

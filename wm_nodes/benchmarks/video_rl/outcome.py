@@ -11,9 +11,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.console import Console
 
 from benchmarks.video_rl import plots, tables
@@ -35,7 +33,7 @@ from benchmarks.video_rl.trainings import (
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.apps.options import prepare_torch
 from wm_nodes.config.load import judge_or_embedded, load_config, load_video_config
-from wm_nodes.config.schema import AGENT, SimulationConfig
+from wm_nodes.config.schema import AGENT
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.progress import tqdm
@@ -44,13 +42,11 @@ from wm_nodes.training.weights import load_weights_file, pack_weights
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import VideoFolder, load_video_folder
-from wm_nodes.video_model.success_reader import SuccessReader, load_success_reader
-from wm_nodes.video_rl.clip_faults import FaultLimits, measure_fault_limits
-from wm_nodes.video_rl.heldout_metrics import fit_tool_correction, measure_clips, measure_executability
+from wm_nodes.video_model.success_reader import load_success_reader
+from wm_nodes.video_rl.heldout_metrics import Yardstick, make_yardstick, measure_clips, measure_executability
 from wm_nodes.video_rl.reference_reward import load_probe, score_clips
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.world_model.position_probe import PositionProbe
-from wm_nodes.world_model.training.tokenizer import probe_targets
 
 MEASURES = ("success_path", "success", "outcome", "scenery")
 SCORES = ("success", "outcome", "scenery")
@@ -174,31 +170,13 @@ def _measure_all(
             write_trainings(arguments, trials, rows, [], of)
 
 
-@dataclass(frozen=True)
-class Yardstick:
-    """What clips of the first MEASURED held-out first frames are measured with: readers, and what recordings that went
-    through the codec say of limits and of the tool's height."""
-
-    heldout: Clips
-    probe: PositionProbe
-    reader: SuccessReader
-    simulation: SimulationConfig
-    limits: FaultLimits
-    correction: NDArray[np.float64]
-
-
 @cache
-def _yardstick(video_model: Path, heldout_bags: tuple[Path, ...], device: torch.device) -> Yardstick:
+def _yardstick(video_model: Path, heldout_bags: tuple[Path, ...], device: torch.device) -> tuple[Clips, Yardstick]:
+    """The first MEASURED held-out recordings, and what clips are measured with, of all of them."""
     folder, probe = load_video_folder(video_model, device), load_probe(shipped_model(TASK), device)
-    simulation = load_config("cpu", {"task": TASK}).simulation
-    recordings = load_clips(heldout_bags, folder.clip["stride"])
-    decoded = folder.codec.decode(folder.codec.encode(recordings.frames))
-    seen = probe.read(decoded)
-    return Yardstick(
-        recordings.select(torch.arange(len(recordings))[:MEASURED]), probe, load_success_reader(video_model, TASK),
-        simulation, measure_fault_limits(decoded, seen, simulation),
-        fit_tool_correction(seen, probe_targets(recordings.ground_truth, TASK)),
-    )
+    recordings, reader = load_clips(heldout_bags, folder.clip["stride"]), load_success_reader(video_model, TASK)
+    by = make_yardstick(folder.codec, recordings, probe, reader, load_config("cpu", {"task": TASK}).simulation)
+    return recordings.select(torch.arange(len(recordings))[:MEASURED]), by
 
 
 def measure_weights(arguments: argparse.Namespace, weights: Path | None, seed: int) -> dict[str, float]:
@@ -208,13 +186,13 @@ def measure_weights(arguments: argparse.Namespace, weights: Path | None, seed: i
     Raises:
         OSError: no weights are kept.
     """
-    by = _yardstick(arguments.video_model, tuple(arguments.heldout_bags), arguments.device)
+    heldout, by = _yardstick(arguments.video_model, tuple(arguments.heldout_bags), arguments.device)
     folder = load_video_folder(arguments.video_model, arguments.device)
     config = load_video_config("outcome", {"seed": seed})
     if weights is not None:
         load_weights_file(folder.network, weights)
-    frames = ClipGenerator(folder, by.heldout, config).evaluate(by.heldout, config.evaluation.num_steps)
+    frames = ClipGenerator(folder, heldout, config).evaluate(heldout, config.evaluation.num_steps)
     positions, given = by.probe.read(frames), folder.clip["num_conditioning"]
-    metrics = measure_clips(frames, positions, by.heldout, by.probe, by.reader, by.limits, by.simulation, given)
-    metrics |= measure_executability(positions, by.heldout, by.correction, by.simulation, folder.clip["stride"])
+    metrics = measure_clips(frames, positions, heldout, by, given)
+    metrics |= measure_executability(positions, heldout, by, folder.clip["stride"])
     return {name: float(metrics[name].mean()) for name in METRICS}

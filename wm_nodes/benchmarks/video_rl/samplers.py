@@ -68,7 +68,7 @@ def dyndiff(eta: float, combine: str = "gated", budget: str = "literal", **knobs
 
 
 def diversity_samplers() -> list[SamplerSetup]:
-    """For diversity: ODE, CPS at several noise levels, DynDiff as written, sparse, and at CPS's noise budget."""
+    """For diversity: ODE, CPS at several noise levels, DynDiff's literal mask, sparse, and at CPS's noise budget."""
     return [
         sampler_setup("ODE", SamplerSettings("ode", 0.0)),
         *(sampler_setup(f"CPS {eta:g}", SamplerSettings("cps", eta)) for eta in (0.2, 0.4, 0.6)),
@@ -85,8 +85,8 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
     """Learning: every sampler on one learner; `learner` holds what they share.
 
     Mix-GRPO and the samplers "window" train all four steps of a window that moves, as many as the others of their nine.
-    NFT trains at three times: with a call of the old weights each they cost what the others' four steps do, a call with
-    its gradient counted as three.
+    "signed FM" (DD-31 with old_decay 0) trains at three times: with a call of the old weights each they cost what the
+    others' four steps do, a call with its gradient counted as three.
     """
     nft = learner.with_values(
         objective="nft", nft=learner.nft.with_values(times=3), kl=learner.kl.with_values(mode="none"),
@@ -119,14 +119,14 @@ def learning_samplers(learner: GrpoConfig) -> list[SamplerSetup]:
             for sampler in (plain, matched, sparse, gated, *quiet)
         ),
         *(replace(_in_window(sampler), name=f"{sampler.name}, window") for sampler in (plain, gated)),
-        sampler_setup("NFT, ODE", SamplerSettings("ode", 0.0), nft),
-        sampler_setup("NFT, CPS 0.6", SamplerSettings("cps", 0.6), nft),
+        sampler_setup("signed FM, ODE", SamplerSettings("ode", 0.0), nft),
+        sampler_setup("signed FM, CPS 0.6", SamplerSettings("cps", 0.6), nft),
     ]
 
 
 def clip_learning_samplers() -> list[SamplerSetup]:
     """Claim B on recorded contexts: CPS and DynDiff at one eta, CPS at the noise that DynDiff spends there, and DynDiff
-    as written."""
+    with its literal mask."""
     samplers = {
         "CPS 0.6": SamplerSettings("cps", 0.6), "CPS 0.4": SamplerSettings("cps", 0.4),
         "DynDiff 0.6 gated, rms": dyndiff(0.6, "gated", "rms"), "DynDiff 0.6 gated": dyndiff(0.6),
@@ -139,7 +139,8 @@ def clip_learning_samplers() -> list[SamplerSetup]:
 
 def outcome_samplers(preset: str = "outcome") -> list[SamplerSetup]:
     """Of the outcome task, or of another preset: CPS, DynDiff at the noise that CPS 0.4 spends, both in a window,
-    DynDiff as written, and NFT by ODE, whose clips differ in their initial noise."""
+    DynDiff with its literal mask, and DD-31 by ODE, whose clips differ in their initial noise: with old_decay 0 and one
+    update on a buffer that is flow matching with signed weights ("signed FM"), not the paper's DiffusionNFT."""
     learner = load_video_config(preset).grpo
     samplers = {
         "CPS 0.4": SamplerSettings("cps", 0.4), "DynDiff 0.54 gated, rms": dyndiff(0.54, "gated", "rms"),
@@ -152,7 +153,7 @@ def outcome_samplers(preset: str = "outcome") -> list[SamplerSetup]:
     windows = [replace(_in_window(sampler, size=2, period=1), name=f"{sampler.name}, window") for sampler in plain[:2]]
     ode = RolloutSettings(CLIP_STEPS, SHIFT, sampler=SamplerSettings("ode", 0.0))
     nft = learner.with_values(objective="nft", nft=learner.nft.with_values(times=CLIP_STEPS - 1))
-    return [*plain, *windows, SamplerSetup("NFT, ODE", ode, nft)]
+    return [*plain, *windows, SamplerSetup("signed FM, ODE", ode, nft)]
 
 
 def _in_window(sampler: SamplerSetup, size: int = 4, period: int = 7) -> SamplerSetup:

@@ -135,7 +135,7 @@ def _rescore_clips(arguments: argparse.Namespace) -> tuple[bool, dict[str, Any],
     device = compute_device(config.device)
     probe, folder = load_probe(shipped_model(config.task), device), load_video_folder(run_dir / "video_model", device)
     bags = recorded_buffers.recorded_episodes(run_dir, "train")
-    contexts = load_clips(bags, config.model.stride)
+    contexts = load_clips(bags, config.model.stride, config.clip_steps)
     with _clip_judge(config, run_dir, contexts, clip_fps(bags[0], config.model.stride)) as judge:
         recordings = recorded_buffers.recorded_bags(run_dir)
         clips = chain.from_iterable(recorded_buffers.read_clips(recording, pictures=True) for recording in recordings)

@@ -107,9 +107,9 @@ def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) ->
         heldout_bags = linked([*map(Path, arguments.heldout_bags)], run_dir / "data" / "heldout")
     else:
         bags, heldout_bags = _data(scene, config.context_episodes if shipped else config.data_episodes, run_dir, stage)
-    heldout = load_clips(heldout_bags, config.model.stride)
+    heldout = load_clips(heldout_bags, config.model.stride, config.clip_steps)
     stage("video model: " + ("the shipped one" if shipped else "flow matching"))
-    clips = load_clips(bags, config.model.stride)
+    clips = load_clips(bags, config.model.stride, config.clip_steps)
     if config.rewards.get(AGENT):
         check_clips(config.judge, clips.frames.shape[1:])
     make_video_model(config, clips, heldout, probe, run_dir, shipped=shipped, command=arguments.command)

@@ -8,11 +8,20 @@ import numpy as np
 import torch
 
 from wm_nodes.apps.policy_run import console
-from wm_nodes.config.load import dump_config
+from wm_nodes.config.load import dump_config, load_config
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.statistics import bootstrap_mean
-from wm_nodes.reports.clip_report import TITLES, ClipSummary, ScoreChange, clip_panels, scores_table, write_clip_report
+from wm_nodes.reports.clip_report import (
+    TITLES,
+    ClipSummary,
+    ScoreChange,
+    clip_panels,
+    hacking_text,
+    scores_table,
+    write_clip_report,
+)
 from wm_nodes.reports.curves import curves
 from wm_nodes.reports.film_strip import film_strip
 from wm_nodes.reports.html import Picture
@@ -22,14 +31,16 @@ from wm_nodes.training.metrics import FILE_NAME, read_metrics
 from wm_nodes.training.weights import load_weights_file
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import load_video_folder
+from wm_nodes.video_model.success_reader import reader_of
+from wm_nodes.video_rl.heldout_metrics import load_or_measure_unrewarded, make_yardstick
 from wm_nodes.video_rl.pretraining import BEFORE
 from wm_nodes.video_rl.reference_reward import more_is_better
 from wm_nodes.video_rl.sampling import ClipGenerator
 from wm_nodes.video_rl.training_run import evaluated_uri
-from wm_nodes.video_rl.validation import SECTION, alarm_text, alarms_of, load_or_measure_scores
+from wm_nodes.video_rl.validation import SECTION, WATCHED, alarm_text, alarms_of, load_or_measure_scores
 from wm_nodes.world_model.position_probe import PositionProbe
 
-AFTER = Path("evaluations") / "after.json"
+AFTER, UNREWARDED = (Path("evaluations") / name for name in ("after.json", "unrewarded.json"))
 STRIPS = 3
 
 
@@ -49,15 +60,27 @@ def conclude(
         load_weights_file(trained.network, run_dir / uri)
     before = load_or_measure_scores(run_dir / BEFORE, base_folder, heldout, probe, config)
     after = load_or_measure_scores(run_dir / AFTER, trained, heldout, probe, config)
-    watched = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []
+    device, shipped = compute_device(config.device), shipped_model(config.task)
+    found = load_or_measure_unrewarded(
+        run_dir / UNREWARDED, (base_folder, trained), heldout, config, lambda: make_yardstick(
+            base_folder.codec, heldout, probe, reader_of(base, config.task, shipped, device),
+            load_config("cpu", {"task": config.task}).simulation,
+        ),
+    )
+    lines = read_metrics(run_dir, SECTION) if (run_dir / FILE_NAME).is_file() else []
+    watched = [line for line in lines if line.get("hacked") is not None]
     summary = as_first_made(run_dir, ClipSummary(
         task=config.task, preset=preset, seed=config.seed, iterations=iterations, version=version,
         weights="averaged" if config.grpo.ema_decay > 0 else "last", contexts=len(before["success"]),
         scores={
             name: score_change(name, before[name], after[name], config.seed) for name in TITLES if name in before
         },
-        evaluations=len(watched),
-        hacked=[
+        unrewarded={
+            name: score_change(name, found.before[name], found.after[name], config.seed) for name in found.before
+        },
+        executed=len(found.before.get("executed_success", ())), not_measured=found.missing,
+        evaluations=len(lines), watched=[name for name in WATCHED if watched and name in watched[-1]],
+        hacked=None if not watched else [
             {"step": line["step"], "reward_slope": alarms[0].proxy_slope,
              "slopes": {alarm.metric: alarm.true_slope for alarm in alarms}, "text": alarm_text(alarms)}
             for line in watched if (alarms := alarms_of(line))
@@ -74,8 +97,8 @@ def conclude(
     if drawn is not None:
         strips.append(Picture("Training", "By buffer; held-out scores are of the weights that are evaluated.", drawn))
     report = write_clip_report(run_dir, summary, strips, config_text=dump_config(config))
-    console.print(scores_table(summary))
-    for alarm in summary.hacked:
+    console.print(scores_table(summary), f"reward hacking: {hacking_text(summary)}", sep="\n", highlight=False)
+    for alarm in summary.hacked or ():
         console.print(f"[bold yellow]reward hacking[/] after {alarm['step']} buffers: {alarm['text']}", highlight=False)
     console.print(f"report   {report}\nsummary  {path}\nbag      {summary.bag}", highlight=False)
 

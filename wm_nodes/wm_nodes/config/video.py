@@ -86,6 +86,9 @@ class VideoEvaluationConfig(SettingsSection):
     """Buffers between two evaluations of the learner; 0: none."""
     window: Annotated[int, Field(ge=3)]
     """Newest evaluations over which training reward and held-out scores are compared, against reward hacking."""
+    executions: NonNegativeInt
+    """Held-out clips whose tool path is followed in the simulator before and after training, about 0.1 s each; 0: none.
+    """
 
 
 class WindowConfig(SettingsSection):
@@ -305,6 +308,9 @@ class VideoRlConfig(SettingsSection):
     """Simulator episodes to train the video model on and to draw contexts from."""
     context_episodes: PositiveInt
     """Those of a run whose video model is the shipped one."""
+    clip_steps: NonNegativeInt
+    """Recorded steps of a clip: longer episodes are cut there, shorter ones left out. 0: the episodes have one length;
+    others are refused."""
     rewards: dict[str, float]
     """Weight of each reward: a score against the recording (video_rl/reference_reward.py), of which `closeness`,
     `ssim`, `perceptual`, `psnr_db`, `scenery` need no simulator state; or `agent`, which needs a judge. Several are

@@ -53,7 +53,7 @@ class VideoModelNode(ManagedNode):
         config = load_video_config(str(self.param("config_file")))
         folder = load_video_folder(Path(str(self.param("video_model_dir"))), compute_device(config.device))
         bags = [Path(text) for text in self.param("context_bags") if text]
-        self._generator = ClipGenerator(folder, load_clips(bags, folder.clip["stride"]), config)
+        self._generator = ClipGenerator(folder, load_clips(bags, folder.clip["stride"], config.clip_steps), config)
         self._files = named_files(self)
         self._loaded = (0, "")  # version and, unless it is the folder's own, sha256
         self._announced = dict[int, PolicyVersion]()

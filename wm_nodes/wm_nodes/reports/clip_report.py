@@ -18,6 +18,14 @@ TITLES = {
     "ssim": "SSIM", "perceptual": "perceptual score", "closeness": "closeness of pictures",
 }
 """Score to its name for people, in the order of the tables; see docs/metrics.md."""
+UNREWARDED_TITLES = {
+    "executed_success": "executed: task done", "executed_object_cm": "executed: object elsewhere, cm",
+    "reader_success": "task done, other reader", "object_permanence": "object still seen (share)",
+    "impossible_tool_steps": "impossible tool steps (share)", "ghost_motion": "object moves untouched (share)",
+    "scenery_change": "scenery change",
+}
+"""The same of metrics that no reward can weigh."""
+ALL_TITLES = TITLES | UNREWARDED_TITLES
 
 
 @dataclass(frozen=True)
@@ -38,8 +46,11 @@ class ClipSummary:
     """The results of a run of loop 2.
 
     scores: by name. contexts: held-out ones behind each. iterations: buffers trained on. version: optimizer steps.
-    weights: which ones were measured after, "averaged" or "last". evaluations: held-out ones made while training.
-    hacked: evaluations with an alarm of DD-2: step (buffers trained on), reward_slope, slopes by score, text.
+    weights: which ones were measured after, "averaged" or "last". unrewarded: as scores, of metrics that no reward can
+    weigh. executed: contexts behind those that begin with executed_. not_measured: why one of them is missing, by name.
+    evaluations: held-out ones made while training. watched: scores that the alarm of DD-2 compared in them. hacked:
+    evaluations with an alarm: step (buffers trained on), reward_slope, slopes by score, text; None: it never looked,
+    because there were fewer evaluations than evaluation.window.
     bag: newest recording. minutes, command (as typed), machine (facts by name), date (year-month-day): of the call that
         made the results.
     """
@@ -52,8 +63,12 @@ class ClipSummary:
     weights: str
     contexts: int
     scores: Mapping[str, ScoreChange]
+    unrewarded: Mapping[str, ScoreChange] = field(default_factory=dict)
+    executed: int = 0
+    not_measured: Mapping[str, str] = field(default_factory=dict)
     evaluations: int = 0
-    hacked: Sequence[Mapping[str, Any]] = ()
+    watched: Sequence[str] = ()
+    hacked: Sequence[Mapping[str, Any]] | None = None
     bag: str = ""
     minutes: float = float("nan")
     command: str = ""
@@ -65,11 +80,27 @@ def clip_verdict(summary: ClipSummary) -> str:
     """One sentence: which scores changed by more than chance explains."""
     parts = []
     for verdict in ("better", "worse"):
-        names = [TITLES[name] for name, change in summary.scores.items() if change.verdict == verdict]
+        both = {**summary.scores, **summary.unrewarded}
+        names = [ALL_TITLES[name] for name, change in both.items() if change.verdict == verdict]
         if names:
             parts.append(f"{verdict.capitalize()}: {'; '.join(names)}")
+    if summary.not_measured:
+        parts.append(f"Not measured: {'; '.join(ALL_TITLES[name] for name in summary.not_measured)}")
     sentence = ". ".join(parts) or "No difference that chance does not explain"
     return f"{sentence} (n = {summary.contexts} held-out contexts)."
+
+
+def hacking_text(summary: ClipSummary) -> str:
+    """One sentence: whether the alarm of DD-2 looked, at what, and whether it rang."""
+    if summary.hacked is None:
+        return (
+            f"Not watched: {summary.evaluations} held-out evaluations while training are fewer than the alarm compares "
+            "(evaluation.every, evaluation.window)."
+        )
+    of = f"{summary.evaluations} held-out evaluations of {', '.join(ALL_TITLES[name] for name in summary.watched)}"
+    if not summary.hacked:
+        return f"No alarm in {of}: none got worse while the training reward rose."
+    return f"The training reward rose while held-out scores got worse ({of})."
 
 
 def scores_table(summary: ClipSummary) -> Table:
@@ -77,7 +108,7 @@ def scores_table(summary: ClipSummary) -> Table:
     title = f"held-out contexts (n = {summary.contexts}), one ODE clip each, {summary.weights} weights"
     columns = ("score", "before", "after", "difference, 95 % bootstrap interval", "")
     marks = {"better": "[green]better[/]", "worse": "[red]worse[/]"}
-    rows = ((name, *cells, marks.get(change.verdict, "")) for name, change, cells in _rows(summary))
+    rows = ((name, *cells, marks.get(verdict, "")) for name, verdict, cells in _rows(summary))
     return make_table(title, columns, rows, left=("score", ""), caption=clip_verdict(summary))
 
 
@@ -118,39 +149,36 @@ def write_clip_report(
     return write_page(run_dir, title, body)
 
 
-def _rows(summary: ClipSummary) -> Iterable[tuple[str, ScoreChange, tuple[str, str, str]]]:
-    for name, change in summary.scores.items():
-        title = TITLES[name]
+def _rows(summary: ClipSummary) -> Iterable[tuple[str, str, tuple[str, str, str]]]:
+    """Name, verdict, and the cells before, after, difference."""
+    for name, change in {**summary.scores, **summary.unrewarded}.items():
+        n = f" (n = {summary.executed})" if name.startswith("executed_") else ""
         interval = estimate((change.difference, change.low, change.high))
-        yield title, change, (f"{change.before:.4f}", f"{change.after:.4f}", interval)
+        yield ALL_TITLES[name] + n, change.verdict, (f"{change.before:.4f}", f"{change.after:.4f}", interval)
+    for name, reason in summary.not_measured.items():
+        yield ALL_TITLES[name], "", ("not measured", "not measured", reason)
 
 
 def _scores(summary: ClipSummary) -> str:
     marks = {"better": "good", "worse": "bad"}
     rows = (
-        (escape(title), *cells, f'<span class="{marks.get(change.verdict, "")}">{change.verdict}</span>')
-        for title, change, cells in _rows(summary)
+        (escape(title), *map(escape, cells), f'<span class="{marks.get(verdict, "")}">{verdict}</span>')
+        for title, verdict, cells in _rows(summary)
     )
     columns = ("score", "before", "after", "difference, 95 % interval", "")
     return (
         html_table(columns, rows, numbers=(1, 2, 3))
         + f'<p class="faint">Means over {summary.contexts} contexts that nothing was trained on, one ODE clip each '
         f"from the same noise; after: the {escape(summary.weights)} weights. Intervals: paired bootstrap over the "
-        "contexts. Positions are read off the pictures by a probe that shares nothing with the video model.</p>"
+        "contexts. Positions are read off the pictures by a probe that shares nothing with the video model. Executed: "
+        "the clip's tool path, followed in the simulator from the same first state.</p>"
     )
 
 
 def _hacking(summary: ClipSummary) -> Iterable[str]:
-    if not summary.evaluations:
-        yield "<p>Not watched: no held-out scores were measured while training (evaluation.every).</p>"
-        return
+    yield f'<p class="{"bad" if summary.hacked else ""}">{escape(hacking_text(summary))}</p>'
     if not summary.hacked:
-        yield (
-            f"<p>No alarm in {summary.evaluations} held-out evaluations: no score got worse while the training reward "
-            "rose.</p>"
-        )
         return
-    yield '<p class="bad">The training reward rose while held-out scores got worse.</p>'
     rows = ((str(alarm["step"]), escape(str(alarm["text"]))) for alarm in summary.hacked)
     yield html_table(("buffers", "alarm"), rows, numbers=(0,))
 

@@ -84,7 +84,8 @@ class RolloutBuffer:
         return replace(self, rewards=values, valid=valid)
 
     def check(self, settings: RolloutSettings, policy_version: int, max_staleness: int) -> None:
-        """Raise RolloutBufferError if the buffer was sampled with other settings, or by weights that are too old."""
+        """Raise RolloutBufferError if the buffer was sampled with other settings, or by weights that are too old, or
+        if a video has a value that is no number."""
         wanted = config_hash(settings)
         if self.config_hash != wanted:
             raise RolloutBufferError(
@@ -97,6 +98,13 @@ class RolloutBuffer:
                 f"the buffer comes from version {self.policy_version}, the learner is at {policy_version}: staleness "
                 f"{staleness} is outside 0 to {max_staleness}; sample again, or raise grpo.max_staleness"
             )
+        rows = {f"rollout.{name}": getattr(self.rollout, name) for name in _ROWS}
+        rows |= {f"condition.{name}": values for name, values in vars(self.condition).items()}
+        for name, values in rows.items():
+            if values is not None and not bool(torch.isfinite(values).all()):
+                video = int((~torch.isfinite(values)).flatten(1).any(1).nonzero()[0])
+                raise RolloutBufferError(f"video {video} of the buffer has a value in {name} that is no number; "
+                                         "lower the learning rate, or begin with other weights")
 
     def to_bytes(self) -> bytes:
         """One safetensors file; from_bytes gives an equal buffer."""

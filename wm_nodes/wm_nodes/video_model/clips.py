@@ -64,15 +64,46 @@ class Clips:
         return Condition(first, self.actions, hashed_words(self.instructions, text_dim)).to(first.device)
 
 
-def load_clips(bags: Sequence[Path], stride: int) -> Clips:
-    """Load the episodes of the bags, in order, as clips.
+def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
+    """Load the episodes of the bags, in order, as clips of one length: no frame is made up.
+
+    steps: of each clip; longer episodes are cut there, shorter ones left out. 0: all episodes have one length.
 
     Raises:
-        BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, or of different sizes.
+        BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, of different sizes or
+            lengths, or with an action or simulator state that is no number.
     """
-    episodes = [_with_truth(episode) for bag in bags for episode in read_episodes(bag)]
-    clips = cut_clips(stack_episodes(episodes, [episode.task for episode in episodes[:1]]), stride)
+    episodes = [_with_truth(checked(episode, bag)) for bag in bags for episode in read_episodes(bag)]
+    lengths = [episode.num_steps for episode in episodes]
+    if not steps and len(set(lengths)) > 1:
+        raise ValueError(
+            f"episodes of {min(lengths)} to {max(lengths)} steps are no clips of one length; set clip_steps: longer "
+            f"ones are cut there, shorter ones left out (a median of {sorted(lengths)[len(lengths) // 2]} steps)"
+        )
+    episodes = [episode for episode in episodes if episode.num_steps >= steps]
+    if lengths and not episodes:
+        raise ValueError(f"no episode has {steps} steps, the longest {max(lengths)}; lower clip_steps")
+    tasks = [episode.task for episode in episodes[:1]]
+    clips = cut_clips(stack_episodes(episodes, tasks, num_steps=steps or None), stride)
     return replace(clips, seeds=tuple(episode.seed for episode in episodes))
+
+
+def checked(episode: Episode, bag: Path) -> Episode:
+    """The episode, whose actions are numbers, and each value of the simulator state in all frames or in none.
+
+    Raises:
+        ValueError: another one; names the first wrong value.
+    """
+    truth = episode.ground_truth
+    wrong = {"actions": ~np.isfinite(episode.actions), "ground_truth": ~np.isfinite(truth) & ~np.isnan(truth).all(0)}
+    for name, where in wrong.items():
+        if where.any():
+            place = tuple(int(i) for i in np.argwhere(where)[0])
+            raise ValueError(
+                f"{bag}: episode {episode.episode_id}: {name}{list(place)} is {getattr(episode, name)[place]}; record "
+                "the episode again, or leave its bag out"
+            )
+    return episode
 
 
 def _with_truth(episode: Episode) -> Episode:
@@ -87,9 +118,11 @@ def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
     """Cut every stride-th frame of each episode, from its first one.
 
     Raises:
-        ValueError: the episodes' steps are no multiple of the stride.
+        ValueError: the episodes' steps are no multiple of the stride, or not all were recorded.
     """
     steps = episodes.num_steps
+    if (episodes.lengths < steps).any():
+        raise ValueError(f"an episode of {episodes.lengths.min()} steps is padded to {steps}; cut all to one length")
     if steps % stride:
         raise ValueError(f"episodes of {steps} steps cannot be cut at every {stride}th frame; choose a divisor")
     actions = episodes.actions.reshape(len(episodes), steps // stride, -1)

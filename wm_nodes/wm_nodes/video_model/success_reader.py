@@ -22,6 +22,7 @@ from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.training.weights import WeightsError, load_weights, pack_weights
 from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.folder import CODEC, read_video_manifest
 from wm_nodes.video_model.tokenizer_codec import Codec
 
 CHANNELS, HIDDEN = (16, 32, 32, 48), 48
@@ -163,6 +164,23 @@ def load_success_reader(folder: Path, task: str, device: torch.device | str = "c
     except WeightsError as error:
         raise ModelFolderError(f"{folder / WEIGHTS}: {error}") from None
     return reader.to(device).eval().requires_grad_(False)
+
+
+def reader_of(folder: Path, task: str, shipped: Path, device: torch.device | str = "cpu") -> SuccessReader | None:
+    """The reader in a video model's folder, else one in the folder `shipped` of a world model that was trained on what
+    the same codec makes, of clips with the same stride where there is one; None without any."""
+    codec, clip = _seen_through(folder)
+    places = [place.parent for place in shipped.glob(f"video_model*/{SUCCESS_MANIFEST}")]
+    places = sorted((place for place in places if _seen_through(place)[0] == codec),
+                    key=lambda place: (_seen_through(place)[1] != clip, place))
+    found = [place for place in (folder, *places) if (place / SUCCESS_MANIFEST).is_file()]
+    return load_success_reader(found[0], task, device) if found else None
+
+
+def _seen_through(folder: Path) -> tuple[str, int]:
+    """The sha256 of a video model's codec, and the stride of its clips."""
+    manifest = read_video_manifest(folder)
+    return manifest["sha256"][CODEC], manifest["clip"]["stride"]
 
 
 def _pixels(images: Tensor) -> Tensor:

@@ -1,64 +1,180 @@
 """Metrics of clips that are never trained on. Shapes: N clips, F frames, H W 3 image, P positions (PROBE_NAMES)."""
 
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import FloatArray
 from wm_nodes.environments.maniskill.replay import execute_paths
+from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model.clips import Clips
+from wm_nodes.video_model.folder import VideoFolder
 from wm_nodes.video_model.success_reader import SuccessReader
-from wm_nodes.video_rl.clip_faults import FaultLimits, find_faults
+from wm_nodes.video_model.tokenizer_codec import Codec
+from wm_nodes.video_rl.clip_faults import FaultLimits, find_faults, measure_fault_limits
 from wm_nodes.video_rl.reference_reward import score_clips
+from wm_nodes.video_rl.sampling import ClipGenerator
+from wm_nodes.video_rl.validation import evaluated_contexts
 from wm_nodes.world_model.position_probe import PositionProbe
+from wm_nodes.world_model.training.tokenizer import probe_targets
 from wm_nodes.world_model.validation.open_loop import OBJECT, TOOL
+
+UNREWARDED = (
+    "executed_success", "executed_object_cm", "reader_success", "object_permanence", "impossible_tool_steps",
+    "ghost_motion", "scenery_change",
+)
+"""What no reward can weigh. executed_success, executed_object_cm: of the clip's tool path in the simulator: whether the
+task is done, and how far the object ends from where the clip shows it. reader_success: whether the other reader sees it
+done. The others: see ClipFaults."""
+EXECUTED = UNREWARDED[:2]
+SAME_SCENE = 2e-3
+"""Most by which a state after a reset may differ from the recorded one, m."""
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """What decoded clips are measured with.
+
+    probe: reads positions. reader: reads success, and is another one; None: there is none. simulation: of the
+    recordings. limits: of what is possible. correction: of fit_tool_correction. The last two are of recordings that
+    went through the codec.
+    """
+
+    probe: PositionProbe
+    reader: SuccessReader | None
+    simulation: SimulationConfig
+    limits: FaultLimits
+    correction: NDArray[np.float64]
+
+
+def make_yardstick(
+    codec: Codec, recordings: Clips, probe: PositionProbe, reader: SuccessReader | None, simulation: SimulationConfig
+) -> Yardstick:
+    """Measure limits and correction on recordings."""
+    decoded = codec.decode(codec.encode(recordings.frames))
+    seen = probe.read(decoded)
+    return Yardstick(
+        probe, reader, simulation, measure_fault_limits(decoded, seen, simulation),
+        fit_tool_correction(seen, probe_targets(recordings.ground_truth, recordings.task)),
+    )
+
+
+@dataclass(frozen=True)
+class Unrewarded:
+    """before, after: of UNREWARDED by name, a value per context; executed ones of the first contexts alone. missing: by
+    name why one is not measured."""
+
+    before: dict[str, list[float]]
+    after: dict[str, list[float]]
+    missing: dict[str, str]
+
+
+def load_or_measure_unrewarded(
+    path: Path, models: tuple[VideoFolder, VideoFolder], heldout: Clips, config: VideoRlConfig,
+    yardstick: Callable[[], Yardstick],
+) -> Unrewarded:
+    """Measure one ODE clip of each of the first `evaluation.contexts` held-out contexts by both models, before and
+    after; read from `path` where they are of the same weights, else written there."""
+    weights = [pack_weights(model.network).sha256 for model in models]
+    of = {"sha256": weights, "evaluation": config.evaluation.model_dump()}
+    if path.is_file() and (saved := json.loads(path.read_text(encoding="utf-8")))["of"] == of:
+        return Unrewarded(**saved["found"])
+    try:
+        by = yardstick()
+        (before, missing), (after, missing_after) = (_measure(model, heldout, by, config) for model in models)
+        missing |= missing_after
+        known = [name for name in UNREWARDED if name not in missing]
+        first, last = ({name: some[name].tolist() for name in known} for some in (before, after))
+        found = Unrewarded(first, last, missing)
+    except ValueError as error:
+        found = Unrewarded({}, {}, dict.fromkeys(UNREWARDED, str(error)))
+    write_atomic(path, json.dumps({"of": of, "found": asdict(found)}).encode())
+    return found
+
+
+def _measure(
+    folder: VideoFolder, heldout: Clips, by: Yardstick, config: VideoRlConfig
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """All that can be measured, and why something cannot."""
+    contexts, missing, given = evaluated_contexts(heldout, config), dict[str, str](), folder.clip["num_conditioning"]
+    frames = ClipGenerator(folder, contexts, config).evaluate(contexts, config.evaluation.num_steps)
+    positions, count = by.probe.read(frames), min(config.evaluation.executions, len(contexts))
+    found = measure_clips(frames, positions, contexts, by, given)
+    if by.reader is None:
+        missing["reader_success"] = "no success reader for clips of this codec"
+    if not count:
+        return found, missing | dict.fromkeys(EXECUTED, "evaluation.executions is 0")
+    try:
+        rows = contexts.select(torch.arange(count))
+        found |= measure_executability(positions[:count], rows, by, folder.clip["stride"])
+    except ValueError as error:
+        missing |= dict.fromkeys(EXECUTED, str(error))
+    return found, missing
 
 
 def measure_clips(
-    frames: Tensor, positions: FloatArray, references: Clips, probe: PositionProbe, reader: SuccessReader,
-    limits: FaultLimits, simulation: SimulationConfig, num_conditioning: int,
+    frames: Tensor, positions: FloatArray, references: Clips, by: Yardstick, num_conditioning: int
 ) -> dict[str, Tensor]:
     """Return by name, float64 (N,), all scores of ClipScores and ClipFaults of decoded clips, uint8 (N, F, H, W, 3),
-    `reader_success`: 1 where the other reader sees the task done in the last frame, and `reader_probability` of it.
+    and where there is a reader `reader_success`: 1 where it sees the task done in the last frame, and
+    `reader_probability` of it.
 
     positions: what the probe reads in the clips, (N, F, P).
     """
-    probability = reader.read(frames[:, -1])
-    scores = score_clips(frames, references, probe, num_conditioning).named()
-    faults = find_faults(frames, positions, limits, simulation, num_conditioning).named()
-    read = {"reader_success": probability >= reader.threshold, "reader_probability": probability}
+    scores = score_clips(frames, references, by.probe, num_conditioning).named()
+    faults = find_faults(frames, positions, by.limits, by.simulation, num_conditioning).named()
+    if by.reader is None:
+        return {**scores, **faults}
+    probability = by.reader.read(frames[:, -1])
+    read = {"reader_success": probability >= by.reader.threshold, "reader_probability": probability}
     return {**scores, **faults, **{name: torch.from_numpy(value.astype(np.float64)) for name, value in read.items()}}
 
 
 def fit_tool_correction(positions: FloatArray, truth: FloatArray) -> NDArray[np.float64]:
     """Return the least-squares map (4, 3) from tool positions that the probe reads in decoded recordings to the true
-    ones, both (N, F, P), with an offset in the last row.
+    ones, both (N, F, P), with an offset in the last row. Raises ValueError where no true one is known.
 
     A codec may make the tool look lower than it is: that of the shipped push_cube does, by 1.1 cm on average and by
     2.3 cm at heights above 12 cm. Uncorrected, paths that pass over the object touch it when they are executed.
     """
-    seen = positions[..., TOOL].reshape(-1, 3).astype(np.float64)
-    found: NDArray[np.float64] = np.linalg.lstsq(
-        np.column_stack([seen, np.ones(len(seen))]), truth[..., TOOL].reshape(-1, 3).astype(np.float64), rcond=None
-    )[0]
+    seen, wanted = (values[..., TOOL].reshape(-1, 3).astype(np.float64) for values in (positions, truth))
+    known = np.isfinite(wanted).all(1)
+    if not known.any():
+        raise ValueError("the recordings have no simulator state")
+    seen = np.column_stack([seen[known], np.ones(known.sum())])
+    found: NDArray[np.float64] = np.linalg.lstsq(seen, wanted[known], rcond=None)[0]
     return found
 
 
 def measure_executability(
-    positions: FloatArray, references: Clips, correction: NDArray[np.float64], simulation: SimulationConfig,
-    stride: int, *, num_workers: int = 1,
+    positions: FloatArray, references: Clips, by: Yardstick, stride: int, *, num_workers: int = 1
 ) -> dict[str, Tensor]:
     """Return by name, float64 (N,), what comes of the clips' tool paths in the simulator (execute_paths):
     `executed_success`, `executed_object_cm`, `executed_tool_cm`.
 
-    positions: read by the probe in decoded clips, (N, F, P). correction: of fit_tool_correction on recordings; the same
-    for all that is compared.
+    positions: read by the probe in decoded clips, (N, F, P).
+
+    Raises:
+        ValueError: as execute_paths; the scene of a reset seed is not the recording's.
     """
-    paths = (positions[..., TOOL] @ correction[:3] + correction[3]).astype(np.float32)
+    paths = (positions[..., TOOL] @ by.correction[:3] + by.correction[3]).astype(np.float32)
     executed = execute_paths(
-        references.task, simulation, references.seeds, paths, positions[:, -1, OBJECT], stride, num_workers=num_workers
+        references.task, by.simulation, references.seeds, paths, positions[:, -1, OBJECT], stride,
+        num_workers=num_workers,
     )
+    recorded = references.ground_truth[:, 0]
+    other = [not np.allclose(*both, atol=SAME_SCENE) for both in zip(executed.starts, recorded, strict=True)]
+    if any(other):
+        seed = references.seeds[other.index(True)]
+        raise ValueError(f"the simulator's scene of reset seed {seed} is not the recording's")
     values = {"success": executed.success, "object_cm": executed.object_error_cm, "tool_cm": executed.tool_error_cm}
     return {f"executed_{name}": torch.from_numpy(np.asarray(value, np.float64)) for name, value in values.items()}

@@ -33,8 +33,10 @@ TRACKING_SCALE_M, OUTCOME_SCALE_M = 0.03, 0.05
 GOAL = [PROBE_NAMES.index(name) for name in ("goal_x", "goal_y")]
 SEEN_MOTION = 12
 """A pixel counts as scenery while no recorded frame differs from the first one by more than this, of 255."""
-ERRORS = ("scenery", "object_cm", "tool_cm")
-"""Scores of which less is better."""
+ERRORS = (
+    "scenery", "object_cm", "tool_cm", "executed_object_cm", "ghost_motion", "impossible_tool_steps", "scenery_change",
+)
+"""Scores of which less is better; the last four are heldout_metrics.UNREWARDED."""
 PICTURE_SCORES = ("ssim", "perceptual", "closeness")
 """What score_pictures() gives."""
 FULL_PSNR_DB = 40.0

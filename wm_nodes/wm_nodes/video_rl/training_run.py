@@ -163,8 +163,9 @@ class VideoRun(TrainingRun):
         with self.learner.averaged_weights():
             scores = self._heldout()
         lines = [*read_metrics(self.run_dir), {"section": SECTION, "step": self.iterations, **scores}]
-        self.hacked = find_hacked_now(lines, self.config.evaluation.window)
-        metrics.write(SECTION, self.iterations, {**scores, **alarm_scalars(self.hacked)})
+        alarms = find_hacked_now(lines, self.config.evaluation.window)
+        self.hacked = alarms or []
+        metrics.write(SECTION, self.iterations, {**scores, **alarm_scalars(alarms)})
 
 
 def flatten_metrics(report: BufferReport) -> dict[str, float]:

@@ -77,7 +77,8 @@ def validation_scores(
     Raises:
         BagError: an unusable bag. ValueError: model_dir has no position probe.
     """
-    clips, probe = load_clips(bags, folder.clip["stride"]), load_probe(model_dir, device_of(folder.network))
+    clips = load_clips(bags, folder.clip["stride"], config.clip_steps)
+    probe = load_probe(model_dir, device_of(folder.network))
 
     def scores() -> dict[str, float]:
         values = context_scores(folder, clips, probe, config)
@@ -88,9 +89,9 @@ def validation_scores(
     return scores
 
 
-def find_hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[HackedMetric]:
+def find_hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[HackedMetric] | None:
     """Return the metrics that fell over the newest `window` evaluations in lines of metrics.jsonl while the training
-    reward rose (DD-2), [] while there are fewer evaluations. The reward of an evaluation is the mean of the buffers
+    reward rose (DD-2), None while there are fewer evaluations. The reward of an evaluation is the mean of the buffers
     since the one before; slopes are per evaluation, of more_is_better(). Only WATCHED scores are compared.
     """
     rewards = {_step(line): line["reward_mean"] for line in lines if line["section"] == "grpo"}
@@ -102,13 +103,17 @@ def find_hacked_now(lines: Sequence[Mapping[str, object]], window: int) -> list[
         if since:
             proxy.append(sum(since) / len(since))
             rows.append(evaluations[step])
+    if len(proxy) < window:
+        return None
     names = [name for name in WATCHED if all(row.get(name) is not None for row in rows)]
     curves = {name: [float(more_is_better(name, float(str(row[name])))) for row in rows] for name in names}
     return find_hacked_metrics(proxy, curves, window=window)
 
 
-def alarm_scalars(alarms: Sequence[HackedMetric]) -> dict[str, float]:
-    """Return for metrics.jsonl the number of alarms, and the slopes of the reward and of each score."""
+def alarm_scalars(alarms: Sequence[HackedMetric] | None) -> dict[str, float]:
+    """Return for metrics.jsonl the number of alarms, and the slopes of the reward and of each score; {} for None."""
+    if alarms is None:
+        return {}
     scalars = {"hacked": float(len(alarms))}
     for alarm in alarms:
         scalars |= {"reward_slope": alarm.proxy_slope, f"hacked_{alarm.metric}": alarm.true_slope}

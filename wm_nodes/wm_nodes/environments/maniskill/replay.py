@@ -22,11 +22,13 @@ from wm_nodes.environments.maniskill.table_top import CUBE, TOOL
 
 @dataclass(frozen=True)
 class Executed:
-    """Per clip. success: bool (N,), the task is done at the end. object_m: float32 (N, 3), where the object ends.
+    """Per clip. starts: float32 (N, P), ground truth after the reset. success: bool (N,), the task is done at the end.
+    object_m: float32 (N, 3), where the object ends.
     object_error_cm: (N,), from there to the imagined place, in the plane. tool_error_cm: (N,), mean distance of the
     tool from the path, at its frames.
     """
 
+    starts: FloatArray
     success: BoolArray
     object_m: FloatArray
     object_error_cm: NDArray[np.float64]
@@ -94,4 +96,5 @@ def _compare(task: str, truths: FloatArray, paths: FloatArray, objects: FloatArr
     ends = truths[:, -1]
     missed = np.linalg.norm(ends[:, CUBE][:, :2] - objects, axis=-1)
     strayed = np.linalg.norm(truths[..., TOOL] - paths, axis=-1).mean(1)
-    return Executed(success(task, ends), ends[:, CUBE], 100 * missed.astype(float), 100 * strayed.astype(float))
+    errors_cm = (100 * metres.astype(float) for metres in (missed, strayed))
+    return Executed(truths[:, 0], success(task, ends), ends[:, CUBE], *errors_cm)
