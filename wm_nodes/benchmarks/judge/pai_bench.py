@@ -127,7 +127,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         raise ValueError("nothing to measure: give --questions with a server, --subject or --background")
     metrics = quality(videos, arguments.images, backbones)
     if arguments.metrics is not None:
-        metrics |= {name: float(value) for name, value in json.loads(arguments.metrics.read_text()).items()}
+        metrics |= {name: float(value) for name, value in json.loads(arguments.metrics.read_bytes()).items()}
     results: dict[str, Any] = {
         "videos": len(videos), "model": arguments.model, "backbones": {k: b.name for k, b in backbones.items()},
         "scores": dict(metrics), "missing": sorted(set(pai.QUALITY) - set(metrics)),

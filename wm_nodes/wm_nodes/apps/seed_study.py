@@ -26,6 +26,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.device import compute_device
+from wm_nodes.core.files import text_lines
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
 from wm_nodes.environments.record import acceptance_plan, collect_plan
@@ -91,7 +92,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def read_results(folder: Path) -> list[dict[str, Any]]:
     path = folder / "results.jsonl"
-    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    rows = [json.loads(line) for line in text_lines(path.read_bytes())] if path.exists() else []
     return [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
 
 

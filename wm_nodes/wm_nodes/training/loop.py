@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from wm_nodes.core.files import text_lines
 from wm_nodes.training import checkpoint
 
 CHECKPOINT_PERIOD_S = 240.0
@@ -130,7 +131,7 @@ class TrainingLoop:
         path = None if self.run_dir is None else self.run_dir / f"metrics_{self.name}.jsonl"
         if self.iteration == 0 or path is None or not path.exists():
             return {}
-        last = json.loads(path.read_text().splitlines()[-1])
+        last = json.loads(text_lines(path.read_bytes())[-1])
         return {key: value for key, value in last.items() if key not in ("iteration", "seconds")}
 
     def _log(self, metrics: Mapping[str, float], seconds: float) -> None:
