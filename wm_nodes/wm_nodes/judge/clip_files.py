@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 from typing import Annotated
 
 import cv2
@@ -133,7 +134,7 @@ def _read_frames(path: Path, fps: float, read: Read) -> ClipRef:
     """Load an array of frames; the agent checks their shape and type."""
     try:
         frames = np.lib.format.read_array(BytesIO(_bytes_of(path, CLIP, "array", read)), allow_pickle=False)
-    except (ValueError, EOFError, SyntaxError, MemoryError) as error:  # a header may be any text and name any size
+    except (ValueError, EOFError, SyntaxError, TokenError, MemoryError) as error:  # its header may say anything
         raise ValueError(f"{path} is no readable array: {error}") from None
     if frames.ndim != 4 or not frames.size:
         raise ValueError(f"{path} holds {frames.dtype} {frames.shape}, not frames (F, H, W, 3); write it again")

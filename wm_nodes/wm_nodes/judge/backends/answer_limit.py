@@ -8,7 +8,7 @@ ANSWER_BYTES = 8 << 20
 """An answer of 1,024 tokens with its reasoning and log-probabilities stays far below it."""
 
 
-class AnswerRefused(Exception):
+class AnswerRefused(httpx2.TransportError):
     """An answer that is not read to its end."""
 
 
