@@ -336,10 +336,12 @@ def test_letters_alone_earn_no_reward_however_sure_they_are(tmp_path: Path) -> N
 
 
 def test_one_letter_among_json_answers_still_counts(tmp_path: Path) -> None:
-    server = ChatServer(level=4, labels={"E": 1.0})
-    refused = Fault("reply", text="I would rather not.")
-    server.faults.extend([Fault(""), refused, refused])  # planning is answered, the first component is not
-    verdict = judged(server, tmp_path)
+    class ShyAboutClarity(ChatServer):
+        def _completion(self, body: dict[str, Any], fault: Fault | None) -> str:
+            shy = "Judge clarity." in json.dumps(body)
+            return super()._completion(body, Fault("reply", text="I would rather not.") if shy else fault)
+
+    verdict = judged(ShyAboutClarity(level=3, labels={"E": 1.0}), tmp_path)
     sources = {score.votes[0].source for stage in verdict.stages for score in stage.components}
     assert verdict.status is Status.OK and sources == {"json", "label"}, verdict.reason
 
