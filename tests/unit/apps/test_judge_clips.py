@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from chat_server import Fault
 from clip_folders import write_clips
 from judge_server import PickyServer, serving
 
@@ -46,6 +47,43 @@ def test_a_servers_verdicts_are_kept_audited_and_gone_on_with(
     assert lines[2] == '{"torn' and [(row["mode"], row["status"]) for row in kept] == [
         ("reward", "OK"), ("reward", "OK"), *[("benchmark", "ERROR")] * 2, *[("benchmark", "OK")] * 2,
     ]
+
+
+class EchoingServer(PickyServer):
+    """Cites the key that it was sent, its / escaped as JSON allows, in every evidence."""
+
+    def _completion(self, body: dict[str, Any], fault: Fault | None) -> str:
+        key = self.headers[-1]["authorization"].removeprefix("Bearer ").replace("/", r"\\/")
+        return super()._completion(body, fault).replace("seen in frame 0", f"I was sent {key}")
+
+
+def test_a_key_stands_in_no_file_and_extra_fields_of_the_configuration_reach_the_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WM_TEST_KEY", "ab/cd+ef/gh")
+    write_clips(tmp_path)
+    fields = {"chat_template_kwargs": {"enable_thinking": False}}
+    (tmp_path / "my.yaml").write_text(f"judge: {{extra_body: {json.dumps(fields)}}}\n")
+    with serving(EchoingServer()) as server:
+        command = ["judge-clips", str(tmp_path), "--judge", server.url, "--judge-model", "judge", "--config",
+                   str(tmp_path / "my.yaml"), "--judge-key-env", "WM_TEST_KEY", "--reads", str(tmp_path / "reads"),
+                   "--audit", str(tmp_path / "audit")]
+        assert main(command) == 0
+        assert all(body.items() >= fields.items() for body in server.requests)
+    files = [path for path in tmp_path.rglob("*") if path.is_file()]
+    reads = [path.read_text() for path in files if path.is_relative_to(tmp_path / "reads")]
+    assert any("I was sent [WM_TEST_KEY]" in text for text in reads)
+    assert not [path for path in files if re.search(rb"ab.{0,4}cd.{0,4}ef", path.read_bytes())]
+
+
+def test_a_field_that_the_judge_sets_itself_is_refused_by_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_clips(tmp_path)
+    (tmp_path / "my.yaml").write_text("judge: {extra_body: {max_tokens: 5, top_k: 3}}\n")
+    command = ["judge-clips", str(tmp_path), "--judge", "http://127.0.0.1:9/v1", "--judge-model", "m", "--config"]
+    assert main([*command, str(tmp_path / "my.yaml")]) == 2
+    assert "judge.extra_body sets max_tokens, which the judge sets itself; leave it out" in capsys.readouterr().err
 
 
 def test_the_embedded_judge_abstains_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
