@@ -20,14 +20,15 @@ CHARS_PER_TOKEN = 4
 class Fault:
     """What happens to one request instead of a good answer.
 
-    kind: status | reset | truncated | slow | hang | garbage | empty | length | reply.
-    text: the body of a status, the content of a reply or length. retry_after: the header of a status.
+    kind: status | reset | truncated | slow | hang | garbage | empty | length | reply | endless | compressed.
+    text: the body of a status, the content of a reply or length. retry_after, location: headers of a status.
     """
 
     kind: str
     status: int = 500
     text: str = "on purpose"
     retry_after: str = ""
+    location: str = ""
 
 
 @asynccontextmanager
@@ -58,6 +59,7 @@ class ChatServer:
     headers: list[dict[str, str]] = field(default_factory=list)
     in_flight: int = 0
     most_in_flight: int = 0
+    num_endless_bytes: int = 0
     url: str = ""
     _seen: list[str] = field(default_factory=list)
 
@@ -99,9 +101,18 @@ class ChatServer:
         await asyncio.sleep(self.delay_s)
         if fault and kind == "status":
             extra = f"Retry-After: {fault.retry_after}\r\n" if fault.retry_after else ""
+            extra += f"Location: {fault.location}\r\n" if fault.location else ""
             await self._send(writer, fault.status, json.dumps({"error": {"message": fault.text}}), extra)
         elif kind == "reset":
             writer.transport.abort()
+        elif fault and kind == "endless":
+            writer.write(f"HTTP/1.1 {fault.status} X\r\nContent-Type: application/json\r\n\r\n".encode())
+            while True:  # until the client has enough
+                writer.write(b" " * (1 << 16))
+                await writer.drain()
+                self.num_endless_bytes += 1 << 16
+        elif kind == "compressed":
+            await self._send(writer, 200, self._completion(body, None), "Content-Encoding: gzip\r\n")
         elif kind == "hang":
             await asyncio.sleep(60)
         elif kind == "garbage":

@@ -112,28 +112,44 @@ def test_a_folder_may_be_named_from_the_run_folder_and_a_longer_list_than_is_hel
         ({}, {"sha256": "0" * 64}, "is not the announced list"),
         ({}, {"deadline_s": float("nan")}, "deadline_s must be 0 (no limit) or a number of seconds, got nan"),
         ({}, {"deadline_s": -1.0}, "a number of seconds, got -1"),
-        ({"file": "gone.mp4", "sha256": ""}, {}, "gone.mp4 is no readable video"),
-        ({"sha256": "0" * 64}, {}, "has content"),
         ({"speed": 3}, {}, "clips.jsonl:2: speed: Extra inputs"),
         ({}, {"folder": "/dev"}, "'/dev' lies outside of the run folder and of allowed_dirs"),
         ({}, {"folder": "~"}, "'~' is no name of a file"),
-        ({"file": "/etc/passwd", "sha256": ""}, {}, "'/etc/passwd' lies outside of the run folder and of allowed_dirs"),
-        ({"goal": "/etc/no_such.png"}, {}, "'/etc/no_such.png' lies outside of the run folder and of allowed_dirs"),
-        ({"reference": "zero"}, {}, "zero' is no regular file; name a file that holds a picture"),
-        ({"file": "link.npy", "sha256": ""}, {}, "link.npy' lies outside of the run folder and of allowed_dirs"),
     ],
-    ids=["no_folder", "another_list", "no_time", "past", "no_file", "another_clip", "unknown_field", "outside", "home",
-         "outside_file", "outside_picture", "no_file_but_a_pipe", "link_outside"],
+    ids=["no_folder", "another_list", "no_time", "past", "unknown_field", "outside", "home"],
 )
 def test_a_folder_that_cannot_be_read_ends_the_goal_with_what_is_wrong(
     evaluator: Evaluator, tmp_path: Path, changed: dict[str, Any], goal: dict[str, Any], said: str
 ) -> None:
     write_clips(tmp_path, **changed)
-    os.mkfifo(tmp_path / "zero")
-    (tmp_path / "link.npy").symlink_to("/dev/zero")
     result = evaluator.judge(**{"folder": str(tmp_path), **goal})
     assert result.termination_reason == JudgeClips.Result.FAILED and said in result.message
     assert not result.verdicts and not evaluator.verdicts
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"file": "gone.mp4", "sha256": ""}, "gone.mp4 is no readable video"),
+        ({"sha256": "0" * 64}, "has content"),
+        ({"file": "/etc/passwd", "sha256": ""}, "'/etc/passwd' lies outside of the run folder and of allowed_dirs"),
+        ({"goal": "/etc/no_such.png"}, "'/etc/no_such.png' lies outside of the run folder and of allowed_dirs"),
+        ({"reference": "zero"}, "zero' is no regular file; name a file that holds a picture"),
+        ({"file": "link.npy", "sha256": ""}, "link.npy' lies outside of the run folder and of allowed_dirs"),
+    ],
+    ids=["no_file", "another_clip", "outside_file", "outside_picture", "no_file_but_a_pipe", "link_outside"],
+)
+def test_a_clip_that_cannot_or_may_not_be_read_is_named_and_the_others_are_judged(
+    evaluator: Evaluator, tmp_path: Path, changed: dict[str, Any], said: str
+) -> None:
+    write_clips(tmp_path, **changed)
+    os.mkfifo(tmp_path / "zero")
+    (tmp_path / "link.npy").symlink_to("/dev/zero")
+    result = evaluator.judge(folder=str(tmp_path))
+    assert (result.termination_reason, result.message) == (JudgeClips.Result.FINISHED, "")
+    good, bad = result.verdicts
+    assert good.status == ClipVerdict.OK and 0 < good.reward <= 1
+    assert bad.status == ClipVerdict.ERROR and np.isnan(bad.reward) and said in bad.reason and not bad.calls
 
 
 @pytest.mark.parametrize(

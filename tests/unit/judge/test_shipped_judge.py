@@ -3,17 +3,22 @@
 import asyncio
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 import pytest
 from evidence_table import EVIDENCE
+from safetensors.numpy import load_file
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task, task_names
+from wm_nodes.core.types import UInt8Array
+from wm_nodes.judge.agent.judge import ComponentScore
 from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import ClipRef, Stage, Status, TaskSpec, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head
+from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads
 from wm_nodes.judge.backends.factory import check_judge, make_judge
 from wm_nodes.judge.dataset.build import HELD_OUT, LabelledClipSource, instruction_of
 from wm_nodes.judge.dataset.edits.clips import LabelledClip
@@ -22,6 +27,7 @@ from wm_nodes.judge.evidence.head import load_head
 from wm_nodes.judge.evidence.sequence import reading_names
 from wm_nodes.judge.training.heads import CONFORMAL
 from wm_nodes.judge.training.temporal_networks import FOLDS
+from wm_nodes.world_model import load_model_folder
 
 FIRST_SEED = 70_000
 
@@ -66,6 +72,30 @@ def test_noise_and_another_size_are_not_judged() -> None:
         task = TaskSpec("push the blue cube into the red target", "push_cube", "panda", frames[0])
         verdict = judged(clip_ref("c", frames, 5.0), task)
         assert verdict.status is Status.ABSTAIN and reason in verdict.reason and np.isnan(verdict.reward)
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["with the given frame", "without it"])
+def test_clarity_is_read_per_frame_whether_or_not_the_clip_begins_with_the_sharp_given_one(given: bool) -> None:
+    """Frames as the world model draws them, after the recorded one; blurred from each on, as generators blur."""
+    models, shipped = load_model_folder(shipped_model("push_cube")), EmbeddedJudge(load_head(shipped_heads()[1]))
+    agent = RewardAgent(shipped, load_rubric(), mode="benchmark")
+    start = load_file(shipped_model("push_cube") / "starts.safetensors")["images"][0]
+    drawn = models.tokenizer.decode(models.tokenizer.encode(start[None])).numpy()
+    sharp = np.repeat(drawn, 9, 0)
+    sharp[0] = start if given else drawn[0]
+
+    def clarity(frames: UInt8Array) -> ComponentScore:
+        task = TaskSpec("push the blue cube into the red target", "push_cube", "panda", start)
+        verdict = asyncio.run(agent.evaluate(clip_ref("c", frames, 5.0), task))
+        return next(c for stage in verdict.stages for c in stage.components if c.component == "clarity")
+
+    assert clarity(sharp).passed
+    for first in (0, 1, 2, 5, 8):
+        frames = sharp.copy()
+        frames[first:] = [cv2.GaussianBlur(frame, (0, 0), 1.2) for frame in sharp[first:]]
+        spoiled = clarity(frames)
+        assert spoiled.status is Status.OK and not spoiled.passed and spoiled.p_fail > 0.9, first
+        assert spoiled.evidence_text.startswith("sharpness_min 0.") and "a frame is blurred" in spoiled.evidence_text
 
 
 @pytest.fixture(scope="module")

@@ -127,8 +127,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         raise ValueError("nothing to measure: give --questions with a server, --subject or --background")
     metrics = quality(videos, arguments.images, backbones)
     if arguments.metrics is not None:
-        text = arguments.metrics.read_text(encoding="utf-8")
-        metrics |= {name: float(value) for name, value in json.loads(text).items()}
+        metrics |= {name: float(value) for name, value in json.loads(arguments.metrics.read_bytes()).items()}
     results: dict[str, Any] = {
         "videos": len(videos), "model": arguments.model, "backbones": {k: b.name for k, b in backbones.items()},
         "scores": dict(metrics), "missing": sorted(set(pai.QUALITY) - set(metrics)),

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from wm_nodes.core.files import write_atomic
+from wm_nodes.core.files import text_lines, write_atomic
 from wm_nodes.judge.agent.judge import Capabilities
 from wm_nodes.judge.dataset.edits.manifest import Manifest
 
@@ -60,7 +60,7 @@ def _read_log(folder: Path) -> list[TestSplitEvaluation]:
     if not path.is_file():
         return []
     try:
-        return [TestSplitEvaluation(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+        return [TestSplitEvaluation(**json.loads(line)) for line in text_lines(path.read_bytes())]
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path} cannot be read: {error}; restore it, or build the set again") from error
 

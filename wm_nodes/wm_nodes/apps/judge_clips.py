@@ -7,11 +7,13 @@ A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red cube into 
 "push_cube"}; also clip_id, robot, fps (of a .npy), reference (the picture that the clip had to start from), goal, and
 sha256, which is checked.
 Verdicts are appended to CLIPS/verdicts.jsonl; started again, it goes on with the clips that this judge, rubric and mode
-have not judged. The exit code is 1 where a clip has no verdict because the judge failed.
+have not judged. A clip that cannot be read has an ERROR of its own. The exit code is 1 where a clip has an ERROR, or no
+clip at all has a reward.
 """
 
 import argparse
 import json
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
@@ -43,14 +45,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Judge what is not judged yet and print a summary; return 1 where the judge failed on a clip."""
+    """Judge what is not judged yet and print a summary; return 1 where a clip has an ERROR, or none has a reward."""
     overrides = judge_settings(arguments) | device_settings(arguments)
     overrides |= {"judge.mode": arguments.mode} if arguments.mode else {}
     config, lines = load_config(arguments.config, overrides), read_list(arguments.clips)
     path = arguments.json or arguments.clips / VERDICTS
     settings = judge_or_embedded(config.judge)
-    if lines:
-        settings = for_clips(settings, read_job(arguments.clips, lines[0]).clip.frames.shape)
+    if first := next((job for line in lines if not (job := read_job(arguments.clips, line)).problem), None):
+        settings = for_clips(settings, first.clip.frames.shape)
     judge = JudgeService(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit, device=config.device)
     with closing(judge), path.open("a+", encoding="utf-8") as written:
         asked = {"judge_id": judge.judge_ids[0], "rubric": judge.rubric.version}
@@ -81,7 +83,10 @@ def run(arguments: argparse.Namespace) -> int:
                     flush()
             flush()
     _summarise(rows, path)
-    return int(any(row["status"] == Status.ERROR for row in rows))
+    unpaid = bool(rows) and all(row["reward"] is None for row in rows)
+    if unpaid:
+        print("error: not one clip has a reward; the reasons are above", file=sys.stderr)
+    return int(unpaid or any(row["status"] == Status.ERROR for row in rows))
 
 
 def _key(job: ClipJob) -> str:
@@ -101,7 +106,7 @@ def _row(job: ClipJob, verdict: Verdict, by: dict[str, Any]) -> dict[str, Any]:
 def _judged_before(written: str, by: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Rows by clip and task that the same judge gave; an ERROR is asked again, a torn line is passed over."""
     found = dict[str, dict[str, Any]]()
-    for text in written.splitlines():
+    for text in written.removeprefix("\ufeff").split("\n"):
         try:
             row = json.loads(text)
         except ValueError:

@@ -128,7 +128,7 @@ def _read_begun(run_dir: Path, verb: str, fixed: Mapping[str, Any]) -> dict[str,
     data = (run_dir / CONFIG).read_bytes() if (run_dir / CONFIG).is_file() else b""
     if not (run_dir / BEGUN).exists():
         begun = {option: value for option, value in fixed.items() if option not in UNKNOWN_BEFORE}
-        for line in data.decode(errors="replace").splitlines():
+        for line in data.decode(errors="replace").split("\n"):
             option, _, value = line.removeprefix("# begun with --").partition(" ")
             option = option.replace("-", "_")
             if line.startswith("# begun with --") and option in begun:

@@ -25,6 +25,7 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.device import compute_device
+from wm_nodes.core.files import text_lines
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
@@ -92,7 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
 def read_results(folder: Path) -> list[dict[str, Any]]:
     path = folder / "results.jsonl"
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines() if path.exists() else [], 1):
+    for number, line in enumerate(text_lines(path.read_bytes()) if path.exists() else [], 1):
         try:
             rows.append(json.loads(line))
         except ValueError as error:

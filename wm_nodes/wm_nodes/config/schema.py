@@ -188,6 +188,7 @@ class OtherJudge(SettingsSection):
     model: str = ""
     api_key_env: str = ""
     folder: str = ""
+    extra_body: dict[str, Any] = {}
 
 
 class StageJudge(OtherJudge):
@@ -241,6 +242,9 @@ class JudgeConfig(SettingsSection):
     abstains."""
     label_token_ids: list[int]
     """openai: token ids of A to E, for servers that give the probabilities of given ids (vLLM: logprob_token_ids)."""
+    extra_body: dict[str, Any]
+    """openai: further fields of every request, e.g. {chat_template_kwargs: {enable_thinking: false}} for a model that
+    reasons before it answers."""
     repeat_share: Annotated[float, Field(ge=0, le=1)]
     """Share of the calls to a server that are made twice: `flip_rate` says how often the second answer is another."""
     keep_reads: bool

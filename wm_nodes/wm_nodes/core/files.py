@@ -1,4 +1,4 @@
-"""Atomic writing and hashing of files."""
+"""Atomic writing, hashing and lines of files."""
 
 import hashlib
 import os
@@ -28,6 +28,14 @@ def write_atomic(path: Path, data: bytes) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def text_lines(data: bytes) -> list[str]:
+    """The lines of a text in UTF-8. A newline alone ends one: str.splitlines also cuts at U+2028, U+2029 and U+0085,
+    which a JSON string may hold. A byte-order mark at the start is left out. Raises UnicodeDecodeError.
+    """
+    *lines, last = data.decode("utf-8-sig").split("\n")
+    return [*lines, last] if last else lines
 
 
 def file_sha256(path: Path) -> str:

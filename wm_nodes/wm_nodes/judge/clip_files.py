@@ -5,12 +5,14 @@ import os
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
+from tokenize import TokenError
 from typing import Annotated
 
 import cv2
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from wm_nodes.core.files import text_lines
 from wm_nodes.core.named_files import CLIP, CLIP_LIST, PICTURE, FileKind, read_regular
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.types import ClipRef, TaskSpec, clip_ref
@@ -19,6 +21,8 @@ from wm_nodes.judge.service import ClipJob
 LIST = "clips.jsonl"
 Read = Callable[[Path, FileKind], bytes]
 """How the files are read: by default from anywhere; raises ValueError for one that is refused, OSError."""
+NO_FRAMES = np.zeros((0, 0, 0, 3), np.uint8)
+"""Of a clip that cannot be read."""
 AT_ONCE = 64
 """Clips whose pixels are held at a time, as long as the judge does not take more at once."""
 
@@ -48,7 +52,7 @@ def read_list(folder: Path, read: Read = read_regular) -> list[ClipLine]:
     """The lines of clips.jsonl. Raises ValueError: no such file, or a bad line; names line, field and problem."""
     path = folder / LIST
     try:
-        content = read(path, CLIP_LIST).decode()
+        content = text_lines(read(path, CLIP_LIST))
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(
             f'{path} is missing: one line per clip, e.g. {{"file": "a.mp4", "instruction": "push the cube", "task_id": '
@@ -57,7 +61,7 @@ def read_list(folder: Path, read: Read = read_regular) -> list[ClipLine]:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is no text in UTF-8: {error}; write the list again") from None
     lines = []
-    for number, text in enumerate(content.splitlines(), 1):
+    for number, text in enumerate(content, 1):
         if not text.strip():
             continue
         try:
@@ -79,7 +83,16 @@ def list_sha256(folder: Path, announced: str = "", read: Read = read_regular) ->
 
 
 def read_job(folder: Path, line: ClipLine, read: Read = read_regular) -> ClipJob:
-    """A clip with its pixels. Raises ValueError: an unreadable file, or another content than its sha256; names it."""
+    """A clip with its pixels; where they cannot be read, a job whose `problem` says why, so that the others are judged."""
+    try:
+        return _read_job(folder, line, read)
+    except (ValueError, cv2.error) as error:
+        task = TaskSpec(line.instruction, line.task_id, line.robot, NO_FRAMES)
+        return ClipJob(ClipRef(line.clip_id or Path(line.file).stem, "", NO_FRAMES, line.fps), task, str(error))
+
+
+def _read_job(folder: Path, line: ClipLine, read: Read) -> ClipJob:
+    """Raises ValueError: an unreadable file, or another content than its sha256; names it."""
     path = folder / line.file
     clip = _read_frames(path, line.fps, read) if path.suffix == ".npy" else read_video(path, read)
     if line.sha256 and clip.sha256 != line.sha256:
@@ -120,9 +133,11 @@ def read_picture(path: Path, read: Read = read_regular) -> UInt8Array:
 def _read_frames(path: Path, fps: float, read: Read) -> ClipRef:
     """Load an array of frames; the agent checks their shape and type."""
     try:
-        frames = np.load(BytesIO(_bytes_of(path, CLIP, "array", read)), allow_pickle=False)
-    except (OSError, ValueError) as error:
+        frames = np.lib.format.read_array(BytesIO(_bytes_of(path, CLIP, "array", read)), allow_pickle=False)
+    except (ValueError, EOFError, SyntaxError, TokenError, MemoryError) as error:  # its header may say anything
         raise ValueError(f"{path} is no readable array: {error}") from None
+    if frames.ndim != 4 or not frames.size:
+        raise ValueError(f"{path} holds {frames.dtype} {frames.shape}, not frames (F, H, W, 3); write it again")
     return clip_ref(path.stem, frames, fps)
 
 

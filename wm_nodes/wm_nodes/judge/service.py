@@ -54,10 +54,11 @@ class TrainingPaused(Exception):
 
 @dataclass(frozen=True, eq=False)
 class ClipJob:
-    """A clip and what it should show."""
+    """A clip and what it should show. problem: why its pixels cannot be read; it is then an ERROR and nobody is asked."""
 
     clip: ClipRef
     task: TaskSpec
+    problem: str = ""
 
 
 @dataclass
@@ -290,7 +291,7 @@ class JudgeService:
                 finished, open_ = wait(open_, POLL_S, FIRST_COMPLETED)
                 for future in finished:
                     done(futures[future], future.result())
-                    if budget is not None:
+                    if budget is not None and not jobs[futures[future] - first].problem:
                         budget.record(future.result(), alone=len(jobs) == 1)
         finally:
             for future in open_:
@@ -301,17 +302,21 @@ class JudgeService:
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     async def _judge_clip(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
+        problem = job.problem
+        verdict = _unjudged(agent, job, self._seed, problem) if problem else await self._evaluate(agent, job, deadline)
+        self.tally.add(verdict)
+        return verdict
+
+    async def _evaluate(self, agent: RewardAgent | AuditedAgent, job: ClipJob, deadline: float | None) -> Verdict:
         left_s = None if deadline is None else deadline - time.monotonic()
         try:
             async with asyncio.timeout(left_s), self._semaphore:
                 bands = agent.rubric.evidence
                 measure = partial(self._evidence.measure, agent.rubric, job.clip, job.task)
                 evidence = await asyncio.to_thread(measure) if bands else {}
-                verdict = await agent.evaluate(job.clip, job.task, evidence)
+                return await agent.evaluate(job.clip, job.task, evidence)
         except TimeoutError:
-            verdict = _late_verdict(agent, job, self._seed)
-        self.tally.add(verdict)
-        return verdict
+            return _unjudged(agent, job, self._seed, "no verdict by the round's deadline")
 
     async def _ask_health(self, slot: _JudgeSlot) -> None:
         self.health = await slot.opened.judge.health()
@@ -325,8 +330,8 @@ class JudgeService:
             await slot.opened.close()
 
 
-def _late_verdict(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) -> Verdict:
-    """The verdict on a clip that was not judged by the round's deadline."""
+def _unjudged(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int, reason: str) -> Verdict:
+    """The verdict on a clip that was not judged."""
     able, now = agent.judge.capabilities, time.time()
     verdict = Verdict(
         clip_id=job.clip.clip_id, status=Status.ERROR, reward=math.nan, level=-1,
@@ -335,7 +340,7 @@ def _late_verdict(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int) ->
             able.judge_id, able.transport, able.model, able.server_version, agent.rubric.version, "", job.clip.sha256,
             seed, now, now,
         ),
-        reason="no verdict by the round's deadline",
+        reason=reason,
     )
     return replace(verdict, audit_id=content_hash(verdict))
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.core.files import text_lines
 from wm_nodes.reports.figures import COLOURS, add_legend, make_figure, save_figure, style_axes
 
 
@@ -67,7 +68,7 @@ def read_series(metrics_file: Path, name: str) -> list[tuple[int, float]]:
         return []
     section, _, metric = name.rpartition("/")
     values: dict[int, float] = {}
-    for text in metrics_file.read_text(encoding="utf-8").splitlines():
+    for text in text_lines(metrics_file.read_bytes()):
         try:
             line = json.loads(text)
         except json.JSONDecodeError:

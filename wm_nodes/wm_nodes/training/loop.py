@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from wm_nodes.core.files import text_lines
 from wm_nodes.core.progress import tqdm
 from wm_nodes.training import checkpoint
 
@@ -131,7 +132,7 @@ class TrainingLoop:
         path = None if self.run_dir is None else self.run_dir / f"metrics_{self.name}.jsonl"
         if self.iteration == 0 or path is None or not path.exists():
             return {}
-        for line in reversed(path.read_text(encoding="utf-8").splitlines()):
+        for line in reversed(text_lines(path.read_bytes())):
             with suppress(ValueError):  # a killed process may have left half a line
                 return {key: value for key, value in json.loads(line).items() if key not in ("iteration", "seconds")}
         return {}

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wm_nodes.core.files import write_atomic
+from wm_nodes.core.files import text_lines, write_atomic
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
@@ -64,7 +64,7 @@ def join_metrics(folders: Sequence[Path], run_dir: Path) -> None:
 def read_metrics(run_dir: Path, section: str | None = None) -> list[dict[str, object]]:
     """Return the lines of metrics.jsonl in order, of one section or all; a last line cut by a crash is left out."""
     lines = []
-    for text in (run_dir / FILE_NAME).read_text(encoding="utf-8").splitlines():
+    for text in text_lines((run_dir / FILE_NAME).read_bytes()):
         try:
             line = json.loads(text)
         except json.JSONDecodeError:

@@ -31,7 +31,7 @@ from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.plans import CallPlan
 from wm_nodes.judge.backends.prompts import data_uri
 from wm_nodes.judge.backends.protocol import Completion
-from wm_nodes.judge.backends.schemas import AnswerError, AnswerFormat, strip_reasoning
+from wm_nodes.judge.backends.schemas import AnswerError, AnswerFormat, json_object
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
 
 RUBRIC = load_rubric()
@@ -247,10 +247,39 @@ def test_task_plan_hack_and_reflection_must_make_sense() -> None:
 
 
 def test_reasoning_and_fences_are_stripped_and_endless_reasoning_is_refused() -> None:
-    assert strip_reasoning('<think>{"a": 2}</think>\n {"a": 1} ') == '{"a": 1}'
-    assert strip_reasoning('so it is 2</think>```json\n{"a": 1}\n```') == '{"a": 1}'
+    assert json_object('<think>{"a": 2}</think>\n {"a": 1} ') == '{"a": 1}'
+    assert json_object('so it is 2</think>```json\n{"a": 1}\n```') == '{"a": 1}'
     with pytest.raises(AnswerError, match="inside <think>"):
-        strip_reasoning('<think>hm {"a": 1}')
+        json_object('<think>hm {"a": 1}')
+
+
+ANSWER = json.dumps(GOOD)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"```JSON\n{ANSWER}\n```", f"Here it is:\n```json\n{ANSWER}\n```\nHope this helps!", f"thought\n{ANSWER}",
+        f"<think>a {{ or two</think>{ANSWER} so: 1", json.dumps({**GOOD, "level": 1.0, "frames": [3.0]}),
+    ],
+)
+def test_words_and_fences_around_the_one_object_and_whole_floats_change_nothing(text: str) -> None:
+    assert form(Stage.VQ, "clarity").read(text) == form(Stage.VQ, "clarity").read(ANSWER)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (f"{ANSWER}\n{ANSWER.replace('1', '0')}", "more than one JSON object"), (ANSWER[:20], "Invalid JSON: Unter"),
+        ('{"items": [' + ANSWER, "Invalid JSON: Expecting"), ("I cannot help with that.", "holds no object"),
+        ("{" * 100_000, "Invalid JSON"), ('{"evidence":' + "[" * 200_000, "Invalid JSON"),
+        (json.dumps({**GOOD, "level": 1.5}), "level: Input should be a valid integer"),
+    ],
+    ids=["two", "cut", "inner", "refusal", "braces", "deep", "half"],
+)
+def test_two_objects_a_cut_one_or_none_are_no_answer(text: str, problem: str) -> None:
+    with pytest.raises(AnswerError, match=problem):
+        form(Stage.VQ, "clarity").read(text)
 
 
 # The ladder
@@ -298,6 +327,50 @@ def test_ignored_response_format_ends_in_label_reads_that_say_so() -> None:
         assert read.reason.startswith("label read, because JSON answers were refused: Invalid JSON")
     assert reads[0].levels == pytest.approx((0.1, 0.2, 0.1, 0.6, 0.0))
     assert sum(read.cost.calls for read in reads) == 4
+
+
+def test_letters_alone_earn_no_reward_however_sure_they_are(tmp_path: Path) -> None:
+    verdict = judged(ChatServer(honours_schema=False, labels={"A": 1.0}), tmp_path)
+    assert verdict.status is Status.ERROR and np.isnan(verdict.reward) and not verdict.valid
+    assert verdict.reason.startswith("no JSON answer was accepted, and letters alone are no judgement: label read, bec")
+
+
+def test_one_letter_among_json_answers_still_counts(tmp_path: Path) -> None:
+    class ShyAboutClarity(ChatServer):
+        def _completion(self, body: dict[str, Any], fault: Fault | None) -> str:
+            shy = "Judge clarity." in json.dumps(body)
+            return super()._completion(body, Fault("reply", text="I would rather not.") if shy else fault)
+
+    verdict = judged(ShyAboutClarity(level=3, labels={"E": 1.0}), tmp_path)
+    sources = {score.votes[0].source for stage in verdict.stages for score in stage.components}
+    assert verdict.status is Status.OK and sources == {"json", "label"}, verdict.reason
+
+
+def test_extra_fields_go_with_every_request_and_make_another_key(tmp_path: Path) -> None:
+    asked, quiet = request(components=["clarity"], votes=[JSON, LABEL]), {"enable_thinking": False}
+    for extra in ({}, {"chat_template_kwargs": quiet}, {"chat_template_kwargs": quiet, "temperature": 0.5}):
+        server = ChatServer()
+        reads_of(asked, server, options=ChatOptions(extra_body=extra), cache=VerdictCache(tmp_path))
+        assert len(server.requests) == 2, "never from the cache of other fields"
+        for body in server.requests:
+            assert {name: body.get(name) for name in extra} == extra and body["max_tokens"] in (1, 1024)
+
+
+@pytest.mark.parametrize("name", ["reasoning", "reasoning_content"])
+def test_a_model_that_thinks_aside_is_read_and_one_that_only_thinks_is_told_how_to_stop(name: str) -> None:
+    class Thinking(ChatServer):
+        def _completion(self, body: dict[str, Any], fault: Fault | None) -> str:
+            reply = json.loads(super()._completion(body, fault))
+            reply["choices"][0]["message"][name] = '{"level": 0} or so'
+            return json.dumps(reply)
+
+    (read,) = reads_of(request(components=["clarity"]), Thinking(level=3))
+    assert (read.status, read.levels) == (Status.OK, (0, 0, 0, 1, 0))
+    server = Thinking()
+    server.faults.append(Fault("length", text=""))
+    reads_of(request(components=["clarity"]), server)
+    told = server.requests[1]["messages"][1]["content"][-1]["text"]
+    assert "not 'stop'; the model reasons first: turn that off by judge.extra_body" in told
 
 
 def test_server_that_can_do_neither_gives_errors_and_no_numbers() -> None:

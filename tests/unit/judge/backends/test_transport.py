@@ -1,6 +1,7 @@
 """The transport of the OpenAI-compatible judge, against a server on real sockets that misbehaves on request."""
 
 import asyncio
+import json
 import logging
 import random
 import sys
@@ -9,11 +10,13 @@ from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 from typing import Any
+from urllib.parse import quote
 
 import pytest
 from chat_server import ChatServer, Fault
 
 from wm_nodes.core.optional import MissingPackageError
+from wm_nodes.judge.backends.answer_limit import ANSWER_BYTES
 from wm_nodes.judge.backends.limits import AdaptiveLimit, Admission, CircuitBreaker
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy, TransportError, retry_after_s
 
@@ -234,6 +237,76 @@ class EchoingServer(ChatServer):
     def _completion(self, body: dict[str, Any], fault: Fault | None) -> str:
         key = self.headers[-1]["authorization"].removeprefix("Bearer ")
         return super()._completion(body, fault).replace("The clip looks fine to me.", f"I was sent {key}.")
+
+
+@pytest.mark.parametrize("status", [301, 302, 303, 307, 308])
+def test_a_redirect_is_refused_and_neither_frames_nor_key_go_there(
+    status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WM_TEST_KEY", "sk-very-secret")
+    elsewhere = ChatServer()
+
+    async def steps(transport: ChatTransport, server: ChatServer) -> None:
+        async with elsewhere.running():
+            there = f"{elsewhere.url}/chat/completions?key=sk-very-secret"
+            server.faults.append(Fault("status", status, location=there))
+            with pytest.raises(TransportError, match="which is not followed.*name it in judge.endpoints") as caught:
+                await transport.complete(BODY, timeout_s=20)
+            host = elsewhere.url.split("/")[2]
+            assert f"HTTP {status}: it redirects to {host}," in str(caught.value) and "secret" not in str(caught.value)
+            assert (caught.value.status, caught.value.tries) == (status, 1)
+
+    talk(steps, ChatServer(), api_key_env="WM_TEST_KEY")
+    assert not elsewhere.requests
+
+
+@pytest.mark.parametrize("status", [200, 400, 500])
+def test_an_endless_answer_is_read_up_to_a_limit_only(status: int) -> None:
+    server = ChatServer()
+    server.faults.extend([Fault("endless", status)] * 2)
+    with pytest.raises(TransportError, match="the answer is longer than 8 MiB"):
+        talk(ask_patiently, server, retry=RetryPolicy(tries=2, base_s=0.01, cap_s=0.02))
+    assert server.num_endless_bytes < 2 * ANSWER_BYTES + (16 << 20), "the rest lies in the sockets"
+
+
+def test_a_compressed_answer_which_could_grow_is_no_answer() -> None:
+    server = ChatServer()
+    server.faults.append(Fault("compressed"))
+    assert talk(ask_patiently, server).tries == 2
+    assert server.headers[0]["accept-encoding"] == "identity"
+
+
+@pytest.mark.parametrize("key", ["a/b+c=d/e", 'quo"te\\back', "it's", "<&>", "%2F%", "[0-9]+"])
+def test_a_key_is_found_however_it_is_written(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WM_TEST_KEY", key)
+    escaped = json.dumps(key)[1:-1].replace("/", "\\/")
+    codes = "".join(f"\\u{ord(character):04X}" for character in key)
+    inner = json.dumps({"evidence": f"{escaped} {codes}"})
+    texts = [key, escaped, codes, quote(key, safe=""), repr(key)[1:-1], inner, json.dumps(inner)]
+    server = ChatServer()
+    server.faults.extend(Fault("reply", text=f"I was sent {text}.") for text in texts)
+    server.faults.append(Fault("status", 401, "x" * 490 + key))
+
+    async def steps(transport: ChatTransport, server: ChatServer) -> None:
+        for text in texts:
+            answer = await transport.complete(BODY, timeout_s=20)
+            said = str(answer.completion.choices[0].message.content)
+            assert "[WM_TEST_KEY]" in said and key not in said and text not in said
+        with pytest.raises(TransportError) as caught:
+            await transport.complete(BODY, timeout_s=20)
+        assert key[:2] not in str(caught.value).partition("x" * 400)[2].rstrip("'}")
+
+    talk(steps, server, api_key_env="WM_TEST_KEY")
+
+
+@pytest.mark.parametrize("key", ["two words", "broken\n", "schlüssel"])
+def test_a_key_that_no_header_can_carry_is_refused_without_being_repeated(
+    key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WM_TEST_KEY", key)
+    with pytest.raises(ValueError, match="the key in WM_TEST_KEY holds a blank, a line break") as caught:
+        ChatTransport([Endpoint("http://127.0.0.1:1/v1", "judge", "WM_TEST_KEY")])
+    assert key.strip() not in str(caught.value)
 
 
 def test_key_comes_from_the_named_variable_and_reaches_no_log_and_no_error(

@@ -82,7 +82,7 @@ def load_questions(folder: Path) -> list[BenchQuestion]:
 
 def _questions(path: Path) -> list[BenchQuestion]:
     try:
-        return [_question(path.stem, entry) for entry in json.loads(path.read_text(encoding="utf-8"))]
+        return [_question(path.stem, entry) for entry in json.loads(path.read_bytes())]
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is no list of yes-or-no questions: {type(error).__name__}: {error}") from None
 

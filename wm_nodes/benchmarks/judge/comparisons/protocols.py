@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from wm_nodes.judge.backends.schemas import AnswerError, strip_reasoning
+from wm_nodes.judge.backends.schemas import AnswerError, json_object
 
 Parts = Mapping[str, float]
 UNIFIED_DIMENSIONS = (
@@ -168,7 +168,7 @@ def _reader(model: type[BaseModel]) -> Callable[[str], Parts]:
 
 def _parse(model: type[Any], text: str) -> Any:
     try:
-        return model.model_validate(json.loads(strip_reasoning(text)))
+        return model.model_validate(json.loads(json_object(text)))
     except ValidationError as error:
         first = error.errors()[0]
         raise AnswerError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None

@@ -151,6 +151,7 @@ class _Run:
             await self._read_patterns()
             confirmed = [flag.pattern for flag in self.flags if flag.confirmed]
             self.stages = {s.stage: s for s in scoring.apply_caps(self._stages_in_order(), confirmed, self.rubric)}
+        self._refuse_letters_alone()
         silent = [c.reason for s in self._stages_in_order() for c in s.components if c.status is Status.ABSTAIN]
         if silent:
             return Status.ABSTAIN, math.nan, "; ".join(silent)
@@ -251,6 +252,12 @@ class _Run:
             self.stages[stage] = scoring.stage_score(stage, scores, self.rubric)
         reason = second.reason or second.evidence_text
         return Change(before.component, before.s, after.s, reason, second.frames_cited, accepted)
+
+    def _refuse_letters_alone(self) -> None:
+        """Raise _Stop(ERROR) where every first read was asked for as JSON and is a letter, its answer being refused."""
+        first = [c.votes[0] for s in self._stages_in_order() for c in s.components if c.votes]
+        if first and all(read.source == "label" and read.vote.kind == "json" for read in first):
+            raise _Stop(Status.ERROR, f"no JSON answer was accepted, and letters alone are no judgement: {first[0].reason}")
 
     async def _read_patterns(self) -> None:
         """Read every hacking pattern once, and those that seem present again."""

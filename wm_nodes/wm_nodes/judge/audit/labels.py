@@ -1,5 +1,6 @@
 """What people say of clips: the file that the viewer exports, for `agree` and `adopt`."""
 
+from codecs import BOM_UTF8
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -54,7 +55,7 @@ class HumanLabels(_FrozenModel):
 def read_labels(path: Path) -> HumanLabels:
     """Read an exported file. Raises AuditError: it cannot be read or is no such file; OSError: it is not there."""
     try:
-        return HumanLabels.model_validate_json(Path(path).read_bytes())
+        return HumanLabels.model_validate_json(Path(path).read_bytes().removeprefix(BOM_UTF8))
     except ValidationError as error:
         first = error.errors(include_input=False, include_url=False)[0]
         where = ".".join(map(str, first["loc"])) or "file"

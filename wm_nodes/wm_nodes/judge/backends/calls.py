@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from wm_nodes.judge.agent.judge import Cost, Read, ReadRequest, Vote
@@ -26,6 +26,11 @@ MEASURED_CALLS = 200
 SEED_LIMIT = 2**31
 MIN_LABEL_MASS = 0.5
 """A label read with less abstains, unless its answers are chosen by a grammar."""
+OWN_FIELDS = frozenset((
+    "model", "messages", "seed", "max_tokens", "response_format", "logprobs", "top_logprobs", "logprob_token_ids",
+    "structured_outputs", "stream", "n",
+))
+"""Of a request, which extra_body may not set."""
 Exchange = Mapping[str, Any]
 """The texts of a request and the raw reply, as JSON values, for an audit log."""
 
@@ -38,7 +43,8 @@ class ChatOptions:
     server can be asked for their probabilities by id. choice_grammar: label reads choose among the letters only, so
     that the label mass no longer warns. max_images: that the server takes in one call. video: the dense profile goes as
     one video (vLLM, --limit-mm-per-prompt with a video), else as images. repeat_share: of the calls that are asked
-    twice, so that it is known how often a live server contradicts itself; the first answer counts.
+    twice, so that it is known how often a live server contradicts itself; the first answer counts. extra_body: further
+    fields of every request.
     """
 
     json_timeout_s: float = 120.0
@@ -50,6 +56,7 @@ class ChatOptions:
     max_images: int = 64
     video: bool = False
     repeat_share: float = 0.0
+    extra_body: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not 0 <= self.repeat_share <= 1:
@@ -76,9 +83,11 @@ class Prompt:
     """A request body, how its answer is read, and `sha`: of all of it but the media, which have their own hash."""
 
     def __init__(
-        self, call: Call, messages: list[Part], fields: dict[str, Any], reader: AnswerFormat | tuple[int, ...]
+        self, call: Call, messages: list[Part], fields: dict[str, Any], reader: AnswerFormat | tuple[int, ...],
+        extra_body: Mapping[str, Any],
     ) -> None:
-        self.body = {"messages": messages, "temperature": 0, "seed": call.vote.seed % SEED_LIMIT, **fields}
+        seed = call.vote.seed % SEED_LIMIT
+        self.body = {"messages": messages, "temperature": 0, "seed": seed, **extra_body, **fields}
         self.reader = reader
         system, user = messages
         self.sha = sha_of([system, user["content"][len(call.media) :], {**self.body, "messages": None}])
@@ -193,7 +202,8 @@ class Caller:
             prior={score.component: level for score in request.prior if (level := prior_level(score)) is not None},
         )
         fields = {"max_tokens": self._options.max_answer_tokens, "response_format": form.response_format}
-        return Prompt(call, self._prompts.json_question(call.media, request, call.components, form), fields, form)
+        messages = self._prompts.json_question(call.media, request, call.components, form)
+        return Prompt(call, messages, fields, form, self._options.extra_body)
 
     def _label_prompt(self, call: Call, component: Component) -> Prompt:
         request, options = call.request, self._options
@@ -203,7 +213,7 @@ class Caller:
         fields = label_options(
             LETTERS[:count], token_ids=options.label_token_ids[:count], grammar=options.choice_grammar
         )
-        return Prompt(call, messages, fields, order)
+        return Prompt(call, messages, fields, order, options.extra_body)
 
 
 def describe_request(call: Call, body: Mapping[str, Any]) -> dict[str, Any]:
@@ -223,11 +233,14 @@ def sha_of(value: Any) -> str:
 
 def _answer_text(completion: Completion) -> str:
     choice = completion.choices[0]
+    message, text = choice.message, choice.message.content or ""
+    thought = message.reasoning or message.reasoning_content or "<think>" in text
+    remedy = "; the model reasons first: turn that off by judge.extra_body" if thought else ""
     if choice.finish_reason != "stop":
-        raise AnswerError(f"finish_reason is {choice.finish_reason!r}, not 'stop'")
-    if not choice.message.content:
-        raise AnswerError("the answer is empty")
-    return choice.message.content
+        raise AnswerError(f"finish_reason is {choice.finish_reason!r}, not 'stop'{remedy}")
+    if not text:
+        raise AnswerError(f"the answer is empty{remedy}")
+    return text
 
 
 def _read_of(finding: ComponentAnswer, vote: Vote) -> Read:

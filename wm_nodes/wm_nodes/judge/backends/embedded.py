@@ -27,7 +27,7 @@ from wm_nodes.judge.evidence.clip import clip_evidence
 from wm_nodes.judge.evidence.head import HACK, TASK_COMPLETION, JudgeHead, components_of
 
 TRANSPORT = "embedded"
-REVISION = "1"
+REVISION = "2"
 """Raised whenever the same head gives other answers, so that two versions have two identities."""
 CACHED_CLIPS = 64
 """Clips whose evidence is cached, for the stages of one verdict."""

@@ -13,7 +13,7 @@ from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import Stage
 from wm_nodes.judge.backends.cache import VerdictCache
-from wm_nodes.judge.backends.calls import ChatOptions, Exchange
+from wm_nodes.judge.backends.calls import OWN_FIELDS, ChatOptions, Exchange
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit_reason
 from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.routed import RoutedJudge
@@ -88,6 +88,8 @@ def _check_one(settings: JudgeConfig) -> None:
             "judge.api_key_env must be the name of an environment variable, e.g. JUDGE_API_KEY; what is there is no "
             "name, perhaps a key, and is not repeated here"
         )
+    if taken := sorted(OWN_FIELDS & settings.extra_body.keys()):
+        raise ValueError(f"judge.extra_body sets {', '.join(taken)}, which the judge sets itself; leave it out")
 
 
 def for_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> JudgeConfig:
@@ -180,7 +182,7 @@ def _open(
         json_timeout_s=settings.json_timeout_s, label_timeout_s=settings.label_timeout_s,
         budget_s=settings.clip_budget_s, max_images=settings.max_images, video=settings.video,
         choice_grammar=settings.choice_grammar, label_token_ids=tuple(settings.label_token_ids),
-        repeat_share=settings.repeat_share,
+        repeat_share=settings.repeat_share, extra_body=settings.extra_body,
     )
     cache = VerdictCache(reads) if reads is not None and settings.keep_reads else None
     return OpenedJudge(OpenAIJudge(transport, rubric, options, cache, on_exchange), transport.close)

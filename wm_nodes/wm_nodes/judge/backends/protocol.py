@@ -1,5 +1,7 @@
 """The part of a chat completion that a judge reads; servers add more, which is dropped."""
 
+from typing import Any
+
 from pydantic import BaseModel, Field
 
 
@@ -17,7 +19,11 @@ class ChoiceLogprobs(BaseModel):
 
 
 class Message(BaseModel):
+    """reasoning, reasoning_content: where servers put a model's thoughts; no part of the answer."""
+
     content: str | None = None
+    reasoning: Any = None
+    reasoning_content: Any = None
 
 
 class Choice(BaseModel):

@@ -4,26 +4,34 @@ One schema per call type: nothing beside the named properties, every string and 
 that the model looks before it scores.
 """
 
-import re
+import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model
 
 from wm_nodes.judge.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING, Component, Stage
 
 NO_PROBLEM = "none"
+_DECODER = json.JSONDecoder()
 COMPLETED_FROM = 3
 """Progress level from which a task counts as completed."""
 
+
+
+def _whole(value: Any) -> Any:
+    """3 of 3.0, which means the same; anything else as it is."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
 Text = Annotated[str, Field(min_length=1, max_length=240)]
-Frame = Annotated[int, Field(ge=0)]
+Frame = Annotated[int, Field(ge=0), BeforeValidator(_whole)]
 Frames = Annotated[list[Frame], Field(max_length=4)]
 CitedFrames = Annotated[list[Frame], Field(min_length=1, max_length=4)]
-Level = Annotated[int, Field(ge=0, le=NUM_LEVELS - 1)]
-PlanLevel = Annotated[int, Field(ge=0, le=NUM_PLAN_LEVELS - 1)]
+Level = Annotated[int, Field(ge=0, le=NUM_LEVELS - 1), BeforeValidator(_whole)]
+PlanLevel = Annotated[int, Field(ge=0, le=NUM_PLAN_LEVELS - 1), BeforeValidator(_whole)]
 
 
 class AnswerError(ValueError):
@@ -90,7 +98,7 @@ class AnswerFormat:
     def read(self, text: str) -> list[ComponentAnswer]:
         """Parse an answer and check schema and sense; one finding per component. Raises AnswerError: what is wrong."""
         try:
-            answer: Any = self.model.model_validate_json(strip_reasoning(text))
+            answer: Any = self.model.model_validate_json(json_object(text))
         except ValidationError as error:
             raise AnswerError("; ".join(_describe_problem(problem) for problem in error.errors()[:3])) from None
         if self.name == "plan":
@@ -177,12 +185,32 @@ class AnswerFormat:
 
 
 def strip_reasoning(text: str) -> str:
-    """What follows the model's reasoning, without a code fence. Raises AnswerError: the reasoning never ended."""
+    """What follows the model's reasoning. Raises AnswerError: the reasoning never ended."""
     _, end, rest = text.rpartition("</think>")
     if not end and "<think>" in text:
         raise AnswerError("the answer ends inside <think>")
-    fenced = re.fullmatch(r"```(?:json)?\s*(.*?)\s*```", rest.strip(), re.DOTALL)
-    return fenced.group(1) if fenced else rest.strip()
+    return rest.strip()
+
+
+def json_object(text: str) -> str:
+    """The one JSON object of an answer; reasoning, words and a fence around it are left out.
+
+    Raises:
+        AnswerError: there is none, a brace that begins no whole object, or more than one.
+    """
+    rest, found = strip_reasoning(text), ""
+    start = rest.find("{")
+    while start >= 0:
+        try:
+            _, end = _DECODER.raw_decode(rest, start)
+        except (ValueError, RecursionError) as error:
+            raise AnswerError(f"Invalid JSON: {error}") from None
+        if found:
+            raise AnswerError("the answer holds more than one JSON object")
+        found, start = rest[start:end], rest.find("{", end)
+    if not found:
+        raise AnswerError("Invalid JSON: the answer holds no object")
+    return found
 
 
 def _model(name: str, **properties: Any) -> type[BaseModel]:

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import os
 import random
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from wm_nodes.judge.backends.protocol import Completion
 CONNECT_S = 5.0
 OVERLOAD = (429, 503)
 _RETRIED = (408, 409, 425, 429)
+_HEADER_VALUE = re.compile("[!-~]+")
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
@@ -69,6 +71,11 @@ class Endpoint:
         key = os.environ.get(self.api_key_env, "")
         if not key:
             raise ValueError(f"{self.base_url} needs a key in the environment variable {self.api_key_env}; export it")
+        if not _HEADER_VALUE.fullmatch(key):
+            raise ValueError(
+                f"the key in {self.api_key_env} holds a blank, a line break or a character that is not ASCII, which no "
+                "HTTP header carries; export it again without that"
+            )
         return key
 
 
@@ -101,13 +108,14 @@ class _Server:
     """An endpoint with its client, limit and breaker."""
 
     def __init__(self, endpoint: Endpoint, client: Any, probe_s: float) -> None:
-        self.endpoint, self.client, self.key = endpoint, client, endpoint.api_key()
+        self.endpoint, self.client = endpoint, client
+        self._key = _written_anyhow(endpoint.api_key()) if endpoint.api_key_env else None
         self.limit = AdaptiveLimit(endpoint.max_in_flight)
         self.breaker = CircuitBreaker(time.monotonic, probe_s=probe_s)
 
     def clean(self, text: str) -> str:
         """The text without the key: servers repeat headers in their error messages, and some in their answers."""
-        return text.replace(self.key, f"[{self.endpoint.api_key_env}]") if self.endpoint.api_key_env else text
+        return self._key.sub(f"[{self.endpoint.api_key_env}]", text) if self._key else text
 
 
 class ChatTransport:
@@ -257,7 +265,13 @@ class ChatTransport:
             raise _FailedTry(text, timed_out=True) from None
         except openai.APIStatusError as error:
             status = error.status_code
-            text = f"HTTP {status}: {error.message[:500]}"
+            text = f"HTTP {status}: {server.clean(error.message)[:500]}"
+            if error.response.has_redirect_location:
+                to = urlsplit(server.clean(error.response.headers["location"])).netloc or "another path"
+                text = (
+                    f"HTTP {status}: it redirects to {to[:200]}, which is not followed, as frames and key would go "
+                    "there; if it is the judge, name it in judge.endpoints"
+                )
             refused = status not in _RETRIED and status < 500
             raise _FailedTry(text, status, retry_after_s(error.response.headers), refused=refused) from None
         except openai.APIConnectionError as error:
@@ -268,12 +282,18 @@ class ChatTransport:
             raise _FailedTry(f"HTTP 200 without a chat completion: {where}: {first['msg']}") from None
 
     def _client(self, endpoint: Endpoint) -> Any:
-        """A client without retries of its own. A loopback server is never reached through a proxy."""
+        """A client without retries of its own that follows no redirect and reads no endless answer. A loopback server is
+        never reached through a proxy."""
+        from wm_nodes.judge.backends.answer_limit import bound_answer  # it needs the client package
+
         loopback = urlsplit(endpoint.base_url).hostname in _LOOPBACK
         return self._openai.AsyncOpenAI(
             base_url=endpoint.base_url, api_key=endpoint.api_key(), max_retries=0,
             timeout=self._openai.Timeout(None, connect=CONNECT_S),
-            http_client=self._openai.DefaultAsyncHttpxClient(trust_env=not loopback),
+            http_client=self._openai.DefaultAsyncHttpxClient(
+                trust_env=not loopback, follow_redirects=False, event_hooks={"response": [bound_answer]},
+                headers={"Accept-Encoding": "identity"},
+            ),
         )
 
 
@@ -287,6 +307,15 @@ class _FailedTry(Exception):
         super().__init__(text)
         self.status, self.retry_after_s = status, retry_after_s
         self.refused, self.timed_out, self.out_of_time = refused, timed_out, out_of_time
+
+
+def _written_anyhow(key: str) -> re.Pattern[str]:
+    """What finds a key as it is, and as it stands in JSON or in a URL: servers may write / as \\/, \\u002f or %2F.
+
+    The backslashes may have been doubled, by JSON inside JSON.
+    """
+    forms = (rf"(?:{re.escape(c)}|u00{ord(c):02x}|%{ord(c):02x})" for c in key)
+    return re.compile("".join(rf"\\{{0,16}}{form}" for form in forms), re.IGNORECASE)
 
 
 def _left_s(deadline: float | None) -> float | None:

@@ -31,6 +31,8 @@ FORMAT = "embedded-judge-1"
 TENSORS, MANIFEST = "judge.safetensors", "judge.json"
 TREE_ARRAYS = ("features", "thresholds", "leaves", "gains")
 TASK_COMPLETION = "task_completion"
+CLARITY, SHARPNESS = "clarity", "sharpness_min"
+"""A component, and the evidence of its blurriest frame."""
 FAIL_LEVEL, PASS_LEVEL = 1, 4
 """A component's labels are pass and fail only: fail is read as "clearly wrong", pass as "clean"."""
 HACK = "hack/"
@@ -79,8 +81,9 @@ class JudgeHead:
     or "is it absent"; for task completion one per level above the lowest; for planning "is it a video" and "is it
     readable", and it is good where no component fails. clean_low, clean_high: (F,), 5 %
     and 95 % quantiles over clips in which nothing fails. size: H, W that evidence is measured at. lengths: fewest and
-    most frames. window: what is read of a picture; None: all of it. readers: their mean is among the evidence. story:
-    how it was made and what it measured.
+    most frames. window: what is read of a picture; None: all of it. readers: their mean is among the evidence.
+    sharpness_limit: a clip with a frame below it is not clear, as the trees learned from whole clips and let one sharp
+    frame excuse the others. story: how it was made and what it measured.
     """
 
     segmenter: Segmenter
@@ -95,6 +98,7 @@ class JudgeHead:
     sha256: str = ""
     window: Window | None = None
     readers: tuple[TemporalNetwork, ...] = ()
+    sharpness_limit: float = 0.0
 
     @property
     def picture_size(self) -> tuple[int, int]:
@@ -113,7 +117,10 @@ class JudgeHead:
 
     def levels(self, target: str, row: FloatArray) -> tuple[float, ...]:
         """Probability of each level, worst first, of a row (1, F). Raises KeyError: no head for this target."""
-        return levels_of(target, [float(p) for p in above_levels(self.questions, target, row)[:, 0]])
+        above = [float(p) for p in above_levels(self.questions, target, row)[:, 0]]
+        if target in (CLARITY, PLANNING) and self._blurriest(row) < self.sharpness_limit:
+            above[-1] = 0.0  # neither clear nor of the highest planning level
+        return levels_of(target, above)
 
     def conformal(self, coverage: float) -> dict[str, tuple[float, float]]:
         """(low, high) of p_fail per component, see conformal_limits. Raises ValueError: coverage not calibrated."""
@@ -126,7 +133,11 @@ class JudgeHead:
         return {target: (float(low), float(high)) for target, (low, high) in limits.items()}
 
     def evidence_text(self, target: str, row: FloatArray) -> str:
-        """Up to three signals that the trees ask most about and that lie outside of what clean clips show."""
+        """Up to three signals that the trees ask most about and that lie outside of what clean clips show; of a blurred
+        frame, its sharpness.
+        """
+        if target == CLARITY and (sharpness := self._blurriest(row)) < self.sharpness_limit:
+            return f"{SHARPNESS} {sharpness:.3g}: a frame is blurred (clear from {self.sharpness_limit:.3g})"
         weight = np.sum([q.trees.importance(len(self.names)) for q in self.questions[target]], 0)
         width = np.maximum(self.clean_high - self.clean_low, 1e-3 + 0.02 * np.abs(self.clean_high))
         outside = np.maximum(row[0] - self.clean_high, self.clean_low - row[0]) / width
@@ -137,6 +148,10 @@ class JudgeHead:
             for i in chosen
         ]
         return "; ".join(parts) or "all evidence within what clean clips show"
+
+    def _blurriest(self, row: FloatArray) -> float:
+        """Sharpness of the blurriest frame."""
+        return float(row[0, self.names.index(SHARPNESS)]) if self.sharpness_limit else np.inf
 
 
 def above_levels(questions: Mapping[str, tuple[HeadQuestion, ...]], target: str, rows: FloatArray) -> Floats:
@@ -186,6 +201,7 @@ def save_head(folder: Path, head: JudgeHead) -> Path:
     manifest = {
         "format": FORMAT, "sha256": hashlib.sha256(data).hexdigest(), "evidence": list(head.names), "lines": lines,
         "limit": known.limit, "size": list(head.size), "lengths": list(head.lengths), "readers": len(head.readers),
+        "sharpness_limit": head.sharpness_limit,
         **({} if head.window is None else {"window": asdict(head.window)}), **head.story,
     }
     return write_model_folder(folder, {TENSORS: data}, manifest, MANIFEST)
@@ -216,15 +232,16 @@ def load_head(folder: Path, device: torch.device | str = "cpu") -> JudgeHead:
         height, width = manifest["size"]
         fewest, most = manifest["lengths"]
         window = Window(**manifest["window"]) if "window" in manifest else None
+        sharpness_limit = float(manifest["sharpness_limit"])
         clean_low, clean_high = arrays["clean_low"], arrays["clean_high"]
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ModelFolderError(f"{folder} is of another architecture: {error}; train it anew") from error
     _check(folder, names, questions, known, (clean_low, clean_high))
-    own = {"format", "sha256", "evidence", "lines", "limit", "size", "lengths", "readers", "window"}
+    own = {"format", "sha256", "evidence", "lines", "limit", "size", "lengths", "readers", "window", "sharpness_limit"}
     story = {name: value for name, value in manifest.items() if name not in own}
     return JudgeHead(
         segmenter, names, questions, known, clean_low, clean_high, (height, width), (fewest, most), story,
-        manifest["sha256"], window, readers,
+        manifest["sha256"], window, readers, sharpness_limit,
     )
 
 

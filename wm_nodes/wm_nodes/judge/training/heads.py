@@ -23,6 +23,7 @@ from wm_nodes.judge.dataset.edits.planning import planning_level
 from wm_nodes.judge.evidence.head import (
     CLIP_AT,
     HACK,
+    SHARPNESS,
     Familiarity,
     HeadQuestion,
     above_levels,
@@ -68,6 +69,15 @@ class Examples:
     def clean(self) -> BoolArray:
         """bool (N,), True where no label fails."""
         return np.array([row.labels.overall for row in self.rows], bool)
+
+
+def sharpness_limit(examples: Examples) -> float:
+    """The lowest sharpness of a frame in clips in which nothing fails. Of n such clips, a further one lies below it with
+    a probability of 1 / (n + 1). Raises ValueError: there is none.
+    """
+    if not examples.clean.any():
+        raise ValueError(f"in each of {len(examples.rows)} clips something fails; build larger sets")
+    return float(examples.evidence[examples.clean, examples.names.index(SHARPNESS)].min())
 
 
 def true_levels(target: str, rows: Sequence[ManifestRow]) -> Levels:

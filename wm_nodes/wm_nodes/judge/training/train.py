@@ -34,7 +34,15 @@ from wm_nodes.judge.evidence.sequence import ObjectSequence, TemporalNetwork, re
 from wm_nodes.judge.evidence.trees import TreeSettings
 from wm_nodes.judge.evidence.window import Window
 from wm_nodes.judge.training.data import load_sets, rows_of, set_clips
-from wm_nodes.judge.training.heads import TARGETS, Examples, conformal_limits, fit_all, fit_familiarity, measure_target
+from wm_nodes.judge.training.heads import (
+    TARGETS,
+    Examples,
+    conformal_limits,
+    fit_all,
+    fit_familiarity,
+    measure_target,
+    sharpness_limit,
+)
 from wm_nodes.judge.training.segmenter import overlaps, segmentation_data, train_segmenter
 from wm_nodes.judge.training.temporal_networks import cross_fit, temporal_data
 from wm_nodes.training.checkpoint import read_tensors
@@ -112,7 +120,8 @@ def make_judge(
     known = fit_familiarity(train, validation)
     size = (recorded[0][1], recorded[0][2])
     return JudgeHead(
-        segmenter, train.names, questions, known, low, high, size, lengths, story, window=plan.window, readers=readers
+        segmenter, train.names, questions, known, low, high, size, lengths, story, window=plan.window, readers=readers,
+        sharpness_limit=sharpness_limit(validation),
     )
 
 

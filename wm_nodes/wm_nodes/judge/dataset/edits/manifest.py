@@ -5,6 +5,7 @@ and a text that version control can show differences of.
 """
 
 import hashlib
+import io
 import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -159,7 +160,7 @@ def to_bytes(manifest: Manifest) -> bytes:
 def from_bytes(data: bytes) -> Manifest:
     """Read and verify a manifest. Raises ManifestError: damaged, of another format, with false counts, or see check."""
     try:
-        first, *lines = data.decode().splitlines(keepends=True)
+        first, *lines = (line.decode() for line in io.BytesIO(data))
         header = json.loads(first)
         if header.get("format") != FORMAT:
             raise ManifestError(f"the manifest has format {header.get('format')!r}, not {FORMAT!r}; build it again")
