@@ -65,5 +65,8 @@ TASK = Task(
     shows_goal=False,
     model_tasks=objects.MODEL_TASKS,
     weak_policies=(WeakPolicy(2, 100, 0.25),),
-    settings={**objects.SETTINGS, "data.behaviours": MOVING},
+    settings={
+        **objects.SETTINGS, "data.behaviours": MOVING, "policy.init_log_std": -2.0, "ppo.target_kl": 0.2,
+        "ppo.kl_reference_weight": 0.01,
+    },
 )
