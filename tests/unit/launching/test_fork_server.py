@@ -1,12 +1,15 @@
 """Nodes fork from a process that has not started CUDA: its imports do not, and it does not fork where one does."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from wm_nodes.launching import fork_server
 from wm_nodes.launching.fork_server import CUDA_RUNS, ForkServer, ForkServerError
 from wm_nodes.launching.runner import preloaded
 from wm_nodes.launching.scenarios import SCENARIOS, build_graph, parse_arguments
@@ -64,3 +67,31 @@ def test_a_server_in_which_cuda_runs_says_so_and_does_not_fork(tmp_path: Path, s
     finally:
         server.close()
     assert output.read_text() == (CUDA_RUNS if started else "node runs\n")
+
+
+def test_a_node_that_came_too_late_is_ended_and_the_next_ones_are_not_taken_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a crowded machine; a killed node was once never noticed, because another one was watched in its place."""
+    (tmp_path / "slow.py").write_text("import time\ntime.sleep(4)\n")
+    (tmp_path / "node.py").write_text(
+        "import os, sys, time\nprint(sys.argv[1], os.getpid(), flush=True)\ntime.sleep(60)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
+    server = ForkServer(sys.executable, ["slow"], environment)
+    try:
+        with (tmp_path / "late.log").open("ab") as late, (tmp_path / "node.log").open("ab") as log:
+            monkeypatch.setattr(fork_server, "ANSWER_S", 1.0)
+            with pytest.raises(ForkServerError, match="does not answer"):
+                server.start(["node", "late"], environment, late.fileno())
+            monkeypatch.setattr(fork_server, "ANSWER_S", 60.0)
+            pid, end = server.start(["node", "next"], environment, log.fileno())
+        while not (said := (tmp_path / "node.log").read_text().split()):
+            time.sleep(0.05)
+        assert said == ["next", str(pid)]
+        os.kill(pid, signal.SIGKILL)
+        assert end.result(20) == -signal.SIGKILL
+        for word in (tmp_path / "late.log").read_text().split()[1:]:
+            assert not Path(f"/proc/{word}").exists()
+    finally:
+        server.close()

@@ -9,6 +9,7 @@ import atexit
 import ctypes
 import gc
 import importlib
+import itertools
 import json
 import os
 import runpy
@@ -25,8 +26,9 @@ from typing import Any
 
 from wm_nodes.core.processes import stat_fields
 
-ANSWER_S = 60.0
-"""Longest time for the imports."""
+ANSWER_S = 300.0
+"""Longest time for the imports: on a crowded machine they took more than 60 s, and in each node by itself they take
+longer."""
 CLOSE_S, ORPHAN_S = 1.0, 5.0
 """Time for the server's end, and for a node's whose server is gone; then they are killed."""
 MESSAGE_BYTES = 2**20
@@ -63,7 +65,10 @@ class ForkServer:
                 command, env=env, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()], start_new_session=True, preexec_fn=end_with_parent,
             )
-        self._started: Future[tuple[int, Future[int]]] = Future()
+        self._starts: dict[int, Future[tuple[int, Future[int]]]] = {}
+        """By number of the request, which its answer repeats."""
+        self._numbers = itertools.count()
+        self._ended = False
         self._ends: dict[int, Future[int]] = {}
         self._lock = threading.Lock()
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -77,14 +82,19 @@ class ForkServer:
         Raises:
             ForkServerError: no answer.
         """
-        request = json.dumps({"arguments": [*arguments], "env": {**env}}).encode()
+        number, started = next(self._numbers), Future[tuple[int, Future[int]]]()
+        request = json.dumps({"number": number, "arguments": [*arguments], "env": {**env}}).encode()
         with self._lock:
-            self._started = Future()
+            self._starts[number] = started
             try:
                 socket.send_fds(self._socket, [request], [output])
-                return self._started.result(ANSWER_S)
+                if self._ended:
+                    raise OSError("it has ended")
+                return started.result(ANSWER_S)
             except (OSError, TimeoutError) as error:
                 raise ForkServerError(f"the process that starts nodes does not answer: {error!r}") from None
+            finally:
+                del self._starts[number]
 
     def close(self) -> None:
         """End the server; nodes that still run are sent SIGTERM."""
@@ -104,14 +114,19 @@ class ForkServer:
             pid = answer["pid"]
             if "code" in answer:
                 self._ends.pop(pid).set_result(answer["code"])
+                continue
+            self._ends[pid] = Future()
+            if (started := self._starts.get(answer["number"])) is not None:
+                started.set_result((pid, self._ends[pid]))
             else:
-                self._ends[pid] = Future()
-                self._started.set_result((pid, self._ends[pid]))
+                end_group(pid)  # who asked for it has given up, and started it otherwise
         for pid, end in self._ends.items():
             _await_orphan(pid)
             end.set_result(-signal.SIGTERM)
-        if not self._started.done():
-            self._started.set_exception(OSError("it has ended"))
+        self._ended = True
+        for started in [*self._starts.values()]:
+            if not started.done():
+                started.set_exception(OSError("it has ended"))
 
     def _receive(self) -> bytes:
         try:
@@ -191,7 +206,7 @@ def serve(connection: socket.socket, modules: Sequence[str]) -> dict[str, Any]:
                 os.setpgid(pid, pid)  # also here, so that a signal to the group finds it from the first moment
             os.close(files[0])
             children.add(pid)
-            connection.send(json.dumps({"pid": pid}).encode())
+            connection.send(json.dumps({"pid": pid, "number": json.loads(message)["number"]}).encode())
 
 
 def _cuda_runs() -> bool:
