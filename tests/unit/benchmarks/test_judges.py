@@ -315,11 +315,11 @@ def test_the_looks_behind_the_published_tables_count_wherever_the_set_is_built(
     again = replace(manifest, rows=tuple(rows))
     able = EmbeddedJudge(load_head(shipped_head())).capabilities
     earlier = record_evaluation(tmp_path, again, able, RUBRIC.version, "")
-    assert len(earlier) == 13 and not (tmp_path / LOG_NAME).exists(), "the shipped judge with its rubric is listed"
+    assert len(earlier) == 15 and not (tmp_path / LOG_NAME).exists(), "the shipped judge with its rubric is listed"
     with pytest.raises(ValueError, match=f"already seen by {read_evaluations(tmp_path)[-1].judge}"):
         record_evaluation(tmp_path, again, replace(able, judge_id="another"), RUBRIC.version, "")
     new_rubric = record_evaluation(tmp_path, again, able, "robot-2-x", "other thresholds")
-    assert len(new_rubric) == 14 and (tmp_path / LOG_NAME).read_text().count("\n") == 1
+    assert len(new_rubric) == 16 and (tmp_path / LOG_NAME).read_text().count("\n") == 1
     (tmp_path / LOG_NAME).write_text(json.dumps(vars(earlier[0])) + "\n")
     assert read_evaluations(tmp_path).count(earlier[0]) == 1, (
         "what is published and in the ledger, too, is one evaluation"

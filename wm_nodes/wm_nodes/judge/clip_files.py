@@ -83,7 +83,7 @@ def list_sha256(folder: Path, announced: str = "", read: Read = read_regular) ->
 
 
 def read_job(folder: Path, line: ClipLine, read: Read = read_regular) -> ClipJob:
-    """A clip with its pixels; where they cannot be read, a job whose `problem` says why, so that the others are judged."""
+    """A clip with its pixels; where they cannot be read, a job whose `problem` says why, and the others are judged."""
     try:
         return _read_job(folder, line, read)
     except (ValueError, cv2.error) as error:
@@ -133,7 +133,8 @@ def read_picture(path: Path, read: Read = read_regular) -> UInt8Array:
 def _read_frames(path: Path, fps: float, read: Read) -> ClipRef:
     """Load an array of frames; the agent checks their shape and type."""
     try:
-        frames = np.lib.format.read_array(BytesIO(_bytes_of(path, CLIP, "array", read)), allow_pickle=False)
+        data = BytesIO(_bytes_of(path, CLIP, "array", read))
+        frames = np.lib.format.read_array(data, allow_pickle=False)  # type: ignore[no-untyped-call]
     except (ValueError, EOFError, SyntaxError, TokenError, MemoryError) as error:  # its header may say anything
         raise ValueError(f"{path} is no readable array: {error}") from None
     if frames.ndim != 4 or not frames.size:

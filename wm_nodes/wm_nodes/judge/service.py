@@ -54,7 +54,7 @@ class TrainingPaused(Exception):
 
 @dataclass(frozen=True, eq=False)
 class ClipJob:
-    """A clip and what it should show. problem: why its pixels cannot be read; it is then an ERROR and nobody is asked."""
+    """A clip and what it should show. problem: why its pixels cannot be read; its verdict is then an ERROR."""
 
     clip: ClipRef
     task: TaskSpec

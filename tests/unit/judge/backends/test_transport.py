@@ -250,7 +250,7 @@ def test_a_redirect_is_refused_and_neither_frames_nor_key_go_there(
         async with elsewhere.running():
             there = f"{elsewhere.url}/chat/completions?key=sk-very-secret"
             server.faults.append(Fault("status", status, location=there))
-            with pytest.raises(TransportError, match="which is not followed.*name it in judge.endpoints") as caught:
+            with pytest.raises(TransportError, match=r"which is not followed.*name it in judge\.endpoints") as caught:
                 await transport.complete(BODY, timeout_s=20)
             host = elsewhere.url.split("/")[2]
             assert f"HTTP {status}: it redirects to {host}," in str(caught.value) and "secret" not in str(caught.value)

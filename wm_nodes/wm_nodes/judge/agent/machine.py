@@ -257,7 +257,8 @@ class _Run:
         """Raise _Stop(ERROR) where every first read was asked for as JSON and is a letter, its answer being refused."""
         first = [c.votes[0] for s in self._stages_in_order() for c in s.components if c.votes]
         if first and all(read.source == "label" and read.vote.kind == "json" for read in first):
-            raise _Stop(Status.ERROR, f"no JSON answer was accepted, and letters alone are no judgement: {first[0].reason}")
+            why = first[0].reason
+            raise _Stop(Status.ERROR, f"no JSON answer was accepted, and letters alone are no judgement: {why}")
 
     async def _read_patterns(self) -> None:
         """Read every hacking pattern once, and those that seem present again."""

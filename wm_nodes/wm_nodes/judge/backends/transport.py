@@ -282,8 +282,9 @@ class ChatTransport:
             raise _FailedTry(f"HTTP 200 without a chat completion: {where}: {first['msg']}") from None
 
     def _client(self, endpoint: Endpoint) -> Any:
-        """A client without retries of its own that follows no redirect and reads no endless answer. A loopback server is
-        never reached through a proxy."""
+        """A client without retries of its own that follows no redirect and reads no endless answer. A loopback server
+        is never reached through a proxy.
+        """
         from wm_nodes.judge.backends.answer_limit import bound_answer  # it needs the client package
 
         loopback = urlsplit(endpoint.base_url).hostname in _LOOPBACK

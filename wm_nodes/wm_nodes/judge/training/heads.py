@@ -72,8 +72,8 @@ class Examples:
 
 
 def sharpness_limit(examples: Examples) -> float:
-    """The lowest sharpness of a frame in clips in which nothing fails. Of n such clips, a further one lies below it with
-    a probability of 1 / (n + 1). Raises ValueError: there is none.
+    """The lowest sharpness of a frame in clips in which nothing fails. A further such clip lies below that of n with a
+    probability of 1 / (n + 1). Raises ValueError: there is none.
     """
     if not examples.clean.any():
         raise ValueError(f"in each of {len(examples.rows)} clips something fails; build larger sets")
