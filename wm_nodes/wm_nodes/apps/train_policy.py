@@ -22,6 +22,7 @@ from wm_nodes.apps.run_options import open_run
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
 from wm_nodes.config.scenes import SCENES, splits
 from wm_nodes.config.schema import AGENT, RunConfig, SimulationConfig
+from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import part_of, parts_of, task_names
 from wm_nodes.core.device import compute_device
@@ -29,7 +30,7 @@ from wm_nodes.core.errors import ModelNotAcceptedError
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
-from wm_nodes.environments.record import HELDOUT_SEEDS, acceptance_plan, collect_plan
+from wm_nodes.environments.record import acceptance_plan, collect_plan
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.launching.scenarios import IMAGINED
@@ -141,7 +142,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     )
     write_summary(run_dir, summary)
     policy = load_policy(config, found.model_dir, found.policy)
-    pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT_SEEDS)
+    pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT.first)
     report = write_report(run_dir, summary, pictures, config_text=dump_config(config))
     if summary.rounds:
         console.print(rounds_table(summary))

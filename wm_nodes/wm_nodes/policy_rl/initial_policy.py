@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
+from wm_nodes.config import seed_ranges
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, success
 from wm_nodes.core.files import write_atomic
@@ -29,8 +30,6 @@ MAX_STARTS, MODEL_STARTS = 512, 64
 """Most first frames of a run, and of those beside a model, from which a launch file imagines by default; of a model of
 several scenes, half as many of each task."""
 NUM_STARTS = 256
-DEMONSTRATION_SEEDS, START_SEEDS = 600_000, 700_000
-SEEDS_PER_RUN = 1000
 
 
 def num_starts(config: RunConfig) -> int:
@@ -41,8 +40,8 @@ def num_starts(config: RunConfig) -> int:
 def starts_plan(config: RunConfig) -> CollectionPlan:
     """Return the plan of the episodes that a run's starts are taken from: one step each, or whole scripted ones."""
     if config.data.start_frames == "first":
-        return first_frames_plan(config, num_starts(config), START_SEEDS)
-    return replace(scripted_plan(config, num_starts(config), START_SEEDS), task=config.task)
+        return first_frames_plan(config, num_starts(config))
+    return replace(scripted_plan(config, num_starts(config), seed_ranges.STARTS), task=config.task)
 
 
 def write_starts(
@@ -116,9 +115,7 @@ def start_files(run_dir: Path) -> tuple[Path, Path]:
 def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Path, Path]:
     """Collect demonstrations and starts and train the weak policy, as far as missing; return start_files()."""
     spare = max(3, config.sft.num_demonstrations // 3)
-    plan = demonstration_plan(
-        config, config.sft.num_demonstrations + spare, DEMONSTRATION_SEEDS + SEEDS_PER_RUN * config.seed
-    )
+    plan = demonstration_plan(config, config.sft.num_demonstrations + spare)
     demos = collect_plan(plan, config, run_dir / "bags" / "demos")
     starts, weak = start_files(run_dir)
     if not starts.exists():

@@ -12,14 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from wm_nodes.config.seed_ranges import EVALUATION
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.core.types import BoolArray, Environment, FloatArray, Rollout, UInt8Array, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.tensor_rollout import Outcomes, TensorRollout
 from wm_nodes.reward import RewardInput, RewardModel
-
-TRAINING_SEED_LIMIT = 1_000_000
-"""Reset seeds of training lie below it; evaluation seeds (presets: evaluation.first_seed) start at it."""
 
 
 class Canceled(Exception):
@@ -54,7 +52,7 @@ def reset_seeds(
     """
     check_whole_groups(num_envs, envs_per_start)
     stream = numpy_stream(seed, "reset", policy_version, step)
-    return stream.integers(0, TRAINING_SEED_LIMIT, num_envs // envs_per_start, dtype=np.uint64).repeat(envs_per_start)
+    return stream.integers(0, EVALUATION.first, num_envs // envs_per_start, dtype=np.uint64).repeat(envs_per_start)
 
 
 def check_whole_groups(num_envs: int, group_size: int) -> None:

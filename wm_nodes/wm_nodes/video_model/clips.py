@@ -71,8 +71,7 @@ def load_clips(bags: Sequence[Path], stride: int) -> Clips:
         BagError: a bag is missing, damaged, or of another version. ValueError: no episodes, or of different sizes.
     """
     episodes = [_with_truth(episode) for bag in bags for episode in read_episodes(bag)]
-    clips = cut_clips(stack_episodes(episodes, [episode.task for episode in episodes[:1]]), stride)
-    return replace(clips, seeds=tuple(episode.seed for episode in episodes))
+    return cut_clips(stack_episodes(episodes, [episode.task for episode in episodes[:1]]), stride)
 
 
 def _with_truth(episode: Episode) -> Episode:
@@ -96,5 +95,5 @@ def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
     return Clips(
         frames=torch.from_numpy(np.ascontiguousarray(episodes.images[:, ::stride])),
         actions=torch.from_numpy(np.ascontiguousarray(actions)), ground_truth=episodes.ground_truth[:, ::stride],
-        instructions=episodes.instructions, task=episodes.tasks[0],
+        instructions=episodes.instructions, task=episodes.tasks[0], seeds=episodes.seeds,
     )
