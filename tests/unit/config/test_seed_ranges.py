@@ -1,5 +1,6 @@
 """Reset seeds: no purpose gets those of another, whatever the root seed, and what does not fit is refused."""
 
+import re
 from itertools import pairwise
 
 import pytest
@@ -88,10 +89,10 @@ def test_nothing_is_collected_on_seeds_of_the_evaluation(first: int, count: int)
 
 
 def test_the_document_lists_every_range() -> None:
-    rows = [line.replace(",", "").split("|") for line in DOCUMENT.read_text().split("## ")[1].splitlines()[5:]]
-    listed = [(int(row[1]), int(row[2]) + 1, row[3]) for row in rows if len(row) > 3]
+    rows = re.findall(r"^- ([0-9,]+)–([0-9,]+): (.*)$", DOCUMENT.read_text(encoding="utf-8"), flags=re.M)
+    listed = [(int(first.replace(",", "")), int(last.replace(",", "")) + 1, text) for first, last, text in rows]
     assert [(first, stop) for first, stop, _ in listed] == [(one.first, one.stop) for one in RANGES]
-    assert all(str(one.block) in text for one, (_, _, text) in zip(RANGES, listed) if one.block)
+    assert all(f"{one.block:,}" in text for one, (_, _, text) in zip(RANGES, listed, strict=True) if one.block)
 
 
 def test_spans_of_seeds_by_hand() -> None:

@@ -30,25 +30,23 @@ from wm_nodes.core.errors import ModelNotAcceptedError
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
-from wm_nodes.environments.record import acceptance_plan, collect_plan
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.launching.scenarios import IMAGINED
+from wm_nodes.policy_rl.acceptance import accept_model
 from wm_nodes.policy_rl.exploit_meter import start_seeds
 from wm_nodes.policy_rl.factories import check_scene, load_policy, load_steppable
 from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_files
-from wm_nodes.policy_rl.pretraining import load_arrays, make_model
+from wm_nodes.policy_rl.pretraining import make_model
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import Summary, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
-from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.folder import read_world_manifest
-from wm_nodes.world_model.validation.acceptance import accept_success_agreement, accept_world_model
 
 ENDOGENOUS = "endogenous"
 ACCEPTANCE, FORMER_ACCEPTANCE = "acceptance.json", "gate.json"
-"""Report of accept_world_model in the run folder, and its name in older ones."""
+"""Report of accept_model in the run folder, and its name in older ones."""
 FIXED = ("preset", "model_dir", "from_scratch", "reward", "environment", "video_model")
 FREE = ("force", "compose")
 DEFAULTS = {
@@ -228,24 +226,23 @@ def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stag
 
 
 def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, real: BoolArray) -> None:
-    """Write acceptance.json and print it; raise ModelNotAcceptedError where the model failed and `force` is not set."""
+    """Write acceptance.json and print it; raise ModelNotAcceptedError where the model failed and `force` is not set. A
+    model about which too few episodes decide nothing is trained in, and the run says so."""
     config = job.config
     successes = (int(imagined.sum()), len(imagined)), (int(real.sum()), len(real))
-    if job.video_model:
-        report = accept_success_agreement(config.task, *successes)
-    else:
-        bags = collect_plan(acceptance_plan(config), config, job.run_dir / "bags" / "heldout")
-        models, heldout = load_model_folder(model_dir, compute_device(config.device)), load_arrays(bags, config)
-        report = accept_world_model(models, heldout, config, *successes)
+    report = accept_model(
+        config, model_dir, load_policy(config, model_dir, start_files(job.run_dir)[1]), *successes,
+        job.run_dir / "bags" / "heldout", video_model_dir=Path(job.video_model) if job.video_model else None,
+    )
     path = job.run_dir / ACCEPTANCE
     path.write_text(json.dumps(report.to_dict(), indent=1))
     console.print(report.table())
-    if not report.passed and not force:
+    if report.failed and not force:
         raise ModelNotAcceptedError(
             f"{', '.join(report.failed)} failed (numbers in {path}): the policy would learn to exploit the model. "
             "Train the model longer or on more data (--from-scratch --preset cpu_full), or go on with --force"
         )
-    job.stage("acceptance passed" if report.passed else "acceptance FAILED, going on because of --force")
+    job.stage(f"acceptance {report.words}" + (", going on because of --force" if report.failed else ""))
 
 
 def _read_acceptance(run_dir: Path) -> dict[str, Any]:

@@ -28,9 +28,16 @@ class AcceptanceConfig(SettingsSection):
     tool_error_ratio: PositiveFloat
     done_precision: Fraction
     done_recall: Fraction
-    """On rollouts of held-out actions, not on real frames."""
+    """On rollouts of held-out actions, not on real frames, and on rollouts of the cloned policy."""
+    clone_episodes: NonNegativeInt = 0
+    """Held-out first frames from which the cloned policy is rolled out, its actions then replayed in the simulator; 0:
+    none."""
+    goal_error_ratio: PositiveFloat = 1.0
+    """Where goals are rewards: errors of imagined goals must be below this share of those of the first frame."""
+    success_margin: PositiveFloat = 1.0
+    """The cloned policy's imagined success must lie within this of its real success, with the whole 95 % interval."""
     require_success_agreement: bool
-    """The SFT policy's imagined success must agree with its real success within the joint 95 % interval."""
+    """Whether that is asked for."""
 
 
 class ModelRefreshConfig(SettingsSection):

@@ -102,6 +102,7 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
             "behaviours": config.data.behaviours,
             "heldout_seeds": [[HELDOUT.first, HELDOUT.first + config.data.num_heldout - 1]],
         },
+        "success_threshold": config.reward.success_threshold,
         "training": {
             "tokenizer": tokenizer_metrics, "decoder": decoder_metrics, "action": action_metrics, "text": text_metrics,
             "probe": probe_metrics,

@@ -1,8 +1,6 @@
-"""Loop 1 on one screen: PPO or GRPO of a policy in an environment, in one process.
-
-The ROS graph is this loop with the environment, the policy, the reward and the learner in a process each, and gives the
-same weights bit for bit (tests/graph/test_training.py). `python -m wm_nodes.policy_rl.train` runs it: a policy that
-knows nothing learns to reach in the shipped world model, no simulator. `--device cuda`: rollouts never leave the GPU.
+"""Loop 1 on one screen: PPO or GRPO of a policy in an environment, in one process. The ROS graph is this loop with the
+environment, the policy, the reward and the learner in a process each, and gives the same weights bit for bit. `python
+-m wm_nodes.policy_rl.train [--device cuda]`: a policy learns to reach in the shipped world model, without a simulator.
 """
 
 import argparse
@@ -12,6 +10,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import Environment, Rollout
+from wm_nodes.policy_rl.acceptance import acceptance_when_made
 from wm_nodes.policy_rl.device_rollout import make_collector
 from wm_nodes.policy_rl.exploit_meter import ExploitMeter
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy, make_training_environment
@@ -54,6 +53,7 @@ def main(words: list[str] | None = None) -> None:
     for version, (rollout, metrics) in enumerate(train_policy(policy, env, reward, config), 1):
         success = rollout_statistics(rollout).success_rate
         print(f"version {version}: imagined success {success:.1%}, {metrics.kl_reference:.3f} nats from version 1")
+    print(f"acceptance of the world model: {acceptance_when_made(model, config)}")
 
 
 if __name__ == "__main__":
