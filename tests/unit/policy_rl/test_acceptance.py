@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from graph.toy import ReachToy, make_policy
 from model_folders import make_model_folder, make_stepped_folder
-
 from unit.policy_rl.test_exploit_meter import SEEDS, ToyModel
+
 from wm_nodes.config.load import load_config
 from wm_nodes.policy_rl import factories
 from wm_nodes.policy_rl.acceptance import accept_model, acceptance_when_made

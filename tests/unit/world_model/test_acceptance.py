@@ -15,8 +15,8 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.dynamics import ActionModel
-from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.validation.acceptance import (
     AcceptanceReport,
     CloneRollouts,
@@ -131,7 +131,7 @@ def test_the_table_shows_every_criterion_and_the_remedy_of_a_failed_one() -> Non
 
 
 def clone(hits: int, false: int, missed: int, others: int = 0) -> CloneRollouts:
-    """Rollouts of the cloned policy: imagined and replayed successes, imagined ones alone, replayed ones alone, none."""
+    """Rollouts by how many are imagined and replayed successes, imagined ones alone, replayed ones alone, neither."""
     counts = [hits, false, missed, others]
     return CloneRollouts(np.repeat([True, True, False, False], counts), np.repeat([True, False, True, False], counts))
 

@@ -75,7 +75,7 @@ def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
         updates = workplace.config.ppo.updates
         for model in [*models, *([SIMULATOR] if arguments.control else [])]:
             wanted = workplace.identity(model, arguments.scenes)
-            if any(wanted == {name: row.get(name) for name in wanted} for row in rows):
+            if is_finished(rows, wanted):
                 continue
             with tqdm(total=updates, desc=f"{Path(model).name}, seed {seed}", unit="update") as bar:
                 rows.append(train_in(workplace, model, arguments.scenes, bar.update))
@@ -87,6 +87,11 @@ def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
         "policies trained in each model", (*columns, *([", ".join(names)] if names else [])),
         [(*line, *([_of_settings(row, names)] if names else [])) for row in rows for line in _lines(row)],
     ))
+
+
+def is_finished(rows: Sequence[Mapping[str, Any]], wanted: Mapping[str, Any]) -> bool:
+    """Whether one of the rows has all of the wanted values."""
+    return any(all(row.get(name) == value for name, value in wanted.items()) for row in rows)
 
 
 def differing(rows: Sequence[dict[str, Any]]) -> list[str]:
@@ -119,7 +124,8 @@ def _lines(row: dict[str, Any]) -> list[tuple[str, ...]]:
     imagined = f"{_percent(row['imagined_before'])} -> {_percent(row['imagined_after'])}"
     return [
         (row["model"], row["task"], str(row["seed"]), name, _percent(found["before"]), _percent(found["after"]),
-         "{difference:+.3f} ({low:+.3f} to {high:+.3f})".format(**found["gain"]), "" if name else imagined, "" if name else _outcome(row))
+         "{difference:+.3f} ({low:+.3f} to {high:+.3f})".format(**found["gain"]),
+         *(("", "") if name else (imagined, _outcome(row))))
         for name, found in {"": first, **row.get("elsewhere", {})}.items()
     ]
 
@@ -128,9 +134,7 @@ def _ranking(arguments: argparse.Namespace, models: list[str]) -> None:
     rows, workplace = _kept_rows(arguments), _workplace(arguments, arguments.seed)
     for path in tqdm(arguments.policies, desc="policies", unit="policy"):
         wanted = {"policy": str(path), "config": workplace.config.model_dump(mode="json")}
-        if not any(
-            set(models) <= row["imagined"].keys() and wanted == {name: row.get(name) for name in wanted} for row in rows
-        ):
+        if not is_finished([row for row in rows if set(models) <= row["imagined"].keys()], wanted):
             rows.append(measure_policy(workplace, path, models))
             write_results(arguments, {"rows": rows})
     correlations = rank_policies(rows, models, arguments.seed)

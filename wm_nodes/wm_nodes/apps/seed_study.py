@@ -40,6 +40,7 @@ from wm_nodes.policy_rl.model_refresh import refresh_round, round_folder, round_
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.summary import acceptance_outcome
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.folder import read_world_manifest
@@ -111,7 +112,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
         lines.add_row(
             row["task"], row["arm"].replace("_", " "), str(row["seed"]), _percent(before), _percent(after),
             f"{100 * pair['difference']:+.1f} ({100 * pair['low']:+.1f} to {100 * pair['high']:+.1f})",
-            f"{_percent(imagined[0])} -> {_percent(imagined[1])}", outcome_of(row),
+            f"{_percent(imagined[0])} -> {_percent(imagined[1])}", acceptance_outcome(row["acceptance"]),
         )
     groups = dict[tuple[str, str, str], list[dict[str, Any]]]()
     for row in rows:
@@ -164,11 +165,6 @@ def gain_over_simulator(rows: Sequence[dict[str, Any]]) -> float | None:
 
 def _plain_items(row: Mapping[str, Any]) -> set[tuple[str, Any]]:
     return {(name, value) for name, value in row.items() if isinstance(value, str | int)}
-
-
-def outcome_of(row: Mapping[str, Any]) -> str:
-    """What acceptance said of a row's model; rows of earlier versions know no `undecided`."""
-    return str(row["acceptance"].get("outcome") or ("passed" if row["accepted"] else "failed"))
 
 
 def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path, identity: Mapping[str, Any]) -> None:

@@ -40,7 +40,7 @@ from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_f
 from wm_nodes.policy_rl.pretraining import make_model
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.summary import Summary, read_readings, write_summary
+from wm_nodes.reports.summary import Summary, acceptance_outcome, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
 from wm_nodes.world_model.folder import read_world_manifest
 
@@ -149,6 +149,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     if summary.by_task:
         console.print(tasks_table(summary))
     console.print(results_table(summary))
+    console.print(f"acceptance of the model: {acceptance_outcome(summary.acceptance)}")
     console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
 
 

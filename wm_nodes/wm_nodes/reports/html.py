@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.core.files import write_atomic
-from wm_nodes.reports.summary import Summary
+from wm_nodes.reports.summary import Summary, acceptance_outcome
 from wm_nodes.reports.tables import (
     EXPLOIT_COLUMNS,
     ROUND_COLUMNS,
@@ -181,7 +181,7 @@ def _acceptance(report: Mapping[str, Any]) -> str:
         return "<p>Not measured.</p>"
     rows = []
     for criterion in report["criteria"]:
-        outcome = str(criterion.get("outcome") or ("passed" if criterion["passed"] else "failed"))
+        outcome = acceptance_outcome(criterion)
         why = {"failed": str(criterion["remedy"]), "undecided": "too few episodes"}.get(outcome, "")
         mark = f'<span class="{MARKS[outcome]}">{outcome}</span>{": " if why else ""}{escape(why)}'
         interval = " to ".join(f"{end:.2f}" for end in criterion.get("interval") or ())
@@ -193,8 +193,9 @@ def _acceptance(report: Mapping[str, Any]) -> str:
     if metrics:
         table = html_table(("metric", "value"), metrics)
         notes += f"<details><summary>all numbers of the held-out rollouts</summary>{table}</details>"
-    words = "Passed" if report["passed"] else "Failed: trained in it all the same"
-    words = "Undecided: too few episodes" if report.get("outcome") == "undecided" else words
+    words = {"failed": "Failed: trained in it all the same", "undecided": "Undecided: too few episodes"}.get(
+        acceptance_outcome(report), "Passed"
+    )
     return (
         f"<p>{words}. Judged on {report['episodes']} held-out real episodes.</p>"
         f"{html_table(('criterion', 'value', '95 %', 'must be', ''), rows, numbers=(1, 2))}{notes}"

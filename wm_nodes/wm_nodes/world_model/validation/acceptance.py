@@ -32,7 +32,7 @@ MORE_NEAR_MISSES = "collect more near misses (data.behaviours.near_miss), or rai
 MORE_SUCCESSES = "collect more successes (data.behaviours), or lower reward.success_threshold"
 POLICY_DATA = "refresh the model with more episodes of weak policies (data.policy_episodes)"
 BETTER_GOALS = "train the text model longer (world_model.text_num_iterations), or set reward.dense_weight to 0"
-MARKS = {"passed": "[green]passed", "failed": "[red]failed[/]: {}", "undecided": "[yellow]undecided[/]: too few episodes"}
+MARKS = {"passed": "[green]passed", "failed": "[red]failed[/]: {}", "undecided": "[yellow]too few episodes"}
 
 
 @dataclass(frozen=True)
