@@ -1,12 +1,15 @@
 """Models as environments: rank correlation by hand, what is kept, and a ranking of real policies."""
 
+import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from model_folders import make_model_folder, make_stepped_folder, write_starts
 
+from benchmarks.environments.cli import differing, is_finished
 from benchmarks.environments.policies import (
     SIMULATOR,
     WORLD_MODEL,
@@ -16,6 +19,7 @@ from benchmarks.environments.policies import (
     spearman,
     train_in,
 )
+from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.core.files import file_sha256
 from wm_nodes.policy_rl.factories import make_policy
@@ -78,3 +82,55 @@ def test_speed_and_imagined_success_are_measured_in_each_model(work: Workplace, 
     imagined = [work.imagined(work.policy(), work.environment(model)) for model in models]
     assert [result.episodes for result in imagined] == [8 * config.evaluation.episodes] * 2
     assert imagined[1].successes > 0
+
+
+def row_of(work: Workplace, model: str = WORLD_MODEL, **changes: object) -> dict[str, Any]:
+    config = load_config("smoke", changes)
+    other = Workplace(config, work.model_dir, work.folder)
+    return {"real_before": {}, **json.loads(json.dumps(other.identity(model, ["train"])))}
+
+
+def test_a_row_is_known_by_every_setting_by_the_models_and_by_the_scenes(work: Workplace, tmp_path: Path) -> None:
+    row = row_of(work)
+    assert is_finished([row], work.identity(WORLD_MODEL, ["train"]))
+    assert not is_finished([row], work.identity(WORLD_MODEL, [])) and not is_finished([row], work.identity(SIMULATOR))
+    for changes in ({"ppo.learning_rate": 1e-5}, {"evaluation.episodes": 3}, {"seed": 1}, {"ppo.advantage": "group"}):
+        other = Workplace(load_config("smoke", changes), work.model_dir, work.folder)
+        assert not is_finished([row], other.identity(WORLD_MODEL, ["train"])), changes
+    video = make_stepped_folder(tmp_path / "video_model")
+    assert len(work.identity(str(video))["models_sha256"]) == 2
+    old = {"model": WORLD_MODEL, "task": "push_cube", "seed": 0, "updates": work.config.ppo.updates}
+    assert not is_finished([old], work.identity(WORLD_MODEL, [])), "nobody knows its settings"
+
+
+def test_the_table_names_the_settings_in_which_rows_differ(work: Workplace) -> None:
+    rows = [row_of(work), row_of(work, **{"ppo.learning_rate": 1e-5, "seed": 3}), {"model": "older"}]
+    assert differing(rows) == ["ppo.learning_rate"]
+    assert differing(rows[:1]) == []
+
+
+@pytest.mark.slow
+@pytest.mark.rendering
+def test_trained_in_prints_acceptance_keeps_refused_rows_and_trains_again_only_by_other_settings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, file = make_model_folder(tmp_path / "model"), tmp_path / "rows.json"
+    words = ["benchmark", "environments", "trained-in", "--preset", "smoke", "--model-dir", str(model), "--seeds", "0",
+             "--json", str(file), "--work", str(tmp_path / "work"), "--set", "data.num_workers=1",
+             "--set", "evaluation.episodes=2", "--set", "acceptance.num_episodes=2"]
+
+    def rows() -> list[dict[str, Any]]:
+        found: list[dict[str, Any]] = json.loads(file.read_text(encoding="utf-8"))["rows"]
+        return found
+
+    assert main(words) == 0
+    (row,) = rows()
+    assert row["accepted"] is False and row["acceptance"]["outcome"] == "failed" and row["acceptance"]["criteria"]
+    assert "acceptance failed (" in capsys.readouterr().out and len(row["course"]) == 2
+    assert main(words) == 0 and rows() == [row]
+    assert main([*words, "--set", "ppo.learning_rate=1e-5"]) == 0
+    rates = [found["config"]["ppo"]["learning_rate"] for found in rows()]
+    assert rates == [row["config"]["ppo"]["learning_rate"], 1e-5]
+    assert "ppo.learning_rate" in capsys.readouterr().out
+    assert main([*words, "--set", "sft.num_demonstrations=3"]) == 2
+    assert "were made with sft.num_demonstrations 4, not 3; take another folder" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 import asyncio
 import functools
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from video_toys import far_sighted_judge
 
 from benchmarks.video_rl.judged import JudgedContexts, open_judge
 from wm_nodes.config.load import load_config, load_video_config
+from wm_nodes.config.seed_ranges import NEW_CONTEXTS
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
@@ -132,7 +134,8 @@ def verdicts(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], 
     scene = load_config("cpu", {"task": "push_cube", "data.num_workers": 1})
     clips = dict[str, tuple[UInt8Array, Clips]]()
     for name, seed in (("success", 250_015), ("failure", 250_002)):
-        bags = collect_plan(scripted_plan(scene, 1, seed), scene, tmp_path_factory.mktemp(name) / "bags")
+        plan = replace(scripted_plan(scene, 1, NEW_CONTEXTS), first_seed=seed)
+        bags = collect_plan(plan, scene, tmp_path_factory.mktemp(name) / "bags")
         recorded, codec = load_clips(bags, 2), codec_of_world_model(MODEL_DIR)
         clips[name] = codec.decode(codec.encode(recorded.frames))[0].numpy(), recorded
     frames, recorded = clips["success"]

@@ -9,7 +9,8 @@ import pytest
 from benchmarks.video_rl.outcome import METRICS
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
-from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
+from wm_nodes.config.seed_ranges import HELDOUT
+from wm_nodes.environments.record import collect_plan, scripted_plan
 
 ARMS = ["CPS 0.4", "signed FM, ODE", "CPS 0.4, judge robot"]
 
@@ -23,7 +24,7 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = load_config("cpu", {"task": "push_cube", "data.num_workers": 1})
-    (bag,) = collect_plan(scripted_plan(scene, 3, HELDOUT_SEEDS), scene, tmp_path / "bags")
+    (bag,) = collect_plan(scripted_plan(scene, 3, HELDOUT), scene, tmp_path / "bags")
     path, kept = tmp_path / "found.json", tmp_path / "weights"
     call = [
         "benchmark", "video-rl", "outcome", "--context-bags", str(bag), "--heldout-bags", str(bag), "--iterations", "1",

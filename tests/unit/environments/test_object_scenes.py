@@ -9,6 +9,7 @@ from transforms3d.quaternions import mat2quat, qinverse, qmult, quat2axangle
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import SCENES, scene_of
+from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES
 from wm_nodes.config.tasks import get_task, success
 from wm_nodes.core.rotations import multiply, to_quaternion
 from wm_nodes.core.seeding import numpy_stream
@@ -246,10 +247,8 @@ def test_a_commanded_pose_says_where_the_hand_is(env: ManiSkillEnvironment) -> N
 
 
 def test_no_seed_of_training_is_one_of_a_test() -> None:
-    from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS
-
     for task in TASKS:
         config = load_config("cpu_full", {"task": task})
-        assert TRAINING_SEEDS + config.data.num_episodes <= HELDOUT_SEEDS
-        assert HELDOUT_SEEDS + config.data.num_heldout <= config.evaluation.first_seed
+        assert MODEL_EPISODES.take(config.data.num_episodes) + config.data.num_episodes <= HELDOUT.first
+        assert HELDOUT.take(config.data.num_heldout) + config.data.num_heldout <= config.evaluation.first_seed
     assert replace(get_task("push")) == get_task("push")

@@ -8,15 +8,9 @@ from graph.toy import ReachToy
 from rl_toys import NUM_ENVS, STEPS, toy_policy, toy_rollout
 
 from wm_nodes.config.load import load_config
+from wm_nodes.config.seed_ranges import EVALUATION
 from wm_nodes.core.types import Rollout
-from wm_nodes.policy_rl.rollouts import (
-    TRAINING_SEED_LIMIT,
-    Convergence,
-    action_noise,
-    collect_rollout,
-    reset_seeds,
-    rollout_statistics,
-)
+from wm_nodes.policy_rl.rollouts import Convergence, action_noise, collect_rollout, reset_seeds, rollout_statistics
 from wm_nodes.reward import RewardInput, RewardResult, RuleReward
 
 
@@ -74,8 +68,8 @@ def test_a_reward_that_cannot_be_given_makes_the_step_invalid_not_worthless() ->
 
 
 def test_training_resets_never_use_an_evaluation_seed() -> None:
-    assert load_config("base").evaluation.first_seed >= TRAINING_SEED_LIMIT
-    assert reset_seeds(0, 1, 2, 10_000).max() < TRAINING_SEED_LIMIT
+    assert load_config("base").evaluation.first_seed >= EVALUATION.first
+    assert reset_seeds(0, 1, 2, 10_000).max() < EVALUATION.first
 
 
 def test_streams_differ_by_seed_version_and_step() -> None:

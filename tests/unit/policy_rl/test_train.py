@@ -37,7 +37,12 @@ def test_a_rollout_has_the_same_number_of_steps_in_fewer_environments() -> None:
 
 def test_the_command_trains_and_names_a_device_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
     train.main(["--task", "reach", "--updates", "1", "--device", "cpu"])
-    assert capsys.readouterr().out.startswith("version 1: imagined success ")
+    told = capsys.readouterr().out
+    assert told.startswith("version 1: imagined success ")
+    assert told.splitlines()[-1] == (
+        "acceptance of the world model: passed on 150 held-out episodes when it was made; its done signal at "
+        "reward.success_threshold 0.4 and the policy in it not judged, without a simulator"
+    )
     with pytest.raises(SystemExit):
         train.main(["--device", "cuda:99"])
     assert "error: device is cuda:99, but " in capsys.readouterr().err

@@ -11,11 +11,19 @@ from rich.console import Console
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.dynamics import ActionModel
+from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.tokenizer import Tokenizer
-from wm_nodes.world_model.validation.acceptance import AcceptanceReport, accept_world_model, apply_criteria
+from wm_nodes.world_model.validation.acceptance import (
+    AcceptanceReport,
+    CloneRollouts,
+    accept_world_model,
+    accepted_when_made,
+    apply_criteria,
+)
 
 TASKS = ("reach", "push_cube")
 GOOD = {
@@ -72,10 +80,30 @@ def test_an_undefined_number_fails_and_is_null_in_json() -> None:
     assert values["criteria"][3]["value"] is None
 
 
-def test_imagined_success_far_above_real_success_fails_and_a_chance_gap_passes() -> None:
-    # Newcombe by hand: 90/100 against 80/200 is a gap of +0.50 with an interval well above 0; 45/100 is +0.05.
+def test_imagined_success_far_above_real_success_fails() -> None:
+    # Newcombe by hand: 90/100 against 80/200 is a gap of +0.50 with an interval well above 0.
     assert judged(GOOD, settings(), imagined=(90, 100)).failed == ("SFT policy: imagined 90/100 - real 80/200 success",)
-    assert judged(GOOD, settings(), imagined=(45, 100)).passed
+
+
+@pytest.mark.parametrize(
+    ("imagined", "real", "outcome"),
+    [
+        ((8, 20), (8, 20), "undecided"),  # no gap at all, but an interval of -0.29 to +0.29: 20 episodes pass nothing
+        ((0, 4), (4, 4), "failed"),  # beyond the margin and beyond chance, however few
+        ((45, 100), (80, 200), "undecided"),  # +0.05, -0.07 to +0.17
+        ((900, 2000), (800, 2000), "passed"),  # the same +0.05, +0.02 to +0.08: not 0, and too small to matter
+        ((1080, 2000), (800, 2000), "undecided"),  # +0.14, to +0.17
+        ((1200, 2000), (800, 2000), "failed"),  # +0.20
+    ],
+)
+def test_agreement_is_an_equivalence_test_which_too_few_episodes_do_not_pass(
+    imagined: tuple[int, int], real: tuple[int, int], outcome: str
+) -> None:
+    report = judged(GOOD, settings(), imagined, real)
+    assert report.outcome == outcome and report.passed == (outcome == "passed")
+    assert report.to_dict()["outcome"] == outcome
+    wider = judged(GOOD, settings(success_margin=0.4), imagined, real)
+    assert wider.outcome == ("failed" if imagined == (0, 4) else "passed")
 
 
 def test_success_in_one_world_only_is_not_judged_and_the_report_says_so() -> None:
@@ -100,6 +128,60 @@ def test_the_table_shows_every_criterion_and_the_remedy_of_a_failed_one() -> Non
     console.print(judged(GOOD | {"tool_ratio_h16": 0.9}, settings()).table())
     text = console.export_text()
     assert "acceptance FAILED" in text and "done recall on rollouts" in text and "train longer" in text
+
+
+def clone(hits: int, false: int, missed: int, others: int = 0) -> CloneRollouts:
+    """Rollouts by how many are imagined and replayed successes, imagined ones alone, replayed ones alone, neither."""
+    counts = [hits, false, missed, others]
+    return CloneRollouts(np.repeat([True, True, False, False], counts), np.repeat([True, False, True, False], counts))
+
+
+@pytest.mark.parametrize(
+    ("found", "precision", "recall"),
+    [
+        (clone(27, 3, 3, 31), "passed", "passed"),  # 27/30 both: 0.74 to 0.97
+        (clone(30, 15, 25), "failed", "undecided"),  # 30/45: to 0.79; 30/55: 0.42 to 0.67
+        (clone(6, 4, 30), "undecided", "failed"),  # 6/10: 0.31 to 0.83; 6/36: to 0.32
+        (clone(1, 0, 0, 63), "undecided", "undecided"),  # 1/1 says nothing
+        (clone(0, 0, 0, 64), "undecided", "undecided"),  # nor does a policy that never succeeds
+        (clone(18, 6, 4), "undecided", "passed"),  # 18/24: 0.55 to 0.88
+    ],
+)
+def test_the_done_signal_is_judged_on_rollouts_of_the_cloned_policy_too(
+    found: CloneRollouts, precision: str, recall: str
+) -> None:
+    criteria, _ = apply_criteria(GOOD, settings(), 16, (40, 100), (80, 200), found)
+    own = {row.name.split(",")[0]: row for row in criteria if "cloned policy" in row.name}
+    assert (own["done precision"].outcome, own["done recall"].outcome) == (precision, recall)
+    assert all(row.interval is not None and row.remedy for row in own.values())
+
+
+def test_a_model_that_only_scripted_episodes_speak_for_is_refused_by_the_cloned_policy() -> None:
+    criteria, _ = apply_criteria(GOOD, settings(), 16, (40, 100), (80, 200), clone(40, 40, 10))
+    report = AcceptanceReport("push_cube", 96, criteria, GOOD)
+    assert report.failed == ("done precision, cloned policy (80)",) and report.words.startswith("failed (done prec")
+
+
+def test_intervals_of_the_held_out_numbers_stand_beside_them() -> None:
+    known = GOOD | {
+        "object_moved_ratio_low_h16": 0.3, "object_moved_ratio_high_h16": 0.5,
+        "done_push_cube_precision_low": 0.7, "done_push_cube_precision_high": 0.95,
+    }
+    criteria, _ = apply_criteria(known, settings(), 16, None, None)
+    assert [row.interval for row in criteria[:1]] == [(0.3, 0.5)] and criteria[1].interval is None
+    assert criteria[2].interval == pytest.approx((0.7, 0.95))
+
+
+def test_what_a_models_manifest_says_stands_in_for_a_measurement() -> None:
+    config = load_config("cpu", {"task": "push_cube"})
+    cube = read_world_manifest(shipped_model("push_cube"))
+    assert accepted_when_made(cube, config).startswith("passed on 150 held-out episodes when it was made")
+    scenes = load_config("cpu", {"task": "push"})
+    found = accepted_when_made(read_world_manifest(shipped_model("push")), scenes)
+    assert found.startswith("passed on 12 held-out episodes")
+    strict = scenes.with_values(acceptance=scenes.acceptance.with_values(tool_error_ratio=0.1))
+    assert accepted_when_made(read_world_manifest(shipped_model("push")), strict).startswith("failed (tool error")
+    assert accepted_when_made({}, config).startswith("not judged: the model's manifest holds no metrics")
 
 
 @pytest.fixture(scope="module")

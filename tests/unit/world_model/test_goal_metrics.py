@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from pushing_scene import episode, success
 from torch import Tensor
 
@@ -13,6 +14,7 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import ActionModel, TextModel, Tokenizer, WorldModels
 from wm_nodes.world_model.dynamics import Prediction
 from wm_nodes.world_model.training.tokenizer import train_tokenizer
+from wm_nodes.world_model.validation.acceptance import accept_world_model
 from wm_nodes.world_model.validation.goals import goal_metrics
 
 CONFIG = load_config("base", {
@@ -99,3 +101,37 @@ def test_each_episode_is_told_its_own_instruction_and_no_success_gives_no_metric
     lost = replace(episodes, success=np.zeros_like(episodes.success))
     assert goal_metrics(models(tokenizer, text), lost, CONFIG, "push_cube") == {}
     assert goal_metrics(models(tokenizer, None), episodes, CONFIG, "push_cube") == {}
+
+
+def test_where_goals_are_rewards_a_text_model_that_learned_nothing_is_refused(tokenizer: Tokenizer) -> None:
+    episodes, first, reached = won(arrays(40, 1000))
+    paid = CONFIG.with_values(reward=CONFIG.reward.with_values(dense_weight=0.5))
+    torch.manual_seed(0)
+    random = TextModel(
+        CONFIG.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
+        vocabulary=("push", "the", "square"), num_tasks=1,
+    ).eval()
+    found = {}
+    for name, text in (
+        ("random", random), ("still", Oracle(tokenizer, first)), ("right", Oracle(tokenizer, reached)),
+    ):
+        report = accept_world_model(models(tokenizer, text), episodes, paid)
+        found[name] = {row.name.split(": ")[1]: row for row in report.criteria if row.name.startswith("imagined goal")}
+        silent = accept_world_model(models(tokenizer, text), episodes, CONFIG)
+        assert not any("goal" in row.name for row in silent.criteria), "goals pay nothing there"
+    assert {name: row.outcome for name, row in found["right"].items()} == dict.fromkeys(found["right"], "passed")
+    assert found["right"].keys() == {"found", "object error / first frame", "tool error / first frame"}
+    for name in ("random", "still"):
+        assert found[name]["object error / first frame"].outcome == "failed"
+        assert found[name]["tool error / first frame"].outcome == "failed"
+    assert found["random"]["found"].outcome == "failed"
+    low, high = found["right"]["object error / first frame"].interval or (1, 0)
+    assert low < found["right"]["object error / first frame"].value < high
+
+
+def test_without_an_episode_that_reaches_the_goal_the_text_model_is_undecided(tokenizer: Tokenizer) -> None:
+    episodes, _, reached = won(arrays(20, 2000))
+    paid = CONFIG.with_values(reward=CONFIG.reward.with_values(dense_weight=0.5))
+    lost = replace(episodes, success=np.zeros_like(episodes.success))
+    report = accept_world_model(models(tokenizer, Oracle(tokenizer, reached)), lost, paid)
+    assert report.undecided == ("imagined goal of push_cube: episodes that reach it",)

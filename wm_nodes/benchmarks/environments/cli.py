@@ -4,6 +4,7 @@ ranks policies, and how fast it steps. The task's world model is always the firs
 
 import argparse
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,17 +74,48 @@ def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
         workplace = _workplace(arguments, seed)
         updates = workplace.config.ppo.updates
         for model in [*models, *([SIMULATOR] if arguments.control else [])]:
-            wanted = (model, workplace.config.task, seed, updates)
-            if any((row["model"], row["task"], row["seed"], row["updates"]) == wanted for row in rows):
+            wanted = workplace.identity(model, arguments.scenes)
+            if is_finished(rows, wanted):
                 continue
             with tqdm(total=updates, desc=f"{Path(model).name}, seed {seed}", unit="update") as bar:
                 rows.append(train_in(workplace, model, arguments.scenes, bar.update))
             write_results(arguments, {"rows": rows})
+            console.print(f"{Path(model).name}, seed {seed}: acceptance {_outcome(rows[-1])}")
+    columns = ("trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined", "acceptance")
+    names = differing(rows)
     console.print(make_table(
-        "policies trained in each model",
-        ("trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined"),
-        [line for row in rows for line in _lines(row)],
+        "policies trained in each model", (*columns, *([", ".join(names)] if names else [])),
+        [(*line, *([_of_settings(row, names)] if names else [])) for row in rows for line in _lines(row)],
     ))
+
+
+def is_finished(rows: Sequence[Mapping[str, Any]], wanted: Mapping[str, Any]) -> bool:
+    """Whether one of the rows has all of the wanted values."""
+    return any(all(row.get(name) == value for name, value in wanted.items()) for row in rows)
+
+
+def differing(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """The dotted settings, but task and seed, that are not the same in all rows that hold theirs."""
+    found = [_dotted(row["config"]) for row in rows if "config" in row]
+    names = dict.fromkeys(name for settings in found for name in settings)
+    return [name for name in names if len({repr(one.get(name)) for one in found}) > 1 and name not in ("task", "seed")]
+
+
+def _dotted(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat = dict[str, Any]()
+    for name, value in values.items():
+        flat |= _dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
+
+
+def _of_settings(row: dict[str, Any], names: Sequence[str]) -> str:
+    settings = _dotted(row.get("config", {}))
+    return ", ".join(str(settings.get(name, "?")) for name in names)
+
+
+def _outcome(row: dict[str, Any]) -> str:
+    """What acceptance says of the model of a row; nothing of the simulator, nor of rows of earlier versions."""
+    return str(row.get("acceptance", {}).get("outcome", ""))
 
 
 def _lines(row: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -92,7 +124,8 @@ def _lines(row: dict[str, Any]) -> list[tuple[str, ...]]:
     imagined = f"{_percent(row['imagined_before'])} -> {_percent(row['imagined_after'])}"
     return [
         (row["model"], row["task"], str(row["seed"]), name, _percent(found["before"]), _percent(found["after"]),
-         "{difference:+.3f} ({low:+.3f} to {high:+.3f})".format(**found["gain"]), "" if name else imagined)
+         "{difference:+.3f} ({low:+.3f} to {high:+.3f})".format(**found["gain"]),
+         *(("", "") if name else (imagined, _outcome(row))))
         for name, found in {"": first, **row.get("elsewhere", {})}.items()
     ]
 
@@ -100,7 +133,8 @@ def _lines(row: dict[str, Any]) -> list[tuple[str, ...]]:
 def _ranking(arguments: argparse.Namespace, models: list[str]) -> None:
     rows, workplace = _kept_rows(arguments), _workplace(arguments, arguments.seed)
     for path in tqdm(arguments.policies, desc="policies", unit="policy"):
-        if not any(row["policy"] == str(path) and set(models) <= row["imagined"].keys() for row in rows):
+        wanted = {"policy": str(path), "config": workplace.config.model_dump(mode="json")}
+        if not is_finished([row for row in rows if set(models) <= row["imagined"].keys()], wanted):
             rows.append(measure_policy(workplace, path, models))
             write_results(arguments, {"rows": rows})
     correlations = rank_policies(rows, models, arguments.seed)

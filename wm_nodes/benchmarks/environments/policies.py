@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256
+from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.statistics import paired_difference, wilson_interval
 from wm_nodes.core.types import Environment
+from wm_nodes.policy_rl.acceptance import accept_model
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.factories import (
     load_policy,
@@ -32,7 +34,10 @@ from wm_nodes.policy_rl.rollouts import collect_rollout, rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
+from wm_nodes.video_model.folder import read_video_manifest
 from wm_nodes.world_model import ImaginedEpisodes
+from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.validation.acceptance import AcceptanceReport
 
 WORLD_MODEL, SIMULATOR = "world_model", "simulator"
 SIMULATOR_ENVS, IMAGINED_EPISODES = 8, 256
@@ -83,6 +88,24 @@ class Workplace:
         with self.simulator(scenes) as env:
             return evaluate(policy, env, how.episodes, how.first_seed, how.deterministic)
 
+    def acceptance(
+        self, model: str, policy: ImagePolicy, imagined: EvaluationResult, real: EvaluationResult
+    ) -> AcceptanceReport:
+        """Whether the policy may be trained in the model, which it has this success in and in the simulator."""
+        return accept_model(
+            self.config, self.model_dir, policy, (imagined.successes, imagined.episodes),
+            (real.successes, real.episodes), self.folder / "bags" / "heldout",
+            video_model_dir=None if model == WORLD_MODEL else Path(model),
+        )
+
+    def identity(self, model: str, scenes: Sequence[str] = ()) -> dict[str, Any]:
+        """What a row of train_in is known by: every setting, and the models' weights."""
+        shas = [] if model in (WORLD_MODEL, SIMULATOR) else [files_sha256(read_video_manifest(Path(model)))]
+        return {
+            "model": model, "config": self.config.model_dump(mode="json"), "scenes": list(scenes),
+            "models_sha256": [files_sha256(read_world_manifest(self.model_dir)), *shas],
+        }
+
     def imagined(self, policy: ImagePolicy, env: Environment) -> EvaluationResult:
         return evaluate(policy, env, min(IMAGINED_EPISODES, 8 * self.config.evaluation.episodes),
                         self.config.evaluation.first_seed)
@@ -91,7 +114,7 @@ class Workplace:
 def train_in(
     workplace: Workplace, model: str, scenes: Sequence[str] = (), on_update: Callable[[], object] = lambda: None
 ) -> dict[str, Any]:
-    """Train the weak policy of a seed in a model; return the row of the table.
+    """Train the weak policy of a seed in a model, whatever acceptance says of it; return the row of the table.
 
     Every KEPT_EVERY-th version lies in workplace.folder / name of the model.
 
@@ -103,6 +126,7 @@ def train_in(
     config, began = workplace.config, time.monotonic()
     policy, env = workplace.policy(), workplace.environment(WORLD_MODEL if model == SIMULATOR else model)
     before = workplace.real(policy), workplace.imagined(policy, env)
+    accepted = None if model == SIMULATOR else workplace.acceptance(model, policy, before[1], before[0])
     elsewhere = {name: [workplace.real(policy, name)] for name in scenes}
     course, kept, seconds = list[float](), list[str](), time.monotonic()
     for update, success_rate in enumerate(_training(workplace, model, policy, env), 1):
@@ -117,7 +141,9 @@ def train_in(
     for name, measured in elsewhere.items():
         measured.append(workplace.real(policy, name))
     return {
-        "model": model, "model_sha256": env.spec.world_model_sha256, "task": config.task, "seed": config.seed,
+        **workplace.identity(model, scenes), "accepted": None if accepted is None else accepted.passed,
+        "acceptance": {} if accepted is None else accepted.to_dict(),
+        "model_sha256": env.spec.world_model_sha256, "task": config.task, "seed": config.seed,
         "updates": config.ppo.updates, "advantage": config.ppo.advantage, "course": course, "policies": kept,
         "real_before": _rate(before[0]), "real_after": _rate(after[0]),
         "imagined_before": _rate(before[1]), "imagined_after": _rate(after[1]),
@@ -152,7 +178,8 @@ def measure_policy(workplace: Workplace, weights: Path, models: Sequence[str]) -
     policy = workplace.policy(weights)
     imagined = {model: _rate(workplace.imagined(policy, workplace.environment(model))) for model in models}
     return {
-        "policy": str(weights), "sha256": file_sha256(weights), "real": _rate(workplace.real(policy)),
+        "policy": str(weights), "sha256": file_sha256(weights), "config": workplace.config.model_dump(mode="json"),
+        "real": _rate(workplace.real(policy)),
         "imagined": imagined,
     }
 

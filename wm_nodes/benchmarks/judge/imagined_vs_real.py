@@ -22,6 +22,7 @@ from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_device, add_json
 from wm_nodes.config.load import default_task, load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.seed_ranges import STARTS
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.core.allocator import keep_freed_memory
@@ -42,7 +43,7 @@ from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.validation.open_loop import ImaginedEpisodes, auc, imagine_episodes
 
-FIRST_SEED = 700_000
+FIRST_SEED = STARTS.first
 """Of the episodes; nothing was ever trained on these."""
 
 
@@ -118,7 +119,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     }
     config = load_config("cpu", given)
     models = load_model_folder(arguments.model_dir or shipped_model(config.task), compute_device(config.device))
-    bags = collect_plan(scripted_plan(config, arguments.episodes, FIRST_SEED), config, arguments.folder)
+    bags = collect_plan(scripted_plan(config, arguments.episodes, STARTS), config, arguments.folder)
     episodes = load_arrays(bags, config)
     imagined = imagine_episodes(models.tokenizer, models.action, episodes)
     last, succeeded = episode_ends(episodes, config.task)

@@ -27,12 +27,13 @@ from benchmarks.video_rl.trainings import against_cps, compare, draw, select, se
 from benchmarks.video_rl.trials import SamplerTrial, ablation_trials, hacking_trials
 from wm_nodes.apps.options import add_device, add_json, add_seed, positive, prepare_torch
 from wm_nodes.config.load import load_config, load_video_config
+from wm_nodes.config.seed_ranges import HELDOUT, NEW_CONTEXTS, SeedRange
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
+from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.training.weights import pack_weights
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_model.clips import load_clips
@@ -45,8 +46,6 @@ from wm_nodes.world_model.position_probe import PositionProbe
 
 BASE_ITERATIONS, BASE_BATCH = 4000, 16
 EPISODES = Path("runs/clip_contexts")
-NEW_SEEDS = 250_000
-"""First reset seed of contexts to train on that the shipped video model has not seen."""
 LEARNER = load_video_config("base").grpo.with_values(learning_rate=1e-4, micro_batch=64)
 """Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
 LOG_COLUMNS = 180  # of tables that go to a file or a pipe
@@ -164,7 +163,7 @@ def _with_both_noises(setups: list[SamplerSetup]) -> list[SamplerSetup]:
 def _clips(arguments: argparse.Namespace) -> None:
     config = load_video_config(arguments.preset, {"seed": arguments.seed})
     folder, probe = _models(arguments, config.task)
-    bags = arguments.context_bags or _episodes(arguments.contexts, HELDOUT_SEEDS, config.task)
+    bags = arguments.context_bags or _episodes(arguments.contexts, HELDOUT, config.task)
     clips = load_clips(bags, folder.clip["stride"])
     drawn = numpy_stream(arguments.seed, "clip_diversity").permutation(len(clips))[: arguments.contexts]
     contexts = clips.select(torch.from_numpy(drawn))
@@ -194,7 +193,7 @@ def _resolution(arguments: argparse.Namespace) -> None:
     folder, probe = _models(arguments, config.task)
     sizes = [{"simulation.image_size": side} for side in (probe.height, *arguments.sizes)]
     recordings = [[bag] for bag in arguments.context_bags] or [
-        _episodes(arguments.contexts, HELDOUT_SEEDS, config.task, size) for size in sizes
+        _episodes(arguments.contexts, HELDOUT, config.task, size) for size in sizes
     ]
     rows, own = list[dict[str, Any]](), None
     for bags in tqdm(recordings, desc="resolution", unit="size"):
@@ -207,18 +206,18 @@ def _resolution(arguments: argparse.Namespace) -> None:
     console.print(tables.resolution_table(rows))
 
 
-def _episodes(clips: int, first_seed: int, task: str, settings: Mapping[str, Any] | None = None) -> list[Path]:
+def _episodes(clips: int, seeds: SeedRange, task: str, settings: Mapping[str, Any] | None = None) -> list[Path]:
     """Bags of scripted episodes, a tenth more than the clips that are wanted: one that ends early gives none."""
     scene = load_config("cpu", {"task": task, **(settings or {})})
-    plan = scripted_plan(scene, math.ceil(1.1 * clips), first_seed)
+    plan = scripted_plan(scene, math.ceil(1.1 * clips), seeds)
     of = "".join(f"_{value}" for value in (settings or {}).values())
-    return collect_plan(plan, scene, EPISODES / f"{task}_{first_seed}_{plan.num_episodes}{of}")
+    return collect_plan(plan, scene, EPISODES / f"{task}_{plan.first_seed}_{plan.num_episodes}{of}")
 
 
 def _clip_learning(arguments: argparse.Namespace) -> None:
     base, probe = _models(arguments, TASK)
-    bags = arguments.context_bags or _episodes(arguments.contexts, NEW_SEEDS, TASK)
-    heldout_bags = arguments.heldout_bags or _episodes(arguments.eval_contexts, HELDOUT_SEEDS, TASK)
+    bags = arguments.context_bags or _episodes(arguments.contexts, NEW_CONTEXTS, TASK)
+    heldout_bags = arguments.heldout_bags or _episodes(arguments.eval_contexts, HELDOUT, TASK)
     contexts, heldout = (load_clips(recorded, base.clip["stride"]) for recorded in (bags, heldout_bags))
     plan = LearningPlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
     of = {"sha256": base.manifest["sha256"]}

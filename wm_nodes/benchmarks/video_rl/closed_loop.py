@@ -32,6 +32,7 @@ from benchmarks.video_rl.trainings import (
 )
 from benchmarks.video_rl.trials import SamplerTrial
 from wm_nodes.apps.options import positive
+from wm_nodes.config.seed_ranges import seed_spans
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.video_model import RolloutBuffer
@@ -180,14 +181,21 @@ def _train(
     probe = load_probe(shipped_model(TASK), arguments.device)
     row = train_arm(folder, contexts, heldout, probe, trial.sampler, trial.plan, seed, on_iteration)
     if arguments.models:
-        _keep_model(arguments.models / row_name(row), folder, arguments.video_model, row)
+        seeds = seed_spans(contexts.seeds)
+        _keep_model(arguments.models / row_name(row), folder, arguments.video_model, row, seeds)
     return row
 
 
-def _keep_model(place: Path, folder: VideoFolder, base: Path, row: Mapping[str, Any]) -> None:
-    """Save the trained model, with the success reader of its base, so that a policy can be trained in it."""
+def _keep_model(
+    place: Path, folder: VideoFolder, base: Path, row: Mapping[str, Any], seeds: list[list[int]]
+) -> None:
+    """Save the trained model, with the success reader of its base, so that a policy can be trained in it.
+
+    seeds: of the contexts that it was post-trained on.
+    """
     kept = ("sampler", "seed", "plan", "learning_rate")
-    story = {"task": TASK, "base": folder.sha256, "post_training": {name: row[name] for name in kept}}
+    story: dict[str, Any] = {"task": TASK, "base": folder.sha256, "post_training": {name: row[name] for name in kept}}
+    story["post_training"]["training_seeds"] = seeds
     save_video_folder(place, folder.codec, folder.network, folder.clip, story)
     for name in (WEIGHTS, SUCCESS_MANIFEST):
         shutil.copyfile(base / name, place / name)

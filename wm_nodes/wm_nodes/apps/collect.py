@@ -12,16 +12,17 @@ from pathlib import Path
 
 from wm_nodes.apps.options import add_preset, positive, settings
 from wm_nodes.config.load import load_config, preset_names
+from wm_nodes.config.seed_ranges import EVALUATION
 from wm_nodes.config.tasks import task_names
 from wm_nodes.core.files import write_atomic
-from wm_nodes.environments.record import TRAINING_SEEDS, collect_plan, keep_plan, read_index, success_table, task_plan
+from wm_nodes.environments.record import collect_plan, keep_plan, read_index, success_table, task_plan
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, help="gets one folder of bags for each task; an existing one goes on")
     parser.add_argument("--tasks", required=True, help=f"separated by commas, of {', '.join(task_names())}")
     parser.add_argument("--episodes", type=positive, required=True, help="of each task")
-    parser.add_argument("--first-seed", type=int, default=TRAINING_SEEDS, help="reset seed of the first (default: 0)")
+    parser.add_argument("--first-seed", type=int, default=0, help="reset seed of the first (default: 0)")
     add_preset(parser, "cpu", preset_names())
 
 
@@ -31,10 +32,10 @@ def run(arguments: argparse.Namespace) -> None:
               for task in arguments.tasks.split(",")}
     bags = list[Path]()
     for task, config in chosen.items():
-        if not 0 <= arguments.first_seed <= config.evaluation.first_seed - arguments.episodes:
+        if not 0 <= arguments.first_seed <= EVALUATION.first - arguments.episodes:
             raise ValueError(
                 f"--first-seed {arguments.first_seed} and {arguments.episodes} episodes are not below "
-                f"{config.evaluation.first_seed}, from where on seeds are those of the evaluation; choose a lower one"
+                f"{EVALUATION.first}, from where on seeds are those of the evaluation; choose a lower one"
             )
         plan = task_plan(config, arguments.episodes, arguments.first_seed)
         keep_plan(plan, arguments.folder / task)

@@ -2,7 +2,8 @@
 
 By policy_rl/train.py, in one process: the updates are bit-equal to those of the graph, without its start-up. In the
 world model, model_refresh.num_rounds above 1 trains in rounds, as apps/model_refresh_loop.py does.
-Each (task, seed, arm) is one line of results.jsonl; finished lines are not run again.
+Each (task, seed, arm) is one line of results.jsonl with its settings; a line of the same settings and model is not run
+again. Models that acceptance refuses are trained in all the same, and their lines say so.
 """
 
 import argparse
@@ -26,23 +27,24 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import model_tasks
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.files import text_lines
+from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
-from wm_nodes.environments.record import acceptance_plan, collect_plan
+from wm_nodes.policy_rl.acceptance import accept_model
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.exploit_meter import ExploitMeter, make_exploit_meter
-from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment, models_of
+from wm_nodes.policy_rl.factories import load_policy, make_endogenous_reward, make_imagined_environment
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import prepare_start
 from wm_nodes.policy_rl.model_refresh import refresh_round, round_folder, round_starts
-from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.policy_rl.rollouts import rollout_statistics
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.summary import acceptance_outcome
 from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
-from wm_nodes.world_model.validation.acceptance import accept_world_model
+from wm_nodes.world_model.folder import read_world_manifest
 
 FORMER_NAMES = {"gate": "acceptance", "gate_passed": "accepted"}
 """Of a row's values, in results written before they were renamed."""
@@ -77,16 +79,21 @@ def run(arguments: argparse.Namespace) -> None:
     folder = arguments.out.expanduser().absolute()
     folder.mkdir(parents=True, exist_ok=True)
     prepare_torch(arguments.threads)
+    configs = set[str]()
     for task in arguments.tasks:
         for seed in arguments.seeds:
             config = load_config(arguments.preset, {"task": task, "seed": seed, **settings(arguments)})
             compute_device(config.device)
+            model_dir, text = arguments.model_dir or shipped_model(task), dump_config(config)
+            configs.add(text)
+            made = {"config": text, "world_model_sha256": files_sha256(read_world_manifest(model_dir))}
             for arm in arguments.arms:
-                if not any((row["task"], row["seed"], row["arm"]) == (task, seed, arm) for row in read_results(folder)):
-                    _run(config, arm, arguments.model_dir or shipped_model(task), folder)
+                identity = {"task": task, "arm": arm, "seed": seed, **made}
+                if not any(identity.items() <= _plain_items(row) for row in read_results(folder)):
+                    _run(config, arm, model_dir, folder, identity)
     rows = read_results(folder)
     Console().print(table(rows))
-    if (gain := gain_over_simulator(rows)) is not None:
+    if (gain := gain_over_simulator([row for row in rows if row["config"] in configs])) is not None:
         print(f"RL in the world model less RL in the simulator, mean over the tasks: {gain:+.1f} points")
 
 
@@ -103,7 +110,7 @@ def read_results(folder: Path) -> list[dict[str, Any]]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """One line per run, and per task and arm the pooled paired difference."""
+    """One line per run, and per task, arm and settings the pooled paired difference."""
     columns = ("task", "trained in", "seed", "real before", "real after", "difference (95 %)", "imagined", "acceptance")
     lines = Table(*columns)
     for row in rows:
@@ -112,10 +119,14 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
         lines.add_row(
             row["task"], row["arm"].replace("_", " "), str(row["seed"]), _percent(before), _percent(after),
             f"{100 * pair['difference']:+.1f} ({100 * pair['low']:+.1f} to {100 * pair['high']:+.1f})",
-            f"{_percent(imagined[0])} -> {_percent(imagined[1])}", "passed" if row["accepted"] else "failed",
+            f"{_percent(imagined[0])} -> {_percent(imagined[1])}", acceptance_outcome(row["acceptance"]),
         )
-    for task, arm in sorted({(row["task"], row["arm"]) for row in rows}):
-        chosen = [row for row in rows if (row["task"], row["arm"]) == (task, arm)]
+    groups = dict[tuple[str, str, str], list[dict[str, Any]]]()
+    for row in rows:
+        lines_of = row.get("config", "").splitlines()
+        settings_of = "\n".join(line for line in lines_of if not line.startswith("seed:"))
+        groups.setdefault((row["task"], row["arm"], settings_of), []).append(row)
+    for (task, arm, _), chosen in sorted(groups.items()):
         pooled = paired_difference(
             [bool(x) for row in chosen for x in row["success_before"]],
             [bool(x) for row in chosen for x in row["success_after"]],
@@ -159,7 +170,11 @@ def gain_over_simulator(rows: Sequence[dict[str, Any]]) -> float | None:
     return mean_gain(rates, *ARMS) if rates else None
 
 
-def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
+def _plain_items(row: Mapping[str, Any]) -> set[tuple[str, Any]]:
+    return {(name, value) for name, value in row.items() if isinstance(value, str | int)}
+
+
+def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path, identity: Mapping[str, Any]) -> None:
     from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 
     started = time.monotonic()
@@ -178,11 +193,11 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         )
 
     real_before, imagined_before = measure(model_dir)
-    acceptance = accept_world_model(
-        models_of(model_dir, config.device),
-        load_arrays(collect_plan(acceptance_plan(config), config, folder / "heldout"), config), config,
-        (imagined_before.successes, imagined_before.episodes), (real_before.successes, real_before.episodes),
+    acceptance = accept_model(
+        config, model_dir, policy, (imagined_before.successes, imagined_before.episodes),
+        (real_before.successes, real_before.episodes), run_dir / "bags" / "heldout",
     )
+    print(f"{config.task}, seed {config.seed}: acceptance {acceptance.words}")
     if arm == "simulator":
         trained = _Trained(_train(policy, real, config, arm, model_dir), model_dir)
     else:
@@ -191,8 +206,7 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
     real.close()
     save_weights(policy, run_dir / f"{arm}.safetensors", {"tokenizer_sha256": policy.encoder.sha256})
     row = {
-        "task": config.task, "arm": arm, "seed": config.seed,
-        "real_before": asdict(success_rate(real_before.success)),
+        **identity, "real_before": asdict(success_rate(real_before.success)),
         "real_after": asdict(success_rate(real_after.success)),
         "imagined_before": asdict(success_rate(imagined_before.success)),
         "imagined_after": asdict(success_rate(imagined_after.success)),
@@ -203,7 +217,6 @@ def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path) -> None:
         "success_after": real_after.success.astype(int).tolist(), "course": trained.course,
         "exploit_meter": trained.readings, "refreshes": trained.refreshes,
         "minutes": (time.monotonic() - started) / 60, "machine": machine_facts(config.device),
-        "config": dump_config(config), "world_model_sha256": models_of(model_dir, config.device).sha256,
     }
     with open(folder / "results.jsonl", "a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")

@@ -22,6 +22,7 @@ from wm_nodes.apps.run_options import open_run
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
 from wm_nodes.config.scenes import SCENES, splits
 from wm_nodes.config.schema import AGENT, RunConfig, SimulationConfig
+from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import part_of, parts_of, task_names
 from wm_nodes.core.device import compute_device
@@ -29,25 +30,23 @@ from wm_nodes.core.errors import ModelNotAcceptedError
 from wm_nodes.core.model_folder import AGAIN, MANIFEST, read_json
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
-from wm_nodes.environments.record import HELDOUT_SEEDS, acceptance_plan, collect_plan
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.launching.scenarios import IMAGINED
+from wm_nodes.policy_rl.acceptance import accept_model
 from wm_nodes.policy_rl.exploit_meter import start_seeds
 from wm_nodes.policy_rl.factories import check_scene, load_policy, load_steppable
 from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_files
-from wm_nodes.policy_rl.pretraining import load_arrays, make_model
+from wm_nodes.policy_rl.pretraining import make_model
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
-from wm_nodes.reports.summary import Summary, as_first_made, read_readings, write_summary
+from wm_nodes.reports.summary import Summary, acceptance_outcome, as_first_made, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
-from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.folder import read_world_manifest
-from wm_nodes.world_model.validation.acceptance import accept_success_agreement, accept_world_model
 
 ENDOGENOUS = "endogenous"
 ACCEPTANCE, FORMER_ACCEPTANCE = "acceptance.json", "gate.json"
-"""Report of accept_world_model in the run folder, and its name in older ones."""
+"""Report of accept_model in the run folder, and its name in older ones."""
 FIXED = ("preset", "model_dir", "from_scratch", "reward", "environment", "video_model")
 FREE = ("force", "compose")
 DEFAULTS = {
@@ -141,7 +140,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     ))
     write_summary(run_dir, summary)
     policy = load_policy(config, found.model_dir, found.policy)
-    pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT_SEEDS)
+    pictures = write_pictures(run_dir, config, found.model_dir, policy, HELDOUT.first)
     report = write_report(run_dir, summary, pictures, config_text=dump_config(config))
     if summary.rounds:
         console.print(rounds_table(summary))
@@ -150,6 +149,7 @@ def _run(arguments: argparse.Namespace, config: RunConfig, run_dir: Path) -> Non
     if summary.by_task:
         console.print(tasks_table(summary))
     console.print(results_table(summary))
+    console.print(f"acceptance of the model: {acceptance_outcome(summary.acceptance)}")
     console.print(f"report   {report}\nsummary  {run_dir / 'summary.json'}\nbag      {summary.bag}", highlight=False)
 
 
@@ -227,24 +227,23 @@ def _model(arguments: argparse.Namespace, config: RunConfig, run_dir: Path, stag
 
 
 def _judge(job: RunContext, model_dir: Path, force: bool, imagined: BoolArray, real: BoolArray) -> None:
-    """Write acceptance.json and print it; raise ModelNotAcceptedError where the model failed and `force` is not set."""
+    """Write acceptance.json and print it; raise ModelNotAcceptedError where the model failed and `force` is not set. A
+    model about which too few episodes decide nothing is trained in, and the run says so."""
     config = job.config
     successes = (int(imagined.sum()), len(imagined)), (int(real.sum()), len(real))
-    if job.video_model:
-        report = accept_success_agreement(config.task, *successes)
-    else:
-        bags = collect_plan(acceptance_plan(config), config, job.run_dir / "bags" / "heldout")
-        models, heldout = load_model_folder(model_dir, compute_device(config.device)), load_arrays(bags, config)
-        report = accept_world_model(models, heldout, config, *successes)
+    report = accept_model(
+        config, model_dir, load_policy(config, model_dir, start_files(job.run_dir)[1]), *successes,
+        job.run_dir / "bags" / "heldout", video_model_dir=Path(job.video_model) if job.video_model else None,
+    )
     path = job.run_dir / ACCEPTANCE
     path.write_text(json.dumps(report.to_dict(), indent=1), encoding="utf-8")
     console.print(report.table())
-    if not report.passed and not force:
+    if report.failed and not force:
         raise ModelNotAcceptedError(
             f"{', '.join(report.failed)} failed (numbers in {path}): the policy would learn to exploit the model. "
             "Train the model longer or on more data (--from-scratch --preset cpu_full), or go on with --force"
         )
-    job.stage("acceptance passed" if report.passed else "acceptance FAILED, going on because of --force")
+    job.stage(f"acceptance {report.words}" + (", going on because of --force" if report.failed else ""))
 
 
 def _read_acceptance(run_dir: Path) -> dict[str, Any]:

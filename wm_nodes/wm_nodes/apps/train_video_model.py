@@ -28,11 +28,12 @@ from wm_nodes.config.load import (
     reward_overrides,
 )
 from wm_nodes.config.schema import AGENT, RunConfig
+from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.progress import tqdm
-from wm_nodes.environments.record import HELDOUT_SEEDS, TRAINING_SEEDS, collect_plan, scripted_plan
+from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.judge.backends.factory import check_clips, check_judge
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph_client import GraphClient
@@ -142,8 +143,8 @@ def linked(bags: Sequence[Path], folder: Path) -> list[Path]:
 def _data(scene: RunConfig, episodes: int, run_dir: Path, stage: Stages) -> tuple[list[Path], list[Path]]:
     """Bags of contexts to train on, and of held-out ones."""
     stage(f"{episodes} + {min(HELDOUT_EPISODES, episodes)} held-out simulator episodes")
-    train = scripted_plan(scene, episodes, TRAINING_SEEDS)
-    held = scripted_plan(scene, min(HELDOUT_EPISODES, episodes), HELDOUT_SEEDS)
+    train = scripted_plan(scene, episodes, MODEL_EPISODES)
+    held = scripted_plan(scene, min(HELDOUT_EPISODES, episodes), HELDOUT)
     bags = collect_plan(train, scene, run_dir / "data" / "train")
     return bags, collect_plan(held, scene, run_dir / "data" / "heldout")
 

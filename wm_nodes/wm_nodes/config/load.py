@@ -12,7 +12,8 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import ValidationError
 
-from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig, SettingsSection
+from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
+from wm_nodes.config.sections import SettingsSection
 from wm_nodes.config.tasks import get_task, task_names
 from wm_nodes.config.video import VideoRlConfig
 

@@ -5,16 +5,19 @@ Loop 2's are in video.py.
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from wm_nodes.config.measurement import AcceptanceConfig, EvaluationConfig, ExploitMeterConfig, ModelRefreshConfig
 from wm_nodes.config.scenes import check_scenes
+from wm_nodes.config.sections import (
+    Fraction,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    SettingsSection,
+)
 from wm_nodes.config.tasks import check_task, instruction
-
-PositiveInt = Annotated[int, Field(ge=1)]
-NonNegativeInt = Annotated[int, Field(ge=0)]
-PositiveFloat = Annotated[float, Field(gt=0)]
-NonNegativeFloat = Annotated[float, Field(ge=0)]
-Fraction = Annotated[float, Field(ge=0, le=1)]
 
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
@@ -25,16 +28,6 @@ ScenesName = Annotated[str, AfterValidator(check_scenes)]
 """Name of a split or of a scene, see config/scenes.py."""
 DeviceName = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
 """Where models compute: cpu, cuda, cuda:N, or auto (a GPU where there is one), see core/device.py."""
-
-
-class SettingsSection(BaseModel):
-    """Frozen, and every unknown key is an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    def with_values(self, **values: Any) -> Self:
-        """A copy with other values, checked as those of a preset are."""
-        return self.model_validate({**dict(self), **values})
 
 
 class SimulationConfig(SettingsSection):
@@ -61,9 +54,9 @@ class SimulationConfig(SettingsSection):
 
 
 class DataConfig(SettingsSection):
-    num_episodes: PositiveInt
+    num_episodes: Annotated[int, Field(ge=1, le=250_000)]
     """Simulator episodes to collect for the world model."""
-    num_heldout: PositiveInt
+    num_heldout: Annotated[int, Field(ge=1, le=100_000)]
     """Episodes kept apart for the acceptance of the world model; never trained on."""
     behaviours: dict[str, NonNegativeFloat]
     """Relative share of each behaviour (expert, noisy, near_miss, biased, waypoint, random, reach, ...)."""
@@ -72,7 +65,7 @@ class DataConfig(SettingsSection):
     start_frames: Literal["first", "any"]
     """Frames of real episodes that imagined ones begin at: first, after the reset; any: one of each episode at random,
     before its success."""
-    policy_episodes: NonNegativeInt
+    policy_episodes: Annotated[int, Field(ge=0, le=10_000)]
     """Episodes of each weak cloned policy (policy_rl/pretraining.py) added to the world model's data; 0: none."""
 
 
@@ -184,11 +177,11 @@ class OtherJudge(SettingsSection):
     """A further judge; as in JudgeConfig, whose other values it shares."""
 
     kind: Literal["openai", "embedded"] = "openai"
-    endpoints: list[str] = []
+    endpoints: list[str] = Field(default=[])
     model: str = ""
     api_key_env: str = ""
     folder: str = ""
-    extra_body: dict[str, Any] = {}
+    extra_body: dict[str, Any] = Field(default={})
 
 
 class StageJudge(OtherJudge):
@@ -272,7 +265,8 @@ class PolicyConfig(SettingsSection):
 
 
 class SftConfig(SettingsSection):
-    num_demonstrations: PositiveInt
+    num_demonstrations: Annotated[int, Field(ge=1, le=750)]
+    """With a third more in reserve, a root seed has reset seeds for as many."""
     num_iterations: PositiveInt
     batch_size: PositiveInt
     learning_rate: PositiveFloat
@@ -329,56 +323,6 @@ class PpoConfig(SettingsSection):
     def envs_per_start(self) -> int:
         """Environments that are reset with one seed."""
         return self.group_size if self.advantage == "group" else 1
-
-
-class ExploitMeterConfig(SettingsSection):
-    """How often the training asks the simulator whether what the model calls success is one; see
-    policy_rl/exploit_meter.py."""
-
-    every: NonNegativeInt
-    """Policy updates from one reading to the next; the first is of the policy that training begins with. 0: off."""
-    episodes: PositiveInt
-    """Of a reading, each from another first frame; always the same ones."""
-    stop_precision: Fraction
-    """Training stops where even the upper end of the precision's 95 % interval is below it; 0: never."""
-
-
-class AcceptanceConfig(SettingsSection):
-    num_episodes: PositiveInt
-    """Held-out real episodes that acceptance is measured on."""
-    object_error_ratio: PositiveFloat
-    """Full-horizon object error must be below this share of the error of copying the first frame."""
-    tool_error_ratio: PositiveFloat
-    done_precision: Fraction
-    done_recall: Fraction
-    """On rollouts of held-out actions, not on real frames."""
-    require_success_agreement: bool
-    """The SFT policy's imagined success must agree with its real success within the joint 95 % interval."""
-
-
-class ModelRefreshConfig(SettingsSection):
-    """Online rounds: train in the model, collect with the policy in the simulator, refresh the model, go on."""
-
-    num_rounds: Annotated[int, Field(ge=1, le=20)]
-    """1: off. ppo.updates are split over the rounds."""
-    episodes_per_round: Annotated[int, Field(ge=1, le=5000)]
-    """Simulator episodes of the round's policy that the model is refreshed on."""
-    heldout_episodes: Annotated[int, Field(ge=1, le=5000)]
-    """Further ones, never trained on, on which the new model is compared with the old one."""
-    replay_episodes: PositiveInt
-    """Scripted simulator episodes mixed into every refresh, against forgetting."""
-    refresh_iterations: PositiveInt
-    learning_rate: PositiveFloat
-    """Peak learning rate of a refresh."""
-    own_starts: Annotated[int, Field(ge=0, le=5000)]
-    """Frames of the policy's own episodes, before success, to imagine from after a refresh, beside the first frames."""
-
-
-class EvaluationConfig(SettingsSection):
-    episodes: PositiveInt
-    first_seed: NonNegativeInt
-    """Reset seed of the first evaluation episode; training never uses seeds from here on."""
-    deterministic: bool
 
 
 class RunConfig(SettingsSection):

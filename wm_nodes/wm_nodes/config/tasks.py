@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from wm_nodes.config.extensions import find_files, load_file
 from wm_nodes.config.scenes import Scene, draw, scenes_of
+from wm_nodes.config.seed_ranges import WEAK_DEMONSTRATIONS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,6 +36,16 @@ class WeakPolicy:
     demonstrations: int
     noise: float
     """Standard deviation of the exploration noise, normalised action units."""
+
+    @property
+    def plan(self) -> tuple[int, int]:
+        """How many demonstrations to try, and the first one's reset seed."""
+        count = self.demonstrations + 3
+        return count, WEAK_DEMONSTRATIONS.take(count, self.number)
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for more policies or demonstrations than there are reset seeds for."""
+        WEAK_DEMONSTRATIONS.take(self.demonstrations + 3, self.number)
 
 
 @dataclass(frozen=True)

@@ -4,17 +4,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from wm_nodes.config.schema import (
-    AGENT,
-    DeviceName,
+from wm_nodes.config.schema import AGENT, DeviceName, JudgeConfig, TaskName
+from wm_nodes.config.sections import (
     Fraction,
-    JudgeConfig,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
     SettingsSection,
-    TaskName,
 )
 
 Anchor = Literal["buffer", "frozen", "lora_off", "moving", "dual"]

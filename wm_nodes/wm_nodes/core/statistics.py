@@ -74,6 +74,20 @@ def bootstrap_mean(
     return float(array.mean()), float(low), float(high)
 
 
+def bootstrap_ratio(top: ArrayLike, bottom: ArrayLike, *, seed: int, draws: int = 2_000) -> tuple[float, float]:
+    """Return the 95 % percentile bootstrap interval of mean(top) / mean(bottom) over pairs; NaN without pairs, or where
+    bottom is 0."""
+    above, below = np.asarray(top, np.float64), np.asarray(bottom, np.float64)
+    if not len(above):
+        return NAN, NAN
+    rows = numpy_stream(seed, "bootstrap_ratio", len(above)).integers(len(above), size=(draws, len(above)))
+    means = below[rows].mean(1)
+    if not (means > 0).all():
+        return NAN, NAN
+    low, high = np.quantile(above[rows].mean(1) / means, (0.025, 0.975))
+    return float(low), float(high)
+
+
 def paired_difference(before: Sequence[bool], after: Sequence[bool], *, z: float = Z_95) -> PairedDifference:
     """Compare two binary results on the same seeds, in the same order.
 

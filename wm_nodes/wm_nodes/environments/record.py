@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.seed_ranges import HELDOUT, STARTS, SeedRange, demonstration_seeds
 from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.specs import simulation_spec
@@ -19,22 +20,20 @@ from wm_nodes.recording import Bag, EpisodeBagWriter
 INDEX, PLAN = "index.csv", "plan.json"
 FROM_TABLE = ("task", "seed", "behaviour", "instruction")
 INDEX_COLUMNS = ("bag", "task", "scene", "seed", "behaviour", "success", "steps", "planner", "instruction")
-TRAINING_SEEDS, HELDOUT_SEEDS = 0, 500_000
-"""First reset seeds of the training and the held-out episodes; evaluation seeds start at evaluation.first_seed."""
 
 
 def acceptance_plan(config: RunConfig) -> CollectionPlan:
     """Return the plan of the held-out episodes that decide about accepting a model."""
-    return scripted_plan(config, min(config.acceptance.num_episodes, config.data.num_heldout), HELDOUT_SEEDS)
+    return scripted_plan(config, min(config.acceptance.num_episodes, config.data.num_heldout), HELDOUT)
 
 
-def scripted_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
+def scripted_plan(config: RunConfig, num_episodes: int, seeds: SeedRange) -> CollectionPlan:
     """Return the plan of episodes of the scripted behaviours in the configured task's scene, for its world model."""
     return CollectionPlan(
         task=recorded_task(config.task),
         simulation=config.simulation,
         num_episodes=num_episodes,
-        first_seed=first_seed,
+        first_seed=seeds.take(num_episodes),
         behaviours=config.data.behaviours,
     )
 
@@ -53,7 +52,7 @@ def model_configs(config: RunConfig) -> list[RunConfig]:
 
 
 def collect_scripted(
-    config: RunConfig, num_episodes: int, first_seed: int, folder: Path, *, behaviour: str = ""
+    config: RunConfig, num_episodes: int, seeds: SeedRange, folder: Path, *, behaviour: str = ""
 ) -> dict[str, list[Path]]:
     """Collect the plan scripted_plan of each of model_configs into bags below `folder`, one folder for each task where
     there are several; returns the bags by task. behaviour: the only one, instead of the configured shares."""
@@ -62,7 +61,7 @@ def collect_scripted(
         configs = [one.with_values(data=one.data.with_values(behaviours={behaviour: 1.0})) for one in configs]
     folders = [folder / one.task if len(configs) > 1 else folder for one in configs]
     return {
-        one.task: collect_plan(scripted_plan(one, num_episodes, first_seed), one, where)
+        one.task: collect_plan(scripted_plan(one, num_episodes, seeds), one, where)
         for one, where in zip(configs, folders, strict=True)
     }
 
@@ -72,18 +71,21 @@ def task_plan(config: RunConfig, num_episodes: int, first_seed: int) -> Collecti
     return CollectionPlan(config.task, config.simulation, num_episodes, first_seed, config.data.behaviours)
 
 
-def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
-    """Return the plan of MPLib demonstrations of the configured task, for behaviour cloning."""
+def demonstration_plan(config: RunConfig, num_episodes: int, first_seed: int | None = None) -> CollectionPlan:
+    """Return the plan of MPLib demonstrations of the configured task, for behaviour cloning. first_seed: None: of the
+    configuration's root seed."""
+    if first_seed is None:
+        first_seed = demonstration_seeds(config.seed, num_episodes)
     return CollectionPlan(
         task=config.task, simulation=config.simulation, num_episodes=num_episodes, first_seed=first_seed,
         behaviours={"expert": 1.0}, end_on_success=True,
     )
 
 
-def first_frames_plan(config: RunConfig, num_episodes: int, first_seed: int) -> CollectionPlan:
+def first_frames_plan(config: RunConfig, num_episodes: int) -> CollectionPlan:
     """Return the plan of episodes of one step: first frames to imagine from."""
     one_step = config.simulation.model_copy(update={"max_episode_steps": 1})
-    return CollectionPlan(config.task, one_step, num_episodes, first_seed, behaviours={"random": 1.0})
+    return CollectionPlan(config.task, one_step, num_episodes, STARTS.take(num_episodes), behaviours={"random": 1.0})
 
 
 def collect_plan(plan: CollectionPlan, config: RunConfig, folder: Path) -> list[Path]:

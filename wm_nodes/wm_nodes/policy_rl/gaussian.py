@@ -7,6 +7,7 @@ mass of the Gaussian's tail beyond it; inside it is the Gaussian's density. So t
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -66,8 +67,8 @@ class DiagonalGaussian:
 
     @property
     def _log_below_BA(self) -> Tensor:
-        return log_ndtr((-LIMIT - self.mean_BA) * torch.exp(-self.log_std_A))
+        return cast(Tensor, log_ndtr((-LIMIT - self.mean_BA) * torch.exp(-self.log_std_A)))
 
     @property
     def _log_above_BA(self) -> Tensor:
-        return log_ndtr((self.mean_BA - LIMIT) * torch.exp(-self.log_std_A))
+        return cast(Tensor, log_ndtr((self.mean_BA - LIMIT) * torch.exp(-self.log_std_A)))

@@ -1,5 +1,6 @@
 """Prepare what a run needs besides a world model: frames to imagine from, the weak policy that RL starts from."""
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 from safetensors.torch import save
 
+from wm_nodes.config import seed_ranges
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, success
 from wm_nodes.core.files import write_atomic
@@ -22,15 +24,14 @@ from wm_nodes.policy_rl.factories import make_policy, make_reconstruct
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording import read_episodes
 from wm_nodes.training.weights import save_weights
+from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS, join_starts, pack_instructions
 
-STARTS = "starts.safetensors"
+STARTS, MADE_OF = "starts.safetensors", "starts.json"
 MAX_STARTS, MODEL_STARTS = 512, 64
 """Most first frames of a run, and of those beside a model, from which a launch file imagines by default; of a model of
 several scenes, half as many of each task."""
 NUM_STARTS = 256
-DEMONSTRATION_SEEDS, START_SEEDS = 600_000, 700_000
-SEEDS_PER_RUN = 1000
 
 
 def num_starts(config: RunConfig) -> int:
@@ -41,8 +42,8 @@ def num_starts(config: RunConfig) -> int:
 def starts_plan(config: RunConfig) -> CollectionPlan:
     """Return the plan of the episodes that a run's starts are taken from: one step each, or whole scripted ones."""
     if config.data.start_frames == "first":
-        return first_frames_plan(config, num_starts(config), START_SEEDS)
-    return replace(scripted_plan(config, num_starts(config), START_SEEDS), task=config.task)
+        return first_frames_plan(config, num_starts(config))
+    return replace(scripted_plan(config, num_starts(config), seed_ranges.STARTS), task=config.task)
 
 
 def write_starts(
@@ -113,12 +114,37 @@ def start_files(run_dir: Path) -> tuple[Path, Path]:
     return run_dir / STARTS, run_dir / "policies" / "weak.safetensors"
 
 
+def _keep_settings(config: RunConfig, run_dir: Path, model_dir: Path) -> None:
+    """Write beside the starts what they and the weak policy follow from; refuse a folder of others."""
+    made_of = config.model_dump(mode="json", include={
+        "task": True, "seed": True, "simulation": True, "sft": True, "policy": True,
+        "data": {"start_frames", "behaviours"} if config.data.start_frames == "any" else {"start_frames"},
+    })
+    made_of["simulation"].pop("render_device")
+    now = {
+        f"{section}.{name}": value for section, values in made_of.items() if isinstance(values, dict)
+        for name, value in values.items()
+    }
+    now |= {"task": config.task, "seed": config.seed, "first frames": num_starts(config)}
+    now["tokenizer"] = read_world_manifest(model_dir)["sha256"]["tokenizer"]
+    path = run_dir / MADE_OF
+    kept = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    for name, value in now.items():
+        if kept.get(name, value) != value:
+            raise ValueError(f"the policy and first frames in {run_dir} were made with {name} {kept[name]}, not "
+                             f"{value}; take another folder")
+    write_atomic(path, json.dumps(now, indent=1).encode())
+
+
 def prepare_start(config: RunConfig, run_dir: Path, model_dir: Path) -> tuple[Path, Path]:
-    """Collect demonstrations and starts and train the weak policy, as far as missing; return start_files()."""
+    """Collect demonstrations and starts and train the weak policy, as far as missing; return start_files().
+
+    Raises:
+        ValueError: the folder holds those of other settings or of another tokenizer.
+    """
+    _keep_settings(config, run_dir, model_dir)
     spare = max(3, config.sft.num_demonstrations // 3)
-    plan = demonstration_plan(
-        config, config.sft.num_demonstrations + spare, DEMONSTRATION_SEEDS + SEEDS_PER_RUN * config.seed
-    )
+    plan = demonstration_plan(config, config.sft.num_demonstrations + spare)
     demos = collect_plan(plan, config, run_dir / "bags" / "demos")
     starts, weak = start_files(run_dir)
     if not starts.exists():

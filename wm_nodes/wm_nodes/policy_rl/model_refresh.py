@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
+from wm_nodes.config.seed_ranges import HELDOUT_ROUNDS, MODEL_EPISODES, ROUNDS, seed_spans
 from wm_nodes.config.tasks import get_task, recorded_task
 from wm_nodes.core.device import compute_device, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.statistics import bootstrap_mean, paired_difference
 from wm_nodes.environments.maniskill.collection import CollectionPlan
-from wm_nodes.environments.record import TRAINING_SEEDS, collect_plan, scripted_plan
+from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.policy_rl.factories import policy_actor
 from wm_nodes.policy_rl.initial_policy import STARTS, write_round_starts
 from wm_nodes.policy_rl.pretraining import load_arrays
@@ -27,10 +28,6 @@ from wm_nodes.world_model import ActionModel, WorldModels, load_model_folder, sa
 from wm_nodes.world_model.folder import read_world_manifest
 from wm_nodes.world_model.training.dynamics import train_action_model
 from wm_nodes.world_model.validation.open_loop import episode_errors
-
-ROUND_SEEDS, ROUND_HELDOUT_SEEDS = 800_000, 900_000
-SEEDS_PER_ROUND = 5_000
-"""Reset seeds of round k start at (k - 1) * SEEDS_PER_ROUND from these; model_refresh.num_rounds is at most 20."""
 
 
 @dataclass(frozen=True)
@@ -101,12 +98,12 @@ def collect_round(
         number: of the round, from 1; also the policy version the bags carry.
     """
     bags = []
-    for name, first_seed, episodes in (
-        ("train", ROUND_SEEDS, config.model_refresh.episodes_per_round),
-        ("heldout", ROUND_HELDOUT_SEEDS, config.model_refresh.heldout_episodes),
+    for name, seeds, episodes in (
+        ("train", ROUNDS, config.model_refresh.episodes_per_round),
+        ("heldout", HELDOUT_ROUNDS, config.model_refresh.heldout_episodes),
     ):
         plan = CollectionPlan(
-            recorded_task(config.task), config.simulation, episodes, first_seed + SEEDS_PER_ROUND * (number - 1), {},
+            recorded_task(config.task), config.simulation, episodes, seeds.take(episodes, number - 1), {},
             make_policy=partial(policy_actor, config, model_dir, weights, None), policy_version=number,
         )
         bags.append(collect_plan(plan, config, folder / name))
@@ -115,7 +112,7 @@ def collect_round(
 
 def collect_replay(config: RunConfig, run_dir: Path) -> list[Path]:
     """Scripted simulator episodes of a run, collected once: the replay of every refresh."""
-    plan = scripted_plan(config, config.model_refresh.replay_episodes, TRAINING_SEEDS)
+    plan = scripted_plan(config, config.model_refresh.replay_episodes, MODEL_EPISODES)
     return collect_plan(plan, config, run_dir / "bags" / "replay")
 
 
@@ -157,6 +154,7 @@ def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], fold
         )
     refreshed = {
         "source_sha256": models.sha256, "round": number, "episodes": len(episodes), "metrics": metrics,
+        "training_seeds": seed_spans(episodes.seeds),
         "model_refresh": config.model_refresh.model_dump(),
     }
     story = {"refreshed": [*manifest.get("refreshed", []), refreshed]}

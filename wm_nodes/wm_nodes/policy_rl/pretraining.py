@@ -14,6 +14,7 @@ import torch
 
 from wm_nodes.config.scenes import splits
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.config.seed_ranges import HELDOUT, MODEL_EPISODES, WEAK_POLICIES, seed_spans
 from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.device import compute_device, device_label, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
@@ -21,13 +22,7 @@ from wm_nodes.core.seeding import initial_weights
 from wm_nodes.core.specs import simulation_spec
 from wm_nodes.environments.maniskill.collection import POLICY_LABEL, CollectionPlan
 from wm_nodes.environments.maniskill.episodes import EXTREME
-from wm_nodes.environments.record import (
-    HELDOUT_SEEDS,
-    TRAINING_SEEDS,
-    collect_plan,
-    collect_scripted,
-    demonstration_plan,
-)
+from wm_nodes.environments.record import collect_plan, collect_scripted, demonstration_plan
 from wm_nodes.policy_rl.factories import policy_actor
 from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, STARTS, train_weak_policy, write_starts
 from wm_nodes.recording import read_episodes
@@ -47,8 +42,6 @@ from wm_nodes.world_model.training.tokenizer import train_tokenizer
 from wm_nodes.world_model.validation.acceptance import model_metrics
 from wm_nodes.world_model.validation.controllability import controllability_metrics
 from wm_nodes.world_model.validation.goals import goal_metrics
-
-POLICY_SEEDS = 300_000
 
 
 def load_arrays(bags: Iterable[Path], config: RunConfig) -> EpisodeArrays:
@@ -73,7 +66,7 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     if config.world_model.text_encoder:
         reader = SentenceEncoder(Path(config.world_model.text_encoder))
         print(f"instructions are read by {reader.folder}, sha256 {reader.sha256[:12]}", file=sys.stderr)
-    bags = collect_scripted(config, config.data.num_episodes, TRAINING_SEEDS, run_dir / "data" / "train")
+    bags = collect_scripted(config, config.data.num_episodes, MODEL_EPISODES, run_dir / "data" / "train")
     episodes = load_arrays(chain(*bags.values()), config)
     with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
         tokenizer, tokenizer_metrics = train_tokenizer(episodes, config, config.seed, run_dir)
@@ -105,10 +98,11 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         },
         "data": {
             "episodes": len(episodes), "policy_episodes": episodes.behaviours.count(POLICY_LABEL),
-            "training_seeds": [TRAINING_SEEDS, TRAINING_SEEDS + config.data.num_episodes - 1],
+            "training_seeds": seed_spans(episodes.seeds),
             "behaviours": config.data.behaviours,
-            "heldout_seeds": [HELDOUT_SEEDS, HELDOUT_SEEDS + config.data.num_heldout - 1],
+            "heldout_seeds": [[HELDOUT.first, HELDOUT.first + config.data.num_heldout - 1]],
         },
+        "success_threshold": config.reward.success_threshold,
         "training": {
             "tokenizer": tokenizer_metrics, "decoder": decoder_metrics, "action": action_metrics, "text": text_metrics,
             "probe": probe_metrics,
@@ -118,7 +112,7 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
     models = WorldModels(shown_by, action, text, tasks, config.simulation, {}, probe)
     for name, (scenes, behaviour) in _heldout_sets(config).items():
         where = run_dir / "data" / name
-        held = collect_scripted(scenes, config.data.num_heldout, HELDOUT_SEEDS, where, behaviour=behaviour)
+        held = collect_scripted(scenes, config.data.num_heldout, HELDOUT, where, behaviour=behaviour)
         found = {task: heldout_metrics(models, load_arrays(its, config), config, task) for task, its in held.items()}
         story[name] = found if len(found) > 1 else next(iter(found.values()))
     write_starts(
@@ -165,11 +159,11 @@ def _collect_policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer)
         folder = _make_tokenizer_folder(config, run_dir, tokenizer)
         weights = run_dir / "policies" / f"weak_{number}.safetensors"
         if not weights.exists():
-            plan = demonstration_plan(chosen, policy.demonstrations + 3, POLICY_SEEDS + 1000 * number)
+            plan = demonstration_plan(chosen, *policy.plan)
             train_weak_policy(chosen, folder, collect_plan(plan, config, run_dir / "data" / "demos"), weights)
         plan = CollectionPlan(
             recorded_task(task), config.simulation, config.data.policy_episodes,
-            POLICY_SEEDS + 10_000 * (number + 1), {},
+            WEAK_POLICIES.take(config.data.policy_episodes, number), {},
             make_policy=partial(policy_actor, chosen, folder, weights, policy.noise),
         )
         bags += collect_plan(plan, config, run_dir / "data" / "policy")

@@ -12,14 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from wm_nodes.config.seed_ranges import EVALUATION
 from wm_nodes.core.seeding import numpy_stream, torch_stream
 from wm_nodes.core.types import BoolArray, Environment, FloatArray, Rollout, UInt8Array, UInt64Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.tensor_rollout import Outcomes, TensorRollout
 from wm_nodes.reward import RewardInput, RewardModel
-
-TRAINING_SEED_LIMIT = 1_000_000
-"""Reset seeds of training lie below it; evaluation seeds (presets: evaluation.first_seed) start at it."""
 
 
 class Canceled(Exception):
@@ -73,7 +71,7 @@ def reset_seeds(
     """
     check_whole_groups(num_envs, envs_per_start)
     stream = numpy_stream(seed, "reset", policy_version, step)
-    return stream.integers(0, TRAINING_SEED_LIMIT, num_envs // envs_per_start, dtype=np.uint64).repeat(envs_per_start)
+    return stream.integers(0, EVALUATION.first, num_envs // envs_per_start, dtype=np.uint64).repeat(envs_per_start)
 
 
 def check_whole_groups(num_envs: int, group_size: int) -> None:
@@ -175,7 +173,7 @@ def rollout_statistics(rollout: Outcomes | TensorRollout) -> RolloutStatistics:
         rollout = rollout.outcomes()
     ended_TN = rollout.terminated_TN | rollout.truncated_TN
     ended_N = ended_TN.any(0)
-    first_TN = np.cumsum(ended_TN, 0) - ended_TN == 0
+    first_TN: BoolArray = np.cumsum(ended_TN, 0) - ended_TN == 0
     returns_N = np.where(first_TN & rollout.valid_TN, rollout.rewards_TN, 0.0).sum(0, dtype=np.float64)
     lengths_N = (first_TN & (rollout.valid_TN | ended_TN)).sum(0)
     successes, episodes = int((first_TN & rollout.terminated_TN).sum()), int(ended_N.sum())

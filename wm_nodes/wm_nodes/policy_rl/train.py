@@ -1,6 +1,5 @@
-"""Loop 1 on one screen: PPO or GRPO of a policy in an environment, in one process. The ROS graph is this loop with the
-environment, the policy, the reward and the learner in a process each, and gives the same weights bit for bit. `python
--m wm_nodes.policy_rl.train [--device cuda]`: a policy learns to reach in the shipped world model, without a simulator.
+"""Loop 1 on one screen: PPO or GRPO of a policy in an environment, in one process; the ROS graph gives the same weights
+bit for bit. `python -m wm_nodes.policy_rl.train [--device cuda]`: a policy learns to reach in the shipped world model.
 """
 
 import argparse
@@ -10,6 +9,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.types import Environment, Rollout
+from wm_nodes.policy_rl.acceptance import acceptance_when_made
 from wm_nodes.policy_rl.device_rollout import make_collector
 from wm_nodes.policy_rl.exploit_meter import ExploitMeter
 from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy, make_training_environment
@@ -51,9 +51,9 @@ def main(words: list[str] | None = None) -> None:
         env = make_training_environment(config, model, model / STARTS, num_envs=config.ppo.num_envs, seed=config.seed)
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    for version, (rollout, metrics) in enumerate(train_policy(policy, env, reward, config), 1):
-        rate, moved = rollout_statistics(rollout).success_rate, metrics.kl_reference
-        print(f"version {version}: imagined success {rate:.1%}, {moved:.3f} nats from version 1")
+    for version, (rollout, _) in enumerate(train_policy(policy, env, reward, config), 1):
+        print(f"version {version}: imagined success {rollout_statistics(rollout).success_rate:.1%}")
+    print(f"acceptance of the world model: {acceptance_when_made(model, config)}")
 
 
 if __name__ == "__main__":

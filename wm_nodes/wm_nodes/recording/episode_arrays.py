@@ -21,7 +21,7 @@ class EpisodeArrays:
     images: uint8 (E, T + 1, H, W, 3). states: float32 (E, T + 1, S), of the tool. actions: float32 (E, T, A), 0 where
     padded. ground_truth: float32 (E, T + 1, P). success: bool (E, T + 1, J), column j for tasks[j], see `labelled`.
     lengths: int64 (E,). recorded_tasks: the task that each episode was recorded for, with its instruction; where the
-    state says which task it is (Task.parts), that one.
+    state says which task it is (Task.parts), that one. seeds: of their resets; () where unknown.
     """
 
     images: UInt8Array
@@ -34,6 +34,7 @@ class EpisodeArrays:
     instructions: tuple[str, ...]
     behaviours: tuple[str, ...]
     recorded_tasks: tuple[str, ...]
+    seeds: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.images)
@@ -64,6 +65,7 @@ class EpisodeArrays:
             self.images[index], self.states[index], self.actions[index], self.ground_truth[index], self.success[index],
             self.lengths[index], self.tasks, tuple(self.instructions[i] for i in index),
             tuple(self.behaviours[i] for i in index), tuple(self.recorded_tasks[i] for i in index),
+            tuple(self.seeds[i] for i in index) if self.seeds else (),
         )
 
     @classmethod
@@ -77,6 +79,7 @@ class EpisodeArrays:
             instructions=tuple(text for part in parts for text in part.instructions),
             behaviours=tuple(text for part in parts for text in part.behaviours),
             recorded_tasks=tuple(task for part in parts for task in part.recorded_tasks),
+            seeds=tuple(seed for part in parts for seed in part.seeds) if all(part.seeds for part in parts) else (),
         )
 
 
@@ -125,5 +128,5 @@ def stack_episodes(
         lengths=lengths, tasks=tuple(tasks), instructions=tuple(e.instruction for e in listed),
         behaviours=tuple(e.behaviour for e in listed), recorded_tasks=tuple(
             own[int(e.states[0, -len(own) :].argmax())] if own else e.task for e, own in zip(listed, parts, strict=True)
-        ),
+        ), seeds=tuple(e.seed for e in listed),
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.core.files import write_atomic
-from wm_nodes.reports.summary import Summary
+from wm_nodes.reports.summary import Summary, acceptance_outcome
 from wm_nodes.reports.tables import (
     EXPLOIT_COLUMNS,
     ROUND_COLUMNS,
@@ -22,6 +22,8 @@ from wm_nodes.reports.tables import (
 )
 
 FILE_NAME = "report.html"
+MARKS = {"passed": "good", "failed": "bad", "undecided": "faint"}
+"""CSS class of each outcome of a criterion."""
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1d1d22; --faint: #66666f; --paper: #fbfbf9; --card: #fff; --line: #dcdcd8;
@@ -179,20 +181,24 @@ def _acceptance(report: Mapping[str, Any]) -> str:
         return "<p>Not measured.</p>"
     rows = []
     for criterion in report["criteria"]:
-        mark = f'<span class="bad">failed</span>: {escape(str(criterion["remedy"]))}'
-        mark = '<span class="good">passed</span>' if criterion["passed"] else mark
+        outcome = acceptance_outcome(criterion)
+        why = {"failed": str(criterion["remedy"]), "undecided": "too few episodes"}.get(outcome, "")
+        mark = f'<span class="{MARKS[outcome]}">{outcome}</span>{": " if why else ""}{escape(why)}'
+        interval = " to ".join(f"{end:.2f}" for end in criterion.get("interval") or ())
         threshold = "" if criterion["threshold"] is None else f"{float(criterion['threshold']):g}"
         rule = escape(f"{criterion['rule']} {threshold}")
-        rows.append((escape(str(criterion["name"])), _value(criterion["value"]), rule, mark))
+        rows.append((escape(str(criterion["name"])), _value(criterion["value"]), interval, rule, mark))
     notes = "".join(f'<p class="faint">{escape(str(note))}</p>' for note in report.get("notes", ()))
     metrics = [(escape(name), _value(value)) for name, value in report.get("metrics", {}).items()]
     if metrics:
         table = html_table(("metric", "value"), metrics)
         notes += f"<details><summary>all numbers of the held-out rollouts</summary>{table}</details>"
-    words = "Passed" if report["passed"] else "Failed: trained in it all the same"
+    words = {"failed": "Failed: trained in it all the same", "undecided": "Undecided: too few episodes"}.get(
+        acceptance_outcome(report), "Passed"
+    )
     return (
         f"<p>{words}. Judged on {report['episodes']} held-out real episodes.</p>"
-        f"{html_table(('criterion', 'value', 'must be', ''), rows, numbers=(1,))}{notes}"
+        f"{html_table(('criterion', 'value', '95 %', 'must be', ''), rows, numbers=(1, 2))}{notes}"
     )
 
 

@@ -92,6 +92,11 @@ def write_summary(run_dir: Path, summary: Any) -> Path:
     return path
 
 
+def acceptance_outcome(report: Mapping[str, Any]) -> str:
+    """The outcome of an AcceptanceReport.to_dict(), or of one of its criteria; earlier versions had only `passed`."""
+    return str(report.get("outcome") or ("passed" if report["passed"] else "failed"))
+
+
 def read_summary(run_dir: Path) -> dict[str, Any]:
     """The values of <run_dir>/summary.json, with the path of the bag as bag_path() says; `acceptance` is called gate in
     older ones.

@@ -84,8 +84,7 @@ def load_clips(bags: Sequence[Path], stride: int, steps: int = 0) -> Clips:
     if lengths and not episodes:
         raise ValueError(f"no episode has {steps} steps, the longest {max(lengths)}; lower clip_steps")
     tasks = [episode.task for episode in episodes[:1]]
-    clips = cut_clips(stack_episodes(episodes, tasks, num_steps=steps or None), stride)
-    return replace(clips, seeds=tuple(episode.seed for episode in episodes))
+    return cut_clips(stack_episodes(episodes, tasks, num_steps=steps or None), stride)
 
 
 def checked(episode: Episode, bag: Path) -> Episode:
@@ -129,5 +128,5 @@ def cut_clips(episodes: EpisodeArrays, stride: int) -> Clips:
     return Clips(
         frames=torch.from_numpy(np.ascontiguousarray(episodes.images[:, ::stride])),
         actions=torch.from_numpy(np.ascontiguousarray(actions)), ground_truth=episodes.ground_truth[:, ::stride],
-        instructions=episodes.instructions, task=episodes.tasks[0],
+        instructions=episodes.instructions, task=episodes.tasks[0], seeds=episodes.seeds,
     )

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from wm_nodes.config.seed_ranges import seed_spans
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import success
 from wm_nodes.config.video import FlowMatchingConfig, VideoRlConfig
@@ -50,13 +51,13 @@ def make_video_model(
         return load_video_folder(folder, device)
     story: dict[str, Any]
     if shipped is not None:
-        model, kept = shipped, ("command", "date", "seed", "episodes", "training")
-        story = {"shipped": {name: model.manifest[name] for name in kept}}
+        model, kept = shipped, ("command", "date", "seed", "episodes", "training_seeds", "training")
+        story = {"shipped": {name: model.manifest[name] for name in kept if name in model.manifest}}
     else:
         model, losses = _train(config, clips, run_dir)
         story = {
             "command": command, "date": date.today().isoformat(), "seed": config.seed, "task": config.task,
-            "episodes": len(clips), "training": losses,
+            "episodes": len(clips), "training_seeds": seed_spans(clips.seeds), "training": losses,
         }
     scores = load_or_measure_scores(run_dir / BEFORE, model, heldout, probe, config)
     story["model"] = config.model.model_dump()

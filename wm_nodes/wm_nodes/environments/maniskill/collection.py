@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.seed_ranges import EVALUATION
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode, FloatArray, Observation
@@ -49,6 +50,15 @@ class CollectionPlan:
     make_policy: Callable[[], PolicyAct] | None = None
     policy_label: str = POLICY_LABEL
     policy_version: int = 0
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for seeds of the evaluation."""
+        first, last = self.first_seed, self.first_seed + self.num_episodes - 1
+        if first < 0 or (first < EVALUATION.stop and last >= EVALUATION.first):
+            raise ValueError(
+                f"{self.num_episodes} episodes of reset seeds {first} to {last} cannot be collected: seeds begin at 0, "
+                f"and {EVALUATION.first} to {EVALUATION.stop - 1} are those of the evaluation; choose another first one"
+            )
 
 
 WriteShard = Callable[[Path, CollectionPlan, list[Episode]], None]

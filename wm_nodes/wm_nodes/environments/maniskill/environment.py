@@ -12,6 +12,7 @@ from transforms3d.euler import euler2quat
 
 from wm_nodes.config.scenes import Scene, scene_of
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.seed_ranges import UNSEEDED
 from wm_nodes.config.tasks import get_task, part_of
 from wm_nodes.core.cameras import CameraModel, Matrix
 from wm_nodes.core.seeding import stream_seed
@@ -92,7 +93,8 @@ class ManiSkillEnvironment:
         mask = np.ones(self.spec.num_envs, bool) if mask is None else mask
         for i in np.flatnonzero(mask):
             self._num_resets += 1
-            seed = stream_seed(self._seed, "reset", self._num_resets) if seeds is None else int(seeds[i])
+            drawn = UNSEEDED.first + stream_seed(self._seed, "reset", self._num_resets) % 2**31
+            seed = drawn if seeds is None else int(seeds[i])
             self._shown[i] = scene_of(self._config.scenes, seed)
             self._parts[i] = part_of(self.spec.task, seed)
             if self._new_physics and self._shown[i] is None:  # a scene of the catalogue is built anew

@@ -15,6 +15,7 @@ import numpy as np
 
 from wm_nodes.config.load import default_task
 from wm_nodes.config.schema import SimulationConfig
+from wm_nodes.config.seed_ranges import MODEL_EPISODES
 from wm_nodes.config.tasks import clip_rules, get_task
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.progress import tqdm
@@ -99,10 +100,12 @@ class SetPlan:
         return replace(self.division, objects=(*self.division.objects, *objects))
 
     def seeds(self, task: str) -> list[int]:
-        """Of the recorded episodes."""
+        """Of the recorded episodes. Raises ValueError for seeds of another purpose."""
         numbers = itertools.count(self.seed)
         wanted = (seed for seed in numbers if not self.development or self.part(task, seed) != "test")
-        return list(itertools.islice(wanted, self.num_episodes))
+        found = list(itertools.islice(wanted, self.num_episodes))
+        MODEL_EPISODES.check(self.seed, found[-1] + 1 - self.seed)
+        return found
 
     def part(self, task: str, seed: int) -> Part:
         return _part_of_seed(task, seed) if self.diverse else self.held_out.part(draw_origin(task, seed, self.shapes))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from safetensors.torch import save
 
 import wm_nodes.judge.evidence
+from wm_nodes.config.seed_ranges import seed_spans
 from wm_nodes.core.device import CPU_DEVICE
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import AGAIN, read_json
@@ -230,7 +231,10 @@ def _load_or_train_segmenter(
 
 def _describe_set(path: Path, manifest: Manifest) -> dict[str, Any]:
     parts = {part: sum(row.part == part for row in manifest.rows) for part in ("train", "validation", "test")}
-    return {"set": path.name, "manifest_sha256": hashlib.sha256(to_bytes(manifest)).hexdigest(), "clips": parts}
+    return {
+        "set": path.name, "manifest_sha256": hashlib.sha256(to_bytes(manifest)).hexdigest(), "clips": parts,
+        "training_seeds": seed_spans(row.origin.seed for row in manifest.rows if row.part != "test"),
+    }
 
 
 def _code_digest() -> bytes:

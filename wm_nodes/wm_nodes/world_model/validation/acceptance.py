@@ -1,47 +1,70 @@
-"""Whether a world model passes acceptance: measured on held-out real episodes, before a policy is trained in it
-(RS-12).
+"""Whether a model passes acceptance: measured on held-out real episodes, and by the policy that training begins with,
+before that policy is trained in it (RS-12).
 
-The numbers come from open_loop.py: recorded actions rolled out open-loop from recorded first frames. Positions
-are read off the imagined pictures by the judge's own probe; "copying" reads them off the first frame instead.
+The numbers of held-out episodes come from open_loop.py: recorded actions rolled out open-loop from recorded first
+frames. Positions are read off the imagined pictures by the judge's own probe; "copying" reads them off the first frame
+instead. Those of the policy come from rollouts of its own (policy_rl/acceptance.py).
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rich.table import Table
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task, parts_of
-from wm_nodes.core.statistics import newcombe_difference
+from wm_nodes.core.statistics import newcombe_difference, wilson_of_share
+from wm_nodes.core.types import BoolArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.world_model import WorldModels
+from wm_nodes.world_model.validation.goals import goal_metrics
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
 
+Outcome = Literal["passed", "failed", "undecided"]
 MORE_TRAINING = (
     "train longer (world_model.num_iterations) or on more episodes near contact (data.num_episodes, data.behaviours)"
 )
 MORE_NEAR_MISSES = "collect more near misses (data.behaviours.near_miss), or raise reward.success_threshold"
 MORE_SUCCESSES = "collect more successes (data.behaviours), or lower reward.success_threshold"
 POLICY_DATA = "refresh the model with more episodes of weak policies (data.policy_episodes)"
+BETTER_GOALS = "train the text model longer (world_model.text_num_iterations), or set reward.dense_weight to 0"
+MARKS = {"passed": "[green]passed", "failed": "[red]failed[/]: {}", "undecided": "[yellow]too few episodes"}
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """passed: value against threshold, as `rule` says. remedy: what to do where it failed.
+    """outcome: of value against threshold, as `rule` says. remedy: what to do where it failed.
 
-    value: NaN where it could not be computed; that fails. threshold: None where `rule` says everything.
+    value: NaN where it could not be computed. threshold: None where `rule` says everything. interval: 95 %, of the
+    value; None where it is not known. undecided: there are too few episodes to pass or to fail the model.
     """
 
     name: str
     value: float
     threshold: float | None
     rule: str
-    passed: bool
+    outcome: Outcome
     remedy: str
+    interval: tuple[float, float] | None = None
+
+    @property
+    def passed(self) -> bool:
+        return self.outcome == "passed"
+
+
+@dataclass(frozen=True)
+class CloneRollouts:
+    """What the policy that training begins with did in the model, bool (E,), and what its actions do in the simulator.
+
+    imagined: success by the model's own done signal. replayed: by the simulator, under the same actions.
+    """
+
+    imagined: BoolArray
+    replayed: BoolArray
 
 
 @dataclass(frozen=True)
@@ -55,31 +78,56 @@ class AcceptanceReport:
     notes: tuple[str, ...] = ()
 
     @property
+    def outcome(self) -> Outcome:
+        """failed: in any criterion; else undecided: in any."""
+        found = {criterion.outcome for criterion in self.criteria}
+        return "failed" if "failed" in found else "undecided" if "undecided" in found else "passed"
+
+    @property
     def passed(self) -> bool:
-        return all(criterion.passed for criterion in self.criteria)
+        return self.outcome == "passed"
 
     @property
     def failed(self) -> tuple[str, ...]:
-        return tuple(criterion.name for criterion in self.criteria if not criterion.passed)
+        return self._with("failed")
+
+    @property
+    def undecided(self) -> tuple[str, ...]:
+        return self._with("undecided")
+
+    def _with(self, outcome: Outcome) -> tuple[str, ...]:
+        return tuple(criterion.name for criterion in self.criteria if criterion.outcome == outcome)
+
+    @property
+    def words(self) -> str:
+        """The outcome and which criteria it is due to, in a line."""
+        names = self.failed or self.undecided
+        return " ".join([self.outcome, *([f"({', '.join(names)})"] if names else [])])
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, numbers that are not finite as None; with `passed` and `failed`."""
+        """Plain values for JSON, numbers that are not finite as None; with `outcome`, `passed`, `failed`,
+        `undecided`."""
         values = asdict(self)
-        values["criteria"] = [{**row, "value": _finite(row["value"])} for row in values["criteria"]]
+        values["criteria"] = [
+            {**row, "value": _finite(row["value"]), "passed": row["outcome"] == "passed"} for row in values["criteria"]
+        ]
         values["metrics"] = {name: _finite(value) for name, value in self.metrics.items()}
-        return {**values, "passed": self.passed, "failed": list(self.failed)}
+        return {
+            **values, "outcome": self.outcome, "passed": self.passed, "failed": list(self.failed),
+            "undecided": list(self.undecided),
+        }
 
     def table(self) -> Table:
         """The criteria for the terminal; remedies where they failed."""
-        words = "passed" if self.passed else "FAILED"
+        words = self.outcome.upper() if self.failed else self.outcome
         rows = []
         for row in self.criteria:
             limit = "" if row.threshold is None else f" {row.threshold:g}"
             value = f"{row.value:.3f}" if math.isfinite(row.value) else "undefined"
-            mark = "[green]passed" if row.passed else f"[red]failed[/]: {row.remedy}"
-            rows.append((row.name, value, row.rule + limit, mark))
+            interval = "" if row.interval is None else f"{row.interval[0]:.2f} to {row.interval[1]:.2f}"
+            rows.append((row.name, value, interval, row.rule + limit, MARKS[row.outcome].format(row.remedy)))
         title = f"acceptance {words}: {self.task}, {self.episodes} held-out real episodes"
-        columns, caption = ("criterion", "value", "must be", ""), "\n".join(self.notes) or None
+        columns, caption = ("criterion", "value", "95 %", "must be", ""), "\n".join(self.notes) or None
         return make_table(title, columns, rows, left=("criterion", "must be", ""), caption=caption)
 
 
@@ -91,26 +139,32 @@ def model_metrics(models: WorldModels, heldout: EpisodeArrays, config: RunConfig
 
 def accept_world_model(
     models: WorldModels, heldout: EpisodeArrays, config: RunConfig, imagined: tuple[int, int] | None = None,
-    real: tuple[int, int] | None = None,
+    real: tuple[int, int] | None = None, clone: CloneRollouts | None = None,
 ) -> AcceptanceReport:
     """Measure whether a world model passes acceptance for config.task.
 
     Args:
         heldout: real episodes with ground truth that the model was not trained on.
         imagined, real: (successes, episodes) of the SFT policy in the model and in the simulator; None: not measured.
+        clone: of the SFT policy; None: not measured.
 
     Raises:
         ValueError: episodes without ground truth, or labelled for other tasks than the model's.
     """
     _check(models, heldout, config.task)
     metrics = model_metrics(models, heldout, config)
-    criteria, notes = apply_criteria(metrics, config, heldout.num_steps, imagined, real)
+    criteria, notes = apply_criteria(metrics, config, heldout.num_steps, imagined, real, clone)
+    if config.reward.dense_weight > 0:
+        for part in parts_of(config.task):
+            goals = goal_metrics(models, heldout, config, part)
+            criteria = (*criteria, *_goals(goals, config, part))
+            metrics |= {f"{part}_{name}": value for name, value in goals.items()}
     return AcceptanceReport(config.task, len(heldout), criteria, metrics, notes)
 
 
 def apply_criteria(
-    metrics: Mapping[str, float], config: RunConfig, num_steps: int, imagined: tuple[int, int] | None,
-    real: tuple[int, int] | None,
+    metrics: Mapping[str, float | None], config: RunConfig, num_steps: int, imagined: tuple[int, int] | None,
+    real: tuple[int, int] | None, clone: CloneRollouts | None = None,
 ) -> tuple[tuple[Criterion, ...], tuple[str, ...]]:
     """Return criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model."""
     limits, task = config.acceptance, config.task
@@ -123,48 +177,146 @@ def apply_criteria(
     criteria = []
     if not get_task(task).moves_object:
         notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
-    else:
-        ratio = _at(metrics, "object_moved_ratio", num_steps)
-        criteria.append(_below(f"object error / copying, step {num_steps}", ratio, limits.object_error_ratio))
-    ratio = _at(metrics, "tool_ratio", num_steps)
-    criteria.append(_below(f"tool error / copying, step {num_steps}", ratio, limits.tool_error_ratio))
+    for name, key, limit in (
+        ("object", "object_moved_ratio", limits.object_error_ratio), ("tool", "tool_ratio", limits.tool_error_ratio),
+    ):
+        if name == "tool" or get_task(task).moves_object:
+            ratio, *ends = (_at(metrics, f"{key}{end}", num_steps) for end in ("", "_low", "_high"))
+            criteria.append(_below(f"{name} error / copying, step {num_steps}", ratio, limit, _interval(*ends)))
     for kind, threshold, remedy in (
         ("precision", limits.done_precision, MORE_NEAR_MISSES), ("recall", limits.done_recall, MORE_SUCCESSES),
     ):
-        found = [metrics.get(f"done_{part}_{kind}", math.nan) for part in parts_of(task)]
-        value = float(np.nanmean(found)) if np.isfinite(found).any() else math.nan
-        name = f"done {kind} on rollouts" + (", mean of the tasks" if len(found) > 1 else "")
-        criteria.append(Criterion(name, value, threshold, ">=", value >= threshold, remedy))
+        value, interval = _mean_of_parts(metrics, parts_of(task), kind)
+        name = f"done {kind} on rollouts" + (", mean of the tasks" if len(parts_of(task)) > 1 else "")
+        outcome: Outcome = "passed" if value >= threshold else "failed"
+        criteria.append(Criterion(name, value, threshold, ">=", outcome, remedy, interval))
+    policy, more = _policy_criteria(config, imagined, real, clone)
+    return (*criteria, *policy), (*notes, *more)
+
+
+def accept_video_model(
+    config: RunConfig, imagined: tuple[int, int], real: tuple[int, int], clone: CloneRollouts | None = None
+) -> AcceptanceReport:
+    """Judge a model that cannot be rolled out as accept_world_model does, by what the SFT policy does in it alone."""
+    criteria, notes = _policy_criteria(config, imagined, real, clone)
+    told = ("Errors of the frames were not judged: the model is no world model.", *notes)
+    return AcceptanceReport(config.task, 0, tuple(criteria), {}, told)
+
+
+def accepted_when_made(manifest: Mapping[str, Any], config: RunConfig) -> str:
+    """Say in a line what the held-out metrics in a world model's manifest mean for config.task, without a simulator."""
+    found = manifest.get("heldout", {})
+    metrics = found.get(config.task, found)
+    steps = config.simulation.max_episode_steps
+    if f"tool_ratio_h{steps:02d}" not in metrics:
+        return f"not judged: the model's manifest holds no metrics of held-out episodes of {config.task}"
+    criteria, _ = apply_criteria(metrics, config, steps, None, None)
+    left_out = "the policy in it"
+    if manifest.get("success_threshold") != config.reward.success_threshold:
+        criteria = tuple(row for row in criteria if not row.name.startswith("done"))
+        left_out = f"its done signal at reward.success_threshold {config.reward.success_threshold:g} and {left_out}"
+    report = AcceptanceReport(config.task, int(metrics.get("episodes") or 0), criteria, {})
+    return (f"{report.words} on {report.episodes} held-out episodes when it was made; {left_out} not judged, without a "
+            "simulator")
+
+
+def _policy_criteria(
+    config: RunConfig, imagined: tuple[int, int] | None, real: tuple[int, int] | None, clone: CloneRollouts | None
+) -> tuple[list[Criterion], list[str]]:
+    """Criteria and notes of what the SFT policy does in the model."""
+    limits, criteria, notes = config.acceptance, list[Criterion](), list[str]()
+    if clone is None:
+        notes.append("The done signal was not judged on rollouts of the cloned policy: none were made.")
+    else:
+        criteria += [
+            _of_clone("precision", clone.replayed[clone.imagined], limits.done_precision, config, MORE_NEAR_MISSES),
+            _of_clone("recall", clone.imagined[clone.replayed], limits.done_recall, config, MORE_SUCCESSES),
+        ]
     if not limits.require_success_agreement:
         notes.append("Agreement of imagined and real success was not asked for (acceptance.require_success_agreement).")
     elif imagined is None or real is None:
         notes.append("Agreement of imagined and real success was not judged: no policy was measured in both.")
     else:
-        criteria.append(_agreement(imagined, real))
-    return tuple(criteria), tuple(notes)
+        criteria.append(_agreement(imagined, real, limits.success_margin))
+    return criteria, notes
 
 
-def accept_success_agreement(task: str, imagined: tuple[int, int], real: tuple[int, int]) -> AcceptanceReport:
-    """Judge a model that cannot be rolled out as accept_world_model does, by (successes, episodes) in both alone."""
-    notes = ("Errors of the frames were not judged: the model is no world model.",)
-    return AcceptanceReport(task, 0, (_agreement(imagined, real),), {}, notes)
-
-
-def _agreement(imagined: tuple[int, int], real: tuple[int, int]) -> Criterion:
+def _agreement(imagined: tuple[int, int], real: tuple[int, int], margin: float) -> Criterion:
+    """An equivalence test: the interval within the margin passes; a gap beyond it, and beyond chance, fails."""
     low, high = newcombe_difference(*imagined, *real)
     gap = imagined[0] / imagined[1] - real[0] / real[1]
     name = f"SFT policy: imagined {imagined[0]}/{imagined[1]} - real {real[0]}/{real[1]} success"
-    rule = f"0 inside its 95 % interval, {low:+.2f} to {high:+.2f}"
-    return Criterion(name, gap, None, rule, bool(low <= 0 <= high), POLICY_DATA)
+    outcome: Outcome = "undecided"
+    if -margin <= low and high <= margin:
+        outcome = "passed"
+    elif abs(gap) > margin and not low <= 0 <= high:
+        outcome = "failed"
+    rule = f"interval within +-{margin:g}"
+    return Criterion(name, gap, None, rule, outcome, POLICY_DATA, (low, high))
 
 
-def _below(name: str, value: float, threshold: float) -> Criterion:
-    return Criterion(name, float(value), threshold, "<=", bool(value <= threshold), MORE_TRAINING)
+def _of_clone(kind: str, right: BoolArray, limit: float, config: RunConfig, remedy: str) -> Criterion:
+    """Fails where even the upper end of the interval misses the limit, passes where the lower end is within
+    acceptance.success_margin of it."""
+    value, low, high = wilson_of_share(right)
+    near = limit - config.acceptance.success_margin
+    outcome: Outcome = "undecided"
+    if high < limit:
+        outcome = "failed"
+    elif value >= limit and low >= near:
+        outcome = "passed"
+    rule = f"interval above {near:.2f}, value >="
+    return Criterion(f"done {kind}, cloned policy ({len(right)})", value, limit, rule, outcome, remedy, (low, high))
 
 
-def _at(metrics: Mapping[str, float], name: str, step: int) -> float:
+def _goals(found: Mapping[str, float], config: RunConfig, part: str) -> list[Criterion]:
+    """Of the goals that the text model imagines for one task."""
+    limits, of = config.acceptance, f"imagined goal of {part}"
+    if not found.get("goal_episodes"):
+        return [Criterion(f"{of}: episodes that reach it", 0.0, 1.0, ">=", "undecided", MORE_SUCCESSES)]
+    share = found["goal_found"]
+    outcome: Outcome = "passed" if share >= limits.done_recall else "failed"
+    ends = _interval(found["goal_found_low"], found["goal_found_high"])
+    criteria = [Criterion(f"{of}: found", share, limits.done_recall, ">=", outcome, BETTER_GOALS, ends)]
+    for name in ("object", "tool") if get_task(part).moves_object else ("tool",):
+        copied = found[f"goal_{name}_copy_cm"]
+        ratio = found[f"goal_{name}_cm"] / copied if copied > 0 else math.nan
+        ends = _interval(found[f"goal_{name}_ratio_low"], found[f"goal_{name}_ratio_high"])
+        criteria.append(_below(f"{of}: {name} error / first frame", ratio, limits.goal_error_ratio, ends, BETTER_GOALS))
+    return criteria
+
+
+def _mean_of_parts(
+    metrics: Mapping[str, float | None], parts: tuple[str, ...], kind: str
+) -> tuple[float, tuple[float, float] | None]:
+    """Mean over the parts whose value is known, and its interval, from those of the parts (MOVER)."""
+    rows = [[_number(metrics.get(f"done_{part}_{kind}{end}")) for end in ("", "_low", "_high")] for part in parts]
+    known = [row for row in rows if math.isfinite(row[0])]
+    if not known:
+        return math.nan, None
+    value = float(np.mean([row[0] for row in known]))
+    below, above = (math.hypot(*(row[0] - row[end] for row in known)) / len(known) for end in (1, 2))
+    return value, _interval(value - below, value + above)
+
+
+def _below(
+    name: str, value: float, threshold: float, interval: tuple[float, float] | None, remedy: str = MORE_TRAINING
+) -> Criterion:
+    outcome: Outcome = "passed" if value <= threshold else "failed"
+    return Criterion(name, float(value), threshold, "<=", outcome, remedy, interval)
+
+
+def _interval(low: float, high: float) -> tuple[float, float] | None:
+    return (low, high) if math.isfinite(low) and math.isfinite(high) else None
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _at(metrics: Mapping[str, float | None], name: str, step: int) -> float:
     """The metric at a step; NaN where no episode was that long."""
-    return float(metrics.get(f"{name}_h{step:02d}", float("nan")))
+    return _number(metrics.get(f"{name}_h{step:02d}"))
 
 
 def _check(models: WorldModels, heldout: EpisodeArrays, task: str) -> None:

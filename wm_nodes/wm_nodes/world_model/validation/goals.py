@@ -5,6 +5,8 @@ import torch
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import get_task
+from wm_nodes.core.statistics import bootstrap_ratio, wilson_of_share
+from wm_nodes.core.types import FloatArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.world_model.folder import WorldModels
 from wm_nodes.world_model.text import TextModel, imagine_goals, instruction_for
@@ -20,7 +22,8 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
     goal_episodes: with an instruction of words that the text model knows; goal_left_out: the others.
     goal_found: share of imagined episodes whose done signal exceeds reward.goal_threshold. goal_object_cm,
     goal_tool_cm, goal_perceptual: distance of the goal, imagined from the first frame and the instruction, from the
-    frame of the first success; `_copy`: of the first frame from it. Positions are read by the probe.
+    frame of the first success; `_copy`: of the first frame from it; `_ratio_low`, `_ratio_high`: bootstrap interval of
+    the first over the second. Positions are read by the probe.
     """
     column = models.task_index(task)
     won = episodes.success[..., column] & episodes.labelled[:, column, None] & episodes.frame_mask
@@ -41,15 +44,20 @@ def goal_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig
         models.text, models.tokenizer, episodes.images[rows, 0], instructions, [column] * len(rows),
         horizon=episodes.num_steps, threshold=config.reward.goal_threshold,
     )
-    metrics["goal_found"] = float(imagined.found.mean())
+    for end, value in zip(("", "_low", "_high"), wilson_of_share(imagined.found)):
+        metrics[f"goal_found{end}"] = value
+    errors = dict[tuple[str, str], FloatArray]()
     read, truth = position_reader(models.tokenizer, models.probe), episode_targets(episodes)[rows, reached]
     real = models.tokenizer.encode(episodes.images[rows, reached])
     for ending, frames in (("", imagined.goals), ("_copy", episodes.images[rows, 0])):
         found = read(frames[:, None])[:, 0]
         for name, columns in (("object", OBJECT), ("tool", TOOL)):
-            errors = 100 * np.linalg.norm(found[:, columns] - truth[:, columns], axis=-1)
-            metrics[f"goal_{name}{ending}_cm"] = float(errors.mean())
+            errors[name, ending] = 100 * np.linalg.norm(found[:, columns] - truth[:, columns], axis=-1)
+            metrics[f"goal_{name}{ending}_cm"] = float(errors[name, ending].mean())
         metrics[f"goal_perceptual{ending}"] = float((models.tokenizer.encode(frames) - real).abs().mean())
+    for name in ("object", "tool"):
+        low, high = bootstrap_ratio(errors[name, ""], errors[name, "_copy"], seed=0)
+        metrics |= {f"goal_{name}_ratio_low": low, f"goal_{name}_ratio_high": high}
     return metrics
 
 

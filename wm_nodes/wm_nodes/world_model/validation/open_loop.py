@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from wm_nodes.core.statistics import bootstrap_ratio, wilson_of_share
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reward.picture_similarity import psnr_db, ssim
@@ -100,9 +101,9 @@ def evaluate_rollouts(
     """Metrics by name (see docs/metrics.md); positions in cm, PSNR in dB, `_hNN` at step NN.
 
     object_/tool_: mean error of `rollout`, of the probe on real frames (`floor`), of the tokenizer's probe on their
-    `latents`, of the first frame (`copy`), and rollout / copy (`ratio`). object_moved_: over the episodes whose object
-    moved. done_<task>_: episodes counted as successful when the signal exceeds `threshold` anywhere, against success
-    anywhere in the recording.
+    `latents`, of the first frame (`copy`), and rollout / copy (`ratio`, with its bootstrap interval `ratio_low` to
+    `ratio_high`). object_moved_: over the episodes whose object moved. done_<task>_: episodes counted as successful
+    when the signal exceeds `threshold` anywhere, against success anywhere in the recording.
     """
     imagined = imagine_episodes(tokenizer, model, episodes)
     truth = episode_targets(episodes)
@@ -171,12 +172,12 @@ def _done(
 
 
 def detection_metrics(scores: FloatArray, positive: BoolArray, threshold: float) -> dict[str, float]:
-    """Precision, recall and agreement of scores > threshold, AUC, and both rates; NaN where undefined."""
+    """Precision and recall with their Wilson intervals, and agreement, of scores > threshold, AUC, and both rates; NaN
+    where undefined."""
     fired = scores > threshold
-    hits = float((fired & positive).sum())
+    shares = {"precision": wilson_of_share(positive[fired]), "recall": wilson_of_share(fired[positive])}
     return {
-        "precision": hits / fired.sum() if fired.any() else float("nan"),
-        "recall": hits / positive.sum() if positive.any() else float("nan"),
+        **{f"{name}{end}": value for name, share in shares.items() for end, value in zip(("", "_low", "_high"), share)},
         "agreement": float((fired == positive).mean()),
         "auc": auc(scores, positive),
         "imagined_rate": float(fired.mean()),
@@ -202,6 +203,8 @@ def _position_metrics(
     }
     metrics = {f"{name}_{key}_cm_{label}": _mean(value) for key, value in errors.items()}
     metrics[f"{name}_rollout_median_cm_{label}"] = float(np.median(errors["rollout"])) if rows.any() else float("nan")
+    interval = bootstrap_ratio(errors["rollout"], errors["copy"], seed=0)
+    metrics |= {f"{name}_ratio_{end}_{label}": value for end, value in zip(("low", "high"), interval)}
     copied = metrics[f"{name}_copy_cm_{label}"]
     metrics[f"{name}_ratio_{label}"] = metrics[f"{name}_rollout_cm_{label}"] / copied if copied > 0 else float("nan")
     return metrics

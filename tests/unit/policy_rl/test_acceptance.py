@@ -1,0 +1,59 @@
+"""Acceptance before a training: held-out episodes and the cloned policy's own rollouts, in the real simulator."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graph.toy import ReachToy, make_policy
+from model_folders import make_model_folder, make_stepped_folder
+from unit.policy_rl.test_exploit_meter import SEEDS, ToyModel
+
+from wm_nodes.config.load import load_config
+from wm_nodes.policy_rl import factories
+from wm_nodes.policy_rl.acceptance import accept_model, acceptance_when_made
+from wm_nodes.policy_rl.exploit_meter import imagine_and_replay, measure_exploit
+
+CONFIG = load_config("smoke", {"data.num_workers": 1, "acceptance.num_episodes": 4, "acceptance.clone_episodes": 3})
+
+
+def test_imagined_and_replayed_success_are_those_of_a_reading_of_every_start() -> None:
+    policy, model = make_policy(load_config("smoke")), ToyModel(4, 0)
+    model.claims = True
+    imagined, replayed = imagine_and_replay(policy, model, ReachToy(1, 0), SEEDS, 0)
+    whole = measure_exploit(policy, model, ReachToy(3, 0), SEEDS, len(SEEDS), 0)
+    np.testing.assert_array_equal(imagined, whole.imagined)
+    np.testing.assert_array_equal(replayed, whole.replayed)
+    assert imagined.all() and 0 < replayed.sum() < len(SEEDS)
+
+
+def test_starts_that_the_simulator_does_not_show_are_refused_without_pictures_too() -> None:
+    with pytest.raises(ValueError, match="first frames are not what the simulator shows"):
+        imagine_and_replay(make_policy(load_config("smoke")), ToyModel(4, 0), ReachToy(1, 0), SEEDS[::-1].copy(), 0)
+
+
+@pytest.mark.rendering
+def test_a_model_is_judged_by_held_out_episodes_and_by_the_cloned_policy_in_it(tmp_path: Path) -> None:
+    model, folder = make_model_folder(tmp_path / "model", CONFIG), tmp_path / "heldout"
+    policy = factories.make_policy(CONFIG, model)
+    report = accept_model(CONFIG, model, policy, (2, 8), (2, 8), folder)
+    kinds = [name.split(",")[0].split(" (")[0] for name in (row.name for row in report.criteria)]
+    assert kinds == [
+        "object error / copying", "tool error / copying", "done precision on rollouts", "done recall on rollouts",
+        "done precision", "done recall", "SFT policy: imagined 2/8 - real 2/8 success",
+    ]
+    assert report.outcome == "failed" and report.episodes == 4 and "SFT" in report.undecided[-1]
+    assert accept_model(CONFIG, model, policy, (2, 8), (2, 8), folder).to_dict() == report.to_dict()
+
+    video = make_stepped_folder(tmp_path / "video_model")
+    own = accept_model(CONFIG, model, policy, (2, 8), (2, 8), folder, video_model_dir=video)
+    assert len(own.criteria) == 3 and own.episodes == 0
+    off = CONFIG.with_values(acceptance=CONFIG.acceptance.with_values(clone_episodes=0))
+    assert len(accept_model(off, model, policy, (2, 8), (2, 8), folder).criteria) == 5
+    smaller = CONFIG.with_values(data=CONFIG.data.with_values(behaviours={"random": 1.0}))
+    with pytest.raises(ValueError, match="was begun with behaviours"):
+        accept_model(smaller, model, policy, (2, 8), (2, 8), folder)
+
+
+def test_a_model_without_held_out_metrics_is_said_to_be_unjudged(tmp_path: Path) -> None:
+    found = acceptance_when_made(make_model_folder(tmp_path / "model", CONFIG), CONFIG)
+    assert found == "not judged: the model's manifest holds no metrics of held-out episodes of push_cube"

@@ -1,0 +1,71 @@
+"""Acceptance of the model that a policy is about to be trained in: a part of every training beside a simulator."""
+
+from pathlib import Path
+
+from wm_nodes.config.schema import RunConfig
+from wm_nodes.environments.record import acceptance_plan, collect_plan, keep_plan
+from wm_nodes.policy_rl.exploit_meter import IMAGINED_ENVS, imagine_and_replay
+from wm_nodes.policy_rl.factories import make_imagined_environment, make_video_environment, models_of
+from wm_nodes.policy_rl.image_policy import ImagePolicy
+from wm_nodes.policy_rl.initial_policy import STARTS, write_starts
+from wm_nodes.policy_rl.pretraining import load_arrays
+from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.imagined_episodes import load_start_seeds
+from wm_nodes.world_model.validation.acceptance import (
+    AcceptanceReport,
+    CloneRollouts,
+    accept_video_model,
+    accept_world_model,
+    accepted_when_made,
+)
+
+
+def accept_model(
+    config: RunConfig, model_dir: Path, policy: ImagePolicy, imagined: tuple[int, int], real: tuple[int, int],
+    folder: Path, *, video_model_dir: Path | None = None,
+) -> AcceptanceReport:
+    """Measure whether a policy may be trained in the world model, or in the video model where one is given.
+
+    Args:
+        policy: that training begins with. imagined, real: its (successes, episodes) in the model and the simulator.
+        folder: of the held-out episodes; those of the same settings that are there are kept.
+
+    Raises:
+        ValueError: the folder was begun with other settings, and as accept_world_model.
+    """
+    plan = acceptance_plan(config)
+    folder.mkdir(parents=True, exist_ok=True)
+    keep_plan(plan, folder)
+    bags = collect_plan(plan, config, folder)
+    clone = _roll_out(config, model_dir, policy, bags, folder, video_model_dir)
+    if video_model_dir is not None:
+        return accept_video_model(config, imagined, real, clone)
+    models = models_of(model_dir, config.device)
+    return accept_world_model(models, load_arrays(bags, config), config, imagined, real, clone)
+
+
+def acceptance_when_made(model_dir: Path, config: RunConfig) -> str:
+    """Say in a line what acceptance makes of a world model's manifest, where there is no simulator to measure in."""
+    return accepted_when_made(read_world_manifest(model_dir), config)
+
+
+def _roll_out(
+    config: RunConfig, model_dir: Path, policy: ImagePolicy, bags: list[Path], folder: Path,
+    video_model_dir: Path | None,
+) -> CloneRollouts | None:
+    """Rollouts of the policy from the first frames of held-out episodes; None where acceptance.clone_episodes is 0."""
+    from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
+
+    if not config.acceptance.clone_episodes:
+        return None
+    starts = folder / STARTS
+    write_starts(bags, starts, config.acceptance.clone_episodes)
+    make = make_imagined_environment if video_model_dir is None else make_video_environment
+    seeds = load_start_seeds(starts, config.task)
+    num_envs = min(len(seeds), IMAGINED_ENVS)
+    env = make(config, video_model_dir or model_dir, starts, num_envs=num_envs, seed=config.seed)
+    simulator = ManiSkillEnvironment(config.task, config.simulation, pictures=False)
+    try:
+        return CloneRollouts(*imagine_and_replay(policy, env, simulator, seeds, config.seed))
+    finally:
+        simulator.close()
