@@ -158,6 +158,32 @@ def test_a_file_that_is_not_in_the_order_of_time_is_read_in_it_where_sequence_nu
         assert_same_episodes(tmp_path / name, own)
 
 
+@pytest.mark.parametrize(("plugin", "mode"), FORMATS)
+def test_a_bag_with_a_damaged_byte_is_a_bag_error_or_gives_a_part_of_its_messages(
+    tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode
+) -> None:
+    path = foreign_copy(own_bag(tmp_path / "own"), tmp_path / "bag", plugin, mode)
+    with Bag(path) as bag:
+        whole = list(bag.messages())
+    (file,) = (each for each in path.iterdir() if each.suffix != ".yaml")
+    content, refused, lost = file.read_bytes(), list[str](), list[str]()
+    for at in range(10, len(content), len(content) // 15):
+        file.write_bytes(content[:at] + bytes([content[at] ^ 0xFF]) + content[at + 1 :])
+        for damaged in (None, list[str]()):
+            try:
+                with Bag(path) as bag:
+                    found = list(bag.messages(damaged=damaged))
+                assert len(found) <= len(whole)
+            except BagError as error:
+                refused.append(str(error))
+        try:
+            assert recover(path, output=tmp_path / f"again_{at}").messages <= len(whole)
+        except BagError as error:
+            lost.append(str(error))
+    assert all("wm recover-bag" in text for text in refused)
+    assert all("no complete message" in text for text in lost)
+
+
 def test_a_bag_with_an_unknown_type_beside_is_read_and_recovered_whole(tmp_path: Path) -> None:
     own = own_bag(tmp_path / "own")
     store = get_typestore(Stores.ROS2_JAZZY)

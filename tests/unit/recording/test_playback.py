@@ -60,9 +60,9 @@ def test_a_loop_over_topics_without_messages_is_refused_and_one_pass_over_them_e
 
 def test_a_loop_over_a_single_moment_neither_floods_nor_holds_on_to_a_stop(tmp_path: Path) -> None:
     playback = Playback(chatter(tmp_path / "bag", [NOW_NS, NOW_NS]), loop=True)
-    threading.Timer(0.5, playback.stop).start()
+    threading.Timer(2.0, playback.stop).start()
     published, _ = played(playback)
-    assert 2 <= len(published) <= 2 * 21
+    assert 2 <= len(published) <= 2 * 81
 
 
 @pytest.mark.parametrize("names", [[], ["/chatter"]])
@@ -77,7 +77,7 @@ def test_a_gap_in_which_the_clock_was_set_is_said_and_not_waited_for(tmp_path: P
 
 def test_a_long_wait_is_said_once_and_ends_by_a_seek(tmp_path: Path) -> None:
     playback = Playback(chatter(tmp_path / "bag", [NOW_NS, NOW_NS + 600 * 10**9, NOW_NS + 601 * 10**9]), rate=2.0)
-    threading.Timer(0.3, playback.seek, (601.0,)).start()
+    threading.Timer(2.0, playback.seek, (601.0,)).start()
     published, said = played(playback)
     assert [data for _, data in published] == [text(0), text(2)]
     assert said == ["the next message is at 600.000 s of the bag, due in 300 s; seek to go on now"]
@@ -140,9 +140,13 @@ def test_a_start_within_a_bag_gives_the_latched_messages_of_before_it_first(tmp_
 
 def test_a_seek_gives_them_too(tmp_path: Path) -> None:
     playback = Playback(latched_bag(tmp_path / "bag"), names=["/spec"], rate=1e-3)
-    threading.Timer(0.2, playback.seek, (4.5,)).start()
-    threading.Timer(0.4, playback.set_rate, (1e3,)).start()
-    published, _ = played(playback)
+
+    def seek() -> None:
+        if playback.messages == 1 and playback.position_s < 4:
+            playback.seek(4.5)
+            playback.set_rate(1e3)
+
+    published, _ = played(playback, seek)
     assert published == [("/spec", text(0)), ("/spec", text(4)), ("/spec", text(5))]
 
 
@@ -164,7 +168,7 @@ def test_what_lies_behind_a_damaged_part_is_played_and_the_part_is_named(tmp_pat
     content[chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size // 2] ^= 0xFF
     file.write_bytes(content)
     playback = Playback(path, loop=loop)
-    threading.Timer(0.5, playback.stop).start()
+    threading.Timer(2.0, playback.stop).start()
     published, said = played(playback)
     assert [data[:10] for _, data in published[:6]] == [text(number)[:10] for number in (0, 1, 2, 6, 7, 8)]
     assert (len(published) > 6) == loop

@@ -122,12 +122,16 @@ class Bag:
         """
         wanted = {c.topic for c in self.connections if not names or c.topic in names}
         note = self._refuse if damaged is None else damaged.append
-        if self.in_file_order:
-            stored = chain.from_iterable(file.in_file(wanted, note) for file in self._files)
-            yield from dropwhile(lambda each: start_ns is not None and each[1] < start_ns, stored)
-            return
-        for file in self._files:
-            yield from file.in_time(wanted, start_ns, note)
+        try:
+            if self.in_file_order:
+                stored = chain.from_iterable(file.in_file(wanted, note) for file in self._files)
+                yield from dropwhile(lambda each: start_ns is not None and each[1] < start_ns, stored)
+            else:
+                yield from chain.from_iterable(file.in_time(wanted, start_ns, note) for file in self._files)
+        except BagError:
+            raise
+        except Exception as error:
+            raise self._damaged(str(error) or type(error).__name__) from error
 
     @cached_property
     def in_file_order(self) -> bool:

@@ -85,8 +85,9 @@ def _copy_records(file: Path, writer: RawBagWriter, note: Note) -> None:
             if _copy_topic(storage.mcap_connection(record, schemas.get(record.schema_id)), writer, note):
                 names[record.id] = record.topic
         elif isinstance(record, Message) and record.channel_id in names:
-            data = storage.plain_message(record.data)
-            writer.write(names[record.channel_id], data, record.log_time, record.publish_time)
+            topic, sent_ns = names[record.channel_id], record.publish_time
+            for _, time_ns, data in storage.plain(file, topic, record.log_time, record.data, note):
+                writer.write(topic, data, time_ns, sent_ns)
 
 
 def _copy_rows(file: Path, writer: RawBagWriter, note: Note) -> None:
@@ -95,7 +96,7 @@ def _copy_rows(file: Path, writer: RawBagWriter, note: Note) -> None:
             names = [c.topic for c in opened.connections if _copy_topic(c, writer, note)]
             for topic, time_ns, data in opened.in_file(names, note):
                 writer.write(topic, data, time_ns)
-    except (ReaderError, apsw.Error) as error:
+    except (ReaderError, apsw.Error, UnicodeDecodeError) as error:
         note(f"{file.name}: {error}")
 
 

@@ -89,20 +89,25 @@ class McapFile:
                         heapq.heappush(ready, (message.log_time, index.chunk_start_offset, number, message))
             if ready:
                 message = heapq.heappop(ready)[-1]
-                yield ids[message.channel_id], message.log_time, plain_message(message.data)
+                yield from plain(self.path, ids[message.channel_id], message.log_time, message.data, note)
 
     def in_file(self, topics: Collection[str], note: Note) -> Iterator[Stored]:
         """Yield the messages of the topics in the order of the file."""
         ids = self._ids(topics)
         for record in scan_mcap(self.path, note):
             if isinstance(record, Message) and record.channel_id in ids:
-                yield ids[record.channel_id], record.log_time, plain_message(record.data)
+                yield from plain(self.path, ids[record.channel_id], record.log_time, record.data, note)
 
     def times(self, topic: str) -> list[int]:
         """The receive times of a topic, ns, in the order of the file."""
-        ids = self._ids([topic])
-        if not self._chunks or not all(index.message_index_offsets for index in self._chunks):
-            return [time_ns for _, time_ns, _ in self.in_file([topic], _ignore)]
+        if self._chunks and all(index.message_index_offsets for index in self._chunks):
+            try:
+                return self._indexed_times(self._ids([topic]))
+            except DAMAGE:
+                pass
+        return [time_ns for _, time_ns, _ in self.in_file([topic], _ignore)]
+
+    def _indexed_times(self, ids: Collection[int]) -> list[int]:
         times = list[int]()
         for index in sorted(self._chunks, key=lambda chunk: chunk.chunk_start_offset):
             entries = list[tuple[int, int]]()
@@ -182,7 +187,7 @@ class Sqlite3File:
         try:
             rows: Any = self._reader.dbconn.execute(query, (*names, start_ns if start_ns is not None else -1))
             for number, time_ns, content in rows:
-                yield names[number], time_ns, plain_message(content)
+                yield from plain(self.path, names[number], time_ns, content, note)
         except apsw.Error as error:
             note(f"{self.path.name}: {error}")
 
@@ -205,8 +210,8 @@ def unpacked(path: Path, scratch: Path, note: Note) -> Path:
         return path
     target = scratch / path.stem
     try:
-        with path.open("rb") as packed, target.open("wb") as plain:
-            zstandard.ZstdDecompressor().copy_stream(packed, plain)
+        with path.open("rb") as packed, target.open("wb") as written:
+            zstandard.ZstdDecompressor().copy_stream(packed, written)
     except zstandard.ZstdError as error:
         note(f"{path.name}: {error}")
     return target
@@ -216,9 +221,14 @@ def is_sqlite3(path: Path) -> bool:
     return _begins_with(path, _SQLITE3)
 
 
-def plain_message(data: bytes) -> bytes:
-    """The message, unpacked where its writer compressed each one (no CDR message begins like zstd)."""
-    return zstandard.ZstdDecompressor().decompressobj().decompress(data) if data[:4] == _ZSTD else data
+def plain(path: Path, topic: str, time_ns: int, data: bytes, note: Note) -> Iterator[Stored]:
+    """The message, unpacked where its writer compressed each one (no CDR message begins like zstd); none if damaged."""
+    try:
+        content = zstandard.ZstdDecompressor().decompressobj().decompress(data) if data[:4] == _ZSTD else data
+    except zstandard.ZstdError as error:
+        note(f"{path.name}, message on {topic} at {time_ns} ns: {error}")
+    else:
+        yield topic, time_ns, content
 
 
 def scan_mcap(path: Path, note: Note) -> Iterator[McapRecord]:
