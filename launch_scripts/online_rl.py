@@ -5,7 +5,7 @@ python3 launch_scripts/online_rl.py [--preset P] [--task T] ...     # --help lis
 
 import sys
 
-from setup.entry import ensure
+from setup import ensure
 
 if __name__ == "__main__":
     ensure()

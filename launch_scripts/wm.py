@@ -6,7 +6,7 @@ python3 launch_scripts/wm.py VERB --help     # explains one
 
 import sys
 
-from setup.entry import ensure
+from setup import ensure
 
 if __name__ == "__main__":
     words = sys.argv[1:] or ["--help"]

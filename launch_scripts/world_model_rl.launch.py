@@ -8,6 +8,6 @@ def generate_launch_description():
 
 
 if __name__ == "__main__":
-    from setup.entry import launch
+    from setup import launch
 
     raise SystemExit(launch("world_model_rl"))

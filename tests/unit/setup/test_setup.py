@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import stat
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 import run_tests
 import torch
 
+import setup
 from setup import entry, interpreter, messages, packages, stamp
 from setup.console import SetupError, isolated_environment, run
 
@@ -338,3 +340,22 @@ def test_the_lock_pins_what_the_requirements_name_and_leaves_torch_to_the_machin
     ]
     assert len(named) > 40 and set(named) <= lock
     assert not any(line.startswith(("torch==", "opencv-python==", "nvidia-cu")) for line in lock)
+
+
+def test_ctrl_c_from_the_first_line_of_a_start_on_is_one_line(
+    tree: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """While Python starts again in the environment the signal waits, for it would be a traceback there."""
+    def interrupted(python: str, arguments: list[str], environment: dict[str, str]) -> None:
+        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(entry, "venv_folder", lambda: tree / ".venv")
+    monkeypatch.setattr(os, "execve", interrupted)
+    try:
+        for start, argument in ((setup.ensure, ["collect"]), (setup.launch, "evaluate")):
+            with pytest.raises(SystemExit, match="130"):
+                start(argument)
+            assert capsys.readouterr().err == "interrupted\n"
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
