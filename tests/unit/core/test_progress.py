@@ -42,5 +42,5 @@ def test_a_log_of_a_process_has_no_carriage_returns_and_a_terminal_has_them() ->
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     subprocess.run([sys.executable, "-c", STEPS], stderr=theirs, check=True)
-    os.close(theirs)
     assert os.read(ours, 1_000_000).startswith(b"\rsteps:")
+    os.close(theirs)  # before, there would be nothing left to read
