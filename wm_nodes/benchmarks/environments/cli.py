@@ -80,7 +80,9 @@ def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
             with tqdm(total=updates, desc=f"{Path(model).name}, seed {seed}", unit="update") as bar:
                 rows.append(train_in(workplace, model, arguments.scenes, bar.update))
             write_results(arguments, {"rows": rows})
-            console.print(f"{Path(model).name}, seed {seed}: acceptance {_outcome(rows[-1])}")
+            if found := rows[-1]["acceptance"]:
+                names = ", ".join(found["failed"] or found["undecided"])
+                console.print(f"{Path(model).name}, seed {seed}: acceptance {found['outcome']} ({names})")
     columns = ("trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined", "acceptance")
     names = differing(rows)
     console.print(make_table(
