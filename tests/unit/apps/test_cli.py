@@ -169,7 +169,7 @@ def test_the_list_of_verbs_is_there_at_once_and_the_scripts_start_the_command(re
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (["-m", "wm_nodes.apps.cli", "recover-bag", "nothing-here"], 2, "error: no .mcap file at nothing-here; "),
+        (["-m", "wm_nodes.apps.cli", "recover-bag", "nothing-here"], 2, "error: no .mcap file at nothing-here, nor "),
         (["-m", "wm_nodes.apps.cli", "retrain", "--help"], 0, "usage: python -m wm_nodes.apps.cli retrain [-h]"),
         (["-m", "wm_nodes.apps.train_policy", "--seed", "1"], 2, "error: wm_nodes.apps.train_policy is not started by "
                                                                 "itself; type: wm train-policy\n"),

@@ -56,9 +56,10 @@ def test_the_first_hundred_root_seeds_have_the_demonstrations_they_always_had_an
 
 
 def test_more_seeds_than_a_range_or_a_block_holds_are_refused_with_the_setting_to_change() -> None:
-    with pytest.raises(ValueError, match=r"1001 demonstrations from reset seed 603000 on do not lie within 603000 to "
-                                         r"603999.*change sft.num_demonstrations"):
-        demonstration_seeds(3, 1001)
+    assert demonstration_seeds(3, 2000) == 603_000, "the last thousand are demonstrations of seed 4, too"
+    with pytest.raises(ValueError, match=r"1001 demonstrations from reset seed 699000 on do not lie within 600000 to "
+                                         r"699999.*change sft.num_demonstrations"):
+        demonstration_seeds(99, 1001)
     with pytest.raises(ValueError, match=r"250001 episodes .* do not lie within 0 to 249999"):
         MODEL_EPISODES.take(250_001)
     assert WEAK_POLICIES.take(10_000, 18) == 490_000 and ROUNDS.take(5000, 19) == 895_000
@@ -110,7 +111,7 @@ def test_stacked_episodes_know_their_seeds_however_they_are_put_together() -> No
 
 
 def test_settings_that_no_range_has_seeds_for_are_refused_before_anything_is_collected() -> None:
-    for name, value in (("sft.num_demonstrations", 751), ("data.num_episodes", 250_001), ("data.num_heldout", 100_001),
+    for name, value in (("data.num_episodes", 250_001), ("data.num_heldout", 100_001),
                         ("data.policy_episodes", 10_001)):
         with pytest.raises(ConfigError, match=name.split(".")[1]):
             load_config("cpu", {name: value})

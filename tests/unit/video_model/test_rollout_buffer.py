@@ -281,7 +281,7 @@ def test_a_buffer_with_a_value_that_is_no_number_is_refused_by_video_and_name(na
     buffer = toy_buffer(Analytic(swirl), settings)
     getattr(buffer.rollout, name)[1].view(-1)[3] = torch.nan
     with pytest.raises(RolloutBufferError, match=f"video 1 of the buffer has a value in rollout.{name}"):
-        buffer.check(settings, 0, 0)
+        RolloutBuffer.from_bytes(buffer.to_bytes())
 
 
 # rewards and parts

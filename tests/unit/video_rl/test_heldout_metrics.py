@@ -7,10 +7,11 @@ import numpy as np
 import torch
 
 from wm_nodes.config.load import load_config, load_video_config
+from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
-from wm_nodes.environments.record import HELDOUT_SEEDS, collect_plan, scripted_plan
+from wm_nodes.environments.record import collect_plan, scripted_plan
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.codec import PatchCodec
@@ -59,7 +60,7 @@ def test_every_metric_of_a_clip_is_a_number_and_the_other_reader_looks_at_the_la
 
 def test_both_models_of_a_run_are_measured_in_the_simulator_and_by_the_other_reader(tmp_path: Path) -> None:
     scene = load_config("cpu", {"task": "push_cube", "data.num_workers": 1})
-    (bag,) = collect_plan(scripted_plan(scene, 3, HELDOUT_SEEDS), scene, tmp_path / "bags")
+    (bag,) = collect_plan(scripted_plan(scene, 3, HELDOUT), scene, tmp_path / "bags")
     config = load_video_config("outcome", {"evaluation.contexts": 3, "evaluation.executions": 2})
     world = shipped_model("push_cube")
     folder = load_video_folder(world / "video_model_outcome")

@@ -86,9 +86,11 @@ def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
     columns = ("trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined", "acceptance")
     names = differing(rows)
     console.print(make_table(
-        "policies trained in each model", (*columns, *([", ".join(names)] if names else [])),
+        "policies trained in each model", (*columns, *(["settings"] if names else [])),
         [(*line, *([_of_settings(row, names)] if names else [])) for row in rows for line in _lines(row)],
     ))
+    if names:
+        console.print(f"settings: {', '.join(names)}", soft_wrap=True)
 
 
 def is_finished(rows: Sequence[Mapping[str, Any]], wanted: Mapping[str, Any]) -> bool:

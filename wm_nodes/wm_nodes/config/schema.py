@@ -265,8 +265,8 @@ class PolicyConfig(SettingsSection):
 
 
 class SftConfig(SettingsSection):
-    num_demonstrations: Annotated[int, Field(ge=1, le=750)]
-    """With a third more in reserve, a root seed has reset seeds for as many."""
+    num_demonstrations: PositiveInt
+    """Up to 750, with a third more in reserve, no two root seeds share a reset seed."""
     num_iterations: PositiveInt
     batch_size: PositiveInt
     learning_rate: PositiveFloat

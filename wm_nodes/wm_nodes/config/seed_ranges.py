@@ -72,10 +72,15 @@ RANGES = (
 
 
 def demonstration_seeds(root_seed: int, count: int) -> int:
-    """Return the first reset seed of a run's `count` demonstrations. Raises ValueError as SeedRange.take."""
-    if root_seed < DEMONSTRATIONS.blocks:
-        return DEMONSTRATIONS.take(count, root_seed)
-    return MORE_DEMONSTRATIONS.take(count, (root_seed - DEMONSTRATIONS.blocks) % MORE_DEMONSTRATIONS.blocks)
+    """Return the first reset seed of a run's `count` demonstrations. Raises ValueError as SeedRange.check.
+
+    Those that a block does not hold are also demonstrations of the root seeds after this one.
+    """
+    more = root_seed - DEMONSTRATIONS.blocks
+    kept, block = (DEMONSTRATIONS, root_seed) if more < 0 else (MORE_DEMONSTRATIONS, more % MORE_DEMONSTRATIONS.blocks)
+    first = kept.first + block * kept.block
+    kept.check(first, count)
+    return first
 
 
 def seed_spans(seeds: Iterable[int]) -> list[list[int]]:

@@ -36,7 +36,7 @@ class DiagonalGaussian:
         the limits, log Phi(-(1 -+ mean) / std) at them."""
         scaled_BA = (actions_BA - self.mean_BA) * torch.exp(-self.log_std_A)
         density_BA = -0.5 * scaled_BA.square() - self.log_std_A - _LOG_SQRT_2PI
-        tail_BA = torch.where(actions_BA > 0, self._log_above_BA, self._log_below_BA)
+        tail_BA = log_ndtr((actions_BA * self.mean_BA - LIMIT) * torch.exp(-self.log_std_A))  # at a limit, +-1
         return torch.where(actions_BA.abs() >= LIMIT, tail_BA, density_BA).sum(-1)
 
     def entropy(self) -> Tensor:

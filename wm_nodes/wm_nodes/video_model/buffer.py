@@ -84,8 +84,7 @@ class RolloutBuffer:
         return replace(self, rewards=values, valid=valid)
 
     def check(self, settings: RolloutSettings, policy_version: int, max_staleness: int) -> None:
-        """Raise RolloutBufferError if the buffer was sampled with other settings, or by weights that are too old, or
-        if a video has a value that is no number."""
+        """Raise RolloutBufferError if the buffer was sampled with other settings, or by weights that are too old."""
         wanted = config_hash(settings)
         if self.config_hash != wanted:
             raise RolloutBufferError(
@@ -98,13 +97,6 @@ class RolloutBuffer:
                 f"the buffer comes from version {self.policy_version}, the learner is at {policy_version}: staleness "
                 f"{staleness} is outside 0 to {max_staleness}; sample again, or raise grpo.max_staleness"
             )
-        rows = {f"rollout.{name}": getattr(self.rollout, name) for name in _ROWS}
-        rows |= {f"condition.{name}": values for name, values in vars(self.condition).items()}
-        for name, values in rows.items():
-            if values is not None and not bool(torch.isfinite(values).all()):
-                video = int((~torch.isfinite(values)).flatten(1).any(1).nonzero()[0])
-                raise RolloutBufferError(f"video {video} of the buffer has a value in {name} that is no number; "
-                                         "lower the learning rate, or begin with other weights")
 
     def to_bytes(self) -> bytes:
         """One safetensors file; from_bytes gives an equal buffer."""
@@ -126,12 +118,16 @@ class RolloutBuffer:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "RolloutBuffer":
-        """Raises RolloutBufferError where the bytes are no rollout buffer, or a truncated one."""
+        """Raises RolloutBufferError where the bytes are no rollout buffer, a truncated one, or one with a value
+        of a video that is no number."""
         try:
             tensors: dict[str, Any] = load(data)
             header = json.loads(metadata_of(data)[_METADATA_KEY])
             tensors.setdefault("rollout.zeta", None)  # absent where only seeds are kept
             rollout = {name: tensors[f"rollout.{name}"] for name in _ROLLOUT_TENSORS}
+            for name, values in tensors.items():
+                if name.startswith("condition.") or name.removeprefix("rollout.") in _ROWS:
+                    _check_finite(name, values)
             rewards = sorted(name for name in tensors if name.startswith("reward."))
             return cls(
                 rollout=VideoRollout(**rollout, steps=tuple(header["steps"]), state_steps=tuple(header["state_steps"])),
@@ -157,6 +153,15 @@ class RolloutBuffer:
         tensors |= {f"reward.{name}": value for name, value in self.rewards.items()}
         tensors |= {"group_ids": self.group_ids, "sample_ids": self.sample_ids, "valid": self.valid}
         return {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
+
+
+def _check_finite(name: str, values: Tensor | None) -> None:
+    if values is not None and not bool(torch.isfinite(values).all()):
+        video = int((~torch.isfinite(values)).flatten(1).any(1).nonzero()[0])
+        raise RolloutBufferError(
+            f"video {video} of the buffer has a value in {name} that is no number; lower the learning rate, or begin "
+            "with other weights"
+        )
 
 
 def concatenate_buffers(parts: Sequence[RolloutBuffer]) -> RolloutBuffer:
