@@ -136,7 +136,7 @@ def more_updates_rows() -> Rows:
 
 def scenes_rows() -> Rows:
     """One line per task: GRPO in the model over its seeds, also in the two splits that were not trained on, PPO in the
-    model and in the simulator; then other settings."""
+    model and in the simulator."""
     found = read("policy_rl_scenes.json")
     for task in dict.fromkeys(one["task"] for one in found["rows"]):
         mine, ppo, control = (
@@ -149,11 +149,6 @@ def scenes_rows() -> Rows:
             " → ".join(percent(mean(one[f"imagined_{when}"]["rate"] for one in mine)) for when in ("before", "after")),
             points(*outcomes(ppo)), points(*outcomes(control)),
         )
-    for one in found["other_settings"]:
-        yield f"{counts([one], 'real_{}')} with `{one['settings']}`"
-    (one,) = found["all_tasks"]
-    imagined = " → ".join(percent(one[f"imagined_{when}"]["rate"]) for when in ("before", "after"))
-    yield f"{counts([one], 'real_{}')}, imagined {imagined} %"
 
 
 def counts(found: list[Run], pattern: str) -> str:

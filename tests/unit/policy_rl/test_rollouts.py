@@ -107,7 +107,8 @@ def test_statistics_are_of_first_episodes_and_later_short_ones_do_not_count() ->
     found = rollout_statistics(
         replace(base, valid_TN=valid, rewards_TN=rewards, terminated_TN=terminated, truncated_TN=truncated)
     )
-    assert (found.episodes, found.successes, found.cut) == (2, 1, 1), "environment 0's second success is left out"
+    assert (found.episodes, found.successes, found.begun) == (2, 1, 3), "environment 0's second success is left out"
+    assert found.cut == 1, "environment 2's, and no second one"
     assert found.success_rate == pytest.approx(1 / 3), "environment 2 did not succeed in the time there was"
     assert found.mean_return == pytest.approx((3 + 1.5) / 2)
     assert found.mean_length == pytest.approx((2 + 3) / 2)

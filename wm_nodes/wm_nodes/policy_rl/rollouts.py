@@ -31,19 +31,21 @@ class RolloutStatistics:
     A later episode has less time: it would be counted where it succeeds early, and not where it fails.
 
     episodes: that ended inside the rollout; mean_return and mean_length (steps) are theirs. successes: of them, those
-    that terminated (the environment's own done signal). cut: that the rollout's end cut short.
+    that terminated (the environment's own done signal). begun: all of them. cut: episodes, first or later, that the
+    rollout's end cut short.
     """
 
     episodes: int
     successes: int
     mean_return: float
     mean_length: float
-    cut: int = 0
+    begun: int
+    cut: int
 
     @property
     def success_rate(self) -> float:
         """Share of the first episodes that succeeded inside the rollout; those cut short did not."""
-        return self.successes / (self.episodes + self.cut) if self.episodes else float("nan")
+        return self.successes / self.begun if self.episodes else float("nan")
 
 
 @dataclass
@@ -177,8 +179,10 @@ def rollout_statistics(rollout: Outcomes | TensorRollout) -> RolloutStatistics:
     returns_N = np.where(first_TN & rollout.valid_TN, rollout.rewards_TN, 0.0).sum(0, dtype=np.float64)
     lengths_N = (first_TN & (rollout.valid_TN | ended_TN)).sum(0)
     successes, episodes = int((first_TN & rollout.terminated_TN).sum()), int(ended_N.sum())
-    cut = int((~ended_N & rollout.valid_TN.any(0)).sum())
+    begun = int((ended_N | rollout.valid_TN.any(0)).sum())
+    last_TN: BoolArray = np.cumsum(ended_TN[::-1], 0)[::-1] == 0
+    cut = int((last_TN & rollout.valid_TN).any(0).sum())
     if not episodes:
-        return RolloutStatistics(0, 0, float("nan"), float("nan"), cut)
+        return RolloutStatistics(0, 0, float("nan"), float("nan"), begun, cut)
     mean_return, mean_length = (float(column[ended_N].mean()) for column in (returns_N, lengths_N))
-    return RolloutStatistics(episodes, successes, mean_return, mean_length, cut)
+    return RolloutStatistics(episodes, successes, mean_return, mean_length, begun, cut)
