@@ -57,16 +57,8 @@ def study_rows() -> Rows:
     lines = list(map(json.loads, (FILES / "policy_rl_seed_study.jsonl").read_text().splitlines()))
     study = {(line["task"], line["arm"], line["seed"]): line for line in lines}
     for task in ("push_cube", "reach"):
-        seeds = range(5)
-        models = [study[task, "world_model", seed] for seed in seeds]
-        controls = [study.get((task, "simulator", seed)) for seed in seeds]
-        for seed, model, control in zip(seeds, models, controls):
-            yield row(
-                task, seed, *(percent(model[key]["successes"] / 200) for key in ("real_before", "real_after")),
-                points(model["success_before"], model["success_after"]),
-                percent(model["imagined_after"]["successes"] / 256),
-                percent(control["real_after"]["successes"] / 200) if control else "",
-            )
+        models = [study[task, "world_model", seed] for seed in range(5)]
+        controls = [study.get((task, "simulator", seed)) for seed in range(5)]
         before, after = ([x for model in models for x in model[key]] for key in ("success_before", "success_after"))
         yield row(task, "0-4", percent(mean(before)), percent(mean(after)), points(before, after), "", "")
         pairs = [(model, control) for model, control in zip(models, controls) if control]
@@ -76,25 +68,28 @@ def study_rows() -> Rows:
             yield row(task, percent(mean(in_model)), percent(mean(in_simulator)), points(in_model, in_simulator))
 
 
+def likelihood_rows() -> Rows:
+    found = read("policy_rl_likelihood.json")
+    for one in [*found["study"], *found["scenes"]]:
+        rates = [percent(one[key]["successes"] / one[key]["episodes"]) for key in ("real_before", "real_after")]
+        yield row(
+            one["task"], "GRPO" if one.get("advantage") == "group" else "PPO", one["seed"], *rates,
+            points(one["success_before"], one["success_after"]),
+            percent(one["imagined_after"]["successes"] / one["imagined_after"]["episodes"]),
+            one["acceptance"]["outcome"],
+        )
+
+
 def points(before: list[bool], after: list[bool]) -> str:
     found = paired_difference(before, after)
     return interval(100 * found.difference, 100 * found.low, 100 * found.high, 1)
 
 
 def decoder_rows() -> Rows:
-    """One line per world model: its held-out rollouts, and the success of policies trained in it."""
+    """Real success, over the seeds, of policies trained in each world model."""
     for one in read("policy_rl_decoders.json")["rows"]:
-        found, trained = one["heldout"], one["trained_in"]
-        real, imagined = (
-            [each[name]["successes"] / each[name]["episodes"] for each in trained]
-            for name in ("real_after", "imagined_after")
-        )
-        yield row(
-            one["model"], ", ".join(f"{found[f'psnr_rollout_db_h{step}']:.1f}" for step in ("01", "04", "16")),
-            f"{found['perceptual_rollout_h16']:.2f}",
-            ", ".join(f"{found[f'{name}_rollout_cm_h16']:.2f}" for name in ("object_moved", "tool")),
-            ", ".join(map(percent, real)), *(percent(mean(rates)) if trained else "" for rates in (real, imagined)),
-        )
+        if trained := [each["real_after"] for each in one["trained_in"]]:
+            yield f"{one['model']} {percent(mean(rate['successes'] / rate['episodes'] for rate in trained))}"
 
 
 def exploiting_rows() -> Rows:
@@ -631,7 +626,7 @@ def judge_rows() -> Rows:
 
 TABLES: dict[str, list[Callable[[], Rows]]] = {
     "policy_rl": [
-        study_rows, decoder_rows, exploiting_rows, more_updates_rows, scenes_rows, scenes_decoder_rows,
+        likelihood_rows, study_rows, decoder_rows, exploiting_rows, more_updates_rows, scenes_rows, scenes_decoder_rows,
     ],
     "video_rl": [
         diversity_rows, clip_rows, learning_rows, long_learning_rows, clip_learning_rows, cost_rows, ablation_rows,
