@@ -81,8 +81,8 @@ def _trained_in(arguments: argparse.Namespace, models: list[str]) -> None:
                 rows.append(train_in(workplace, model, arguments.scenes, bar.update))
             write_results(arguments, {"rows": rows})
             if found := rows[-1]["acceptance"]:
-                names = ", ".join(found["failed"] or found["undecided"])
-                console.print(f"{Path(model).name}, seed {seed}: acceptance {found['outcome']} ({names})")
+                why = ", ".join(found["failed"] or found["undecided"])
+                console.print(f"{Path(model).name}, seed {seed}: acceptance {found['outcome']} ({why})")
     columns = ("trained in", "task", "seed", "scenes", "real before", "real after", "gain", "imagined", "acceptance")
     names = differing(rows)
     console.print(make_table(
