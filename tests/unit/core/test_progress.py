@@ -27,6 +27,16 @@ def test_a_file_gets_first_and_last_line_of_a_quick_bar_and_nothing_that_moves_a
     assert not {"\r", "\x1b"} & {*file.getvalue()} and max(map(len, lines)) < 120
 
 
+def test_what_is_said_behind_a_bar_makes_no_further_lines_of_a_file() -> None:
+    file = io.StringIO()
+    with tqdm(total=100, file=file) as bar:
+        for step in range(100):
+            bar.update()
+            bar.set_postfix(success=step)
+            bar.set_postfix_str(f"step {step}")
+    assert file.getvalue().count("\n") == 2 and "step 99" in file.getvalue()
+
+
 def test_a_slow_bar_shows_every_so_often_how_far_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "LINE_S", 0.0)
     file = io.StringIO()

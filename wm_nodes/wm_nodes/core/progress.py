@@ -14,10 +14,17 @@ class tqdm(bars.tqdm):  # type: ignore[type-arg]
 
     def __init__(self, *args: Any, **options: Any) -> None:
         file = options.get("file") or sys.stderr
-        if not file.isatty():
+        self._in_lines = not file.isatty()
+        if self._in_lines:
             lines = {"file": _Lines(file), "mininterval": LINE_S, "maxinterval": LINE_S, "ascii": True}
             options = {"disable": False, **options, **lines}
         super().__init__(*args, **options)
+
+    def set_postfix(self, ordered_dict: Any = None, refresh: bool | None = True, **values: Any) -> None:
+        super().set_postfix(ordered_dict, refresh and not self._in_lines, **values)  # else a line for each call
+
+    def set_postfix_str(self, s: str = "", refresh: bool = True) -> None:
+        super().set_postfix_str(s, refresh and not self._in_lines)
 
 
 class _Lines:

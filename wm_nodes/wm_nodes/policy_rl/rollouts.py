@@ -47,6 +47,10 @@ class RolloutStatistics:
         """Share of the first episodes that succeeded inside the rollout; those cut short did not."""
         return self.successes / self.begun if self.episodes else float("nan")
 
+    def unfailed_after(self, unfailed: int) -> int:
+        """Updates in a row without a failed episode, this rollout's included, `unfailed` of them before it."""
+        return unfailed + 1 if self.success_rate == 1.0 else 0
+
 
 @dataclass
 class Convergence:
@@ -60,7 +64,7 @@ class Convergence:
 
     def reached(self, rollout: Outcomes | TensorRollout) -> bool:
         """Count the rollout of one more update; return whether training has converged."""
-        self.unfailed = self.unfailed + 1 if rollout_statistics(rollout).success_rate == 1.0 else 0
+        self.unfailed = rollout_statistics(rollout).unfailed_after(self.unfailed)
         return 0 < self.wanted <= self.unfailed
 
 

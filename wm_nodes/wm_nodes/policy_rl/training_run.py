@@ -145,7 +145,7 @@ class PolicyTraining(TrainingRun):
         progress.dropped_gap += dropped.gap
         progress.dropped_stale += dropped.stale
         progress.mean_return, progress.success_rate = statistics.mean_return, statistics.success_rate
-        progress.unfailed = progress.unfailed + 1 if statistics.success_rate == 1.0 else 0
+        progress.unfailed = statistics.unfailed_after(progress.unfailed)
         self.save()
         seconds = time.perf_counter() - began
         counts = {"episodes": float(statistics.episodes), "cut_episodes": float(statistics.cut)}
