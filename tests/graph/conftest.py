@@ -54,9 +54,9 @@ def graph(domain: int, tmp_path: Path, request: pytest.FixtureRequest) -> Iterat
     yield graph
     codes = graph.stop()
     killed = request.node.get_closest_marker("kills") is not None
-    if killed:
+    if killed or any(codes.values()):
         clean_shared_memory(os.environ)
-    else:
+    if not killed:
         assert all(code == 0 for code in codes.values()), f"exit codes {codes}; logs in {graph.folder}"
 
 

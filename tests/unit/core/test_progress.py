@@ -46,7 +46,8 @@ def test_a_slow_bar_shows_every_so_often_how_far_it_is(monkeypatch: pytest.Monke
     assert [f"{n}/3" in file.getvalue() for n in range(3)] == [True, True, False] and "reward=0.5" in file.getvalue()
 
 
-def test_a_log_of_a_process_has_no_carriage_returns_and_a_terminal_has_them() -> None:
+def test_a_log_of_a_process_has_no_carriage_returns_and_a_terminal_has_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TQDM_DISABLE", raising=False)  # main() of the command sets it, in other tests
     done = subprocess.run([sys.executable, "-c", STEPS], capture_output=True, check=True)
     assert b"\r" not in done.stderr and done.stderr.count(b"\n") == 2
     ours, theirs = pty.openpty()

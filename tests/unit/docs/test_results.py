@@ -536,6 +536,26 @@ def stage_rows() -> Rows:
         yield row(stage, *(f"{stages[stage]['ms']:.1f}" for stages in (first, second)))
 
 
+def device_rows() -> Rows:
+    found = read("speed_device.json")
+    ways = ("loop over host arrays", "eager", "captured")
+    points: dict[tuple[Any, ...], Run] = {}
+    for one in found["imagination"]:
+        points.setdefault((f"{one['model']}, {one['px']} px", one["envs"]), {})[one["way"]] = one
+    for (model, envs), by_way in points.items():
+        if envs in (64, 1024):
+            rates = (f"{by_way[way]['median']:,.0f}" if way in by_way else "" for way in ways)
+            yield row(model, envs, *rates, f"{max(one['peak_mib'] for one in by_way.values()) / 1024:.1f}")
+    exact, bfloat16 = (percent(one["terminated_equal"]) for one in found["agreement"] if "terminated_equal" in one)
+    yield f"float32: {exact} % of ends are the same; bfloat16: {bfloat16} %"
+    tokenizer, action = (
+        next(one for one in found["training"] if (one["trained"], one["model"], one["batch"]) == (name, "gpu", batch))
+        for name, batch in (("tokenizer", 256), ("action model", 64))
+    )
+    yield f"tokenizer {tokenizer['median']:.0f} ms ({tokenizer['peak_mib'] / 1024:.1f} GiB)"
+    yield f"action model {action['median']:.0f} ms ({action['peak_mib'] / 1024:.1f} GiB)"
+
+
 # --- shipped_models.md ------------------------------------------------------------------------------------------
 def heldout(folder: str, name: str = "heldout") -> Run:
     metrics: Run = json.loads((SHIPPED / folder / "manifest.json").read_text())[name]
@@ -641,6 +661,7 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         imagined_rows, policy_camera_rows,
     ],
     "speed": [speed_summary_rows, stage_rows],
+    "../devices": [device_rows],
     "shipped_models": [world_model_rows, scenes_model_rows, done_rows, video_model_rows, judge_rows],
 }
 
