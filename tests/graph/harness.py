@@ -54,8 +54,8 @@ def own_domain() -> Iterator[int]:
     One in whose ports nothing is left in /dev/shm comes first: where a process ended while it held a port's lock, all
     that follow wait for it inside Fast DDS.
     """
-    used = {(int(name.removeprefix(PORT)) - FIRST_PORT) // PORTS_PER_DOMAIN for name in shm_files() if re.fullmatch(rf"{PORT}\d+", name)}
-    for domain in sorted(DOMAINS, key=lambda domain: domain in used):
+    ports = [int(name.removeprefix(PORT)) for name in shm_files() if re.fullmatch(rf"{PORT}\d+", name)]
+    for domain in sorted(DOMAINS, key={(port - FIRST_PORT) // PORTS_PER_DOMAIN for port in ports}.__contains__):
         with contextlib.ExitStack() as stack:
             file = stack.enter_context(open(f"/tmp/wm_test_domain_{domain}.lock", "w", encoding="utf-8"))
             try:

@@ -57,9 +57,10 @@ def test_the_first_hundred_root_seeds_have_the_demonstrations_they_always_had_an
 
 def test_more_seeds_than_a_range_or_a_block_holds_are_refused_with_the_setting_to_change() -> None:
     assert demonstration_seeds(3, 2000) == 603_000, "the last thousand are demonstrations of seed 4, too"
-    with pytest.raises(ValueError, match=r"1001 demonstrations from reset seed 699000 on do not lie within 600000 to "
-                                         r"699999.*change sft.num_demonstrations"):
-        demonstration_seeds(99, 1001)
+    assert demonstration_seeds(99, 2000) == 2_099_000, "too few are behind its block"
+    with pytest.raises(ValueError, match=r"2000 demonstrations from reset seed 2147482000 on do not lie within 2000000 "
+                                         r"to 2147483647.*change sft.num_demonstrations"):
+        demonstration_seeds(2_145_582, 2000)
     with pytest.raises(ValueError, match=r"250001 episodes .* do not lie within 0 to 249999"):
         MODEL_EPISODES.take(250_001)
     assert WEAK_POLICIES.take(10_000, 18) == 490_000 and ROUNDS.take(5000, 19) == 895_000

@@ -62,7 +62,7 @@ EVALUATION = SeedRange(
     "evaluation episodes", 1_000_000, 2_000_000, "evaluation.first_seed or evaluation.episodes"
 )
 MORE_DEMONSTRATIONS = SeedRange("demonstrations", 2_000_000, 2**31, "sft.num_demonstrations", 1000)
-"""Of the root seeds that have no block of DEMONSTRATIONS."""
+"""Of the root seeds that have no block of DEMONSTRATIONS, or too little behind it."""
 UNSEEDED = SeedRange("resets without a seed", 2**31, 2**32, "")
 """2^32 is where the simulator's seeds end: it takes larger ones modulo that."""
 RANGES = (
@@ -76,8 +76,11 @@ def demonstration_seeds(root_seed: int, count: int) -> int:
 
     Those that a block does not hold are also demonstrations of the root seeds after this one.
     """
-    more = root_seed - DEMONSTRATIONS.blocks
-    kept, block = (DEMONSTRATIONS, root_seed) if more < 0 else (MORE_DEMONSTRATIONS, more % MORE_DEMONSTRATIONS.blocks)
+    kept, block = DEMONSTRATIONS, root_seed
+    if root_seed >= kept.blocks:
+        kept, block = MORE_DEMONSTRATIONS, (root_seed - kept.blocks) % MORE_DEMONSTRATIONS.blocks
+    elif kept.first + block * kept.block + count > kept.stop:
+        kept = MORE_DEMONSTRATIONS
     first = kept.first + block * kept.block
     kept.check(first, count)
     return first
