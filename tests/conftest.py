@@ -2,12 +2,10 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from graph.shm_maps import mapped, processes
 from judge_server import PickyServer, serving
 
 from wm_nodes.launching.domain_lock import DomainLock, first_free
@@ -55,6 +53,14 @@ def pytest_configure() -> None:
     os.environ.update({name: environment[name] for name in ("AMENT_PREFIX_PATH", "PATH")})
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """A process that follows one that hung inside DDS does not wait for what that one held."""
+    if hasattr(session.config, "workerinput"):
+        from left_over import remove_left_over
+
+        remove_left_over(ports=False)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what uses a device. run_tests.py looks for tests marked alone in tests/graph only, to import none twice."""
@@ -94,19 +100,7 @@ def repository() -> Path:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Remove what killed processes left in /dev/shm; files of living processes are locked or mapped and stay."""
-    from wm_nodes.launching.runner import clean_shared_memory
+    """Leave no shared memory behind; the last process looks for ports."""
+    from left_over import remove_left_over
 
-    clean_shared_memory(graph_environment())
-    if not hasattr(session.config, "workerinput"):
-        _remove_unused_ports()
-
-
-def _remove_unused_ports() -> None:
-    """Fast DDS's own tool passes over ports whose lock file is gone."""
-    in_use = set[str]().union(*map(mapped, processes()))
-    for port in Path("/dev/shm").glob("fastrtps_port*"):
-        if str(port) not in in_use:
-            for path in (port, port.with_name(f"sem.{port.name}_mutex")):
-                with suppress(OSError):
-                    path.unlink()
+    remove_left_over(ports=not hasattr(session.config, "workerinput"))

@@ -12,8 +12,7 @@ pytest.importorskip("rclpy", reason="the graph tests need rclpy")
 
 from graph.harness import Graph, Probe, own_domain
 from judge_server import PickyServer, serving
-
-from wm_nodes.launching.runner import clean_shared_memory
+from left_over import remove_left_over
 
 LOG_LINES = 25
 
@@ -55,7 +54,7 @@ def graph(domain: int, tmp_path: Path, request: pytest.FixtureRequest) -> Iterat
     codes = graph.stop()
     killed = request.node.get_closest_marker("kills") is not None
     if killed or any(codes.values()):
-        clean_shared_memory(os.environ)
+        remove_left_over(ports=not killed)
     if not killed:
         assert all(code == 0 for code in codes.values()), f"exit codes {codes}; logs in {graph.folder}"
 

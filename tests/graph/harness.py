@@ -18,13 +18,13 @@ from typing import IO, Any, ClassVar
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph.forked import ForkedNode, fork_node
+from left_over import remove_left_over
 from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.launching.runner import clean_shared_memory
 from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.endpoint_matching import EndpointTable
 from wm_nodes.ros.qos import topic
@@ -317,10 +317,10 @@ class Graph:
                 threads = thread_names(process.pid)
                 process.send_signal(signal.SIGABRT)
                 codes[name] = process.wait(5)
+                remove_left_over()
                 if IN_MIDDLEWARE.search(self.log(name)):
                     codes[name] = 0
                     warnings.warn(f"{name} hung in the middleware's destructors; threads: {threads}", stacklevel=2)
-                    clean_shared_memory(os.environ)
         for log in self._logs:
             log.close()
         return codes

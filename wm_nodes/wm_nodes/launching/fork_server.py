@@ -7,6 +7,7 @@ stopped and awaited in the same way, and it ends as `python -m MODULE ARGS` does
 
 import atexit
 import ctypes
+import faulthandler
 import gc
 import importlib
 import itertools
@@ -218,6 +219,7 @@ def _cuda_runs() -> bool:
 def main() -> None:
     """`python -m wm_nodes.launching.fork_server FILE_DESCRIPTOR [MODULE ...]`."""
     request = serve(socket.socket(fileno=int(sys.argv[1])), sys.argv[2:])
+    faulthandler.enable()  # rclpy's events executor does so, too, but not before the node is there
     os.environ.clear()
     os.environ.update(request["env"])
     known = {*sys.path}
