@@ -29,11 +29,13 @@ def test_a_servers_verdicts_are_kept_audited_and_gone_on_with(
     write_clips(tmp_path)
     with serving(PickyServer()) as server:
         command = ["judge-clips", str(tmp_path), "--judge", server.url, "--judge-model", "judge"]
-        assert main([*command, "--audit", str(tmp_path / "audit")]) == 0
+        assert main([*command, "--audit", str(tmp_path / "audit"), "--round", "3"]) == 0
         assert "2 clips (2 OK), mean reward 0." in capsys.readouterr().out
         rows, asked = rows_of(tmp_path), len(server.requests)
         assert [row["clip_id"] for row in rows] == ["a", "mine"] and all(0 < row["reward"] <= 1 for row in rows)
+        assert all(isinstance(row["accepted"], bool) for row in rows)
         record = read_record(tmp_path / "audit")
+        assert {evaluation.round_number for evaluation in record.judged()} == {3}
         assert [e.verdict.audit_id for e in record.judged() if e.verdict] == [row["audit_id"] for row in rows]
         with (tmp_path / VERDICTS).open("a") as file:
             file.write('{"torn')

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import mean, median, variance
@@ -60,7 +61,8 @@ def study_rows() -> Rows:
         models = [study[task, "world_model", seed] for seed in range(5)]
         controls = [study.get((task, "simulator", seed)) for seed in range(5)]
         before, after = ([x for model in models for x in model[key]] for key in ("success_before", "success_after"))
-        yield row(task, "0-4", percent(mean(before)), percent(mean(after)), points(before, after), "", "")
+        if task == "reach":
+            yield f"from {percent(mean(before))} to {percent(mean(after))} %, {points(before, after)}"
         pairs = [(model, control) for model, control in zip(models, controls) if control]
         in_model = [x for model, _ in pairs for x in model["success_after"]]
         in_simulator = [x for _, control in pairs for x in control["success_after"]]
@@ -69,15 +71,34 @@ def study_rows() -> Rows:
 
 
 def likelihood_rows() -> Rows:
+    """PushCube, a line per seed; then the scenes' tasks, one for each algorithm, bold where a seed's paired interval
+    excludes 0."""
     found = read("policy_rl_likelihood.json")
-    for one in [*found["study"], *found["scenes"]]:
+    for one in found["study"]:
         rates = [percent(one[key]["successes"] / one[key]["episodes"]) for key in ("real_before", "real_after")]
         yield row(
-            one["task"], "GRPO" if one.get("advantage") == "group" else "PPO", one["seed"], *rates,
-            points(one["success_before"], one["success_after"]),
+            one["task"], one["seed"], *rates, points(one["success_before"], one["success_after"]),
             percent(one["imagined_after"]["successes"] / one["imagined_after"]["episodes"]),
             one["acceptance"]["outcome"],
         )
+    for task, advantage in dict.fromkeys((one["task"], one["advantage"]) for one in found["scenes"]):
+        seeds = {
+            one["seed"]: one for one in found["scenes"] if (one["task"], one["advantage"]) == (task, advantage)
+        }
+        gains = [one["real_after"]["successes"] - one["real_before"]["successes"] for one in seeds.values()]
+        outcomes = Counter(one["acceptance"]["outcome"] for one in seeds.values())
+        yield row(
+            task, "GRPO" if advantage == "group" else "PPO",
+            *(before_after(seeds[seed]) if seed in seeds else "" for seed in range(3)), f"{mean(gains):+.1f}",
+            percent(mean(one["imagined_after"]["rate"] for one in seeds.values())),
+            ", ".join(f"{outcomes[outcome]} {outcome}" for outcome in sorted(outcomes)),
+        )
+
+
+def before_after(one: Run) -> str:
+    difference = paired_difference(one["success_before"], one["success_after"])
+    text = f"{one['real_before']['successes']} → {one['real_after']['successes']}"
+    return f"**{text}**" if difference.low > 0 or difference.high < 0 else text
 
 
 def points(before: list[bool], after: list[bool]) -> str:
@@ -129,40 +150,14 @@ def more_updates_rows() -> Rows:
     yield f"seeds 0, 1 end at {longer} of 200, with 24 at {usual}"
 
 
-def scenes_rows() -> Rows:
-    """One line per task: GRPO in the model over its seeds, also in the two splits that were not trained on, PPO in the
-    model and in the simulator."""
-    found = read("policy_rl_scenes.json")
-    for task in dict.fromkeys(one["task"] for one in found["rows"]):
-        mine, ppo, control = (
-            [one for one in found["rows"] if (one["task"], one["model"], one["advantage"]) == (task, *way)]
-            for way in (("world_model", "group"), ("world_model", "gae"), ("simulator", "gae"))
+def control_rows_of_scenes() -> Rows:
+    """PPO in the simulator, over the seeds of a task."""
+    rows = read("policy_rl_scenes.json")["rows"]
+    for task in dict.fromkeys(one["task"] for one in rows):
+        before, after = (
+            sum(one[f"real_{when}"]["successes"] for one in rows if one["task"] == task) for when in ("before", "after")
         )
-        unseen = [split for one in mine for split in one["elsewhere"].values()]
-        yield row(
-            task, counts(mine, "real_{}"), points(*outcomes(mine)), counts(unseen, "{}"),
-            " → ".join(percent(mean(one[f"imagined_{when}"]["rate"] for one in mine)) for when in ("before", "after")),
-            points(*outcomes(ppo)), points(*outcomes(control)),
-        )
-
-
-def counts(found: list[Run], pattern: str) -> str:
-    """Successes before and after, and episodes."""
-    before, after = ([one[pattern.format(when)] for one in found] for when in ("before", "after"))
-    successes = (sum(rate["successes"] for rate in rates) for rates in (before, after))
-    return f"{' → '.join(map(str, successes))} / {sum(rate['episodes'] for rate in after)}"
-
-
-def outcomes(found: list[Run]) -> list[list[bool]]:
-    """Of every episode, before and after."""
-    return [[x for one in found for x in one[f"success_{when}"]] for when in ("before", "after")]
-
-
-def scenes_decoder_rows() -> Rows:
-    (one,) = read("policy_rl_scenes.json")["with_decoder_for_rollouts"]
-    before, after = (one[name]["successes"] for name in ("real_before", "real_after"))
-    imagined = (percent(one[name]["rate"]) for name in ("imagined_before", "imagined_after"))
-    yield f"{one['task']} goes from {before} to {after}, imagined from {' to '.join(imagined)}"
+        yield f"{task} {before} → {after}"
 
 
 # --- video_rl.md ------------------------------------------------------------------------------------------------
@@ -646,7 +641,7 @@ def judge_rows() -> Rows:
 
 TABLES: dict[str, list[Callable[[], Rows]]] = {
     "policy_rl": [
-        likelihood_rows, study_rows, decoder_rows, exploiting_rows, more_updates_rows, scenes_rows, scenes_decoder_rows,
+        likelihood_rows, study_rows, decoder_rows, exploiting_rows, more_updates_rows, control_rows_of_scenes,
     ],
     "video_rl": [
         diversity_rows, clip_rows, learning_rows, long_learning_rows, clip_learning_rows, cost_rows, ablation_rows,

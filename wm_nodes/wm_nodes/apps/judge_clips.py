@@ -6,9 +6,9 @@
 A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red cube into the green target", "task_id":
 "push_cube"}; also clip_id, robot, fps (of a .npy), reference (the picture that the clip had to start from), goal, and
 sha256, which is checked.
-Verdicts are appended to CLIPS/verdicts.jsonl; started again, it goes on with the clips that this judge, rubric and mode
-have not judged. A clip that cannot be read has an ERROR of its own. The exit code is 1 where a clip has an ERROR, or no
-clip at all has a reward.
+Verdicts are appended to CLIPS/verdicts.jsonl (`accepted`: whether the clip is a success; null where the judge cannot
+tell); started again, it goes on with the clips that this judge, rubric and mode have not judged. A clip that cannot be
+read has an ERROR of its own. The exit code is 1 where a clip has an ERROR, or no clip at all has a reward.
 """
 
 import argparse
@@ -28,6 +28,7 @@ from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import for_clips
 from wm_nodes.judge.clip_files import AT_ONCE, read_job, read_list
+from wm_nodes.judge.decisions import accepts
 from wm_nodes.judge.service import ClipJob, JudgeService
 
 VERDICTS = "verdicts.jsonl"
@@ -40,6 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     add_judge(parser)
     parser.add_argument("--mode", choices=("reward", "benchmark"), help="benchmark: every component is read")
     parser.add_argument("--audit", type=Path, help="folder of an audit log to write, for the viewer and for people")
+    parser.add_argument("--round", type=int, default=0, metavar="N", help="of these clips in that log (default: 0)")
     parser.add_argument("--reads", type=Path, help="folder that keeps a server's answers")
     add_json(parser, f"default: {VERDICTS} beside the clips")
 
@@ -65,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress = tqdm(total=len(lines), desc="judged", unit="clip", disable=None)
 
         def flush() -> None:
-            for job, verdict in zip(waiting, judge.judge(waiting), strict=True):
+            for job, verdict in zip(waiting, judge.judge(waiting, round_number=arguments.round), strict=True):
                 rows.append(_row(job, verdict, by))
                 written.write(json.dumps(rows[-1]) + "\n")
             written.flush()
@@ -96,7 +98,7 @@ def _key(job: ClipJob) -> str:
 def _row(job: ClipJob, verdict: Verdict, by: dict[str, Any]) -> dict[str, Any]:
     return {
         "clip_id": job.clip.clip_id, "key": _key(job), "status": str(verdict.status),
-        "reward": verdict.reward if verdict.valid else None, "level": verdict.level,
+        "reward": verdict.reward if verdict.valid else None, "accepted": accepts(verdict), "level": verdict.level,
         "stages": {str(s.stage): s.s for s in verdict.stages if s.status is Status.OK},
         "hacks": [flag.pattern for flag in verdict.hack_flags if flag.confirmed],
         "reason": verdict.reason, "audit_id": verdict.audit_id, **by,

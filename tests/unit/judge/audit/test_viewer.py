@@ -73,13 +73,17 @@ def test_two_clips_are_labelled_with_keys_exported_and_compared(
     assert main(["audit", "view", str(log), "--sample", str(log / "sample-2.json")]) == 0
     page.open(log / "view.html")
     page.until("document.querySelector('.strip img').naturalWidth === 96")
-    page.press("a", "ArrowDown", "a", "e", "ArrowDown", "d", "ArrowDown", "u")  # planning, clarity, brightness, color
-    page.press("ArrowRight", "ArrowUp", "ArrowUp")  # clip 1: clarity, which the judge fails
-    for key, answer in (("a", "fail"), ("d", "pass")):
-        page.press(key)
+    told = "[...document.querySelectorAll('main .good, main .bad')].map((node) => node.textContent)"
+    assert page.js(told) == [], "what the judge says is not shown before"
+    page.press("3", "p", "e", "f", "u")  # planning, clarity and its reason, brightness, color: each goes on
+    assert page.js("row().name") == "temporal" and page.js(told) == ["pass", "pass", "pass"]
+    page.press("ArrowRight", *["ArrowUp"] * 3)  # clip 1: clarity, which the judge fails
+    for key, answer in (("f", "fail"), ("p", "pass")):
+        page.press(key, "ArrowUp")
         assert page.js("labelsOf(clip()).clarity.answer") == answer
-    page.press("1", "e", "e", "ArrowUp", "2")  # and planning
-    page.press("7", "ArrowDown", "ArrowDown", "ArrowDown", "ArrowDown", "4", "x")  # no such key; temporal, taken back
+    page.press("1", "e", "e", "ArrowUp", "ArrowUp", "2")  # and planning
+    page.press("7", "a", "d", *["ArrowDown"] * 3, "4", "ArrowUp", "x")  # no such keys; temporal, taken back
+    page.js("new Promise((done) => setTimeout(done, 500))")  # the browser writes what it keeps behind the page's back
     page.open(log / "view.html")  # again: the browser has kept the labels
     assert page.js("document.querySelector('header .faint').textContent") == "2 of 3 clips labelled"
     page.press("s")
@@ -122,7 +126,7 @@ def test_texts_of_a_judge_stay_texts(tmp_path: Path, page: Page) -> None:
     judge_all(log, Hostile(clean_table(RUBRIC, occlusion=UNUSABLE)), [job])
     assert main(["audit", "view", str(log)]) == 0
     page.open(log / "view.html")
-    page.press("ArrowDown", "ArrowDown")
+    page.press("3", "p", "p", "ArrowUp")
     assert page.js("window.hacked") is None
     assert page.js("document.querySelector('main h2').textContent") == HOSTILE
     assert page.js("document.querySelectorAll('script').length") == 2
@@ -142,13 +146,21 @@ def test_clips_without_a_verdict_or_without_pictures_are_shown_as_such(tmp_path:
     judge_all(log, FaultyJudge(clean_table(RUBRIC), "robot", "error"), [jobs[0], (broken, jobs[1][1])])
     assert main(["audit", "view", str(log)]) == 0
     page.open(log / "view.html")
-    assert "ERROR: robot: finish_reason length" in page.js("document.querySelector('main').textContent")
-    page.press("ArrowDown", "a", *["ArrowDown"] * 6, "a")  # clarity has an answer, the robot has none
-    assert page.js("Object.keys(labelsOf(clip())).length") == 1
-    assert "The judge gives no answer on robot" in page.js("document.querySelector('.banner').textContent")
+    names, shown = "rows().map(({ name }) => name)", "document.querySelector('main').textContent"
+    decided = page.js(names)
+    assert "clarity" in decided and "robot" not in decided
+    page.press(*["u"] * (len(decided) - 1))
+    assert "finish_reason length" not in page.js(shown)
+    page.press("u")
+    assert "ERROR: robot: finish_reason length" in page.js(shown)
+    page.press("r")
+    assert "robot" in page.js(names) and "overall" in page.js(names)
+    page.press("r")
     page.press("ArrowRight", " ", ".", " ")
     text = page.js("document.querySelector('main').textContent")
     assert "no pictures: the clip is malformed" in text and "frames hold pixels that are not finite" in text
+    page.press("p")
+    assert "The judge decided no row of this clip" in page.js("document.querySelector('.banner').textContent")
     no_complaints(page)
 
 

@@ -2,7 +2,7 @@
 // Everything that is shown goes through textContent or a property; nothing here makes markup of data.
 const data = JSON.parse(document.getElementById("data").textContent);
 const key = `audit-labels:${data.page}`;
-const state = { clip: 0, row: 0, frame: 0, playing: 0, hidden: false, annotator: "", labels: {} };
+const state = { clip: 0, row: 0, frame: 0, playing: 0, all: false, annotator: "", labels: {} };
 const ui = {};
 
 function el(tag, options = {}, ...children) {
@@ -16,11 +16,15 @@ function el(tag, options = {}, ...children) {
 }
 
 const clip = () => data.clips[state.clip];
-const rows = () => data.rubrics[clip().rubric].rows;
+const labelsOf = (one) => state.labels[one.evaluation]?.rows ?? {};
+// Rows that the judge decided, or that are labelled. Its answer shows once a row is labelled, the rest once all are.
+const rowsOf = (one) => data.rubrics[one.rubric].rows.filter(({ name }) =>
+  state.all || labelsOf(one)[name] || (one.rows[name]?.value ?? null) !== null);
+const rows = () => rowsOf(clip());
 const row = () => rows()[state.row];
+const finished = () => rows().every(({ name }) => labelsOf(clip())[name]);
 const number = (value, digits = 2) => (value === null || value === undefined ? "-" : value.toFixed(digits));
 const imageUrl = (name) => `${data.media}/${name}`;
-const labelsOf = (one) => state.labels[one.evaluation]?.rows ?? {};
 const said = (entry) => data.clips[state.clip].rows[entry.name] ?? { value: null, votes: [], frames: [], why: "" };
 
 const joined = (...parts) => parts.filter(Boolean).join(" · ");
@@ -63,16 +67,12 @@ function keep() {
 
 function warn(text) { ui.banner.textContent = text; ui.banner.hidden = !text; }
 
-function setLabel(change) {
+function setLabel(name, change) {
   const one = clip();
   const held = (state.labels[one.evaluation] ??= { audit_id: one.audit_id, rows: {} });
-  const before = held.rows[row().name] ?? { answer: "unsure", level: null, explanation: null };
-  held.rows[row().name] = { ...before, ...change };
-  keep();
-  warn("");
-  drawRow(state.row);
-  drawItem(state.clip);
-  drawProgress();
+  const before = held.rows[name] ?? { answer: "unsure", level: null, explanation: null };
+  held.rows[name] = { ...before, ...change };
+  changed();
 }
 
 function clearLabel() {
@@ -80,31 +80,39 @@ function clearLabel() {
   if (!held) return;
   delete held.rows[row().name];
   if (!Object.keys(held.rows).length) delete state.labels[clip().evaluation];
+  changed();
+}
+
+function changed() {
   keep();
-  drawRow(state.row);
+  warn("");
+  drawRows();
   drawItem(state.clip);
   drawProgress();
 }
 
-function agree(yes) {
-  const entry = row();
-  const value = said(entry).value;
-  if (value === null) return warn(`The judge gives no answer on ${entry.name}; press a level 0 to 4, or u for unsure.`);
-  if (entry.stage === "PLAN") return yes ? setLevel(value) : warn("Press the level 0 to 3 that you see.");
-  setLabel({ answer: (value ? yes : !yes) ? "pass" : "fail", level: null });
+function answer(change) {
+  setLabel(row().name, change);
+  setRow(state.row + 1);
+}
+
+function say(passes) {
+  if (row().stage === "PLAN") return warn(`Press the level 0 to ${row().levels.length - 1} that you see.`);
+  answer({ answer: passes ? "pass" : "fail", level: null });
 }
 
 function setLevel(level) {
   const entry = row();
   const count = entry.levels.length;
-  if (level >= count) return warn(count ? `${entry.name} has levels 0 to ${count - 1}.` : "Press a or d.");
-  setLabel({ answer: level >= (entry.stage === "PLAN" ? 2 : 3) ? "pass" : "fail", level });
+  if (level >= count) return warn(count ? `${entry.name} has levels 0 to ${count - 1}.` : "Press p or f.");
+  answer({ answer: level >= (entry.stage === "PLAN" ? 2 : 3) ? "pass" : "fail", level });
 }
 
 function explain() {
-  const label = labelsOf(clip())[row().name];
-  if (!label) return warn("Label the row first, then say whether the judge's reason is right.");
-  setLabel({ explanation: label.explanation === null ? true : label.explanation ? false : null });
+  const mine = labelsOf(clip());
+  const { name } = rows()[mine[row().name] ? state.row : Math.max(0, state.row - 1)];
+  if (!mine[name]) return warn("Label the row first, then say whether the judge's reason is right.");
+  setLabel(name, { explanation: mine[name].explanation === null ? true : mine[name].explanation ? false : null });
 }
 
 function labelFile() {
@@ -131,11 +139,10 @@ function save() {
 function drawItem(index) {
   const one = data.clips[index];
   const done = Object.keys(labelsOf(one)).length;
-  const total = data.rubrics[one.rubric].rows.length;
-  const marks = [one.stratum, one.second ? "second annotator" : "", one.status === "OK" ? "" : one.status];
   ui.items[index].replaceChildren(
     el("div", { text: one.clip_id }),
-    el("div", { className: "faint", text: [`${done}/${total} labelled`, ...marks.filter(Boolean)].join(" · ") }),
+    el("div", { className: "faint",
+      text: joined(`${done}/${rowsOf(one).length} labelled`, one.second && "second annotator") }),
   );
   ui.items[index].classList.toggle("now", index === state.clip);
 }
@@ -150,7 +157,6 @@ function show(index) {
   const before = state.clip;
   state.clip = index;
   state.frame = 0;
-  state.row = Math.min(state.row, rows().length - 1);
   stop();
   drawItem(before);
   drawItem(index);
@@ -160,9 +166,6 @@ function show(index) {
 
 function drawClip() {
   const one = clip();
-  const reward = one.reward === null
-    ? el("span", { className: "bad", text: `${one.status}: ${one.reason}` })
-    : el("span", { text: `reward ${number(one.reward, 3)}${one.reason ? ` (${one.reason})` : ""}` });
   ui.player = el("img", { alt: "current frame", width: 224 });
   ui.playerText = el("figcaption");
   ui.frames = one.frames.map((name, index) => el("figure", { onclick: () => setFrame(index) },
@@ -170,30 +173,36 @@ function drawClip() {
     el("figcaption", { text: `${index} · ${number(index / one.fps)} s` })));
   const still = (name, text) => (name ? el("figure", {},
     el("img", { loading: "lazy", width: 96, alt: text, src: imageUrl(name) }), el("figcaption", { text })) : null);
-  ui.rows = rows().map((entry, index) => el("div", { className: "row", onclick: () => setRow(index) }));
-  const table = el("div", { className: "rows" });
-  let stage = "";
-  rows().forEach((entry, index) => {
-    if (entry.stage !== stage) table.append(stageHead((stage = entry.stage)));
-    table.append(ui.rows[index]);
-    drawRow(index);
-  });
+  ui.table = el("div", { className: "rows" });
+  ui.told = el("div");
   ui.main.replaceChildren(...[
     el("h2", { className: "text", text: one.clip_id }),
     el("p", { className: "text", text: one.instruction }),
     el("p", { className: "faint text", text: joined(one.task, one.robot, one.camera, one.source, `round ${one.round}`,
-      `judge ${one.judge.id}`, `rubric ${one.rubric}`, one.stratum && `drawn as ${one.stratum}`) }),
-    el("p", { className: "judge" }, reward),
+      `judge ${one.judge.id}`, `rubric ${one.rubric}`) }),
     el("div", { className: "pictures" },
       el("figure", {}, ui.player, ui.playerText),
       el("div", {}, still(one.reference, "reference"), still(one.goal, "goal")),
       el("div", { className: "strip" }, ...ui.frames)),
     one.frames.length ? null : el("p", { className: "bad", text: "no pictures: the clip is malformed" }),
-    table, ...details(one),
+    ui.table, ui.told,
   ].filter(Boolean));
   ui.main.scrollTop = 0;
+  drawRows();
   setFrame(0);
-  setRow(state.row);
+}
+
+function drawRows() {
+  const shown = rows();
+  ui.rows = shown.map((entry, index) => el("div", { className: "row", onclick: () => setRow(index) }));
+  ui.table.replaceChildren();
+  shown.forEach((entry, index) => {
+    if (entry.stage !== shown[index - 1]?.stage) ui.table.append(stageHead(entry.stage));
+    ui.table.append(ui.rows[index]);
+    drawRow(index);
+  });
+  ui.told.replaceChildren(...(finished() ? details(clip()) : []));
+  setRow(Math.min(state.row, Math.max(0, shown.length - 1)));
 }
 
 function stageHead(name) {
@@ -202,14 +211,14 @@ function stageHead(name) {
   const threshold = data.rubrics[one.rubric].thresholds[name];
   const titles = { PLAN: "Planning", HACK: "Hacking patterns", ALL: "The whole clip" };
   const head = el("div", { className: "stage", text: `${titles[name] ?? name} ` });
-  if (!found) return head;
+  if (!found || !finished()) return head;
   const numbers = `S ${number(found.s)} against ${number(threshold)}, weight ${number(one.weights[name])}`;
   const text = found.status === "OK" ? joined(numbers, found.veto && `vetoed by ${found.veto}`)
     : found.status.toLowerCase();
-  head.append(el("span", { className: "faint judge", text: `${text} ` }));
+  head.append(el("span", { className: "faint", text: `${text} ` }));
   if (found.status === "OK") {
     const result = found.passed ? "passed" : "failed";
-    head.append(el("span", { className: `judge ${found.passed ? "good" : "bad"}`, text: result }));
+    head.append(el("span", { className: found.passed ? "good" : "bad", text: result }));
   }
   return head;
 }
@@ -218,7 +227,7 @@ function drawRow(index) {
   const entry = rows()[index];
   const judge = said(entry);
   const mine = labelsOf(clip())[entry.name];
-  const kind = judge.value === null ? "faint" : entry.stage === "PLAN" ? "" : judge.value ? "good" : "bad";
+  const kind = !mine || judge.value === null ? "faint" : entry.stage === "PLAN" ? "" : judge.value ? "good" : "bad";
   const numbers = judge.p_fail === undefined ? ""
     : `s ${number(judge.s)}, p(fail) ${number(judge.p_fail)}, margin ${number(judge.margin)}`;
   const titles = ["vote", "levels 0 ..", "mass", "frames", "reason"];
@@ -228,33 +237,36 @@ function drawRow(index) {
       number(vote.mass), vote.frames.join(" "), joined(vote.status !== "OK" && vote.status, vote.why, vote.reason)];
     votes.append(el("tr", {}, ...cells.map((text) => el("td", { className: "why", text }))));
   }
+  const by = el("p", { className: "faint", text: joined(judge.decided_by, numbers, judge.reason) });
+  const told = mine ? [by, judge.votes.length ? votes : ""] : [];
   ui.rows[index].replaceChildren(
     el("div", { text: entry.name }),
     el("div", { className: "mine", text: labelWord(entry, mine) || "-" }),
-    el("div", { className: `judge ${kind}`, text: word(entry, judge.value) }),
-    el("div", { className: "judge why", text: judge.why || judge.reason || "" }),
+    el("div", { className: kind, text: mine ? word(entry, judge.value) : "" }),
+    el("div", { className: "why", text: mine ? judge.why || judge.reason || "" : "" }),
     el("div", { className: "more" },
       el("p", { className: "faint", text: entry.question }),
-      keyTable(entry.levels.map((text, level) => [String(level), text])),
-      el("p", { className: "judge faint", text: joined(judge.decided_by, numbers, judge.reason) }),
-      judge.votes.length ? el("div", { className: "judge" }, votes) : null),
+      keyTable(entry.levels.map((text, level) => [String(level), text])), ...told),
   );
 }
 
 function details(one) {
-  const parts = [];
+  const reward = one.reward === null ? `${one.status}: ${one.reason}`
+    : `reward ${number(one.reward, 3)}${one.reason ? ` (${one.reason})` : ""}`;
+  const drawn = one.stratum ? `, drawn as ${one.stratum}` : "";
+  const parts = [el("p", { className: one.reward === null ? "bad" : "", text: `${reward}${drawn}` })];
   one.reflections.forEach((second) => {
-    parts.push(el("h3", { className: "judge", text: `Second look: ${second.triggers.join("; ")}` }));
+    parts.push(el("h3", { text: `Second look: ${second.triggers.join("; ")}` }));
     for (const change of second.changes) {
       const moved = `${change.component} ${number(change.before)} → ${number(change.after)}`;
       const taken = `${change.accepted ? "" : "not "}accepted, frames ${change.frames.join(" ")}`;
-      parts.push(el("p", { className: "judge why", text: `${moved}, ${taken}: ${change.reason}` }));
+      parts.push(el("p", { className: "why", text: `${moved}, ${taken}: ${change.reason}` }));
     }
   });
   const short = (value) => (value === null ? "-" : +value.toPrecision(4));
   const list = (values) => Object.entries(values).map(([name, value]) => `${name} ${short(value)}`).join(", ");
   const signals = list(one.evidence);
-  if (signals) parts.push(el("p", { className: "judge faint", text: `evidence: ${signals}` }));
+  if (signals) parts.push(el("p", { className: "faint", text: `evidence: ${signals}` }));
   parts.push(el("p", { className: "faint", text: `cost: ${one.reads} reads, ${list(one.cost)}` }));
   const names = joined(`clip ${one.sha256}`, `audit id ${one.audit_id}`, `line ${one.evaluation}`);
   parts.push(el("p", { className: "faint text", text: names }));
@@ -267,8 +279,8 @@ function setRow(index) {
   state.row = index;
   ui.rows[index].classList.add("now");
   ui.rows[index].scrollIntoView({ block: "nearest" });
-  const cited = new Set(said(row()).frames);
-  ui.frames.forEach((figure, frame) => figure.classList.toggle("cited", cited.has(frame) && !state.hidden));
+  const cited = new Set(labelsOf(clip())[row().name] ? said(row()).frames : []);
+  ui.frames.forEach((figure, frame) => figure.classList.toggle("cited", cited.has(frame)));
 }
 
 function setFrame(index) {
@@ -297,24 +309,28 @@ function nextOpen() {
   warn("Every clip has a label.");
 }
 
-function hide() {
-  state.hidden = !state.hidden;
-  document.body.classList.toggle("hidden", state.hidden);
-  setRow(state.row);
+function showAll() {
+  state.all = !state.all;
+  drawRows();
 }
 
+const labelling = (act) => () => (row() ? act() : warn("The judge decided no row of this clip; r shows all rows."));
 const KEYS = {
-  a: [() => agree(true), "agree with the judge"], d: [() => agree(false), "disagree"],
-  u: [() => setLabel({ answer: "unsure", level: null }), "unsure"],
-  e: [explain, "the judge's reason is right, wrong, not judged"], x: [clearLabel, "clear the label"],
+  p: [labelling(() => say(true)), "pass; of a hacking pattern: absent"],
+  f: [labelling(() => say(false)), "fail; of a hacking pattern: present"],
+  u: [labelling(() => answer({ answer: "unsure", level: null })), "unsure"],
+  e: [labelling(explain), "the judge's reason is right, wrong, not judged: of this row, or the one just labelled"],
+  x: [labelling(clearLabel), "clear the label"],
   ArrowDown: [() => setRow(state.row + 1), "next row"], ArrowUp: [() => setRow(state.row - 1), "row before"],
   ArrowRight: [() => show(state.clip + 1), "next clip"], ArrowLeft: [() => show(state.clip - 1), "clip before"],
   n: [nextOpen, "next clip without labels"], " ": [play, "play or stop"],
   ",": [() => step(-1), "frame before"], ".": [() => step(1), "next frame"],
-  h: [hide, "hide what the judge says, or show it"],
+  r: [showAll, "also the rows that the judge did not decide, or only those it did"],
   s: [save, "export the labels as a file"], "?": [() => ui.help.showModal(), "this help"],
 };
-for (let level = 0; level <= 4; level += 1) KEYS[level] = [() => setLevel(level), `label with level ${level}`];
+for (let level = 0; level <= 4; level += 1) {
+  KEYS[level] = [labelling(() => setLevel(level)), `label with level ${level}`];
+}
 
 function onKey(event) {
   const typing = event.target instanceof HTMLInputElement;
