@@ -106,13 +106,6 @@ def points(before: list[bool], after: list[bool]) -> str:
     return interval(100 * found.difference, 100 * found.low, 100 * found.high, 1)
 
 
-def decoder_rows() -> Rows:
-    """Real success, over the seeds, of policies trained in each world model."""
-    for one in read("policy_rl_decoders.json")["rows"]:
-        if trained := [each["real_after"] for each in one["trained_in"]]:
-            yield f"{one['model']} {percent(mean(rate['successes'] / rate['episodes'] for rate in trained))}"
-
-
 def exploiting_rows() -> Rows:
     """One line per task and means against exploiting, over the seeds; differences are from the model as shipped."""
     found = read("policy_rl_against_exploiting.json")["rows"]
@@ -138,16 +131,6 @@ def precision(readings: list[Run]) -> float:
     """Of the exploit meter, over the episodes of all readings."""
     calls = [reading["imagined_success"] * reading["episodes"] for reading in readings]
     return sum(n * reading["precision"] for n, reading in zip(calls, readings, strict=True)) / sum(calls)
-
-
-def more_updates_rows() -> Rows:
-    found = read("policy_rl_decoders.json")
-    shipped = found["rows"][-1]["trained_in"][:2]
-    longer, usual = (
-        ", ".join(str(one["real_after"]["successes"]) for one in trained)
-        for trained in (found["hundred_updates"], shipped)
-    )
-    yield f"seeds 0, 1 end at {longer} of 200, with 24 at {usual}"
 
 
 def control_rows_of_scenes() -> Rows:
@@ -538,7 +521,7 @@ def device_rows() -> Rows:
     for one in found["imagination"]:
         points.setdefault((f"{one['model']}, {one['px']} px", one["envs"]), {})[one["way"]] = one
     for (model, envs), by_way in points.items():
-        if envs in (64, 1024):
+        if envs in (64, 1024) and model in ("shipped, 64 px", "gpu, 128 px"):
             rates = (f"{by_way[way]['median']:,.0f}" if way in by_way else "" for way in ways)
             yield row(model, envs, *rates, f"{max(one['peak_mib'] for one in by_way.values()) / 1024:.1f}")
     exact, bfloat16 = (percent(one["terminated_equal"]) for one in found["agreement"] if "terminated_equal" in one)
@@ -641,7 +624,7 @@ def judge_rows() -> Rows:
 
 TABLES: dict[str, list[Callable[[], Rows]]] = {
     "policy_rl": [
-        likelihood_rows, study_rows, decoder_rows, exploiting_rows, more_updates_rows, control_rows_of_scenes,
+        likelihood_rows, study_rows, exploiting_rows, control_rows_of_scenes,
     ],
     "video_rl": [
         diversity_rows, clip_rows, learning_rows, long_learning_rows, clip_learning_rows, cost_rows, ablation_rows,
