@@ -162,6 +162,14 @@ def test_a_model_that_only_scripted_episodes_speak_for_is_refused_by_the_cloned_
     assert report.failed == ("done precision, cloned policy (80)",) and report.words.startswith("failed (done prec")
 
 
+def test_a_policy_better_than_the_done_signal_is_precise_is_warned_of() -> None:
+    def notes(real: int, found: CloneRollouts) -> str:
+        return " ".join(apply_criteria(GOOD, settings(), 16, (90, 100), (real, 100), found)[1])
+
+    assert "imagined successes 78% are real, and it succeeds in 91% already" in notes(91, clone(46, 13, 3))
+    assert "already" not in notes(70, clone(46, 13, 3)) + notes(70, clone(0, 0, 3))
+
+
 def test_intervals_of_the_held_out_numbers_stand_beside_them() -> None:
     known = GOOD | {
         "object_moved_ratio_low_h16": 0.3, "object_moved_ratio_high_h16": 0.5,
