@@ -22,8 +22,8 @@ from setup.entry import ensure, interruptible
 
 ROOT = Path(__file__).resolve().parents[1]
 FAILED, CRASHED = (Path(".pytest_cache/v") / name for name in ("cache/lastfailed", "wm/crashed"))
-MOST_AGAIN = 8
-"""More failed tests than this are no accident of their neighbours."""
+MOST_AGAIN = 24
+"""More failed tests than this are no accident: neither of their neighbours, nor of a process that hung inside DDS."""
 MOST_CRASHES = 2
 """After more ended processes pytest-xdist stops, and tests are left out."""
 BY_FILE = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder", f"--max-worker-restart={MOST_CRASHES}")
