@@ -15,8 +15,10 @@ def remove_left_over(*, ports: bool = True) -> None:
     ports: also those whose lock file is gone, which Fast DDS's own tool passes over.
     """
     clean_shared_memory(graph_environment())
+    if not ports:
+        return
     in_use = set[str]().union(*map(mapped, processes()))
-    for port in Path("/dev/shm").glob("fastrtps_port*") if ports else ():
+    for port in Path("/dev/shm").glob("fastrtps_port*"):
         if str(port) not in in_use:
             for path in (port, port.with_name(f"sem.{port.name}_mutex")):
                 with suppress(OSError):

@@ -82,15 +82,14 @@ def likelihood_rows() -> Rows:
             one["acceptance"]["outcome"],
         )
     for task, advantage in dict.fromkeys((one["task"], one["advantage"]) for one in found["scenes"]):
-        seeds = {
-            one["seed"]: one for one in found["scenes"] if (one["task"], one["advantage"]) == (task, advantage)
-        }
-        gains = [one["real_after"]["successes"] - one["real_before"]["successes"] for one in seeds.values()]
-        outcomes = Counter(one["acceptance"]["outcome"] for one in seeds.values())
+        seeds = [one for one in found["scenes"] if (one["task"], one["advantage"]) == (task, advantage)]
+        assert [one["seed"] for one in seeds] == [0, 1, 2]
+        gains = [one["real_after"]["successes"] - one["real_before"]["successes"] for one in seeds]
+        outcomes = Counter(one["acceptance"]["outcome"] for one in seeds)
         yield row(
             task, "GRPO" if advantage == "group" else "PPO",
-            *(before_after(seeds[seed]) if seed in seeds else "" for seed in range(3)), f"{mean(gains):+.1f}",
-            percent(mean(one["imagined_after"]["rate"] for one in seeds.values())),
+            *map(before_after, seeds), f"{mean(gains):+.1f}",
+            percent(mean(one["imagined_after"]["rate"] for one in seeds)),
             ", ".join(f"{outcomes[outcome]} {outcome}" for outcome in sorted(outcomes)),
         )
 

@@ -74,7 +74,7 @@ RANGES = (
 def demonstration_seeds(root_seed: int, count: int) -> int:
     """Return the first reset seed of a run's `count` demonstrations. Raises ValueError as SeedRange.check.
 
-    Those that a block does not hold are also demonstrations of the root seeds after this one.
+    Those that a block does not hold are also demonstrations of other root seeds, mostly of those after this one.
     """
     kept, block = DEMONSTRATIONS, root_seed
     if root_seed >= kept.blocks:

@@ -232,8 +232,7 @@ def _policy_criteria(
             _of_clone("precision", clone.replayed[clone.imagined], limits.done_precision, config, MORE_NEAR_MISSES),
             _of_clone("recall", clone.imagined[clone.replayed], limits.done_recall, config, MORE_SUCCESSES),
         ]
-        precision = clone.replayed[clone.imagined].mean() if clone.imagined.any() else math.nan
-        if real is not None and precision < real[0] / real[1]:
+        if real is not None and (precision := criteria[0].value) < real[0] / real[1]:
             notes.append(f"Of the cloned policy's imagined successes {precision:.0%} are real, and it succeeds in "
                          f"{real[0] / real[1]:.0%} already: training in this model may make it worse.")
     if not limits.require_success_agreement:

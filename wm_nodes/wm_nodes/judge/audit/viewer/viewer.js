@@ -199,7 +199,7 @@ function drawRows() {
   shown.forEach((entry, index) => {
     if (entry.stage !== shown[index - 1]?.stage) ui.table.append(stageHead(entry.stage));
     ui.table.append(ui.rows[index]);
-    drawRow(index);
+    drawRow(entry, index);
   });
   ui.told.replaceChildren(...(finished() ? details(clip()) : []));
   setRow(Math.min(state.row, Math.max(0, shown.length - 1)));
@@ -223,8 +223,7 @@ function stageHead(name) {
   return head;
 }
 
-function drawRow(index) {
-  const entry = rows()[index];
+function drawRow(entry, index) {
   const judge = said(entry);
   const mine = labelsOf(clip())[entry.name];
   const kind = !mine || judge.value === null ? "faint" : entry.stage === "PLAN" ? "" : judge.value ? "good" : "bad";
