@@ -21,7 +21,8 @@ class DeviceError(ValueError):
 def compute_device(name: str) -> torch.device:
     """Return the device called `name`: cpu, cuda, cuda:N, or auto (a GPU where there is one, else the CPU).
 
-    On a GPU, float32 convolutions are float32 from then on: torch's default, TF32, keeps 10 bits of their fractions.
+    On a GPU, float32 convolutions are float32 from then on (torch's default, TF32, keeps 10 bits of their fractions),
+    and cuDNN takes algorithms that give the same bits twice, so that a resumed run goes on as the first did.
 
     Raises:
         DeviceError: there is no such device; says what to do.
@@ -37,7 +38,7 @@ def compute_device(name: str) -> torch.device:
     count = torch.cuda.device_count()
     if (device.index or 0) >= count:
         raise DeviceError(f"device is {name}, but the GPUs here are cuda:0 to cuda:{count - 1}; name one of them")
-    torch.backends.cudnn.allow_tf32 = False
+    torch.backends.cudnn.allow_tf32, torch.backends.cudnn.deterministic = False, True
     return device
 
 
