@@ -125,10 +125,9 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
 
 def parser_of(name: str, program: str) -> Parser:
     """The parser of a verb, which imports its module. Its arguments' `run` does the verb."""
-    kind, _, experiment = name.partition(" ")
-    file = (experiment or kind).replace("-", "_")
+    file, experiment = (words.replace("-", "_").replace(" ", "_") for words in (name, name.removeprefix("benchmark ")))
     with leaving_when_interrupted():
-        module = import_module(f"wm_nodes.apps.{file}" if kind != "benchmark" else f"{BENCHMARKS}.{file}.cli")
+        module = import_module(f"wm_nodes.apps.{file}" if experiment == file else f"{BENCHMARKS}.{experiment}.cli")
     parser = Parser(
         prog=program, description=module.__doc__, epilog=EXIT_CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
