@@ -46,6 +46,8 @@ GROUPS = {
         "recover-bag": "bring back a recording whose process was killed",
     },
     "judge": {
+        "judge serve-help": "which open model for which memory, and how it is served",
+        "judge check": "what a judge is good for, by shipped labelled clips",
         "judge-clips": "judge videos of your own",
         "audit": "verify, label, replay and compare the judge's logs",
         "build-judge-dataset": "clips with known labels, from the simulator",
