@@ -82,10 +82,10 @@ def test_a_field_that_the_judge_sets_itself_is_refused_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_clips(tmp_path)
-    (tmp_path / "my.yaml").write_text("judge: {extra_body: {max_tokens: 5, top_k: 3}}\n")
+    (tmp_path / "my.yaml").write_text("judge: {extra_body: {response_format: 5, top_k: 3}}\n")
     command = ["judge-clips", str(tmp_path), "--judge", "http://127.0.0.1:9/v1", "--judge-model", "m", "--config"]
     assert main([*command, str(tmp_path / "my.yaml")]) == 2
-    assert "judge.extra_body sets max_tokens, which the judge sets itself; leave it out" in capsys.readouterr().err
+    assert "judge.extra_body sets response_format, which the judge sets itself; leave it out" in capsys.readouterr().err
 
 
 def test_the_embedded_judge_abstains_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

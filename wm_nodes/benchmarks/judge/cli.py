@@ -11,7 +11,16 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks.judge import fault_visibility, hacking, imagined_vs_real, metrics, pai_bench, speed, tables
+from benchmarks.judge import (
+    fault_visibility,
+    hacking,
+    imagined_vs_real,
+    metrics,
+    pai_bench,
+    speed,
+    success_clips,
+    tables,
+)
 from benchmarks.judge.compared import PROTOCOLS, ComparedRow, answer_file, compared, comparison_table, num_answers
 from benchmarks.judge.efficiency import ARMS, measure_savings, savings_table, trials
 from benchmarks.judge.judges import NAMES, open_comparison, open_judge
@@ -44,6 +53,7 @@ OTHERS = {
     "imagined-vs-real": (imagined_vs_real, "the judge on imagined clips against what the simulator says"),
     "speed": (speed, "clips that the embedded judge reads per second"),
     "fault-visibility": (fault_visibility, "pixels by which a physical fault differs from its clean recording"),
+    "success-clips": (success_clips, "labelled episodes of RoboRewardBench or of a table: MAE, AUROC, accuracy"),
     "pai-bench": (pai_bench, "the robot protocol of PAI-Bench over a folder of videos"),
 }
 

@@ -68,7 +68,7 @@ class LabelJudge:
             levels = _spread(self._level(request.stage, known.labels, name, errs), 5)
         cost = Cost(calls=1, images=len(request.media))
         cited = (0,) if request.stage is Stage.REFLECT else ()
-        return Read(name, levels, vote.kind, vote, frames_cited=cited, cost=cost)
+        return Read(name, levels, "json" if vote.kind == "json" else "label", vote, frames_cited=cited, cost=cost)
 
     def _level(self, stage: Stage, labels: ClipTruth, name: Component, errs: bool) -> int:
         if stage is Stage.HACK:

@@ -39,7 +39,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", default="cpu", help="a preset or .yaml with a judge section (default: cpu)")
     add_device(parser)
     add_judge(parser)
-    parser.add_argument("--mode", choices=("reward", "benchmark"), help="benchmark: every component is read")
+    parser.add_argument(
+        "--mode", choices=("reward", "benchmark", "topreward"),
+        help="benchmark: every component is read; topreward: the reward is a server's probability of True for 'the "
+        "task is completed', and nothing else is read",
+    )
     parser.add_argument("--audit", type=Path, help="folder of an audit log to write, for the viewer and for people")
     parser.add_argument("--round", type=int, default=0, metavar="N", help="of these clips in that log (default: 0)")
     parser.add_argument("--reads", type=Path, help="folder that keeps a server's answers")
@@ -57,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         settings = for_clips(settings, first.clip.frames.shape)
     judge = JudgeService(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit, device=config.device)
     with closing(judge), path.open("a+", encoding="utf-8") as written:
-        asked = {"judge_id": judge.judge_ids[0], "rubric": judge.rubric.version}
+        asked = {"judge_id": judge.judge_ids[0], "rubric": judge.version}
         by = {**asked, "mode": settings.mode, "seed": config.seed}
         written.seek(0)
         before = written.read()

@@ -60,6 +60,10 @@ def add_judge(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--judge-model", default="", metavar="NAME", help="its name on the server")
     parser.add_argument("--judge-key-env", default="", metavar="VARIABLE", help="environment variable with its key")
+    parser.add_argument(
+        "--judge-field", action="append", default=[], metavar="NAME=VALUE",
+        help="further field of every request to it, in YAML, e.g. 'chat_template_kwargs={enable_thinking: false}'",
+    )
     parser.add_argument("--rubric", default="", help="rubric pack: a name, or a .yaml file")
 
 
@@ -84,7 +88,9 @@ def positive(text: str) -> int:
 
 def judge_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """The dotted settings that the options of add_judge stand for."""
-    return judge_overrides(arguments.judge, arguments.judge_model, arguments.judge_key_env, arguments.rubric)
+    fields = dict(parse_override(text) for text in arguments.judge_field)
+    named = judge_overrides(arguments.judge, arguments.judge_model, arguments.judge_key_env, arguments.rubric)
+    return named | {f"judge.extra_body.{name}": value for name, value in fields.items()}
 
 
 def settings(arguments: argparse.Namespace) -> dict[str, Any]:

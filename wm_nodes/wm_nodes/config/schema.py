@@ -207,8 +207,9 @@ class JudgeConfig(SettingsSection):
     """embedded: abstain where the answer is not sure at this coverage (0.8, 0.9, 0.95 or 0.98); 0: always decide."""
     rubric: str
     """Rubric pack: a name, or a .yaml file."""
-    mode: Literal["reward", "benchmark"]
-    """reward: a closed gate ends the reading of a clip; benchmark: every component is read."""
+    mode: Literal["reward", "benchmark", "topreward"]
+    """reward: a closed gate ends the reading of a clip; benchmark: every component is read; topreward: the reward is
+    the probability of "True" for "the task is completed", one token of a server, without planning or gates."""
     call_plan: Literal["auto", "pack", "fanout"]
     """One call per stage (pack) or per component (fanout); auto: by the measured cache, not repeatable bit by bit."""
     robot: str
@@ -237,7 +238,8 @@ class JudgeConfig(SettingsSection):
     """openai: token ids of A to E, for servers that give the probabilities of given ids (vLLM: logprob_token_ids)."""
     extra_body: dict[str, Any]
     """openai: further fields of every request, e.g. {chat_template_kwargs: {enable_thinking: false}} for a model that
-    reasons before it answers."""
+    reasons before it answers, {max_completion_tokens: 4096} in place of the judge's own max_tokens, or vLLM's
+    mm_processor_kwargs and media_io_kwargs."""
     repeat_share: Annotated[float, Field(ge=0, le=1)]
     """Share of the calls to a server that are made twice: `flip_rate` says how often the second answer is another."""
     keep_reads: bool

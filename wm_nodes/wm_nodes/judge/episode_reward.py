@@ -192,7 +192,7 @@ class EpisodeReward:
     @property
     def version(self) -> int:
         """Differs with judge, rubric and mode; fits uint64."""
-        return version_of(self.name, self._judge.judge_id, self._judge.rubric.version, self._judge.settings.mode)
+        return version_of(self.name, self._judge.judge_id, self._judge.version, self._judge.settings.mode)
 
     def forget(self) -> None:
         """Drop the unfinished episodes, because the environment was (re)started."""

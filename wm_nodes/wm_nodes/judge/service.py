@@ -157,6 +157,11 @@ class JudgeService:
         return self._slots[0].agent.rubric
 
     @property
+    def version(self) -> str:
+        """Of the words that the judges are asked in, see RewardAgent."""
+        return self._slots[0].agent.version
+
+    @property
     def judge_id(self) -> str:
         """Identity of the judge of the last round; before the first round, of the first judge."""
         return self._used.judge_id
@@ -337,7 +342,7 @@ def _unjudged(agent: RewardAgent | AuditedAgent, job: ClipJob, seed: int, reason
         clip_id=job.clip.clip_id, status=Status.ERROR, reward=math.nan, level=-1,
         stages=tuple(map(skipped_stage, GATED)), plan=None, reflections=(), hack_flags=(), cost=Cost(),
         provenance=Provenance(
-            able.judge_id, able.transport, able.model, able.server_version, agent.rubric.version, "", job.clip.sha256,
+            able.judge_id, able.transport, able.model, able.server_version, agent.version, "", job.clip.sha256,
             seed, now, now,
         ),
         reason=reason,

@@ -187,3 +187,12 @@ def test_a_server_that_is_lost_or_understands_too_little_gives_an_error_and_no_r
 
     through_proxy(endpoint, [Fault("reset")] * 4, lost)
     with_judge(endpoint, judged)
+
+
+def test_the_probability_of_true_is_no_number_where_the_server_knows_no_logprobs(endpoint: Endpoint) -> None:
+    async def judged(judge: OpenAIJudge, _: ChatTransport) -> None:
+        verdict = await RewardAgent(judge, load_rubric(), mode="topreward").evaluate(CLIP, TASK)
+        assert (verdict.status, verdict.valid, verdict.cost.calls) == (Status.ERROR, False, 1)
+        assert math.isnan(verdict.reward) and "gives no logprobs" in verdict.reason
+
+    with_judge(endpoint, judged)

@@ -29,14 +29,15 @@ class Cost:
 
 @dataclass(frozen=True)
 class Vote:
-    """How a component is asked. json: evidence first, then a level. label: one token, probabilities per option.
+    """How a component is asked. json: evidence first, then a level. label: one token, probabilities per option. truth:
+    one token, the probability of "True" (topreward.py).
 
     negative: "which defect is visible", options listed worst first. positive: options in the order of `seed`.
     levels.option_order gives the order, levels.map_back undoes it. index: 0 is the first read of a stage.
     """
 
     index: int
-    kind: Literal["json", "label"]
+    kind: Literal["json", "label", "truth"]
     polarity: Literal["positive", "negative"]
     seed: int
 

@@ -2,6 +2,7 @@
 
 PRECHECK -> PLAN -> VQ -> IF -> TC -> PC -> REFLECT -> HACK -> AGGREGATE. In reward mode a failed gate ends the reading;
 in benchmark mode every component is read. If reflection opens a closed gate, the stages after it are read, too, once.
+Mode topreward reads one probability instead (topreward.py).
 The result is always a Verdict; its reward is NaN where the judge fails or abstains.
 """
 
@@ -14,7 +15,7 @@ from dataclasses import replace
 from typing import Literal
 
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.judge.agent import levels, reflection, scoring
+from wm_nodes.judge.agent import levels, reflection, scoring, topreward
 from wm_nodes.judge.agent.judge import ComponentScore, Cost, Judge, JudgeError, MediaItem, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.precheck import precheck
 from wm_nodes.judge.agent.profiles import DENSE_MAX, cited_media, profile_media
@@ -42,7 +43,7 @@ from wm_nodes.judge.agent.verdict import (
     content_hash,
 )
 
-Mode = Literal["reward", "benchmark"]
+Mode = Literal["reward", "benchmark", "topreward"]
 CallPlan = Literal["pack", "fanout", "auto"]
 
 
@@ -67,17 +68,23 @@ class RewardAgent:
         self.judge, self.rubric, self.mode, self.seed, self.call_plan = judge, rubric, mode, seed, call_plan
         self.max_reads, self.budget_s = max_reads, budget_s
         patterns = rubric.hack.patterns if rubric.hack.enabled else ()
-        needed = {PLANNING, *rubric.component_names, *patterns}
+        staged = mode != topreward.MODE
+        needed = {PLANNING, *rubric.component_names, *patterns} if staged else {topreward.COMPONENT}
         can = judge.capabilities.components
         if can is not None and needed - can:
             raise ValueError(f"judge {judge.capabilities.judge_id} does not read {', '.join(sorted(needed - can))}")
         if judge.capabilities.max_frames < 2:
             raise ValueError(f"a judge must see 2 frames or more, it takes {judge.capabilities.max_frames}")
-        smallest = 1 + len(rubric.component_names) + 2 * len(patterns)
+        smallest = 1 + len(rubric.component_names) + 2 * len(patterns) if staged else 1
         if max_reads < smallest:
             raise ValueError(f"max_reads must be >= {smallest}, one read of everything, got {max_reads}")
         if not budget_s > 0:
             raise ValueError(f"budget_s must be > 0, got {budget_s}")
+
+    @property
+    def version(self) -> str:
+        """Of the words that the judge is asked in: the rubric's, or that of mode topreward."""
+        return topreward.VERSION if self.mode == topreward.MODE else self.rubric.version
 
     async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
         """Judge one clip. evidence: endogenous signals by name; they cause votes and second looks, nothing else."""
@@ -102,7 +109,7 @@ class RewardAgent:
             hack_flags=tuple(run.flags),
             cost=replace(run.cost, wall_s=time.monotonic() - clock),
             provenance=Provenance(
-                able.judge_id, able.transport, able.model, able.server_version, self.rubric.version,
+                able.judge_id, able.transport, able.model, able.server_version, self.version,
                 hashlib.sha256("".join(run.prompts).encode()).hexdigest(), clip.sha256, self.seed, started, time.time(),
             ),
             reason=reason,
@@ -141,6 +148,8 @@ class _Run:
         if check.kind == "no video":
             self.level = 0
             return Status.OK, 0.0, check.reason
+        if self.agent.mode == topreward.MODE:
+            return await self._read_truth()
         self.plan = plan = await self._read_plan()
         self.level = plan.level
         await self._read_stages(plan)
@@ -156,6 +165,15 @@ class _Run:
         if silent:
             return Status.ABSTAIN, math.nan, "; ".join(silent)
         return Status.OK, scoring.reward(plan.weights, self._stages_in_order(), self.rubric), ""
+
+    async def _read_truth(self) -> tuple[Status, float, str]:
+        """One stage with one component whose s is p("True"); it gates nothing."""
+        media = topreward.shown_frames(self.clip, self.agent.judge.capabilities.max_frames)
+        vote = topreward.vote(self.agent.seed)
+        (read,) = await self._ask(Stage.TC, (topreward.COMPONENT,), vote, Profile.D, media=media)
+        score = self._score_read(read)
+        self.stages = {Stage.TC: StageScore(Stage.TC, score.status, score.s, score.status is Status.OK, (score,))}
+        return score.status, score.s, score.reason
 
     async def _read_plan(self) -> PlanResult:
         (read,) = await self._ask(Stage.PLAN, (PLANNING,), levels.first_vote(self.agent.seed), Profile.S)

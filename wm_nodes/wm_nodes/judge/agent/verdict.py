@@ -72,7 +72,9 @@ class HackFlag:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Origin of a verdict. prompt_sha: over the prompts of all reads. started, ended: Unix time, s."""
+    """Origin of a verdict. rubric_version: of the words of its questions (RewardAgent.version). prompt_sha: over the
+    prompts of all reads. started, ended: Unix time, s.
+    """
 
     judge_id: str
     transport: str
@@ -89,8 +91,8 @@ class Provenance:
 @dataclass(frozen=True)
 class Verdict:
     """The agent's result for one clip. reward: in [0, 1], NaN unless status is OK. level: planning level; 0 where
-    PRECHECK found no video, -1 without planning. stages: VQ, IF, TC, PC. reason: of any status but OK. audit_id:
-    content hash without times, equal for equal seeds and equal answers of the judge.
+    PRECHECK found no video, -1 without planning. stages: VQ, IF, TC, PC; TC alone in mode topreward. reason: of any
+    status but OK. audit_id: content hash without times, equal for equal seeds and equal answers of the judge.
     """
 
     clip_id: str

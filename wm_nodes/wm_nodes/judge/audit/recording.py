@@ -42,6 +42,10 @@ class AuditedAgent:
         return self._agent.rubric
 
     @property
+    def version(self) -> str:
+        return self._agent.version
+
+    @property
     def judge(self) -> Judge:
         return self._agent.judge
 

@@ -10,8 +10,9 @@ import json
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
+from wm_nodes.judge.agent import topreward
 from wm_nodes.judge.agent.judge import Cost, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.levels import map_back, one_hot, option_order
 from wm_nodes.judge.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING, Component, Stage, Status
@@ -27,10 +28,12 @@ SEED_LIMIT = 2**31
 MIN_LABEL_MASS = 0.5
 """A label read with less abstains, unless its answers are chosen by a grammar."""
 OWN_FIELDS = frozenset((
-    "model", "messages", "seed", "max_tokens", "response_format", "logprobs", "top_logprobs", "logprob_token_ids",
+    "model", "messages", "seed", "response_format", "logprobs", "top_logprobs", "logprob_token_ids",
     "structured_outputs", "stream", "n",
 ))
 """Of a request, which extra_body may not set."""
+TOKEN_LIMITS = frozenset(("max_tokens", "max_completion_tokens"))
+"""Whichever of them extra_body sets stands in the place of the judge's own limit."""
 Exchange = Mapping[str, Any]
 """The texts of a request and the raw reply, as JSON values, for an audit log."""
 
@@ -39,12 +42,12 @@ Exchange = Mapping[str, Any]
 class ChatOptions:
     """json_timeout_s, label_timeout_s: per try. budget_s: all calls of one ReadRequest together, waits included.
 
-    max_answer_tokens: of a JSON answer; one that needs more has failed. label_token_ids: token ids of A to E, where the
-    server can be asked for their probabilities by id. choice_grammar: label reads choose among the letters only, so
-    that the label mass no longer warns. max_images: that the server takes in one call. video: the dense profile goes as
-    one video (vLLM, --limit-mm-per-prompt with a video), else as images. repeat_share: of the calls that are asked
-    twice, so that it is known how often a live server contradicts itself; the first answer counts. extra_body: further
-    fields of every request.
+    max_answer_tokens: of a JSON answer, if extra_body sets none; one that needs more has failed. label_token_ids: token
+    ids of A to E, where the server can be asked for their probabilities by id. choice_grammar: label reads choose among
+    the letters only, so that the label mass no longer warns. max_images: that the server takes in one call. video: the
+    dense profile goes as one video (vLLM, --limit-mm-per-prompt with a video), else as images. repeat_share: of the
+    calls that are asked twice, so that it is known how often a live server contradicts itself; the first answer counts.
+    extra_body: further fields of every request.
     """
 
     json_timeout_s: float = 120.0
@@ -87,7 +90,9 @@ class Prompt:
         extra_body: Mapping[str, Any],
     ) -> None:
         seed = call.vote.seed % SEED_LIMIT
-        self.body = {"messages": messages, "temperature": 0, "seed": seed, **extra_body, **fields}
+        given = TOKEN_LIMITS & extra_body.keys()
+        own = {name: value for name, value in fields.items() if not (given and name in TOKEN_LIMITS)}
+        self.body = {"messages": messages, "temperature": 0, "seed": seed, **extra_body, **own}
         self.reader = reader
         system, user = messages
         self.sha = sha_of([system, user["content"][len(call.media) :], {**self.body, "messages": None}])
@@ -130,7 +135,7 @@ class Caller:
         self._transport, self._prompts, self._options = transport, prompts, options
 
     def prompt(self, call: Call) -> Prompt:
-        return self._label_prompt(call, call.components[0]) if call.vote.kind == "label" else self._json_prompt(call)
+        return self._json_prompt(call) if call.vote.kind == "json" else self._label_prompt(call, call.components[0])
 
     async def answer(self, call: Call, prompt: Prompt, bill: CallCost) -> list[Read]:
         """One Read per component of the call; those without an answer have status ERROR and say why."""
@@ -174,13 +179,16 @@ class Caller:
         options, order = self._options, prompt.reader
         assert isinstance(order, tuple)  # label prompts are read by the order of their options
         answer = await self._send(call, prompt.body, bill, options.label_timeout_s)
-        probabilities, mass = option_probabilities(answer.completion, LETTERS[: len(order)])
+        truth = call.vote.kind == "truth"
+        constrained = options.choice_grammar and not truth
+        words = topreward.WORDS if truth else LETTERS[: len(order)]
+        probabilities, mass = option_probabilities(answer.completion, words)
         self.label_masses.append(mass)
-        if mass == 0 or (mass < MIN_LABEL_MASS and not options.choice_grammar):
+        if mass == 0 or (mass < MIN_LABEL_MASS and not constrained):
             reason = f"label mass {mass:.3f} is below {MIN_LABEL_MASS}"
             return Read(component, (), "label", call.vote, mass, Status.ABSTAIN, reason)
-        label_mass = 1.0 if options.choice_grammar else mass
-        return Read(component, map_back(probabilities, order), "label", call.vote, label_mass)
+        levels = topreward.levels_of(probabilities) if truth else map_back(probabilities, order)
+        return Read(component, levels, "label", call.vote, 1.0 if constrained else mass)
 
     async def _send(self, call: Call, body: dict[str, Any], bill: CallCost, timeout_s: float) -> ChatAnswer:
         try:
@@ -207,6 +215,9 @@ class Caller:
 
     def _label_prompt(self, call: Call, component: Component) -> Prompt:
         request, options = call.request, self._options
+        if call.vote.kind == "truth":  # neither token ids, which are those of letters, nor a grammar
+            messages = self._prompts.truth_question(call.media, request)
+            return Prompt(call, messages, label_options(topreward.WORDS), (), options.extra_body)
         count = NUM_PLAN_LEVELS if request.stage is Stage.PLAN else NUM_LEVELS
         order = option_order(call.vote, request.clip.sha256, component, count)
         messages = self._prompts.label_question(call.media, request, component, call.vote, order)
@@ -252,4 +263,5 @@ def _read_of(finding: ComponentAnswer, vote: Vote) -> Read:
 
 
 def _failed_read(component: Component, vote: Vote, reason: str) -> Read:
-    return Read(component, (), vote.kind, vote, label_mass=0.0, status=Status.ERROR, reason=reason)
+    source: Literal["json", "label"] = "json" if vote.kind == "json" else "label"
+    return Read(component, (), source, vote, label_mass=0.0, status=Status.ERROR, reason=reason)

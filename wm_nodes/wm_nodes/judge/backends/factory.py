@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from wm_nodes.config.schema import JudgeConfig, OtherJudge, StageJudge
 from wm_nodes.core.device import CPU, compute_device
+from wm_nodes.judge.agent import topreward
 from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import Stage
@@ -69,6 +70,11 @@ def check_judge(settings: JudgeConfig) -> None:
 
 
 def _check_one(settings: JudgeConfig) -> None:
+    if settings.mode == topreward.MODE and (settings.kind == "embedded" or settings.routes):
+        raise ValueError(
+            "judge.mode topreward reads the probability of a word from one server: set judge.endpoints and judge.model "
+            f"(got judge.kind {settings.kind}), and leave judge.routes empty"
+        )
     if settings.kind == "embedded":
         if settings.folder and not Path(settings.folder).is_dir():
             raise ValueError(

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from wm_nodes.core.types import UInt8Array
+from wm_nodes.judge.agent import topreward
 from wm_nodes.judge.agent.judge import ComponentScore, MediaItem, ReadRequest, Vote
 from wm_nodes.judge.agent.rubric import ComponentRubric, PlanningRubric, Rubric
 from wm_nodes.judge.agent.types import NUM_LEVELS, PLANNING, ClipRef, Component, Profile, Stage, TaskSpec
@@ -84,6 +85,11 @@ class Prompts:
         options = "\n".join(f"{letter}: {entry.levels[level]}" for letter, level in zip(letters, order))
         rule = f"Answer with one letter, {', '.join(letters[:-1])} or {letters[-1]}, and nothing else."
         return self._messages(media, request, [_text(f"{component}: {question}\n{options}"), _text(rule)])
+
+    def truth_question(self, media: Sequence[Part], request: ReadRequest) -> list[Part]:
+        """Ask whether the frames complete the task (topreward.py)."""
+        statement = _text(topreward.STATEMENT.format(instruction=request.task.instruction))
+        return [{"role": "system", "content": topreward.SYSTEM}, {"role": "user", "content": [*media, statement]}]
 
     def entry(self, stage: Stage, component: Component) -> ComponentRubric | PlanningRubric:
         """What the rubric says of a component, a hacking pattern, or planning. Raises ValueError: it says nothing."""

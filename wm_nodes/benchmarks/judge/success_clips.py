@@ -1,0 +1,199 @@
+"""A judge against public sets of recorded episodes in a local folder, through the reward agent's own service.
+
+    wm benchmark judge success-clips FOLDER --format roboreward --judge http://host:8000/v1 --judge-model NAME
+
+roboreward: FOLDER is the data set teetone/RoboReward (RoboRewardBench is its part test) or one of its parts, as it is
+published: metadata.jsonl beside the videos, a line each {"file_name": "SOURCE/NAME.mp4", "task": "...", "reward": 1 to
+5}. Success is reward 5. The mean absolute error (MAE) is that of the score 1 + 4 R, as it is and rounded.
+rt1: episodes with a success label. RT-1 is published as RLDS shards, and no layout of videos with failures could be
+established; so FOLDER holds the videos and labels.csv with the columns file, instruction, label (1 or 0).
+
+With --mode topreward, --prefixes K also reads K prefixes of every successful clip: VOC is the rank correlation of
+log p(True) with time, 0 where all are equal. Nothing is downloaded. Clips without a reward are counted, never scored.
+"""
+
+import argparse
+import csv
+import json
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from benchmarks.environments.policies import spearman
+from benchmarks.speed.results import write_results
+from wm_nodes.apps.options import add_device, add_json, add_judge, add_seed, device_settings, judge_settings, positive
+from wm_nodes.config.load import load_config
+from wm_nodes.core.files import text_lines
+from wm_nodes.core.progress import tqdm
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.statistics import auroc, bootstrap_mean, wilson_interval
+from wm_nodes.judge.agent import topreward
+from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.clip_files import ClipLine, read_job
+from wm_nodes.judge.decisions import accepts
+from wm_nodes.judge.service import ClipJob, JudgeService
+
+METADATA, TABLE, TEST, COLUMNS = "metadata.jsonl", "labels.csv", "test", {"file", "instruction", "label"}
+TOP_SCORE, ROBOT, DRAWS = 5, "not told", 1000
+
+
+class LabelledVideo(NamedTuple):
+    """score: 1 to 5, None where only success is labelled."""
+
+    file: str
+    instruction: str
+    success: bool
+    score: int | None = None
+
+
+def read_roboreward(folder: Path) -> tuple[Path, list[LabelledVideo]]:
+    """The folder of the videos, and their labels. Raises ValueError: no such list, or a bad line; names it."""
+    folder = folder if (folder / METADATA).is_file() else folder / TEST
+    videos = []
+    for number, line in enumerate(_lines(folder / METADATA, "the data set teetone/RoboReward, or its folder test"), 1):
+        try:
+            row = json.loads(line)
+            file, task, score = row["file_name"], row["task"], row["reward"]
+            if not (isinstance(file, str) and isinstance(task, str) and score in range(1, TOP_SCORE + 1)):
+                raise ValueError
+        except (ValueError, KeyError, TypeError):
+            raise ValueError(
+                f"{folder / METADATA}:{number}: needs file_name, task and a reward of 1 to 5, got {line[:200]}"
+            ) from None
+        videos.append(LabelledVideo(file, task, score == TOP_SCORE, int(score)))
+    return folder, videos
+
+
+def read_table(folder: Path) -> tuple[Path, list[LabelledVideo]]:
+    """As read_roboreward, of a table of success labels."""
+    rows = csv.DictReader(_lines(folder / TABLE, "the videos of episodes and labels.csv (file, instruction, label)"))
+    if missing := COLUMNS - set(rows.fieldnames or ()):
+        raise ValueError(f"{folder / TABLE} has no column {', '.join(sorted(missing))}; write file,instruction,label")
+    videos = []
+    for row in rows:
+        if row["label"] not in ("0", "1") or not row["file"]:
+            raise ValueError(f"{folder / TABLE}:{rows.line_num}: needs a file and the label 1 or 0, got {row}")
+        videos.append(LabelledVideo(row["file"], row["instruction"], row["label"] == "1"))
+    return folder, videos
+
+
+def _lines(path: Path, what: str) -> list[str]:
+    try:
+        return [line for line in text_lines(path.read_bytes()) if line.strip()]
+    except (FileNotFoundError, NotADirectoryError):
+        raise ValueError(f"{path} is missing; the folder must hold {what}. Nothing is downloaded") from None
+
+
+FORMATS = {"roboreward": read_roboreward, "rt1": read_table}
+
+
+Answers = Sequence[bool | None]
+
+
+def success_numbers(success: Sequence[bool], accepted: Answers, rewards: Sequence[float], seed: int) -> dict[str, Any]:
+    """Accuracy and F1 over decided clips, AUROC over clips with a reward (else NaN); [value, low, high] of 95 %."""
+    truth, said, paid = np.array(success, bool), np.array(accepted, bool), ~np.isnan(rewards)
+    known = np.array([answer is not None for answer in accepted], bool)
+    right = int((truth == said)[known].sum())
+    return {
+        "decided": int(known.sum()),
+        "accuracy": [right / max(1, known.sum()), *wilson_interval(right, int(known.sum()))],
+        "f1": _bootstrapped(f1, truth[known], said[known], seed),
+        "auroc": _bootstrapped(auroc, truth[paid], np.array(rewards)[paid], seed),
+    }
+
+
+def f1(labels: ArrayLike, answers: ArrayLike) -> float:
+    """2 TP / (2 TP + FP + FN) of the successes; NaN where there is none, neither labelled nor said."""
+    truth, said = np.array(labels, bool), np.array(answers, bool)
+    both = int(truth.sum() + said.sum())
+    return 2 * int((truth & said).sum()) / both if both else float("nan")
+
+
+def score_errors(scores: Sequence[int], rewards: Sequence[float], seed: int) -> dict[str, Any]:
+    """MAE of 1 + 4 R over clips with a reward; [value, low, high] of 95 %."""
+    pairs = [(score, 1 + (TOP_SCORE - 1) * r) for score, r in zip(scores, rewards, strict=True) if not np.isnan(r)]
+    if not pairs:
+        return {}
+    truth, said = np.array(pairs).T
+    errors = {"mae": np.abs(truth - said), "mae_rounded": np.abs(truth - said.round())}
+    return {name: bootstrap_mean(error, seed=seed) for name, error in errors.items()}
+
+
+def _bootstrapped(statistic: Callable[[Any, Any], float], one: Any, other: Any, seed: int) -> list[float]:
+    rows = numpy_stream(seed, "success-clips", len(one)).integers(max(1, len(one)), size=(DRAWS, len(one)))
+    drawn = [value for index in rows if not np.isnan(value := statistic(one[index], other[index]))]
+    low, high = np.quantile(drawn, (0.025, 0.975)) if drawn else (np.nan, np.nan)
+    return [statistic(one, other), float(low), float(high)]
+
+
+def voc(judge: JudgeService, job: ClipJob, count: int) -> float:
+    """Value-order correlation of a clip's progress; NaN where a prefix has no number."""
+    jobs = [ClipJob(clip, job.task) for clip in topreward.prefixes(job.clip, count)]
+    values = [topreward.log_p_true(verdict) for verdict in judge.judge(jobs)]
+    if np.isnan(values).any():
+        return float("nan")
+    return 0.0 if len(set(values)) == 1 else spearman(values, range(len(values)), seed=0, draws=0)[0]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--format", choices=FORMATS, required=True)
+    parser.add_argument("--mode", choices=("reward", topreward.MODE), default="reward", help="of the judge")
+    parser.add_argument("--clips", type=positive, help="the first so many; default: all")
+    parser.add_argument("--prefixes", type=positive, metavar="K", help=f"as published: {topreward.NUM_PREFIXES}")
+    parser.add_argument("--reads", type=Path, help="folder that keeps a server's answers")
+    add_judge(parser)
+    add_device(parser)
+    add_seed(parser)
+    add_json(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Judge the clips, print the numbers and write --json."""
+    if arguments.prefixes and arguments.mode != topreward.MODE:
+        raise ValueError(f"--prefixes {arguments.prefixes} needs --mode topreward")
+    chosen = judge_settings(arguments) | device_settings(arguments) | {"judge.mode": arguments.mode}
+    config = load_config("cpu", chosen)
+    folder, videos = FORMATS[arguments.format](arguments.folder)
+    videos = videos[: arguments.clips]
+    rows, curves, size = list[Verdict](), list[float](), config.judge.concurrency
+    judge = JudgeService(config.judge, seed=arguments.seed, reads=arguments.reads, device=config.device)
+    with closing(judge), tqdm(total=len(videos), desc="judged", unit="clip") as bar:
+        for part in (videos[start : start + size] for start in range(0, len(videos), size)):
+            lines = [ClipLine(file=video.file, instruction=video.instruction, robot=ROBOT) for video in part]
+            jobs = [read_job(folder, line) for line in lines]
+            rows += judge.judge(jobs)
+            if arguments.prefixes:
+                curves += [voc(judge, j, arguments.prefixes) for j, v in zip(jobs, part) if v.success and not j.problem]
+            bar.update(len(part))
+    results = _results(videos, rows, [value for value in curves if not np.isnan(value)], arguments.seed)
+    for name in ("clips", "statuses", "decided", "accuracy", "f1", "auroc", "mae", "mae_rounded", "voc"):
+        if name in results:
+            shown = results[name]
+            print(f"{name:12} " + ("{:.3f} ({:.3f} to {:.3f})".format(*shown) if len(np.shape(shown)) else str(shown)))
+    write_results(arguments, {
+        "experiment": "success-clips", "format": arguments.format, "judge": judge.judge_id, "mode": arguments.mode,
+        "rubric": judge.version, "seed": arguments.seed, **results,
+    })
+
+
+def _results(videos: Sequence[LabelledVideo], rows: list[Verdict], curves: list[float], seed: int) -> dict[str, Any]:
+    rewards, accepted = [row.reward for row in rows], [accepts(row) for row in rows]
+    results = {
+        "clips": len(videos), "statuses": dict(Counter(str(row.status) for row in rows)),
+        **success_numbers([video.success for video in videos], accepted, rewards, seed),
+        **({"voc": bootstrap_mean(curves, seed=seed), "curves": len(curves)} if curves else {}),
+    }
+    if all(video.score is not None for video in videos):
+        results |= score_errors([video.score or 0 for video in videos], rewards, seed)
+    results["rows"] = [
+        {**video._asdict(), "reward": row.reward, "accepted": answer, "status": str(row.status), "reason": row.reason}
+        for video, row, answer in zip(videos, rows, accepted)
+    ]
+    return results
