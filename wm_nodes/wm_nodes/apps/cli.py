@@ -47,6 +47,7 @@ GROUPS = {
     },
     "judge": {
         "judge-clips": "judge videos of your own",
+        "judge hack": "whether a judge can be hacked on clips of your own",
         "audit": "verify, label, replay and compare the judge's logs",
         "build-judge-dataset": "clips with known labels, from the simulator",
         "train-judge": "the embedded judge, from such clips; or measure it",
