@@ -28,8 +28,8 @@ OPTIONS = {
     "recover-bag": "bag --output",
     "judge-clips": "clips --config --device --judge --judge-model --judge-key-env --rubric --mode --audit --reads "
     "--json",
-    "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit --limit-clips "
-    "--seed --reads --json --pictures",
+    "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
+    "--limit-clips --seed --reads --json --pictures",
     "audit": "verify recover sample view agree people replay adopt",
     "build-judge-dataset": "folder --tasks --episodes --edits --stacks --seed --shapes --recipes --development "
     "--diverse --policy-view --stride --device --benchmark --check",
