@@ -34,9 +34,9 @@ from wm_nodes.judge.agent.types import ClipRef, Profile, Stage, Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.video_rl.group_advantages import trainable
 
-QUIET = {"voting": {"audit_share": 0.0}}
+QUIET = {"voting": {"audit_share": 0.0}, "reflection": {"audit_share": 0.0}}
 RUBRIC = load_rubric(overrides=QUIET)
-PLAIN_OVERRIDES = QUIET | {"reflection": {"enabled": False}, "hack": {"enabled": False}}
+PLAIN_OVERRIDES: dict[str, Any] = QUIET | {"reflection": {"enabled": False}, "hack": {"enabled": False}}
 PLAIN = load_rubric(overrides=PLAIN_OVERRIDES)
 NUM_COMPONENTS, NUM_PATTERNS = 12, 4
 
@@ -303,7 +303,7 @@ def test_evidence_and_chance_are_reasons_for_a_second_look() -> None:
     )
     verdict = judge_clip(ScriptedJudge(clean_table(rubric)), rubric, evidence={"flicker": 2.0})
     assert verdict.reflections[0].triggers == ("temporal passed against evidence flicker 2",)
-    always = load_rubric(overrides={"hack": {"enabled": False}, "voting": {"audit_share": 1.0}})
+    always = load_rubric(overrides={"hack": {"enabled": False}, "reflection": {"audit_share": 1.0}})
     assert judge_clip(ScriptedJudge(clean_table(always)), always).reflections[0].triggers == ("drawn at random",)
 
 
