@@ -17,8 +17,8 @@ from benchmarks.judge.call_counter import CountingJudge
 from benchmarks.judge.cli import add_options
 from benchmarks.judge.efficiency import measure_savings, trials
 from benchmarks.judge.judges import open_judge
-from benchmarks.judge.label_judge import KnownClip, LabelJudge
-from benchmarks.judge.labels import truth_of
+from benchmarks.judge.label_judge import LabelJudge
+from benchmarks.judge.labels import known_labels, truth_of
 from benchmarks.judge.line_file import LineFile
 from benchmarks.judge.metrics import agreement, cost_row, missed_patterns, missed_targets, mistakes, pattern_rows
 from benchmarks.judge.run import JudgeTrial, Outcome, judge_rows
@@ -64,8 +64,8 @@ def manifest(folder: Path) -> Manifest:
     return load_set(folder)
 
 
-def oracle(manifest: Manifest, error: float = 0.0) -> LabelJudge:
-    return LabelJudge({row.sha256: KnownClip(row.labels, row.edits) for row in manifest.rows}, RUBRIC, error=error)
+def oracle(manifest: Manifest) -> LabelJudge:
+    return LabelJudge({row.sha256: known_labels(row.labels, row.edits) for row in manifest.rows}, RUBRIC)
 
 
 def judged(judge: Any, folder: Path, manifest: Manifest, path: Path, trial: JudgeTrial | None = None) -> list[Any]:
@@ -352,7 +352,6 @@ def test_the_command_prints_and_writes_the_table(
         (["table", str(folder), "--judge", "simulator", "--stages", "PC"], "got --judge simulator"),
         (["comparisons", str(folder), "--url", "http://127.0.0.1:1/v1"], "--model NAME"),
         (["table", str(folder), "--folder", str(tmp_path)], "holds no judge.json"),
-        (["table", str(folder), "--judge", "simulator", "--error", "2"], "got 2.0"),
     ):
         assert main(["benchmark", "judge", *wrong]) == 2
         assert "error:" in (shown := capsys.readouterr().err) and complaint in shown
