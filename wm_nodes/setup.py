@@ -7,7 +7,7 @@ NODES = (
     "video_model", "clip_evaluator", "video_learner",
 )
 
-KINDS = ("xml", "yaml", "json", "css", "js", "safetensors", "txt")
+KINDS = ("xml", "yaml", "json", "jsonl", "css", "js", "safetensors", "txt", "png")
 """Of data files."""
 
 setup(

@@ -18,7 +18,7 @@ def shipped_model(task: str) -> Path:
     known: list[str] = []
     wanted = parts_of(task) if task in task_names() else (task,)
     for manifest in sorted(PRETRAINED.glob("*/manifest.json")):
-        tasks = json.loads(manifest.read_text(encoding="utf-8"))["tasks"]
+        tasks = json.loads(manifest.read_text(encoding="utf-8")).get("tasks", [])
         if set(wanted) <= set(tasks):
             return manifest.parent
         known += tasks

@@ -33,13 +33,15 @@ class ClipLine(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     file: Annotated[str, Field(min_length=1)]
-    """A video, or a .npy of uint8 (F, H, W, 3), RGB."""
+    """A video, a .npy of uint8 (F, H, W, 3), RGB, or a .png of the frames one below the other."""
+    frames: Annotated[int, Field(ge=2)] | None = None
+    """How many a .png holds; of no other file."""
     instruction: str
     clip_id: str = ""
     task_id: str = ""
     robot: str = "panda"
     fps: Annotated[float, Field(gt=0)] = 5.0
-    """Of a .npy; a video has its own."""
+    """Of a .npy or .png; a video has its own."""
     reference: str = ""
     """The conditioning image; empty: the first frame."""
     goal: str = ""
@@ -94,7 +96,12 @@ def read_job(folder: Path, line: ClipLine, read: Read = read_regular) -> ClipJob
 def _read_job(folder: Path, line: ClipLine, read: Read) -> ClipJob:
     """Raises ValueError: an unreadable file, or another content than its sha256; names it."""
     path = folder / line.file
-    clip = _read_frames(path, line.fps, read) if path.suffix == ".npy" else read_video(path, read)
+    if (line.frames is None) == (path.suffix == ".png"):
+        raise ValueError(f"{path}: `frames` says how many frames a .png holds, and goes with no other file")
+    if line.frames:
+        clip = _read_strip(path, line.frames, line.fps, read)
+    else:
+        clip = _read_frames(path, line.fps, read) if path.suffix == ".npy" else read_video(path, read)
     if line.sha256 and clip.sha256 != line.sha256:
         raise ValueError(f"{path} has content {clip.sha256}, not {line.sha256}; copy it again")
     clip = ClipRef(line.clip_id or path.stem, clip.sha256, clip.frames, clip.fps)
@@ -140,6 +147,14 @@ def _read_frames(path: Path, fps: float, read: Read) -> ClipRef:
     if frames.ndim != 4 or not frames.size:
         raise ValueError(f"{path} holds {frames.dtype} {frames.shape}, not frames (F, H, W, 3); write it again")
     return clip_ref(path.stem, frames, fps)
+
+
+def _read_strip(path: Path, num_frames: int, fps: float, read: Read) -> ClipRef:
+    """Cut a picture into frames of equal height."""
+    strip = read_picture(path, read)
+    if len(strip) % num_frames:
+        raise ValueError(f"{path} is {len(strip)} px high, no multiple of {num_frames} frames; correct `frames`")
+    return clip_ref(path.stem, strip.reshape(num_frames, -1, *strip.shape[1:]), fps)
 
 
 def _bytes_of(path: Path, kind: FileKind, what: str, read: Read) -> bytes:
