@@ -12,13 +12,14 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Literal
 
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.agent import levels, reflection, scoring
 from wm_nodes.judge.agent.judge import ComponentScore, Cost, Judge, JudgeError, MediaItem, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.precheck import precheck
-from wm_nodes.judge.agent.profiles import DENSE_MAX, cited_media, profile_media
+from wm_nodes.judge.agent.profiles import DENSE_MAX, Energy, cited_media, frame_energy, profile_media
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import (
     GATED,
@@ -309,10 +310,15 @@ class _Run:
             raise _Stop(Status.ERROR, f"{stage}: asked for {asked}, the judge answered {got or 'nothing'}")
         return [answered[name] for name in names]
 
+    @cached_property
+    def _energy(self) -> Energy:
+        return frame_energy(self.clip.frames)
+
     def _media_of(self, profile: Profile) -> tuple[MediaItem, ...]:
         if profile not in self._media:
             most = self.agent.judge.capabilities.max_frames
-            media = profile_media(self.clip, self.task, profile, max_frames=min(DENSE_MAX, most))
+            most_dense = min(DENSE_MAX, most)
+            media = profile_media(self.clip, self.task, profile, motion=self._energy, max_frames=most_dense)
             if len(media) > most:
                 raise _Stop(Status.ERROR, f"profile {profile}: {len(media)} images, the judge takes {most} in a call")
             self._media[profile] = media
