@@ -42,7 +42,7 @@ from wm_nodes.judge.decisions import PAPER, accepts, decisions_of, row_names
 from wm_nodes.judge.evidence.head import load_head
 
 RUBRIC = load_rubric()
-QUIET = load_rubric(overrides={"voting": {"audit_share": 0.0}})
+QUIET = load_rubric(overrides={"voting": {"audit_share": 0.0}, "reflection": {"audit_share": 0.0}})
 
 
 def verdict_of(**changed: Any) -> Verdict:
@@ -314,10 +314,11 @@ def test_the_looks_behind_the_published_tables_count_wherever_the_set_is_built(
     rows = [replace(manifest.rows[0], origin=origin, part=BENCHMARK.held_out.part(origin)) for origin in drawn]
     again = replace(manifest, rows=tuple(rows))
     able = EmbeddedJudge(load_head(shipped_head())).capabilities
-    earlier = record_evaluation(tmp_path, again, able, RUBRIC.version, "")
+    published = read_evaluations(tmp_path)[-1].rubric
+    earlier = record_evaluation(tmp_path, again, able, published, "")
     assert len(earlier) == 15 and not (tmp_path / LOG_NAME).exists(), "the shipped judge with its rubric is listed"
     with pytest.raises(ValueError, match=f"already seen by {read_evaluations(tmp_path)[-1].judge}"):
-        record_evaluation(tmp_path, again, replace(able, judge_id="another"), RUBRIC.version, "")
+        record_evaluation(tmp_path, again, replace(able, judge_id="another"), published, "")
     new_rubric = record_evaluation(tmp_path, again, able, "robot-2-x", "other thresholds")
     assert len(new_rubric) == 16 and (tmp_path / LOG_NAME).read_text().count("\n") == 1
     (tmp_path / LOG_NAME).write_text(json.dumps(vars(earlier[0])) + "\n")

@@ -32,7 +32,7 @@ from wm_nodes.judge.dataset.edits.clips import LabelledClip
 from wm_nodes.judge.dataset.edits.generator import STATE_RECIPES, apply_edit
 from wm_nodes.judge.dataset.edits.recipes import apply
 
-RUBRIC = load_rubric(overrides={"voting": {"audit_share": 0.0}})
+RUBRIC = load_rubric(overrides={"voting": {"audit_share": 0.0}, "reflection": {"audit_share": 0.0}})
 PLAN = SearchPlan(generations=4, candidates=4)
 
 

@@ -39,7 +39,7 @@ PACKS = {
 }
 """Ways of judging: the rubric pack of each. neither: no votes and no reflection."""
 AUDITED = {"nothing": (0, 0), "votes": (1, 0), "looks": (0, 1)}
-"""Audit shares of votes and of second looks: of no clip, and of all, which gives the cost and finds per audited clip."""
+"""Audit shares of votes and of second looks: of no clip, or of all, for the cost and finds per audited clip."""
 RATES, SHARES, AUDIT_RATE = (0.05, 0.1, 0.2), (0.0, 0.5, 1.0), 0.1
 MEASURES = ("accuracy", "components", "faults_accepted", "successes_kept", "silent", "calls", "images")
 console = Console()
@@ -86,8 +86,8 @@ async def judge_clips(clips: Sequence[LabelledClip], judge: LabelJudge, rubric: 
 
 
 def measured(clips: Sequence[LabelledClip], found: Sequence[Judged], rubric: Rubric) -> dict[str, float]:
-    """MEASURES of one pass over the clips. accuracy: share of clips that are accepted or refused as their label says; one
-    without a verdict is not. components: balanced accuracy, mean over the components, of the clips where each was read.
+    """MEASURES of one pass over the clips. accuracy: share of clips accepted or refused as labelled; one without
+    a verdict is not. components: balanced accuracy, mean over the components, of the clips where each was read.
     """
     accepted = np.array([one.accepted is True for one in found])
     silent = np.array([one.accepted is None for one in found])
@@ -95,8 +95,9 @@ def measured(clips: Sequence[LabelledClip], found: Sequence[Judged], rubric: Rub
     truths = [clip.truth.rows(rubric) for clip in clips]
     balanced = []
     for name in rubric.component_names:
-        known = [(t[name], one.passed[name]) for t, one in zip(truths, found) if name in one.passed and t[name] is not None]
-        balanced.append(balanced_accuracy([truth for truth, _ in known], [passed for _, passed in known]))
+        read = [(truth[name], one.passed[name]) for truth, one in zip(truths, found) if name in one.passed]
+        known = [(label, passed) for label, passed in read if label is not None]
+        balanced.append(balanced_accuracy([label for label, _ in known], [passed for _, passed in known]))
     return {
         "accuracy": float(((accepted == success) & ~silent).mean()), "components": float(np.nanmean(balanced)),
         "faults_accepted": float(accepted[fault].mean()), "successes_kept": float(accepted[success].mean()),
@@ -173,7 +174,7 @@ def ways_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     first = rows[0]
     title = f"{first['rate']:.0%} of reads err, {_kind(first)}: the agent, and other ways less the agent"
     cells = [
-        (row["way"], *(_cell(name, row["difference"].get(name) or row[name], bool(row["difference"])) for name in MEASURES))
+        (row["way"], *(_cell(name, (row["difference"] or row)[name], bool(row["difference"])) for name in MEASURES))
         for row in rows
     ]
     return make_table(title, ("way", *MEASURES), cells)

@@ -27,7 +27,8 @@ from wm_nodes.judge.agent.verdict import Verdict
 
 VARIANTS = [
     f"robot_{name}" for name in (
-        "all_votes", "no_physics", "no_planning", "no_reflection", "no_votes", "open_gates", "single_read", "soft_gates",
+        "all_votes", "no_physics", "no_planning", "no_reflection", "no_votes", "open_gates", "single_read",
+        "soft_gates",
     )
 ]
 ROBOT = load_rubric()
@@ -39,8 +40,8 @@ UNPAID = {"planning": {"weights": [[0.2, 0.3, 0.5, 0]] * 4}}
 def judged(pack: str, mode: Any = "reward", **table: Any) -> tuple[Verdict, list[Stage]]:
     """The verdict on one clip, and the stages that were asked for."""
     judge, clip = ScriptedJudge(clean_table(ROBOT, **table)), make_clip()
-    agent = RewardAgent(judge, load_rubric(pack, {} if pack == "robot_single_read" else {"voting": {"audit_share": 0}}),
-                        mode=mode)
+    quiet = {"voting": {"audit_share": 0}, "reflection": {"audit_share": 0}}
+    agent = RewardAgent(judge, load_rubric(pack, quiet), mode=mode)
     return asyncio.run(agent.evaluate(clip, make_task(clip))), [request.stage for request in judge.requests]
 
 
