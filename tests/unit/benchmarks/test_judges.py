@@ -17,8 +17,8 @@ from benchmarks.judge.call_counter import CountingJudge
 from benchmarks.judge.cli import add_options
 from benchmarks.judge.efficiency import measure_savings, trials
 from benchmarks.judge.judges import open_judge
-from benchmarks.judge.label_judge import KnownClip, LabelJudge
-from benchmarks.judge.labels import truth_of
+from benchmarks.judge.label_judge import LabelJudge
+from benchmarks.judge.labels import known_labels, truth_of
 from benchmarks.judge.line_file import LineFile
 from benchmarks.judge.metrics import agreement, cost_row, missed_patterns, missed_targets, mistakes, pattern_rows
 from benchmarks.judge.run import JudgeTrial, Outcome, judge_rows
@@ -42,7 +42,7 @@ from wm_nodes.judge.decisions import PAPER, accepts, decisions_of, row_names
 from wm_nodes.judge.evidence.head import load_head
 
 RUBRIC = load_rubric()
-QUIET = load_rubric(overrides={"voting": {"audit_share": 0.0}})
+QUIET = load_rubric(overrides={"voting": {"audit_share": 0.0}, "reflection": {"audit_share": 0.0}})
 
 
 def verdict_of(**changed: Any) -> Verdict:
@@ -64,8 +64,8 @@ def manifest(folder: Path) -> Manifest:
     return load_set(folder)
 
 
-def oracle(manifest: Manifest, error: float = 0.0) -> LabelJudge:
-    return LabelJudge({row.sha256: KnownClip(row.labels, row.edits) for row in manifest.rows}, RUBRIC, error=error)
+def oracle(manifest: Manifest) -> LabelJudge:
+    return LabelJudge({row.sha256: known_labels(row.labels, row.edits) for row in manifest.rows}, RUBRIC)
 
 
 def judged(judge: Any, folder: Path, manifest: Manifest, path: Path, trial: JudgeTrial | None = None) -> list[Any]:
@@ -314,10 +314,11 @@ def test_the_looks_behind_the_published_tables_count_wherever_the_set_is_built(
     rows = [replace(manifest.rows[0], origin=origin, part=BENCHMARK.held_out.part(origin)) for origin in drawn]
     again = replace(manifest, rows=tuple(rows))
     able = EmbeddedJudge(load_head(shipped_head())).capabilities
-    earlier = record_evaluation(tmp_path, again, able, RUBRIC.version, "")
+    published = read_evaluations(tmp_path)[-1].rubric
+    earlier = record_evaluation(tmp_path, again, able, published, "")
     assert len(earlier) == 15 and not (tmp_path / LOG_NAME).exists(), "the shipped judge with its rubric is listed"
     with pytest.raises(ValueError, match=f"already seen by {read_evaluations(tmp_path)[-1].judge}"):
-        record_evaluation(tmp_path, again, replace(able, judge_id="another"), RUBRIC.version, "")
+        record_evaluation(tmp_path, again, replace(able, judge_id="another"), published, "")
     new_rubric = record_evaluation(tmp_path, again, able, "robot-2-x", "other thresholds")
     assert len(new_rubric) == 16 and (tmp_path / LOG_NAME).read_text().count("\n") == 1
     (tmp_path / LOG_NAME).write_text(json.dumps(vars(earlier[0])) + "\n")
@@ -352,7 +353,6 @@ def test_the_command_prints_and_writes_the_table(
         (["table", str(folder), "--judge", "simulator", "--stages", "PC"], "got --judge simulator"),
         (["comparisons", str(folder), "--url", "http://127.0.0.1:1/v1"], "--model NAME"),
         (["table", str(folder), "--folder", str(tmp_path)], "holds no judge.json"),
-        (["table", str(folder), "--judge", "simulator", "--error", "2"], "got 2.0"),
     ):
         assert main(["benchmark", "judge", *wrong]) == 2
         assert "error:" in (shown := capsys.readouterr().err) and complaint in shown

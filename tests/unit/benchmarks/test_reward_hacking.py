@@ -21,7 +21,8 @@ from benchmarks.judge.hacking import (
     plot_curves,
     true_value,
 )
-from benchmarks.judge.label_judge import KnownClip, LabelJudge
+from benchmarks.judge.label_judge import LabelJudge
+from benchmarks.judge.labels import known_labels
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import load_config
 from wm_nodes.judge.agent.rubric import load_rubric
@@ -31,7 +32,7 @@ from wm_nodes.judge.dataset.edits.clips import LabelledClip
 from wm_nodes.judge.dataset.edits.generator import STATE_RECIPES, apply_edit
 from wm_nodes.judge.dataset.edits.recipes import apply
 
-RUBRIC = load_rubric(overrides={"voting": {"audit_share": 0.0}})
+RUBRIC = load_rubric(overrides={"voting": {"audit_share": 0.0}, "reflection": {"audit_share": 0.0}})
 PLAN = SearchPlan(generations=4, candidates=4)
 
 
@@ -42,7 +43,7 @@ def defective(seed: int = 0) -> SearchStart:
 
 def told(reward: Proxy, judge: LabelJudge) -> Proxy:
     async def proxy(clip: LabelledClip, task: TaskSpec) -> float | None:
-        judge.clips[clip.sha256] = KnownClip(clip.labels, clip.edits)
+        judge.clips[clip.sha256] = known_labels(clip.labels, clip.edits)
         return await reward(clip, task)
 
     return proxy

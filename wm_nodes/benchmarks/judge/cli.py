@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks.judge import (
+    erring,
     fault_visibility,
     hacking,
     imagined_vs_real,
@@ -24,7 +25,8 @@ from benchmarks.judge import (
 from benchmarks.judge.compared import PROTOCOLS, ComparedRow, answer_file, compared, comparison_table, num_answers
 from benchmarks.judge.efficiency import ARMS, measure_savings, savings_table, trials
 from benchmarks.judge.judges import NAMES, open_comparison, open_judge
-from benchmarks.judge.label_judge import KnownClip, LabelJudge
+from benchmarks.judge.label_judge import LabelJudge
+from benchmarks.judge.labels import known_labels
 from benchmarks.judge.line_file import LineFile
 from benchmarks.judge.run import JudgeTrial, Outcome, judge_rows
 from benchmarks.judge.search_starts import hacking_starts
@@ -51,6 +53,7 @@ ROUTED = [stage for stage in Stage if stage is not Stage.REFLECT]
 console = Console()
 OTHERS = {
     "imagined-vs-real": (imagined_vs_real, "the judge on imagined clips against what the simulator says"),
+    "erring": (erring, "what planning, gates, votes and reflection gain and cost under a judge that errs"),
     "speed": (speed, "clips that the embedded judge reads per second"),
     "fault-visibility": (fault_visibility, "pixels by which a physical fault differs from its clean recording"),
     "success-clips": (success_clips, "labelled episodes of RoboRewardBench or of a table: MAE, AUROC, accuracy"),
@@ -106,7 +109,6 @@ def _common() -> argparse.ArgumentParser:
     common.add_argument("--api-key-env", default="", help="environment variable that holds their key")
     common.add_argument("--price", nargs=2, type=float, default=[], metavar="USD", help="per million tokens in and out")
     common.add_argument("--max-images", type=int, default=64, help="that it takes in one call")
-    common.add_argument("--error", type=float, default=0.0, help="of the control: share of reads that are wrong")
     return common
 
 
@@ -218,7 +220,7 @@ def _with_labels(reward: hacking.Proxy, judge: Judge) -> hacking.Proxy:
         return reward
 
     async def proxy(clip: LabelledClip, task: TaskSpec) -> float | None:
-        judge.clips[clip.sha256] = KnownClip(clip.labels, clip.edits)
+        judge.clips[clip.sha256] = known_labels(clip.labels, clip.edits)
         return await reward(clip, task)
 
     return proxy

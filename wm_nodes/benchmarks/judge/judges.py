@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.judge.comparisons.chat import ChatComparison
-from benchmarks.judge.label_judge import KnownClip, LabelJudge
+from benchmarks.judge.label_judge import LabelJudge
+from benchmarks.judge.labels import known_labels
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import JudgeConfig, StageJudge
 from wm_nodes.core.device import compute_device
@@ -35,8 +36,7 @@ async def open_judge(
     if arguments.stages and arguments.judge != "embedded":
         raise ValueError(f"--stages gives stages of the embedded judge to --model; got --judge {arguments.judge}")
     if arguments.judge == "simulator":
-        clips = {row.sha256: KnownClip(row.labels, row.edits) for row in manifest.rows}
-        yield LabelJudge(clips, rubric, error=arguments.error, seed=arguments.seed)
+        yield LabelJudge({row.sha256: known_labels(row.labels, row.edits) for row in manifest.rows}, rubric)
         return
     if arguments.judge == "embedded" and not arguments.stages:
         head = load_head(arguments.folder or shipped_head(), compute_device(arguments.device))

@@ -1,89 +1,121 @@
-"""A judge that knows the labels and errs at a known rate: a control of the benchmark, never a reward.
-
-It shows how the agent works with a judge of a given accuracy: the upper bound of Table 2, what early exits cost and
-save, and how far votes correct independent errors.
-"""
+"""A judge that knows the labels of clips and errs at a known rate: a control of the agent, never a reward."""
 
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, Read, ReadRequest, Vote
-from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import NUM_PLAN_LEVELS, PLANNING, Component, Stage
-from wm_nodes.judge.dataset.edits.clips import TC, ClipTruth, Edit
-from wm_nodes.judge.dataset.edits.planning import planning_level
+import numpy as np
 
-SURE = 0.9
-"""Probability that an answer gives to its level; the rest goes to the level beside it."""
-CLEAN, WRONG, UNSAID = 4, 1, 2
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.types import FloatArray
+from wm_nodes.judge.agent.judge import Capabilities, Health, Read, ReadRequest
+from wm_nodes.judge.agent.rubric import Rubric
+from wm_nodes.judge.agent.types import NUM_LEVELS, NUM_PLAN_LEVELS, PLANNING, Stage
+
+CLEAN, WRONG, ABSENT, PRESENT = 4, 1, 4, 0
+"""Levels of a component that passes and of one that fails, of a pattern that is not there and of one that is."""
+SHARED, FIRST_VOTE, SECOND_LOOK, NUM_DRAWS = 0, 1, 8, 9
+"""Draws of a component of a clip: the shared one, those of votes 0 to 6, that of reflection's second look."""
 
 
 @dataclass(frozen=True)
-class KnownClip:
-    labels: ClipTruth
-    edits: tuple[Edit, ...]
+class ClipLabels:
+    """passed: by component; where it is None or missing nobody knows, and the judge sees no fault. planning: level 0 to
+    3. completion: level 0 to 4. patterns: hacking patterns that are there.
+    """
+
+    passed: Mapping[str, bool | None]
+    planning: int
+    completion: int
+    patterns: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Errors:
+    """rate: share of reads that are wrong. shared: correlation of the errors of two reads of one component of one clip;
+    at 1 all votes and second looks repeat one answer. honest: a read is as sure as it is often right; else always sure.
+
+    Raises:
+        ValueError: rate is outside [0, 0.5], or shared outside [0, 1].
+    """
+
+    rate: float = 0.0
+    shared: float = 0.0
+    honest: bool = False
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.rate <= 0.5 and 0 <= self.shared <= 1):
+            raise ValueError(f"rate must lie in [0, 0.5] and shared in [0, 1], got {self}")
 
 
 class LabelJudge:
-    """Answers from the labels of known clips. error: probability that a read says the contrary; drawn by clip,
-    component and vote, so that votes are independent, which those of a real judge are not.
+    """Answers from the labels of clips, by their SHA-256.
+
+    With probability `shared` all reads of a component of a clip use one draw, else each read has its own. A draw is
+    wrong with probability q: the rate, or u^(1 / (2 rate) - 1) / 2 of a uniform u, whose mean is the rate, where
+    honest. A wrong component or pattern says the contrary; a wrong level of planning or task completion is one or two
+    off. The answer has probability 1 - q where honest, what else it could have said has q. Equal seeds draw equally
+    whatever the errors, so that settings are compared in pairs.
 
     Raises:
-        ValueError: error is outside [0, 1]; at a read: a clip it does not know.
+        ValueError: at a read, a clip it does not know.
     """
 
-    def __init__(self, clips: Mapping[str, KnownClip], rubric: Rubric, *, error: float = 0.0, seed: int = 0) -> None:
-        if not 0 <= error <= 1:
-            raise ValueError(f"error must be a share in [0, 1], got {error}")
-        self.clips, self._rubric, self._error, self._seed = dict(clips), rubric, error, seed
+    def __init__(
+        self, clips: Mapping[str, ClipLabels], rubric: Rubric, errors: Errors | None = None, *, seed: int = 0
+    ) -> None:
+        self.clips, self.errors, self._seed = dict(clips), errors or Errors(), seed
+        graded = rubric.stages[Stage.TC].components if Stage.TC in rubric.stages else ()
+        self._graded, self._components = (PLANNING, *graded), (PLANNING, *rubric.component_names)
+        self._patterns = tuple(rubric.hack.patterns)
+        self._drawn: dict[str, FloatArray] = {}
         self._labels = hashlib.sha256(repr(sorted(clips.items())).encode()).hexdigest()[:8]
 
     @property
     def capabilities(self) -> Capabilities:
-        names = frozenset({PLANNING, *self._rubric.component_names, *self._rubric.hack.patterns})
-        model = f"labels {self._labels}, error {self._error:g}, seed {self._seed}"
-        return Capabilities("simulator labels", "none", model, "1", names, reasons=False, deterministic=True)
+        model = f"labels {self._labels}, {self.errors}, seed {self._seed}"
+        names = frozenset({*self._components, *self._patterns})
+        return Capabilities("labels", "none", model, "2", names, reasons=False, deterministic=True)
 
     async def health(self) -> Health:
         return Health(True)
 
     async def read(self, request: ReadRequest) -> list[Read]:
-        known = self.clips.get(request.clip.sha256)
-        if known is None:
+        if request.clip.sha256 not in self.clips:
             raise ValueError(f"clip {request.clip.clip_id} has no labels; this judge knows the clips of its set only")
-        return [self._read(request, known, name, vote) for name in request.components for vote in request.votes]
-
-    def _read(self, request: ReadRequest, known: KnownClip, name: str, vote: Vote) -> Read:
-        rng = numpy_stream(self._seed, f"oracle/{request.clip.sha256}/{request.stage}/{name}/{vote.index}")
-        errs = bool(rng.random() < self._error)
-        if name == PLANNING:
-            level = planning_level(known.labels, known.edits)
-            level = 2 if level is None else level
-            if errs:
-                level += 1 if level + 1 < NUM_PLAN_LEVELS else -1
-            levels = _spread(level, NUM_PLAN_LEVELS)
-        else:
-            levels = _spread(self._level(request.stage, known.labels, name, errs), 5)
-        cost = Cost(calls=1, images=len(request.media))
         cited = (0,) if request.stage is Stage.REFLECT else ()
-        return Read(name, levels, "json" if vote.kind == "json" else "label", vote, frames_cited=cited, cost=cost)
+        return [
+            Read(name, self._levels(request, name, vote.index), "json" if vote.kind == "json" else "label", vote, frames_cited=cited)
+            for name in request.components for vote in request.votes
+        ]
 
-    def _level(self, stage: Stage, labels: ClipTruth, name: Component, errs: bool) -> int:
-        if stage is Stage.HACK:
-            return CLEAN if (labels.pattern != name) != errs else 0
-        if name == TC:
-            return 4 - labels.tc_level if errs else labels.tc_level
-        passed = labels.passed.get(name)
-        if passed is None:
-            return UNSAID
-        return CLEAN if passed != errs else WRONG
+    def _levels(self, request: ReadRequest, name: str, vote: int) -> tuple[float, ...]:
+        is_pattern = request.stage is Stage.HACK
+        row = len(self._components) + self._patterns.index(name) if is_pattern else self._components.index(name)
+        draws = self._draws(request.clip.sha256)[row]
+        own = SECOND_LOOK if request.stage is Stage.REFLECT else FIRST_VOTE + vote
+        sureness, fault, offset = draws[SHARED if draws[SHARED, 3] < self.errors.shared else own, :3]
+        rate, honest = self.errors.rate, self.errors.honest and self.errors.rate > 0
+        q = sureness ** (0.5 / rate - 1) / 2 if honest else rate
+        truth, other = self._answers(self.clips[request.clip.sha256], name, is_pattern, offset)
+        said, unsaid = (other, truth) if fault < q else (truth, other)
+        levels = [0.0] * (NUM_PLAN_LEVELS if name == PLANNING else NUM_LEVELS)
+        levels[said], levels[unsaid] = (1 - q, q) if honest else (1.0, 0.0)
+        return tuple(levels)
 
+    def _answers(self, labels: ClipLabels, name: str, is_pattern: bool, offset: float) -> tuple[int, int]:
+        """The true level and the one that an error says. offset: uniform in [0, 1), which of the levels near it."""
+        if is_pattern:
+            return (PRESENT, ABSENT) if name in labels.patterns else (ABSENT, PRESENT)
+        if name not in self._graded:
+            return (WRONG, CLEAN) if labels.passed.get(name) is False else (CLEAN, WRONG)
+        truth, count = (labels.planning, NUM_PLAN_LEVELS) if name == PLANNING else (labels.completion, NUM_LEVELS)
+        near = [level for level in range(count) if 0 < abs(level - truth) <= 2]
+        return truth, near[int(offset * len(near))]
 
-def _spread(level: int, count: int) -> tuple[float, ...]:
-    """SURE on the level, the rest on its neighbour: below it from the middle on, so that "borderline" fails."""
-    beside = level - 1 if level >= count // 2 else level + 1
-    levels = [0.0] * count
-    levels[level], levels[beside] = SURE, 1 - SURE
-    return tuple(levels)
+    def _draws(self, sha256: str) -> FloatArray:
+        """Uniform in [0, 1), (component, draw, what for)."""
+        if sha256 not in self._drawn:
+            shape = (len(self._components) + len(self._patterns), NUM_DRAWS, 4)
+            self._drawn[sha256] = numpy_stream(self._seed, f"labels/{sha256}").random(shape, np.float32)
+        return self._drawn[sha256]

@@ -5,16 +5,26 @@ the same names: wm_nodes.judge.decisions.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.judge.label_judge import ClipLabels
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING
 from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.dataset.edits.clips import ClipTruth, Edit
 from wm_nodes.judge.dataset.edits.manifest import ManifestRow
 from wm_nodes.judge.dataset.edits.planning import planning_level
-from wm_nodes.judge.decisions import OVERALL, STAGES
+from wm_nodes.judge.decisions import FAIR_LEVEL, OVERALL, STAGES
 
 Known = bool | int | None
+
+
+def known_labels(labels: ClipTruth, edits: Sequence[Edit]) -> ClipLabels:
+    """What the control is told of a clip; a planning level that nobody knows is fair."""
+    level, pattern = planning_level(labels, edits), labels.pattern
+    patterns = frozenset({pattern} if pattern is not None else ())
+    return ClipLabels(dict(labels.passed), FAIR_LEVEL if level is None else level, labels.tc_level, patterns)
 
 
 def truth_of(row: ManifestRow, rubric: Rubric) -> dict[str, Known]:

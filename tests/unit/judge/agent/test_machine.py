@@ -34,9 +34,9 @@ from wm_nodes.judge.agent.types import ClipRef, Profile, Stage, Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.video_rl.group_advantages import trainable
 
-QUIET = {"voting": {"audit_share": 0.0}}
+QUIET = {"voting": {"audit_share": 0.0}, "reflection": {"audit_share": 0.0}}
 RUBRIC = load_rubric(overrides=QUIET)
-PLAIN_OVERRIDES = QUIET | {"reflection": {"enabled": False}, "hack": {"enabled": False}}
+PLAIN_OVERRIDES: dict[str, Any] = QUIET | {"reflection": {"enabled": False}, "hack": {"enabled": False}}
 PLAIN = load_rubric(overrides=PLAIN_OVERRIDES)
 NUM_COMPONENTS, NUM_PATTERNS = 12, 4
 
@@ -151,6 +151,41 @@ def test_the_audit_share_of_clips_is_voted_on_the_same_ones_each_time() -> None:
     judge, clips = ScriptedJudge(clean_table(rubric)), [make_clip(seed) for seed in range(30)]
     first, again = ([judge_clip(judge, rubric, clip=clip).num_reads for clip in clips] for _ in range(2))
     assert first == again and set(first) == {13, 25} and 3 <= first.count(25) <= 16
+
+
+def test_votes_and_second_looks_are_audited_in_shares_of_their_own() -> None:
+    shares = {"voting": {"audit_share": 0.3}, "reflection": {"audit_share": 0.3}, "hack": {"enabled": False}}
+    rubric, clips = load_rubric(overrides=shares), [make_clip(seed) for seed in range(40)]
+    judged = [judge_clip(ScriptedJudge(clean_table(rubric)), rubric, clip=clip) for clip in clips]
+    voted = [len(verdict.stages[0].components[0].votes) == 2 for verdict in judged]
+    looked = [bool(verdict.reflections) for verdict in judged]
+    assert 4 <= sum(voted) <= 20 and 4 <= sum(looked) <= 20 and voted != looked
+    none = load_rubric(overrides=shares | {"reflection": {"audit_share": 0.0}})
+    again = [judge_clip(ScriptedJudge(clean_table(none)), none, clip=clip) for clip in clips]
+    assert [len(verdict.stages[0].components[0].votes) == 2 for verdict in again] == voted
+    assert not any(verdict.reflections for verdict in again)
+
+
+def test_patterns_are_read_behind_a_closed_gate_in_audited_clips_only() -> None:
+    changed: dict[str, Any] = {"robot": UNUSABLE, "occlusion": UNUSABLE, "physics": UNUSABLE}
+    plain = judge_clip(ScriptedJudge(clean_table(RUBRIC, **changed)), RUBRIC)
+    assert plain.stages[1].passed is False and not plain.hack_flags
+    every = load_rubric(overrides={"voting": {"audit_share": 1.0}, "reflection": {"audit_share": 0.0}})
+    audited = judge_clip(ScriptedJudge(clean_table(every, **changed)), every)
+    assert [flag.pattern for flag in audited.hack_flags if flag.confirmed] == ["occlusion", "physics"]
+    assert audited.stages[2].status is audited.stages[3].status is Status.SKIPPED, "a cap reads no stage"
+    assert audited.stages[0].components[0].decided_by == "cap by occlusion" and audited.reward < plain.reward
+
+
+@settings(max_examples=60, deadline=None)
+@given(reads_of(RUBRIC), st.sampled_from(["hard", "soft", "lexicographic", "open"]))
+def test_reading_patterns_behind_a_closed_gate_never_raises_the_reward(table: dict[str, Any], kind: str) -> None:
+    shares = {"voting": {"audit_share": 1.0}, "reflection": {"audit_share": 0.0}, "reward": {"gate": kind}}
+    read, unread = (load_rubric(overrides=shares | {"hack": {"enabled": enabled}}) for enabled in (True, False))
+    watched, other = (judge_clip(ScriptedJudge(table), rubric, max_reads=200) for rubric in (read, unread))
+    assert watched.status is other.status
+    if other.valid:
+        assert len(watched.hack_flags) == NUM_PATTERNS and watched.reward <= other.reward
 
 
 def test_votes_that_the_budget_forbids_are_left_out_and_what_is_left_over_decides() -> None:
@@ -303,7 +338,7 @@ def test_evidence_and_chance_are_reasons_for_a_second_look() -> None:
     )
     verdict = judge_clip(ScriptedJudge(clean_table(rubric)), rubric, evidence={"flicker": 2.0})
     assert verdict.reflections[0].triggers == ("temporal passed against evidence flicker 2",)
-    always = load_rubric(overrides={"hack": {"enabled": False}, "voting": {"audit_share": 1.0}})
+    always = load_rubric(overrides={"hack": {"enabled": False}, "reflection": {"audit_share": 1.0}})
     assert judge_clip(ScriptedJudge(clean_table(always)), always).reflections[0].triggers == ("drawn at random",)
 
 

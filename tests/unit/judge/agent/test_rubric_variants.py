@@ -25,7 +25,12 @@ from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import Stage, Status
 from wm_nodes.judge.agent.verdict import Verdict
 
-VARIANTS = [f"robot_{name}" for name in ("no_physics", "no_planning", "open_gates", "single_read", "soft_gates")]
+VARIANTS = [
+    f"robot_{name}" for name in (
+        "all_votes", "no_physics", "no_planning", "no_reflection", "no_votes", "open_gates", "single_read",
+        "soft_gates",
+    )
+]
 ROBOT = load_rubric()
 DOUBT = (0.0, 0.2, 0.1, 0.0, 0.7)
 UNPAID = {"planning": {"weights": [[0.2, 0.3, 0.5, 0]] * 4}}
@@ -35,8 +40,8 @@ UNPAID = {"planning": {"weights": [[0.2, 0.3, 0.5, 0]] * 4}}
 def judged(pack: str, mode: Any = "reward", **table: Any) -> tuple[Verdict, list[Stage]]:
     """The verdict on one clip, and the stages that were asked for."""
     judge, clip = ScriptedJudge(clean_table(ROBOT, **table)), make_clip()
-    agent = RewardAgent(judge, load_rubric(pack, {} if pack == "robot_single_read" else {"voting": {"audit_share": 0}}),
-                        mode=mode)
+    quiet = {"voting": {"audit_share": 0}, "reflection": {"audit_share": 0}}
+    agent = RewardAgent(judge, load_rubric(pack, quiet), mode=mode)
     return asyncio.run(agent.evaluate(clip, make_task(clip))), [request.stage for request in judge.requests]
 
 
@@ -83,6 +88,17 @@ def test_with_single_reads_the_first_answer_decides() -> None:
     assert single.num_reads == 1 + 12 + 4 < voted.num_reads and not single.reflections
     assert [len(score.votes) for stage in single.stages for score in stage.components] == [1] * 12
     assert single.reward < voted.reward
+
+
+def test_packs_take_away_votes_or_second_looks_alone_or_vote_on_everything() -> None:
+    table = {"clarity": [DOUBT, CLEAN, CLEAN], "interaction": UNUSABLE}
+    found = {name: judged(f"robot_{name}", **table)[0] for name in ("no_votes", "no_reflection", "all_votes")}
+    votes = {
+        name: [len(score.votes) for score in verdict.stages[0].components] for name, verdict in found.items()
+    }
+    assert votes["no_reflection"][0] == 2 and set(votes["all_votes"]) == {2}
+    assert found["no_votes"].stages[1].components[0].decided_by == "first read"
+    assert found["no_votes"].reflections and not found["no_reflection"].reflections
 
 
 @pytest.mark.parametrize("mode", ["reward", "benchmark"])

@@ -64,6 +64,16 @@ def test_a_verdict_comes_out_of_the_log_bit_equal(tmp_path: Path, case: str, mod
     assert verify(tmp_path).problems == []
 
 
+def test_patterns_of_refused_clips_are_in_the_log_and_replayed(tmp_path: Path) -> None:
+    rubric = load_rubric("robot", {"voting": {"audit_share": 0.5}})
+    judge = ScriptedJudge(clean_table(rubric, robot=UNUSABLE, occlusion=UNUSABLE))
+    verdicts = judge_all(tmp_path, judge, clips(8), rubric=rubric)
+    assert 0 < sum(bool(verdict.hack_flags) for verdict in verdicts) < len(verdicts)
+    record = read_record(tmp_path)
+    assert all(asyncio.run(replay_evaluation(record, evaluation)).equal for evaluation in record.judged())
+    assert verify(tmp_path).problems == []
+
+
 def test_writing_down_changes_no_verdict_and_equal_runs_have_equal_hashes(tmp_path: Path) -> None:
     table = clean_table(RUBRIC, **TABLES["votes"])
     bare = [asyncio.run(RewardAgent(ScriptedJudge(table), RUBRIC, seed=1).evaluate(*pair)) for pair in clips(3)]

@@ -98,7 +98,8 @@ def test_a_clip_is_put_where_a_person_learns_most(tmp_path: Path) -> None:
     judges = {clip.clip_id: ScriptedJudge(clean_table(RUBRIC, **table)) for (clip, _), table in zip(jobs, tables)}
     judges["clip4"].second = {"clarity": WRONG}
     evidence = {"clip1": {"surprise": 9.0}}
-    rubric = load_rubric("robot", {"evidence": EVIDENCE, "voting": {"audit_share": 1.0}})
+    always = {"audit_share": 1.0}
+    rubric = load_rubric("robot", {"evidence": EVIDENCE, "voting": always, "reflection": always})
     judge_all(tmp_path, JudgeByClip(judges), jobs, rubric=rubric, evidence=evidence, mode="benchmark")
     strata = {e.clip_id: stratum_of(e, rubric) for e in read_record(tmp_path).judged()}
     assert strata == {

@@ -35,7 +35,7 @@ BANDS = {"still_energy": {"component": "temporal", "low": 1e-3}, "flicker_max": 
 
 def pack(folder: Path, **bands: dict[str, object]) -> Path:
     file = folder / "bands.yaml"
-    quiet = {"voting": {"audit_share": 0.0}}
+    quiet = {"voting": {"audit_share": 0.0}, "reflection": {"audit_share": 0.0}}
     file.write_text(json.dumps({"extends": "robot", "name": "bands", "evidence": bands, **quiet}))
     return file
 

@@ -2,8 +2,8 @@
 
 PRECHECK -> PLAN -> VQ -> IF -> TC -> PC -> REFLECT -> HACK -> AGGREGATE. In reward mode a failed gate ends the reading;
 in benchmark mode every component is read. If reflection opens a closed gate, the stages after it are read, too, once.
-Mode topreward reads one probability instead (topreward.py).
-The result is always a Verdict; its reward is NaN where the judge fails or abstains.
+Mode topreward reads one probability instead (topreward.py). Of audited clips the hacking patterns are read behind a closed gate, too. The result is always a Verdict; its reward is
+NaN where the judge fails or abstains.
 """
 
 import asyncio
@@ -12,13 +12,14 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Literal
 
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.judge.agent import levels, reflection, scoring, topreward
 from wm_nodes.judge.agent.judge import ComponentScore, Cost, Judge, JudgeError, MediaItem, Read, ReadRequest, Vote
 from wm_nodes.judge.agent.precheck import precheck
-from wm_nodes.judge.agent.profiles import DENSE_MAX, cited_media, profile_media
+from wm_nodes.judge.agent.profiles import DENSE_MAX, Energy, cited_media, frame_energy, profile_media
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import (
     GATED,
@@ -138,7 +139,7 @@ class _Run:
         self.flags: list[HackFlag] = []
         self.cost, self.num_reads, self.prompts = Cost(), 0, list[str]()
         self._media: dict[Profile, tuple[MediaItem, ...]] = {}
-        self._audited = self._is_drawn("audit")
+        self._audited = self._is_drawn("audit", self.rubric.voting.audit_share)
 
     async def judge_clip(self) -> tuple[Status, float, str]:
         """Go through every state. Raises _Stop where the judge fails or, in reward mode, cannot say."""
@@ -156,7 +157,8 @@ class _Run:
         if self.rubric.reflection.enabled:
             await self._reflect(plan)
             await self._read_stages(plan)
-        if self.rubric.hack.enabled and all(self.stages[s].status is not Status.SKIPPED for s in self.rubric.gated):
+        all_read = all(self.stages[stage].status is not Status.SKIPPED for stage in self.rubric.gated)
+        if self.rubric.hack.enabled and (all_read or self._audited):
             await self._read_patterns()
             confirmed = [flag.pattern for flag in self.flags if flag.confirmed]
             self.stages = {s.stage: s for s in scoring.apply_caps(self._stages_in_order(), confirmed, self.rubric)}
@@ -238,7 +240,8 @@ class _Run:
 
     async def _reflect(self, plan: PlanResult) -> None:
         stages = self._stages_in_order()
-        reasons = reflection.triggers(plan, stages, self.rubric, self.evidence, drawn=self._is_drawn("reflect"))
+        drawn = self._is_drawn("reflect", self.rubric.reflection.audit_share)
+        reasons = reflection.triggers(plan, stages, self.rubric, self.evidence, drawn=drawn)
         names = reflection.suspects(reasons, stages, self.rubric.reflection.max_changes)
         last_read = [stage.stage for stage in stages if stage.status is not Status.SKIPPED][-1]
         if not reasons or 2 * len(names) > self._spare_reads(last_read) or not names:
@@ -324,10 +327,15 @@ class _Run:
             raise _Stop(Status.ERROR, f"{stage}: asked for {asked}, the judge answered {got or 'nothing'}")
         return [answered[name] for name in names]
 
+    @cached_property
+    def _energy(self) -> Energy:
+        return frame_energy(self.clip.frames)
+
     def _media_of(self, profile: Profile) -> tuple[MediaItem, ...]:
         if profile not in self._media:
             most = self.agent.judge.capabilities.max_frames
-            media = profile_media(self.clip, self.task, profile, max_frames=min(DENSE_MAX, most))
+            most_dense = min(DENSE_MAX, most)
+            media = profile_media(self.clip, self.task, profile, motion=self._energy, max_frames=most_dense)
             if len(media) > most:
                 raise _Stop(Status.ERROR, f"profile {profile}: {len(media)} images, the judge takes {most} in a call")
             self._media[profile] = media
@@ -343,7 +351,6 @@ class _Run:
     def _stages_in_order(self) -> tuple[StageScore, ...]:
         return tuple(self.stages[stage] for stage in GATED)
 
-    def _is_drawn(self, name: str) -> bool:
-        """A seeded draw of the audit share, by clip content."""
-        stream = numpy_stream(self.agent.seed, f"{name}/{self.clip.sha256}")
-        return bool(stream.random() < self.rubric.voting.audit_share)
+    def _is_drawn(self, name: str, share: float) -> bool:
+        """A seeded draw of a share of the clips, by content."""
+        return bool(numpy_stream(self.agent.seed, f"{name}/{self.clip.sha256}").random() < share)

@@ -74,7 +74,8 @@ class VotingRubric(RubricSection):
     levels: tuple[int, ...]
     """Planning levels at which every component is voted on."""
     audit_share: Share
-    """Share of clips that are voted on and reflected upon at random."""
+    """Share of clips, drawn by content, that are audited: every component is voted on, and hacking patterns are read
+    behind a closed gate, too."""
     min_label_mass: Share
     """A read with less: ABSTAIN."""
     veto: Share
@@ -109,7 +110,7 @@ class PatternRubric(ComponentRubric):
 
 class HackRubric(RubricSection):
     enabled: bool
-    """Read the patterns of clips whose stages were all read: no early exit."""
+    """Read the patterns of clips whose stages were all read: no early exit; and of audited clips."""
     confirm: Share
     """A pattern this probable in two reads is confirmed."""
     patterns: dict[str, PatternRubric]
@@ -137,6 +138,8 @@ class ReflectionRubric(RubricSection):
     level_gap: Annotated[float, Field(gt=0)]
     """Planning level against 3 x mean stage score: a difference of this much is looked at again."""
     max_changes: Annotated[int, Field(ge=1)]
+    audit_share: Share
+    """Share of clips, drawn by content, that are looked at again without another reason."""
     conflicts: tuple[Conflict, ...]
 
 

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Any
 
 from wm_nodes.judge.agent.judge import ComponentScore, Cost
@@ -120,12 +120,16 @@ MEASURED = frozenset({"cost", "started", "ended", "audit_id"})
 
 def content_hash(verdict: Verdict) -> str:
     """SHA-256, hexadecimal, of a verdict as canonical JSON without what is MEASURED; NaN counts as null."""
-    return hashlib.sha256(json.dumps(_plain(asdict(verdict)), sort_keys=True, allow_nan=False).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(_plain(verdict), sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
+    if value is None or isinstance(value, (str, int)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if is_dataclass(value):
+        value = vars(value)
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items() if key not in MEASURED}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
