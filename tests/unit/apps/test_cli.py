@@ -30,8 +30,8 @@ OPTIONS = {
     "--json",
     "judge check": "judge --model --key-env --rubric --limit --reads --set --device --json",
     "judge serve-help": "--memory",
-    "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit --limit-clips "
-    "--seed --reads --json --pictures",
+    "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
+    "--limit-clips --seed --reads --json --pictures",
     "audit": "verify recover sample view agree people replay adopt",
     "build-judge-dataset": "folder --tasks --episodes --edits --stacks --seed --shapes --recipes --development "
     "--diverse --policy-view --stride --device --benchmark --check",

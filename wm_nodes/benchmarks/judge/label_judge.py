@@ -85,7 +85,10 @@ class LabelJudge:
             raise ValueError(f"clip {request.clip.clip_id} has no labels; this judge knows the clips of its set only")
         cited = (0,) if request.stage is Stage.REFLECT else ()
         return [
-            Read(name, self._levels(request, name, vote.index), "json" if vote.kind == "json" else "label", vote, frames_cited=cited)
+            Read(
+                name, self._levels(request, name, vote.index), "json" if vote.kind == "json" else "label", vote,
+                frames_cited=cited,
+            )
             for name in request.components for vote in request.votes
         ]
 

@@ -2,8 +2,8 @@
 
 PRECHECK -> PLAN -> VQ -> IF -> TC -> PC -> REFLECT -> HACK -> AGGREGATE. In reward mode a failed gate ends the reading;
 in benchmark mode every component is read. If reflection opens a closed gate, the stages after it are read, too, once.
-Mode topreward reads one probability instead (topreward.py). Of audited clips the hacking patterns are read behind a closed gate, too. The result is always a Verdict; its reward is
-NaN where the judge fails or abstains.
+Of audited clips the hacking patterns are read behind a closed gate, too. Mode topreward reads one probability instead
+(topreward.py). The result is always a Verdict; its reward is NaN where the judge fails or abstains.
 """
 
 import asyncio
