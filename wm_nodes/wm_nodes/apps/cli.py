@@ -49,6 +49,7 @@ GROUPS = {
         "judge serve-help": "which open model for which memory, and how it is served",
         "judge check": "what a judge is good for, by shipped labelled clips",
         "judge-clips": "judge videos of your own",
+        "judge calibrate": "the embedded judge, on recordings in which nothing is wrong",
         "judge hack": "whether a judge can be hacked on clips of your own",
         "audit": "verify, label, replay and compare the judge's logs",
         "build-judge-dataset": "clips with known labels, from the simulator",

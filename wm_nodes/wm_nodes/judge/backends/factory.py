@@ -16,10 +16,12 @@ from wm_nodes.judge.agent.types import Stage
 from wm_nodes.judge.backends.cache import VerdictCache
 from wm_nodes.judge.backends.calls import OWN_FIELDS, ChatOptions, Exchange
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit_reason
+from wm_nodes.judge.backends.one_class import OneClassJudge
 from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.routed import RoutedJudge
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
 from wm_nodes.judge.evidence.head import load_head
+from wm_nodes.judge.one_class.ranges import has_ranges
 
 AnyJudge = TypeVar("AnyJudge", JudgeConfig, OtherJudge, StageJudge)
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -81,7 +83,7 @@ def _check_one(settings: JudgeConfig) -> None:
                 f"judge.folder {settings.folder!r} is no folder; name that of a trained judge (make one with "
                 "wm train-judge), or leave it empty for the shipped one"
             )
-        if settings.conformal:
+        if settings.conformal and not has_ranges(_folder(settings)):
             load_head(_folder(settings)).conformal(settings.conformal)
         return
     if not settings.endpoints or not settings.model:
@@ -125,13 +127,18 @@ def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
     settings = for_clips(settings, shape)
     others: list[OtherJudge] = [*settings.routes, *settings.fallbacks]
     for judge in (settings, *(_single_judge(settings, other) for other in others)):
-        if judge.kind != "embedded" or not (reason := unfit_reason(load_head(_folder(judge)), shape)):
+        if judge.kind != "embedded" or not (reason := _unfit_reason(_folder(judge), shape)):
             continue
         raise ValueError(
             f"the embedded judge {_folder(judge)} cannot judge clips of {shape[0]} frames, {shape[1]} x {shape[2]} "
             f"px: {reason}. Name a server (judge.kind openai, judge.endpoints, judge.model), or in judge.folder a "
             "judge that was trained on such clips (wm train-judge)"
         )
+
+
+def _unfit_reason(folder: Path, shape: tuple[int, ...]) -> str:
+    """Why the embedded judge of a folder cannot judge clips of this shape, or ""."""
+    return OneClassJudge(folder).unfit_reason(shape) if has_ranges(folder) else unfit_reason(load_head(folder), shape)
 
 
 def judge_name(settings: JudgeConfig) -> str:
@@ -177,6 +184,8 @@ def _open(
     settings: JudgeConfig, rubric: Rubric, reads: Path | None, on_exchange: Callable[[Exchange], None], device: str
 ) -> OpenedJudge:
     """The judge itself, whatever its routes."""
+    if settings.kind == "embedded" and has_ranges(_folder(settings)):
+        return OpenedJudge(OneClassJudge(_folder(settings), settings.conformal, device), _close_nothing)
     if settings.kind == "embedded":
         head = load_head(_folder(settings), compute_device(device))
         return OpenedJudge(EmbeddedJudge(head, settings.conformal), _close_nothing)

@@ -1,0 +1,263 @@
+"""A judge in this process that no fault was ever shown: a clip is refused for what is strange in it (RA-17 to RA-20).
+
+It needs a world model of the clip's scene and normal ranges in its folder (wm judge calibrate). It is deterministic:
+all votes of a component and the second read of a reflection get the same answer.
+"""
+
+import asyncio
+import math
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from wm_nodes.core.device import CPU, compute_device
+from wm_nodes.core.model_folder import ModelFolderError
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest
+from wm_nodes.judge.agent.levels import first_vote
+from wm_nodes.judge.agent.types import NUM_LEVELS, PLANNING, ClipRef, Component, Stage, Status, TaskSpec
+from wm_nodes.judge.one_class.calibration import word_pairs
+from wm_nodes.judge.one_class.imagination import model_numbers
+from wm_nodes.judge.one_class.pictures import HUES, picture_numbers, things_in
+from wm_nodes.judge.one_class.ranges import COMPONENTS, KEPT, NormalRanges, file_of, load_ranges
+from wm_nodes.world_model import WorldModels, load_model_folder
+
+REVISION = "1"
+"""Raised whenever the same ranges give other answers, so that two versions have two identities."""
+CACHED_CLIPS = 64
+"""Clips whose numbers are kept, for the stages of one verdict."""
+STEEPNESS = 40.0
+"""Of the failure probability around the limit: 0.5 there, 0.98 a tenth above it."""
+FAIL_LEVEL, PASS_LEVEL = 1, 4
+"""A component that fails is "clearly wrong", one that passes "clean"."""
+TASK_COMPLETION = "task_completion"
+PATTERNS: Mapping[str, tuple[Component, ...]] = {
+    "occlusion": ("clarity",), "motion": ("temporal",), "background": ("background",),
+    "physics": ("interaction", "deformation", "geometry"),
+}
+"""Components whose failure is each hacking pattern's."""
+WHOLE_PICTURE = ("clarity", "brightness", "color", "temporal")
+"""Components whose failure makes a clip poor; that of another one, fair."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was measured of one clip."""
+
+    unfit: str
+    """Why it cannot be judged, or ""."""
+    worst: Mapping[Component, tuple[float, str]]
+    """By component its strangest number in spreads, and which that is."""
+    done: Mapping[str, float]
+    """Done signal at the end, by task."""
+    naming: tuple[Status, str]
+    """Whether what the instruction names is seen: OK, ERROR for no, ABSTAIN for unknown; and why."""
+
+
+class OneClassJudge:
+    """A Judge over a world model and its normal ranges.
+
+    Answers ABSTAIN, with a reason, for clips of another size or length, for instructions in words that the recordings
+    have not, and for the completion of tasks that the world model does not know.
+
+    Args:
+        folder: of the world model, with normal ranges in it. conformal: a share, e.g. 0.9, below 0.97: it abstains, too,
+            on what is stranger than this share of the recordings and not beyond the limit. 0: it always decides.
+
+    Raises:
+        ModelFolderError: the folder holds no world model, or no ranges of this model.
+    """
+
+    def __init__(self, folder: Path, conformal: float = 0.0, device: str = CPU) -> None:
+        self._folder = folder
+        self._models: WorldModels = load_model_folder(folder, compute_device(device))
+        self._ranges = {stride: load_ranges(folder, stride) for stride in (1, 2, 3, 4) if file_of(folder, stride).is_file()}
+        if not self._ranges:
+            load_ranges(folder, 1)  # says how to make them
+        for ranges in self._ranges.values():
+            if ranges.world_model != self._models.sha256:
+                raise ModelFolderError(
+                    f"{file_of(folder, ranges.stride)} was made for another world model; make it anew: "
+                    f"wm judge calibrate {folder} BAG --stride {ranges.stride}"
+                )
+        self._conformal = conformal
+        self._sure = {stride: ranges.limit(conformal) if conformal else math.inf for stride, ranges in self._ranges.items()}
+        self._cache: OrderedDict[str, tuple[NormalRanges, Finding]] = OrderedDict()
+        self._lock = threading.Lock()
+        self._num_reads = self._num_abstained = 0
+
+    @property
+    def capabilities(self) -> Capabilities:
+        known = {*COMPONENTS.values(), *PATTERNS, PLANNING, TASK_COMPLETION}
+        return Capabilities(
+            self.name, "embedded", f"one-class {self.sha256[:12]}", REVISION, frozenset(known), deterministic=True,
+            card=self.card,
+        )
+
+    @property
+    def sha256(self) -> str:
+        """Of the ranges, which name the world model."""
+        return min(self._ranges.items())[1].sha256
+
+    @property
+    def name(self) -> str:
+        return f"embedded:{self.sha256[:12]}" + (f"@{self._conformal:g}" if self._conformal else "")
+
+    @property
+    def card(self) -> str:
+        """What it was calibrated on."""
+        lines = [f"one-class judge {self.sha256[:12]} of {self._folder.name}"]
+        for stride, ranges in self._ranges.items():
+            lines.append(
+                f"every {stride}. step: {ranges.story.get('recordings')} recordings; limit {ranges.limit():.2f} spreads "
+                f"at {KEPT:.0%}; {ranges.lengths[0]} to {ranges.lengths[1]} frames; tasks {', '.join(ranges.done)}"
+            )
+        return "\n".join(lines)
+
+    async def read(self, request: ReadRequest) -> list[Read]:
+        """Answer every component once per vote. Raises JudgeError: an unmeasurable clip, or an unknown component."""
+        if unknown := set(request.components) - (self.capabilities.components or frozenset()):
+            raise JudgeError(f"the embedded judge does not read {', '.join(sorted(unknown))}")
+        started = time.monotonic()
+        try:
+            ranges, finding = await asyncio.to_thread(self._find, request.clip, request.task)
+        except ValueError as error:
+            raise JudgeError(f"no numbers: {error}") from error
+        cost = Cost(calls=1, images=len(request.media), wall_s=time.monotonic() - started)
+        reads: list[Read] = []
+        for name in request.components:
+            for vote in request.votes:
+                answer = self._answer(name, request.stage is Stage.HACK, request.task, ranges, finding)
+                reads.append(replace(answer, vote=vote, cost=cost if not reads else Cost()))
+        self._num_reads += len(reads)
+        self._num_abstained += sum(read.status is Status.ABSTAIN for read in reads)
+        return reads
+
+    async def health(self) -> Health:
+        """Always available; details count the reads and the abstentions."""
+        return Health(True, "", {"reads": float(self._num_reads), "abstained": float(self._num_abstained)})
+
+    def _find(self, clip: ClipRef, task: TaskSpec) -> tuple[NormalRanges, Finding]:
+        key = f"{clip.sha256} {task.instruction} {task.task_id} {hash(task.reference_frame.tobytes())}"
+        with self._lock:
+            if key not in self._cache:
+                self._cache[key] = self._measure(clip, task)
+                while len(self._cache) > CACHED_CLIPS:
+                    self._cache.popitem(last=False)
+            return self._cache[key]
+
+    def _measure(self, clip: ClipRef, task: TaskSpec) -> tuple[NormalRanges, Finding]:
+        ranges = self.ranges_for(clip.fps)
+        if reason := self.unfit_reason(clip.frames.shape, clip.fps):
+            return ranges, Finding(reason, {}, {}, (Status.OK, ""))
+        side, origin = self._models.simulation.image_size, np.asarray(ranges.origin, np.float32)
+        numbers = picture_numbers(clip.frames, task.reference_frame, side, ranges.still)
+        drawn, done = model_numbers(self._models, clip.frames, task.reference_frame, ranges.stride, origin)
+        strange = ranges.strangeness(numbers | drawn)
+        worst: dict[Component, tuple[float, str]] = {}
+        for name, component in COMPONENTS.items():
+            worst[component] = max(worst.get(component, (-math.inf, "")), (strange[name], name))
+        return ranges, Finding("", worst, done, self._naming(task, ranges))
+
+    def ranges_for(self, fps: float) -> NormalRanges:
+        """The ranges of clips with so many frames per second; the nearest where there are none."""
+        stride = self._models.simulation.control_hz / fps
+        return self._ranges[min(self._ranges, key=lambda known: abs(math.log(known / stride)))]
+
+    def unfit_reason(self, shape: tuple[int, ...], fps: float | None = None) -> str:
+        """Why no clip of this shape (frames, height, width, 3) can be judged, or "". fps: None: of the first ranges."""
+        ranges = self.ranges_for(fps or self._models.simulation.control_hz / min(self._ranges))
+        height, width = self._models.tokenizer.height, self._models.tokenizer.width
+        if tuple(shape[1:3]) != (height, width):
+            return f"{shape[1]} x {shape[2]} px, judged are {height} x {width} px"
+        if not ranges.lengths[0] <= shape[0] <= ranges.lengths[1]:
+            return f"{shape[0]} frames, judged are {ranges.lengths[0]} to {ranges.lengths[1]}"
+        return ""
+
+    def _naming(self, task: TaskSpec, ranges: NormalRanges) -> tuple[Status, str]:
+        """Whether every coloured thing that the instruction names is in the reference frame."""
+        heard = dict[str, set[str]]()
+        for pair in ranges.words:
+            first, second = pair.split()
+            if first in HUES:
+                heard.setdefault(second, set()).add(first)
+        side = self._models.simulation.image_size
+        views = [task.reference_frame[:, i * side : (i + 1) * side] for i, stays in enumerate(ranges.still) if stays]
+        seen = {colour for view in views for colour in things_in(view)}
+        known = {word for pair in ranges.words for word in pair.split()}
+        for pair in word_pairs(task.instruction):
+            colour, noun = pair.split()
+            if colour not in HUES:
+                continue
+            if colour not in seen:
+                return Status.ERROR, f"the {colour} {noun} is not in the first frame; there are {', '.join(sorted(seen))}"
+            if len(heard.get(noun, ())) == 1 and colour not in heard[noun]:
+                return Status.ERROR, f"the {noun} here is {min(heard[noun])}, not {colour}"
+        strange = [word for pair in word_pairs(task.instruction) for word in pair.split() if word not in known | set(HUES)]
+        if strange:
+            return Status.ABSTAIN, f"the recordings' instructions do not have {', '.join(dict.fromkeys(strange))}"
+        return Status.OK, ""
+
+    def _answer(self, name: Component, hack: bool, task: TaskSpec, ranges: NormalRanges, finding: Finding) -> Read:
+        vote = first_vote(0)
+        if finding.unfit:
+            return Read(name, (), "embedded", vote, status=Status.ABSTAIN, reason=finding.unfit)
+        if hack:
+            score, number = max(finding.worst[component] for component in PATTERNS[name])
+            return Read(name, _two_levels(self._p_fail(score, ranges)), "embedded", vote, evidence_text=_text(score, number, ranges))
+        if name == PLANNING:
+            return self._planning(ranges, finding)
+        if name == TASK_COMPLETION:
+            return self._completion(task, ranges, finding)
+        score, number = finding.worst[name]
+        text, status = _text(score, number, ranges), Status.OK
+        if name == "objective":
+            status, reason = finding.naming
+            if status is Status.ERROR:
+                return Read(name, _two_levels(1.0), "embedded", vote, evidence_text=reason)
+            if status is Status.ABSTAIN:
+                return Read(name, (), "embedded", vote, status=status, reason=reason)
+        if self._sure[ranges.stride] < score <= ranges.limit():
+            reason = f"{text}: stranger than {self._conformal:.0%} of the recordings, and not beyond the limit"
+            return Read(name, (), "embedded", vote, status=Status.ABSTAIN, reason=reason)
+        return Read(name, _two_levels(self._p_fail(score, ranges)), "embedded", vote, evidence_text=text)
+
+    def _planning(self, ranges: NormalRanges, finding: Finding) -> Read:
+        p_fail = {name: self._p_fail(score, ranges) for name, (score, _) in finding.worst.items()}
+        if finding.naming[0] is Status.ERROR:
+            p_fail["objective"] = 1.0
+        poor, some = max(p_fail[name] for name in WHOLE_PICTURE), max(p_fail.values())
+        focus = tuple(sorted((name for name in p_fail if p_fail[name] >= 0.5), key=lambda name: -p_fail[name]))
+        return Read(PLANNING, (0.0, poor, some - poor, 1 - some), "embedded", first_vote(0), focus=focus)
+
+    def _completion(self, task: TaskSpec, ranges: NormalRanges, finding: Finding) -> Read:
+        vote, name = first_vote(0), TASK_COMPLETION
+        if task.task_id not in ranges.done:
+            reason = f"not calibrated on task {task.task_id!r}, only on {', '.join(ranges.done)}"
+            return Read(name, (), "embedded", vote, status=Status.ABSTAIN, reason=reason)
+        threshold, signal = ranges.done[task.task_id], finding.done[task.task_id]
+        q = 1 / (1 + math.exp(_log_odds(threshold) - _log_odds(signal)))
+        text = f"done signal {signal:.3f}, done from {threshold:.3f}"
+        return Read(name, _two_levels(1 - q), "embedded", vote, evidence_text=text)
+
+    def _p_fail(self, score: float, ranges: NormalRanges) -> float:
+        return 1 / (1 + math.exp(min(50.0, STEEPNESS * (1 - score / ranges.limit()))))
+
+
+def _two_levels(p_fail: float) -> tuple[float, ...]:
+    levels = [0.0] * NUM_LEVELS
+    levels[FAIL_LEVEL], levels[PASS_LEVEL] = p_fail, 1 - p_fail
+    return tuple(levels)
+
+
+def _log_odds(p: float) -> float:
+    p = min(max(p, 1e-6), 1 - 1e-6)
+    return math.log(p / (1 - p))
+
+
+def _text(score: float, number: str, ranges: NormalRanges) -> str:
+    return f"{number} {score:.2f} spreads above its median, normal to {ranges.limit():.2f}"

@@ -1,0 +1,167 @@
+"""Measure normal ranges on recordings in which nothing is wrong: as they are, decoded, imagined, harmlessly changed."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from wm_nodes.config.tasks import get_task, part_of, parts_of, success, task_names
+from wm_nodes.core.progress import tqdm
+from wm_nodes.core.seeding import numpy_stream
+from wm_nodes.core.types import Episode, FloatArray, UInt8Array
+from wm_nodes.judge.one_class import imagination, pictures
+from wm_nodes.judge.one_class.ranges import NormalRanges, done_threshold, fit
+from wm_nodes.world_model import WorldModels
+from wm_nodes.world_model.validation.open_loop import imagine
+
+SHORTEST = 4
+"""Frames of a clip that ends with its success, at least."""
+MOVES = 3.0
+"""A view whose outermost pixels change by more grey levels on average has a camera that moves."""
+RIM_PX = 3
+
+
+@dataclass
+class _Rows:
+    """Measured clips."""
+
+    numbers: list[dict[str, float]] = field(default_factory=list)
+    """Of each clip."""
+    recording: list[int] = field(default_factory=list)
+    """The recording that it is a form of."""
+    ends: dict[str, list[tuple[float, bool]]] = field(default_factory=dict)
+    """By task the done signal at a clip's end, and whether the task is done there."""
+
+
+def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, seed: int) -> NormalRanges:
+    """Measure the normal ranges of a world model's clips.
+
+    Args:
+        episodes: recorded ones in the model's cameras, done and undone, of the tasks that shall be judged.
+        stride: steps between two frames of a clip.
+
+    Raises:
+        ValueError: too few recordings, pictures of another size than the model's, or as model_numbers.
+    """
+    recorded = [episode for episode in episodes if episode.num_steps >= stride * (SHORTEST - 1)]
+    still = _still_views(models, recorded)
+    origin = _origin(models, recorded)
+    rows, longest, words = _Rows(), 0, set[str]()
+    for index, episode in enumerate(tqdm(recorded, desc="measured", unit="episode")):
+        rng = numpy_stream(seed, f"normal ranges/{index}")
+        words |= set(word_pairs(episode.instruction))
+        steps = _end(episode, stride, rng)
+        longest = max(longest, len(episode.images[: steps + 1 : stride]))
+        for shown in _forms(models, episode, steps, stride, rng):
+            reference = shown[0]
+            seen = pictures.picture_numbers(shown, reference, models.simulation.image_size, still)
+            drawn, signals = imagination.model_numbers(models, shown, reference, stride, origin)
+            rows.numbers.append(seen | drawn)
+            rows.recording.append(index)
+            for task, done in done_at(models.tasks, episode, steps).items():
+                rows.ends.setdefault(task, []).append((signals[task], done))
+    return NormalRanges(
+        world_model=models.sha256, stride=stride, lengths=(SHORTEST - 1, 2 * longest), still=still,
+        origin=(float(origin[0]), float(origin[1]), float(origin[2])), done={
+            task: done_threshold(*zip(*ends)) for task, ends in sorted(rows.ends.items())
+        }, words=tuple(sorted(words)),
+        **fit(rows.numbers, rows.recording, seed),
+        story={"recordings": len(recorded), "clips": len(rows.numbers), "seed": seed},
+    )
+
+
+def word_pairs(instruction: str) -> list[str]:
+    """Neighbouring words, lower case, "the" and "a" left out."""
+    words = [word for word in instruction.lower().replace(",", " ").split() if word not in ("the", "a", "an")]
+    return [f"{first} {second}" for first, second in zip(words, words[1:])]
+
+
+def done_at(tasks: Sequence[str], episode: Episode, step: int) -> dict[str, bool]:
+    """Whether each of the tasks that a recording can show is done at a frame: by its ground truth, or as recorded."""
+    known, own = task_names(), episode.task
+    if own in known and parts_of(own) != (own,):
+        own = part_of(own, episode.seed)
+    done = {
+        task: bool(success(task, episode.ground_truth[step]))
+        for task in tasks if task in known and own in known and get_task(task).scene is get_task(own).scene
+    }
+    return {**done, own: bool(episode.success[step])} if own in tasks else done
+
+
+def _end(episode: Episode, stride: int, rng: np.random.Generator) -> int:
+    """Steps of the clip: half of the successful recordings end with the first success, as episodes do."""
+    steps = len(episode.actions) // stride * stride
+    success = np.flatnonzero(episode.success)
+    if not len(success) or rng.random() < 0.5:
+        return int(steps)
+    return int(min(steps, max(stride * (SHORTEST - 1), -(-success[0] // stride) * stride)))
+
+
+def _forms(
+    models: WorldModels, episode: Episode, steps: int, stride: int, rng: np.random.Generator
+) -> Sequence[UInt8Array]:
+    """The recording as it is, decoded, imagined from its first frame and actions, and harmlessly changed."""
+    frames = episode.images[: steps + 1 : stride]
+    decoded = models.tokenizer.decode(models.tokenizer.encode(frames)).cpu().numpy()
+    decoded[0] = frames[0]
+    told = imagine(
+        models.tokenizer, models.action, frames[:1], episode.actions[None, :steps], episode.states[None, : steps + 1]
+    )
+    imagined = np.concatenate([frames[:1], told.frames[0, stride - 1 :: stride]])
+    return frames, decoded, imagined, harmless(frames, rng)
+
+
+def harmless(frames: UInt8Array, rng: np.random.Generator) -> UInt8Array:
+    """One of eight changes that nobody minds: JPEG, noise, exposure, half a pixel, flicker, softness, one frame too
+    many or too few, a slight cast."""
+    kind = int(rng.integers(8))
+    pixels = frames.astype(np.float32)
+    if kind == 0:
+        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(60, 96))]
+        coded = [cv2.imencode(".jpg", frame, quality)[1] for frame in frames]
+        return np.stack([cv2.imdecode(code, cv2.IMREAD_COLOR) for code in coded]).astype(np.uint8)
+    if kind == 1:
+        pixels = pixels + rng.normal(0, rng.uniform(1, 4), frames.shape)
+    elif kind == 2:
+        pixels = pixels * rng.uniform(0.8, 1.12)
+    elif kind == 3:
+        move = np.array([[1, 0, rng.uniform(-0.5, 0.5)], [0, 1, rng.uniform(-0.5, 0.5)]], np.float32)
+        size = frames.shape[2], frames.shape[1]
+        pixels = np.stack([cv2.warpAffine(f, move, size, borderMode=cv2.BORDER_REPLICATE) for f in pixels])
+    elif kind == 4:
+        pixels = pixels * (1 + rng.uniform(0.01, 0.04) * rng.choice([-1, 1], (len(frames), 1, 1, 1)))
+    elif kind == 5:
+        pixels = np.stack([cv2.GaussianBlur(frame, (0, 0), 0.5) for frame in pixels])
+    elif kind == 6 and len(frames) > SHORTEST:
+        at = int(rng.integers(1, len(frames) - 1))
+        pixels = np.delete(pixels, at, 0) if rng.random() < 0.5 else np.insert(pixels, at, pixels[at], 0)
+    elif kind == 7:
+        pixels = pixels + rng.uniform(-4, 4, 3) * np.linspace(0, 1, len(frames))[:, None, None, None]
+    changed: UInt8Array = np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
+    return changed
+
+
+def _still_views(models: WorldModels, episodes: Sequence[Episode]) -> tuple[bool, ...]:
+    side, width = models.simulation.image_size, models.tokenizer.width
+    changes = np.zeros(width // side)
+    for episode in episodes[:20]:
+        change = np.abs(episode.images[1:].astype(np.int16) - episode.images[0]).mean((0, 3))
+        for view in range(len(changes)):
+            part = change[:, view * side : (view + 1) * side]
+            rim = np.concatenate([part[:, :RIM_PX].ravel(), part[:, -RIM_PX:].ravel(), part[-RIM_PX:].ravel()])
+            changes[view] += float(np.median(rim)) / min(20, len(episodes))
+    return tuple(bool(change < MOVES) for change in changes)
+
+
+def _origin(models: WorldModels, episodes: Sequence[Episode]) -> FloatArray:
+    """Median of the recorded states less the probe's tool positions, (3,)."""
+    if models.probe is None:
+        raise ValueError("the embedded judge needs a world model with a position probe; train it anew")
+    parts = [
+        episode.states[:, :3] - models.probe.read(episode.images)[:, imagination.PLACES["tool"]]
+        for episode in episodes[:50]
+    ]
+    if not parts:
+        raise ValueError("the bags hold no episode that is long enough; name more bags")
+    return np.asarray(np.median(np.concatenate(parts), 0), np.float32)

@@ -1,0 +1,147 @@
+"""What the numbers of a clip are where nothing is wrong, and the limit that follows (RA-18 to RA-20).
+
+Half of the recordings says where each number lies and how far it goes; the other half, how far the strangest number of
+a recording goes, which gives the limit. No fault is ever shown. Shapes: N clips, F numbers.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wm_nodes.core.files import write_atomic
+from wm_nodes.core.model_folder import ModelFolderError, read_json
+from wm_nodes.judge.one_class import imagination, pictures
+
+FORMAT = "normal-ranges-1"
+COMPONENTS = {**pictures.COMPONENTS, **imagination.COMPONENTS}
+NAMES = tuple(sorted(COMPONENTS))
+KEPT = 0.97
+"""Share of the recordings, in every form, whose strangest number stays within the limit."""
+LEAST = 100
+"""Recordings that are needed."""
+LEAST_SPREAD = {"_m": 0.01, "_px": 1.0, "": 0.05}
+"""A number's spread is at least this, by the end of its name: m, px, and shares or grey levels."""
+PIXELS = {
+    "thing_moves_alone", "thing_jump", "thing_far_of_robot", "robot_jump", "thing_twice", "robot_apart", "stranger",
+    "shifted",
+}
+"""Numbers in px."""
+
+
+@dataclass(frozen=True)
+class NormalRanges:
+    """The ranges of one world model's clips at one number of steps between two frames."""
+
+    world_model: str
+    """SHA-256 of the world model."""
+    stride: int
+    """Steps between two frames."""
+    lengths: tuple[int, int]
+    """Fewest and most frames of a clip that is judged."""
+    still: tuple[bool, ...]
+    """Whether the camera of each view stands still."""
+    origin: tuple[float, float, float]
+    """What the position probe's tool lacks to be the model's state, m."""
+    middle: Mapping[str, float]
+    """Median of each number."""
+    spread: Mapping[str, float]
+    """How far each number goes above its median."""
+    scores: tuple[float, ...]
+    """Of each recording of the other half, the strangest number of its strangest form, in spreads, sorted."""
+    done: Mapping[str, float]
+    """By task, the done signal from which it counts as done."""
+    words: tuple[str, ...]
+    """Pairs of neighbouring words of the recordings' instructions, with a space between."""
+    story: Mapping[str, Any] = field(default_factory=dict)
+    """How it was made."""
+
+    def limit(self, kept: float = KEPT) -> float:
+        """The score that a share `kept` of new recordings like these stays within (RA-20)."""
+        place = min(len(self.scores), math.ceil(kept * (len(self.scores) + 1)))
+        return self.scores[place - 1]
+
+    def strangeness(self, numbers: Mapping[str, float]) -> dict[str, float]:
+        """Each number in spreads above its median."""
+        return {name: (numbers[name] - self.middle[name]) / self.spread[name] for name in NAMES}
+
+    @property
+    def sha256(self) -> str:
+        """Of everything that decides an answer."""
+        return hashlib.sha256(json.dumps(asdict(self) | {"story": {}}, sort_keys=True).encode()).hexdigest()
+
+
+def file_of(folder: Path, stride: int) -> Path:
+    """Where the ranges of a world model's folder are."""
+    return folder / f"normal_ranges_{stride}.json"
+
+
+def has_ranges(folder: Path) -> bool:
+    """Whether a world model's folder is a judge."""
+    return any(folder.glob("normal_ranges_*.json"))
+
+
+def save_ranges(folder: Path, ranges: NormalRanges) -> Path:
+    """Write the ranges into the world model's folder."""
+    path = file_of(folder, ranges.stride)
+    write_atomic(path, (json.dumps({"format": FORMAT, **asdict(ranges)}, indent=1) + "\n").encode())
+    return path
+
+
+def load_ranges(folder: Path, stride: int) -> NormalRanges:
+    """Load the ranges of a world model's folder.
+
+    Raises:
+        ModelFolderError: there are none for this stride, or they are damaged or of another version; names the remedy.
+    """
+    path, remedy = file_of(folder, stride), f"make it: wm judge calibrate {folder} BAG --stride {stride}"
+    content = read_json(path, remedy)
+    try:
+        if content.pop("format") != FORMAT or set(content["middle"]) != set(NAMES):
+            raise ValueError("it is of another version")
+        pairs = {name: tuple(content[name]) for name in ("lengths", "still", "origin", "scores", "words")}
+        return NormalRanges(**{**content, **pairs})
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFolderError(f"{path} cannot be used: {error}; {remedy}") from None
+
+
+def fit(rows: Sequence[Mapping[str, float]], recordings: Sequence[int], seed: int) -> dict[str, Any]:
+    """Return middle, spread and scores of NormalRanges.
+
+    Args:
+        rows: the numbers of each clip. recordings: of each row, the recording that it is a form of.
+
+    Raises:
+        ValueError: fewer than LEAST recordings.
+    """
+    known, values = np.unique(recordings), np.array([[row[name] for name in NAMES] for row in rows])
+    if len(known) < LEAST:
+        raise ValueError(f"normal ranges need at least {LEAST} recordings, got {len(known)}; name more bags")
+    order = np.random.default_rng(seed).permutation(known)
+    first = np.isin(recordings, order[: len(order) // 2])
+    middle = np.median(values[first], axis=0)
+    least = np.array([LEAST_SPREAD["_px" if n in PIXELS else "_m" if n.endswith("_m") else ""] for n in NAMES])
+    spread = np.maximum(values[first].max(0) - middle, least)
+    strangest = ((values - middle) / spread).max(1)
+    others = order[len(order) // 2 :]
+    scores = sorted(float(strangest[np.asarray(recordings) == recording].max()) for recording in others)
+    return {
+        "middle": dict(zip(NAMES, middle.tolist())), "spread": dict(zip(NAMES, spread.tolist())),
+        "scores": tuple(scores),
+    }
+
+
+def done_threshold(signals: Sequence[float], done: Sequence[bool]) -> float:
+    """The signal that separates done from undone recordings with the least mean of both errors; 0.5 without either."""
+    signal, is_done = np.asarray(signals), np.asarray(done)
+    if is_done.all() or not is_done.any():
+        return 0.5
+    edges = np.unique(np.clip(signal, 1e-3, 1 - 1e-3))
+    wrong = [(signal[is_done] <= edge).mean() + (signal[~is_done] > edge).mean() for edge in edges]
+    best = np.flatnonzero(np.isclose(wrong, min(wrong)))
+    return float(np.sqrt(edges[best[0]] * edges[min(best[-1] + 1, len(edges) - 1)]))
