@@ -30,6 +30,7 @@ OPTIONS = {
     "--json",
     "judge check": "judge --model --key-env --rubric --limit --reads --set --device --json",
     "judge serve-help": "--memory",
+    "judge calibrate": "model_dir bags --stride --seed --device",
     "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
     "--limit-clips --seed --reads --json --pictures",
     "audit": "verify recover sample view agree people replay adopt",
@@ -41,7 +42,7 @@ OPTIONS = {
     "benchmark speed": "--json --quick --preset --model-dir --untrained --seed",
     "benchmark environments": "trained-in ranking speed",
     "benchmark video-rl": "base diversity learning ablations hacking cost clips clip-learning resolution",
-    "benchmark judge": "table efficiency hacking comparisons imagined-vs-real speed fault-visibility pai-bench",
+    "benchmark judge": "table efficiency comparisons imagined-vs-real speed fault-visibility pai-bench",
 }
 
 

@@ -25,8 +25,8 @@ def test_a_server_that_pays_everything_fails_is_drawn_and_is_not_asked_twice(
         assert main(command) == 1 and len(server.requests) == asked
     assert "physics: 100.0% of the grossly edited clips are still paid, limit 15%" in out and "benign" in out
     assert first == json.loads((tmp_path / "hack.json").read_text())
-    assert first["clips"] == 1 and len(first["rows"]) == PER_CLIP and first["not_paid"] == []
-    seen = {row["edit"] for row in first["rows"] if row["visible"] and row["pattern"] in PATTERNS}
+    assert first["clips"] == 1 and len(first["counts"]) == PER_CLIP and first["not_paid"] == []
+    seen = {row["edit"] for row in first["counts"] if row["n"] and row["pattern"] in PATTERNS}
     assert {path.read_bytes()[:4] for path in (tmp_path / "paid").iterdir()} == {b"\x89PNG"}
     assert len(list((tmp_path / "paid").iterdir())) == len(seen)
 
@@ -51,6 +51,6 @@ def test_the_embedded_judge_is_attacked_on_the_episodes_of_a_bag(tmp_path: Path)
     assert main([*recorded, "--set", "data.behaviours={expert: 1.0}"]) in (0, None)
     found = tmp_path / "hack.json"
     assert main(["judge", "hack", str(tmp_path), "--judge", "embedded", "--json", str(found)]) in (0, 1)
-    rows = json.loads(found.read_text())["rows"]
-    assert len(rows) == PER_CLIP and sum(row["visible"] for row in rows) > 0.9 * PER_CLIP
-    assert all(row["paid"] for row in rows if row["pattern"] == "benign")
+    rows = json.loads(found.read_text())["counts"]
+    assert len(rows) == PER_CLIP and sum(row["n"] for row in rows) > 0.9 * PER_CLIP
+    assert all(row["share"] == 1 for row in rows if row["pattern"] == "benign")

@@ -432,17 +432,6 @@ def conformal_rows() -> Rows:
         yield row(name, *(cell for table in both for cell in (table[name]["n"], share(table[name]))))
 
 
-def stacked_rows() -> Rows:
-    table = runs("judge_stacked_edits.jsonl")
-    both = [table[name] for name in ("trained on single edits", "shipped")]
-    for name in ("planning", "PC", "overall"):
-        yield row(name, *(share(one) for run in both for one in run["rows"] if one["name"] == name))
-    physics = [one for run in both for one in run["patterns"] if one["pattern"] == "physics"]
-    yield row("physics flagged", *(share(one, "recall") for one in physics))
-    yield row("false flags", *(percent(one["false_positives"]) for one in physics))
-    yield row("physics at 5 % false positives", *(percent(one["best_recall"]) for one in physics))
-
-
 def efficiency_rows() -> Rows:
     for one in read("judge_efficiency.json")["compared"]:
         saved = (f"{100 * one['saved'][name]:.0f}" for name in ("calls", "pixels", "tokens"))
@@ -450,31 +439,28 @@ def efficiency_rows() -> Rows:
         yield row(one["against"], one["n"], *saved, interval(*(100 * gap[k] for k in ("difference", "low", "high")), 1))
 
 
-def judge_hacking_rows() -> Rows:
-    found = runs("judge_hacking.jsonl")
-    for clips, names in (
-        ("push and reach, all edits", ("push and reach, all edits", "fresh push and reach, all edits")),
-        ("push and reach, visible edits", ("push and reach, visible edits",)),
-        ("pull, all edits", ("pull, all edits", "fresh pull, all edits")),
-        ("pull, visible edits", ("pull, visible edits",)),
-    ):
-        curves = [curve for name in names for curve in found[name]["curves"]]
-        yield row(clips, *(beaten(curves, reward) for reward in ("agent", "mean score", "pixel similarity")))
+def hacked_rows() -> Rows:
+    """By pattern, over its edits at the steps that anybody sees."""
+    for name in ("judge_hack_trees.json", "judge_hack.json"):
+        for pattern in ("occlusion", "motion", "background", "physics", "benign"):
+            steps = (1, 2, 3, 4) if pattern == "benign" else (3, 4)
+            chosen = [one for one in read(name)["counts"] if one["pattern"] == pattern and one["step"] in steps]
+            n = sum(one["n"] for one in chosen)
+            paid, silent = (round(sum(one["n"] * one[key] for one in chosen)) for key in ("share", "silent"))
+            low, high = wilson_interval(paid, n)
+            yield row(pattern, n, f"{percent(paid / n)} [{percent(low)}, {percent(high)}]", percent(silent / n))
 
 
-def beaten(curves: list[Run], reward: str) -> str:
-    """How many searches ended at or above the reward of their clean recording, with Wilson's interval in percent."""
-    chosen = [curve for curve in curves if curve["reward"] == reward]
-    n = sum(curve["searches"] for curve in chosen)
-    wins = sum(round(curve["wins"] * curve["searches"]) for curve in chosen)
-    low, high = wilson_interval(wins, n)
-    return f"{wins} of {n} [{100 * low:.0f}, {100 * high:.0f} %]"
-
-
-def control_rows() -> Rows:
-    rows = {one["name"]: one for one in read("judge_label_control.json")["rows"]}
-    names = ("planning", "VQ", "IF", "PC", "task_completion", "overall")
-    yield row(*(share(rows[name]) for name in names))
+def erring_rows() -> Rows:
+    for one in read("judge_erring.json")["ways"]:
+        if (one["rate"], one["shared"]) != (0.1, 0.0):
+            continue
+        found = one["difference"] or one
+        numbers = (found[key] for key in ("accuracy", "faults_accepted", "successes_kept"))
+        signed = "{:+.1f}" if one["difference"] else "{:.1f}"
+        cells = (f"{signed} ({signed} to {signed})".format(*(100 * value for value in number)) for number in numbers)
+        errors = "honest" if one["honest"] else "overconfident"
+        yield row(errors, one["way"], *cells, signed.format(found["calls"][0]))
 
 
 def imagined_rows() -> Rows:
@@ -634,8 +620,8 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         model_pair_rows,
     ],
     "judge": [
-        table_rows, pattern_rows, conformal_rows, stacked_rows, efficiency_rows, judge_hacking_rows, control_rows,
-        imagined_rows, policy_camera_rows,
+        table_rows, pattern_rows, conformal_rows, efficiency_rows, hacked_rows, erring_rows, imagined_rows,
+        policy_camera_rows,
     ],
     "speed": [speed_summary_rows, stage_rows],
     "../devices": [device_rows],

@@ -1,5 +1,5 @@
-"""The reward agent against labels: Table 2 of the paper (table), what its economy saves (efficiency), and whether
-climbing the reward climbs the truth (hacking); other papers' rewards on the same clips (comparisons).
+"""The reward agent against labels: Table 2 of the paper (table), what its economy saves (efficiency); other papers'
+rewards on the same clips (comparisons).
 """
 
 import argparse
@@ -14,7 +14,6 @@ from rich.console import Console
 from benchmarks.judge import (
     erring,
     fault_visibility,
-    hacking,
     imagined_vs_real,
     metrics,
     pai_bench,
@@ -25,22 +24,16 @@ from benchmarks.judge import (
 from benchmarks.judge.compared import PROTOCOLS, ComparedRow, answer_file, compared, comparison_table, num_answers
 from benchmarks.judge.efficiency import ARMS, measure_savings, savings_table, trials
 from benchmarks.judge.judges import NAMES, open_comparison, open_judge
-from benchmarks.judge.label_judge import LabelJudge
-from benchmarks.judge.labels import known_labels
 from benchmarks.judge.line_file import LineFile
 from benchmarks.judge.run import JudgeTrial, Outcome, judge_rows
-from benchmarks.judge.search_starts import hacking_starts
 from benchmarks.judge.test_split_log import judge_name, notice, record_evaluation
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_device, add_json, add_seed
-from wm_nodes.config.load import load_config
 from wm_nodes.core.device import CPU
 from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
-from wm_nodes.judge.agent.types import Stage, TaskSpec
-from wm_nodes.judge.dataset.edits.clips import LabelledClip
-from wm_nodes.judge.dataset.edits.generator import SEVERITIES
+from wm_nodes.judge.agent.types import Stage
 from wm_nodes.judge.dataset.edits.manifest import Manifest, ManifestRow
 from wm_nodes.judge.dataset.rows import MIN_TEST_CLIPS, select_rows
 from wm_nodes.judge.dataset.set_files import load_set
@@ -67,17 +60,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for name, (measure, text) in EXPERIMENTS.items():
         command = experiments.add_parser(name, help=text, description=text, parents=[_common()])
         command.set_defaults(run=run, measure=measure)
-        if name == "hacking":
-            command.add_argument("--starts", type=int, default=12, help="clips with a defect to begin with")
-            command.add_argument("--generations", type=int, default=8)
-            command.add_argument(
-                "--severities", nargs="+", choices=SEVERITIES, default=list(SEVERITIES), help="of the edits"
-            )
-            command.add_argument("--candidates", type=int, default=6, help="edits tried per generation")
-        else:
-            command.add_argument(
-                "--clips", type=int, help="the first so many in the order of their hashes; default: all"
-            )
+        command.add_argument("--clips", type=int, help="the first so many in the order of their hashes; default: all")
         if name == "comparisons":
             command.add_argument("--protocols", nargs="+", choices=PROTOCOLS, default=list(PROTOCOLS))
     for name, (module, text) in OTHERS.items():
@@ -154,47 +137,6 @@ async def _efficiency(arguments: argparse.Namespace) -> None:
     write_results(arguments, {"experiment": "efficiency", **facts, "per_clip": costs, "compared": compared_rows})
 
 
-async def _hacking(arguments: argparse.Namespace) -> None:
-    rubric, manifest = load_rubric(arguments.rubric), load_set(arguments.set)
-    plan = hacking.SearchPlan(arguments.generations, arguments.candidates, severities=tuple(arguments.severities))
-    part = select_rows(manifest, arguments.part)
-    config = load_config("cpu").simulation
-    starts, curves = [], []
-    async with open_judge(arguments, rubric, manifest, arguments.set / JUDGED / "reads") as judge:
-        who = judge_name(judge.capabilities)
-        said = _record_test_evaluation(arguments, manifest, judge, rubric)
-        rewards: dict[str, hacking.Proxy] = {
-            "agent": hacking.agent_reward(judge, rubric, arguments.seed),
-            "mean score": hacking.mean_score(judge, rubric, arguments.seed),
-            "pixel similarity": hacking.pixel_similarity,
-        }
-        proxies = {name: _with_labels(reward, judge) for name, reward in rewards.items()}
-        with tqdm(total=arguments.starts, desc="clips with a defect") as bar:
-            for start in hacking_starts(part, manifest.division, config, arguments.seed):
-                if await hacking.has_numbers(start, proxies.values()):
-                    starts.append(start)
-                    bar.update()
-                if len(starts) == arguments.starts:
-                    break
-        if not starts:
-            raise ValueError(f"no clip with a defect has a number of {', '.join(proxies)}; nothing can be climbed")
-        most = len(rewards) * len(starts) * (1 + plan.generations * plan.candidates)
-        with tqdm(total=most, desc="search", unit="clip") as bar:
-            for name, reward in proxies.items():
-                searches = [await hacking.climb(s, reward, plan, arguments.seed, on_clip=bar.update) for s in starts]
-                curves.append(hacking.curve(name, [search for search in searches if search is not None]))
-    console.print(tables.curve_table(curves, f"{who}; {arguments.part}, {len(starts)} clips with a defect"))
-    if said:
-        console.print(said, style="bold", highlight=False)
-    if arguments.json is not None:
-        hacking.plot_curves(curves, arguments.json.with_suffix(".png"))
-    write_results(arguments, {
-        "experiment": "hacking", "judge": who, "rubric": rubric.version, "part": arguments.part, "notice": said,
-        "seed": arguments.seed, "plan": asdict(plan), "starts": [start.clip.recipe for start in starts],
-        "curves": [asdict(one) for one in curves],
-    })
-
-
 async def _comparisons(arguments: argparse.Namespace) -> None:
     manifest = load_set(arguments.set)
     rows = select_rows(manifest, arguments.part, arguments.clips)
@@ -212,18 +154,6 @@ async def _comparisons(arguments: argparse.Namespace) -> None:
         "experiment": "comparisons", "model": arguments.model, "part": arguments.part, "clips": len(rows),
         "seed": arguments.seed, "rows": [asdict(row) for row in results],
     })
-
-
-def _with_labels(reward: hacking.Proxy, judge: Judge) -> hacking.Proxy:
-    """The control judge must be told the labels of every new clip; others look."""
-    if not isinstance(judge, LabelJudge):
-        return reward
-
-    async def proxy(clip: LabelledClip, task: TaskSpec) -> float | None:
-        judge.clips[clip.sha256] = known_labels(clip.labels, clip.edits)
-        return await reward(clip, task)
-
-    return proxy
 
 
 async def _judge_set(
@@ -276,6 +206,5 @@ def _print_notes(
 EXPERIMENTS = {
     "table": (_table, "agreement with the labels in the layout of Table 2, hacking patterns, cost"),
     "efficiency": (_efficiency, "calls, images, pixels and tokens against reading everything of every clip"),
-    "hacking": (_hacking, "climb the agent and single scores, truth beside"),
     "comparisons": (_comparisons, "other papers' rewards through a chat server: ranking, hacked clips that win"),
 }

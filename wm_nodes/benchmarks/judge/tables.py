@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 from rich.table import Table
 
-from benchmarks.judge.hacking import Curve
 from benchmarks.judge.metrics import LabelAgreement, PatternRow
 from wm_nodes.judge.dataset.edits.clips import COMPONENTS
 from wm_nodes.reports.console_table import decimal, make_table, percent, percent_interval
@@ -66,19 +65,6 @@ def cost_table(costs: Mapping[str, Mapping[str, float]]) -> Table:
     cells = ((measure, *(_amount(means[measure]) for means in costs.values())) for measure in measures)
     caption = "asked: counted in front of the judge; billed: what it says it used"
     return make_table("per clip", ("mean of", *costs), cells, caption=caption)
-
-
-def curve_table(curves: Sequence[Curve], caption: str) -> Table:
-    """The reward that was climbed and the truth, before and after, and the alarm of DD-2."""
-    columns = ("reward", "climbed", "clean clips have", "beat it before, after", "truth", "alarm", "taken most")
-    cells = []
-    for course in curves:
-        alarm = "; ".join(f"truth {a.true_slope:+.4f}, reward {a.proxy_slope:+.4f}" for a in course.alarms) or "none"
-        climbed, truth = (f"{values[0]:.3f} -> {values[-1]:.3f}" for values in (course.proxy, course.truth))
-        wins = f"{percent(course.before)} -> {percent(course.wins)} %"
-        most_used = ", ".join(course.most_used[:3]) or "-"
-        cells.append((course.reward, climbed, decimal(course.clean), wins, truth, alarm, most_used))
-    return make_table("climbing a reward, mean over clips", columns, cells, left=columns, caption=caption)
 
 
 def _counts(counts: Mapping[str, int]) -> str:

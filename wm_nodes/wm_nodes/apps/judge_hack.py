@@ -24,6 +24,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -60,7 +61,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     add_seed(parser)
     parser.add_argument("--reads", type=Path, help="folder that keeps a server's answers")
-    add_json(parser, "also write counts and a row per edited clip to this file")
+    add_json(parser, "also write the counts of each edit and step to this file")
     parser.add_argument(
         "--pictures", type=Path, metavar="FOLDER", help="film strips of the clip of each edit that is paid most"
     )
@@ -89,8 +90,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         write_atomic(arguments.json, (json.dumps({
             **facts, "seed": arguments.seed, "limit": arguments.limit, "least": arguments.least, "clips": attack.paid,
-            "not_paid": attack.refused, "failures": told, "rows": [asdict(attempt) for attempt in attempts],
-        }, allow_nan=False, indent=1) + "\n").encode())
+            "not_paid": attack.refused, "failures": told, "counts": _counts(attempts),
+        }, indent=1) + "\n").encode())
     if arguments.pictures:
         print(f"{len(attack.draw(arguments.pictures))} pictures in {arguments.pictures}")
     return int(bool(told))
@@ -107,6 +108,17 @@ def _jobs(folder: Path, robot: str) -> Iterator[ClipJob]:
             clip = clip_ref(str(bag.relative_to(folder) / str(episode.episode_id)), episode.images, fps, "real")
             task = TaskSpec(episode.instruction, episode.task, robot, episode.images[0], actions=episode.actions)
             yield ClipJob(clip, task)
+
+
+def _counts(attempts: Sequence[Attempt]) -> list[dict[str, Any]]:
+    """How each edit fared at each step; None in place of NaN."""
+    counts = []
+    for edit in EDITS:
+        for step in STEPS:
+            found = [attempt for attempt in attempts if (attempt.edit, attempt.step) == (edit.name, step)]
+            known = {name: None if value != value else value for name, value in asdict(paid_of(found)).items()}
+            counts.append({"pattern": edit.pattern, "edit": edit.name, "step": step, **known})
+    return counts
 
 
 def _edit_table(attempts: Sequence[Attempt], caption: str) -> Table:

@@ -54,7 +54,7 @@ def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, 
         steps = _end(episode, stride, rng)
         longest = max(longest, len(episode.images[: steps + 1 : stride]))
         for shown in _forms(models, episode, steps, stride, rng):
-            reference = shown[0]
+            reference = episode.images[0]
             seen = pictures.picture_numbers(shown, reference, models.simulation.image_size, still)
             drawn, signals = imagination.model_numbers(models, shown, reference, stride, origin)
             rows.numbers.append(seen | drawn)

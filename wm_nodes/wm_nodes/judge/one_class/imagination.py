@@ -93,13 +93,18 @@ def _next_frames(
     states = F.pad(between, (0, state_dim - 3))
     if state_dim > 3:
         states[..., 3:] = model.condition.state_mean[3:]
-    current, caches = latents_TSD[:-1], model.trunk.new_ring_caches(len(step), latents_TSD.device)
     if stride == 1:
-        prediction = model(current[None], actions[None], states[0][None], states[1][None])
-        return normalise_tokens(current + prediction.change_BTSD[0]), prediction.done_logits_BTKJ[0]
-    for i in range(stride):
-        current, logits = model.advance(current, actions, states[i], states[i + 1], caches)
-    return current, logits
+        prediction = model(latents_TSD[:-1][None], actions[None], states[0][None], states[1][None])
+        return normalise_tokens(latents_TSD[:-1] + prediction.change_BTSD[0]), prediction.done_logits_BTKJ[0]
+    caches = model.trunk.new_ring_caches(1, latents_TSD.device)
+    imagined, done = list[Tensor](), list[Tensor]()
+    for t in range(len(step)):
+        current = latents_TSD[t : t + 1]
+        for i in range(stride):
+            current, logits = model.advance(current, actions[t : t + 1], states[i, t : t + 1], states[i + 1, t : t + 1], caches)
+        imagined.append(current[0])
+        done.append(logits[0])
+    return torch.stack(imagined), torch.stack(done)
 
 
 def _blocks(pictures_THW: Tensor) -> Tensor:
