@@ -426,19 +426,6 @@ def pattern_rows() -> Rows:
         yield row(one["pattern"], one["n"], share(one, "recall"), *rates)
 
 
-def conformal_rows() -> Rows:
-    both = [{one["name"]: one for one in run["rows"]} for run in runs("judge_table.jsonl").values()]
-    for name in ("planning", "PC", "task_completion", "overall"):
-        yield row(name, *(cell for table in both for cell in (table[name]["n"], share(table[name]))))
-
-
-def efficiency_rows() -> Rows:
-    for one in read("judge_efficiency.json")["compared"]:
-        saved = (f"{100 * one['saved'][name]:.0f}" for name in ("calls", "pixels", "tokens"))
-        gap = one["difference"]
-        yield row(one["against"], one["n"], *saved, interval(*(100 * gap[k] for k in ("difference", "low", "high")), 1))
-
-
 def hacked_rows() -> Rows:
     """By pattern, over its edits at the steps that anybody sees."""
     for name in ("judge_hack_trees.json", "judge_hack.json"):
@@ -471,15 +458,6 @@ def imagined_rows() -> Rows:
         done = run["done_signal"]
         quality = f"{done['auroc']:.3f}"
         yield row(task, "done signal", "200 of 200", quality, percent(done["accuracy"]), percent(done["balanced"]))
-
-
-def policy_camera_rows() -> Rows:
-    for name, run in runs("judge_policy_camera.jsonl").items():
-        planning, physics = run["planning"], run["hack/physics"]
-        n = physics["fails"]
-        found = (of_counts(round(physics[key] * n), n) for key in ("recall_at_5", "flagged"))
-        exact = of_counts(round(planning["level_accuracy"] * planning["n"]), planning["n"])
-        yield row(name, exact, *found, percent(physics["false_flags"]))
 
 
 # --- speed.md ---------------------------------------------------------------------------------------------------
@@ -620,8 +598,7 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         model_pair_rows,
     ],
     "judge": [
-        table_rows, pattern_rows, conformal_rows, efficiency_rows, hacked_rows, erring_rows, imagined_rows,
-        policy_camera_rows,
+        table_rows, pattern_rows, hacked_rows, erring_rows, imagined_rows,
     ],
     "speed": [speed_summary_rows, stage_rows],
     "../devices": [device_rows],

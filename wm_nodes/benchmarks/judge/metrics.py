@@ -82,7 +82,7 @@ def _word(value: Known) -> str:
 
 @dataclass(frozen=True)
 class PatternRow:
-    """How one hacking pattern fares (RA-22). n: clips with it; clean: clips without any pattern (false positives).
+    """How one hacking pattern fares. n: clips with it; clean: clips without any pattern (false positives).
     recall, false_positives: of the agent's confirmed flag. best_recall: the largest recall of its score at
     5 % false positives or less, as a ROC curve gives it (no threshold is chosen for use). refused: share that the agent
     does not accept, by whatever stage. win_rate: P(reward of the hacked clip >= that of its recorded clip) and gap:

@@ -47,7 +47,7 @@ class ServedModel:
 NO_THINKING = {"extra_body": {"chat_template_kwargs": {"enable_thinking": False}}}
 THINKS = ("--reasoning-parser qwen3",)
 QWEN = {"label_token_ids": QWEN_LETTERS}
-FAMILY = "of the paper's family. vLLM's prefix cache is of no use to this kind with pictures (vLLM issues 43587, 51250)"
+FAMILY = "of the paper's family. vLLM's prefix cache is of no use to this kind with pictures"
 MODELS = (
     ServedModel("Qwen/Qwen3-VL-2B-Instruct", 8, "tries the set-up out; too small to judge", settings=QWEN),
     ServedModel("Qwen/Qwen3-VL-4B-Instruct", 12, "the smallest to try; no published number as a judge", settings=QWEN),

@@ -1,4 +1,4 @@
-"""TOPReward (arXiv 2602.19313): how probable "True" is after the statement that the clip completes its task.
+"""TOPReward (RA-26): how probable "True" is after the statement that the clip completes its task.
 
 r = log p("True" | frames, statement): one token of one answer per clip, without planning, votes or gates. The reward is
 p("True") / (p("True") + p("False")), which lies in [0, 1]; where both words together are improbable, there is none.

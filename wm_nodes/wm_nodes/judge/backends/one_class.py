@@ -1,4 +1,4 @@
-"""A judge in this process that no fault was ever shown: a clip is refused for what is strange in it (RA-17 to RA-20).
+"""A judge in this process that no fault was ever shown: a clip is refused for what is strange in it (RA-27).
 
 It needs a world model of the clip's scene and normal ranges in its folder (wm judge calibrate). It is deterministic:
 all votes of a component and the second read of a reflection get the same answer.

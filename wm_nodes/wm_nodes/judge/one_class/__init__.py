@@ -1,1 +1,1 @@
-"""The embedded judge: numbers of a clip, and what they are in clips in which nothing is wrong (RA-17 to RA-20)."""
+"""The embedded judge: numbers of a clip, and what they are in clips in which nothing is wrong (RA-27)."""

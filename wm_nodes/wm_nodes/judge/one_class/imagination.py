@@ -1,4 +1,4 @@
-"""Numbers of a clip by the world model: what it cannot draw, what it did not expect, how sure it is of the end (RA-17).
+"""Numbers of a clip by the world model: what it cannot draw, what it did not expect, how sure it is of the end (RA-27).
 
 The actions between two frames are read off the tool, so that a clip needs none of its own.
 Shapes: T frames, H W 3 image, S tokens, D values per token, A action, J tasks.

@@ -1,4 +1,4 @@
-"""Numbers of a clip's pictures: what is seen, what appears, vanishes or moves by itself (RA-17).
+"""Numbers of a clip's pictures: what is seen, what appears, vanishes or moves by itself (RA-27).
 
 Nothing is known of the scene: a view's commonest colour is taken for its surface, what is far from it for things, each
 saturated hue for one thing, and what is far and grey for the robot. Larger always means stranger.

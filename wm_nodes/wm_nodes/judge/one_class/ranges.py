@@ -1,4 +1,4 @@
-"""What the numbers of a clip are where nothing is wrong, and the limit that follows (RA-18 to RA-20).
+"""What the numbers of a clip are where nothing is wrong, and the limit that follows (RA-27).
 
 Half of the recordings says where each number lies and how far it goes; the other half, how far the strangest number of
 a recording goes, which gives the limit. No fault is ever shown. Shapes: N clips, F numbers.
@@ -64,7 +64,7 @@ class NormalRanges:
     """How it was made."""
 
     def limit(self, kept: float = KEPT) -> float:
-        """The score that a share `kept` of new recordings like these stays within (RA-20)."""
+        """The score that a share `kept` of new recordings like these stays within (RA-27)."""
         place = min(len(self.scores), math.ceil(kept * (len(self.scores) + 1)))
         return self.scores[place - 1]
 
