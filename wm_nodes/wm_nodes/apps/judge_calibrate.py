@@ -34,8 +34,13 @@ def run(arguments: argparse.Namespace) -> None:
     episodes = [episode for bag in arguments.bags for episode in read_episodes(bag)]
     ranges = calibrate(models, episodes, stride=arguments.stride, seed=arguments.seed)
     path = save_ranges(arguments.model_dir, replace(ranges, story={**ranges.story, "command": arguments.command}))
-    print(f"{path}: {len(episodes)} recordings, {len(NAMES)} numbers; {ranges.lengths[0]} to {ranges.lengths[1]} frames")
-    print(f"strangest number of a recording, in spreads: median {ranges.limit(0.5):.2f}, limit at {KEPT:.0%} "
-          f"{ranges.limit():.2f}, largest {ranges.scores[-1]:.2f}")
+    print(
+        f"{path}: {ranges.story['recordings']} recordings, {len(NAMES)} numbers; "
+        f"{ranges.lengths[0]} to {ranges.lengths[1]} frames"
+    )
+    print(
+        f"strangest number of a recording, in spreads: median {ranges.limit(0.5):.2f}, limit at {KEPT:.0%} "
+        f"{ranges.limit():.2f}, largest {ranges.scores[-1]:.2f}"
+    )
     for task, signal in ranges.done.items():
         print(f"{task}: done from a signal of {signal:.3f}")

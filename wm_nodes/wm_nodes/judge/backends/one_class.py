@@ -20,10 +20,10 @@ from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest
 from wm_nodes.judge.agent.levels import first_vote
 from wm_nodes.judge.agent.types import NUM_LEVELS, PLANNING, ClipRef, Component, Stage, Status, TaskSpec
-from wm_nodes.judge.one_class.calibration import word_pairs
+from wm_nodes.judge.one_class.calibration import words_of
 from wm_nodes.judge.one_class.imagination import model_numbers
 from wm_nodes.judge.one_class.pictures import HUES, picture_numbers, things_in
-from wm_nodes.judge.one_class.ranges import COMPONENTS, KEPT, NormalRanges, file_of, load_ranges
+from wm_nodes.judge.one_class.ranges import COMPONENTS, KEPT, NormalRanges, file_of, load_ranges, strides_of
 from wm_nodes.world_model import WorldModels, load_model_folder
 
 REVISION = "1"
@@ -65,19 +65,22 @@ class OneClassJudge:
     have not, and for the completion of tasks that the world model does not know.
 
     Args:
-        folder: of the world model, with normal ranges in it. conformal: a share, e.g. 0.9, below 0.97: it abstains, too,
-            on what is stranger than this share of the recordings and not beyond the limit. 0: it always decides.
+        folder: of the world model, with normal ranges in it.
+        conformal: a share, e.g. 0.9, below KEPT: it abstains, too, on what is stranger than this share of the
+            recordings and not beyond the limit. 0: it always decides.
+        device: the setting `device` (core/device.py).
 
     Raises:
         ModelFolderError: the folder holds no world model, or no ranges of this model.
+        ValueError: conformal is not below KEPT.
     """
 
     def __init__(self, folder: Path, conformal: float = 0.0, device: str = CPU) -> None:
+        if not 0 <= conformal < KEPT:
+            raise ValueError(f"judge.conformal must be below {KEPT}, the share that the limit keeps, got {conformal}")
         self._folder = folder
         self._models: WorldModels = load_model_folder(folder, compute_device(device))
-        self._ranges = {stride: load_ranges(folder, stride) for stride in (1, 2, 3, 4) if file_of(folder, stride).is_file()}
-        if not self._ranges:
-            load_ranges(folder, 1)  # says how to make them
+        self._ranges = {stride: load_ranges(folder, stride) for stride in strides_of(folder) or (1,)}
         for ranges in self._ranges.values():
             if ranges.world_model != self._models.sha256:
                 raise ModelFolderError(
@@ -85,13 +88,16 @@ class OneClassJudge:
                     f"wm judge calibrate {folder} BAG --stride {ranges.stride}"
                 )
         self._conformal = conformal
-        self._sure = {stride: ranges.limit(conformal) if conformal else math.inf for stride, ranges in self._ranges.items()}
+        self._sure = {
+            stride: ranges.limit(conformal) if conformal else math.inf for stride, ranges in self._ranges.items()
+        }
         self._cache: OrderedDict[str, tuple[NormalRanges, Finding]] = OrderedDict()
         self._lock = threading.Lock()
         self._num_reads = self._num_abstained = 0
 
     @property
     def capabilities(self) -> Capabilities:
+        """What it reads, and who it is."""
         known = {*COMPONENTS.values(), *PATTERNS, PLANNING, TASK_COMPLETION}
         return Capabilities(
             self.name, "embedded", f"one-class {self.sha256[:12]}", REVISION, frozenset(known), deterministic=True,
@@ -105,6 +111,7 @@ class OneClassJudge:
 
     @property
     def name(self) -> str:
+        """Of its ranges and its share."""
         return f"embedded:{self.sha256[:12]}" + (f"@{self._conformal:g}" if self._conformal else "")
 
     @property
@@ -113,8 +120,9 @@ class OneClassJudge:
         lines = [f"one-class judge {self.sha256[:12]} of {self._folder.name}"]
         for stride, ranges in self._ranges.items():
             lines.append(
-                f"every {stride}. step: {ranges.story.get('recordings')} recordings; limit {ranges.limit():.2f} spreads "
-                f"at {KEPT:.0%}; {ranges.lengths[0]} to {ranges.lengths[1]} frames; tasks {', '.join(ranges.done)}"
+                f"every {stride}. step: {ranges.story.get('recordings')} recordings; "
+                f"limit {ranges.limit():.2f} spreads at {KEPT:.0%}; {ranges.lengths[0]} to {ranges.lengths[1]} frames; "
+                f"tasks {', '.join(ranges.done)}"
             )
         return "\n".join(lines)
 
@@ -142,6 +150,7 @@ class OneClassJudge:
         return Health(True, "", {"reads": float(self._num_reads), "abstained": float(self._num_abstained)})
 
     def _find(self, clip: ClipRef, task: TaskSpec) -> tuple[NormalRanges, Finding]:
+        """The finding of a clip and its ranges, measured once."""
         key = f"{clip.sha256} {task.instruction} {task.task_id} {hash(task.reference_frame.tobytes())}"
         with self._lock:
             if key not in self._cache:
@@ -152,7 +161,11 @@ class OneClassJudge:
 
     def _measure(self, clip: ClipRef, task: TaskSpec) -> tuple[NormalRanges, Finding]:
         ranges = self.ranges_for(clip.fps)
-        if reason := self.unfit_reason(clip.frames.shape, clip.fps):
+        reason = self.unfit_reason(clip.frames.shape, clip.fps)
+        if not reason and task.reference_frame.shape != clip.frames.shape[1:]:
+            height, width = task.reference_frame.shape[:2]
+            reason = f"the reference frame is {height} x {width} px, the clip is not"
+        if reason:
             return ranges, Finding(reason, {}, {}, (Status.OK, ""))
         side, origin = self._models.simulation.image_size, np.asarray(ranges.origin, np.float32)
         numbers = picture_numbers(clip.frames, task.reference_frame, side, ranges.still)
@@ -180,53 +193,53 @@ class OneClassJudge:
 
     def _naming(self, task: TaskSpec, ranges: NormalRanges) -> tuple[Status, str]:
         """Whether every coloured thing that the instruction names is in the reference frame."""
-        heard = dict[str, set[str]]()
+        colours = dict[str, set[str]]()
         for pair in ranges.words:
             first, second = pair.split()
             if first in HUES:
-                heard.setdefault(second, set()).add(first)
+                colours.setdefault(second, set()).add(first)
         side = self._models.simulation.image_size
         views = [task.reference_frame[:, i * side : (i + 1) * side] for i, stays in enumerate(ranges.still) if stays]
         seen = {colour for view in views for colour in things_in(view)}
-        known = {word for pair in ranges.words for word in pair.split()}
-        for pair in word_pairs(task.instruction):
-            colour, noun = pair.split()
+        words = words_of(task.instruction)
+        for colour, noun in zip(words, [*words[1:], "thing"]):
             if colour not in HUES:
                 continue
             if colour not in seen:
-                return Status.ERROR, f"the {colour} {noun} is not in the first frame; there are {', '.join(sorted(seen))}"
-            if len(heard.get(noun, ())) == 1 and colour not in heard[noun]:
-                return Status.ERROR, f"the {noun} here is {min(heard[noun])}, not {colour}"
-        strange = [word for pair in word_pairs(task.instruction) for word in pair.split() if word not in known | set(HUES)]
-        if strange:
-            return Status.ABSTAIN, f"the recordings' instructions do not have {', '.join(dict.fromkeys(strange))}"
+                there = ", ".join(sorted(seen)) or "none"
+                return Status.ERROR, f"the {colour} {noun} is not in the first frame; colours there: {there}"
+            if len(colours.get(noun, ())) == 1 and colour not in colours[noun]:
+                return Status.ERROR, f"the {noun} here is {min(colours[noun])}, not {colour}"
+        known = {word for pair in ranges.words for word in pair.split()} | set(HUES)
+        if strange := [word for word in dict.fromkeys(words) if word not in known]:
+            return Status.ABSTAIN, f"the recordings' instructions do not have {', '.join(strange)}"
         return Status.OK, ""
 
     def _answer(self, name: Component, hack: bool, task: TaskSpec, ranges: NormalRanges, finding: Finding) -> Read:
-        vote = first_vote(0)
+        """The answer to one component, or, of the stage HACK, to one pattern."""
         if finding.unfit:
-            return Read(name, (), "embedded", vote, status=Status.ABSTAIN, reason=finding.unfit)
+            return _abstention(name, finding.unfit)
         if hack:
             score, number = max(finding.worst[component] for component in PATTERNS[name])
-            return Read(name, _two_levels(self._p_fail(score, ranges)), "embedded", vote, evidence_text=_text(score, number, ranges))
+            return _decision(name, self._p_fail(score, ranges), _text(score, number, ranges))
         if name == PLANNING:
             return self._planning(ranges, finding)
         if name == TASK_COMPLETION:
             return self._completion(task, ranges, finding)
+        status, reason = finding.naming if name == "objective" else (Status.OK, "")
+        if status is Status.ERROR:
+            return _decision(name, 1.0, reason)
+        if status is Status.ABSTAIN:
+            return _abstention(name, reason)
         score, number = finding.worst[name]
-        text, status = _text(score, number, ranges), Status.OK
-        if name == "objective":
-            status, reason = finding.naming
-            if status is Status.ERROR:
-                return Read(name, _two_levels(1.0), "embedded", vote, evidence_text=reason)
-            if status is Status.ABSTAIN:
-                return Read(name, (), "embedded", vote, status=status, reason=reason)
+        text = _text(score, number, ranges)
         if self._sure[ranges.stride] < score <= ranges.limit():
-            reason = f"{text}: stranger than {self._conformal:.0%} of the recordings, and not beyond the limit"
-            return Read(name, (), "embedded", vote, status=Status.ABSTAIN, reason=reason)
-        return Read(name, _two_levels(self._p_fail(score, ranges)), "embedded", vote, evidence_text=text)
+            more = f"stranger than {self._conformal:.0%} of the recordings, and not beyond the limit"
+            return _abstention(name, f"{text}: {more}")
+        return _decision(name, self._p_fail(score, ranges), text)
 
     def _planning(self, ranges: NormalRanges, finding: Finding) -> Read:
+        """Poor by the whole picture's components, fair by any other; the failing ones are looked at first."""
         p_fail = {name: self._p_fail(score, ranges) for name, (score, _) in finding.worst.items()}
         if finding.naming[0] is Status.ERROR:
             p_fail["objective"] = 1.0
@@ -235,23 +248,27 @@ class OneClassJudge:
         return Read(PLANNING, (0.0, poor, some - poor, 1 - some), "embedded", first_vote(0), focus=focus)
 
     def _completion(self, task: TaskSpec, ranges: NormalRanges, finding: Finding) -> Read:
-        vote, name = first_vote(0), TASK_COMPLETION
+        """Done at even odds where the done signal is at the task's threshold."""
         if task.task_id not in ranges.done:
-            reason = f"not calibrated on task {task.task_id!r}, only on {', '.join(ranges.done)}"
-            return Read(name, (), "embedded", vote, status=Status.ABSTAIN, reason=reason)
+            known = ", ".join(ranges.done) or "none"
+            return _abstention(TASK_COMPLETION, f"not calibrated on task {task.task_id!r}, only on {known}")
         threshold, signal = ranges.done[task.task_id], finding.done[task.task_id]
         q = 1 / (1 + math.exp(_log_odds(threshold) - _log_odds(signal)))
-        text = f"done signal {signal:.3f}, done from {threshold:.3f}"
-        return Read(name, _two_levels(1 - q), "embedded", vote, evidence_text=text)
+        return _decision(TASK_COMPLETION, 1 - q, f"done signal {signal:.3f}, done from {threshold:.3f}")
 
     def _p_fail(self, score: float, ranges: NormalRanges) -> float:
+        """Of a score in spreads."""
         return 1 / (1 + math.exp(min(50.0, STEEPNESS * (1 - score / ranges.limit()))))
 
 
-def _two_levels(p_fail: float) -> tuple[float, ...]:
+def _abstention(name: Component, reason: str) -> Read:
+    return Read(name, (), "embedded", first_vote(0), status=Status.ABSTAIN, reason=reason)
+
+
+def _decision(name: Component, p_fail: float, text: str) -> Read:
     levels = [0.0] * NUM_LEVELS
     levels[FAIL_LEVEL], levels[PASS_LEVEL] = p_fail, 1 - p_fail
-    return tuple(levels)
+    return Read(name, tuple(levels), "embedded", first_vote(0), evidence_text=text)
 
 
 def _log_odds(p: float) -> float:

@@ -1,7 +1,9 @@
 """Measure normal ranges on recordings in which nothing is wrong: as they are, decoded, imagined, harmlessly changed."""
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -20,6 +22,7 @@ SHORTEST = 4
 MOVES = 3.0
 """A view whose outermost pixels change by more grey levels on average has a camera that moves."""
 RIM_PX = 3
+"""Width of the outermost pixels: left, right and bottom."""
 
 
 @dataclass
@@ -45,12 +48,13 @@ def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, 
         ValueError: too few recordings, pictures of another size than the model's, or as model_numbers.
     """
     recorded = [episode for episode in episodes if episode.num_steps >= stride * (SHORTEST - 1)]
+    _check_sizes(models, recorded)
     still = _still_views(models, recorded)
     origin = _origin(models, recorded)
     rows, longest, words = _Rows(), 0, set[str]()
     for index, episode in enumerate(tqdm(recorded, desc="measured", unit="episode")):
         rng = numpy_stream(seed, f"normal ranges/{index}")
-        words |= set(word_pairs(episode.instruction))
+        words |= {" ".join(pair) for pair in pairwise(words_of(episode.instruction))}
         steps = _end(episode, stride, rng)
         longest = max(longest, len(episode.images[: steps + 1 : stride]))
         for shown in _forms(models, episode, steps, stride, rng):
@@ -71,10 +75,9 @@ def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, 
     )
 
 
-def word_pairs(instruction: str) -> list[str]:
-    """Neighbouring words, lower case, "the" and "a" left out."""
-    words = [word for word in instruction.lower().replace(",", " ").split() if word not in ("the", "a", "an")]
-    return [f"{first} {second}" for first, second in zip(words, words[1:])]
+def words_of(instruction: str) -> list[str]:
+    """Its words, lower case, without articles and punctuation."""
+    return [word for word in re.findall(r"[\w'-]+", instruction.lower()) if word not in ("the", "a", "an")]
 
 
 def done_at(tasks: Sequence[str], episode: Episode, step: int) -> dict[str, bool]:
@@ -120,7 +123,7 @@ def harmless(frames: UInt8Array, rng: np.random.Generator) -> UInt8Array:
     if kind == 0:
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(60, 96))]
         coded = [cv2.imencode(".jpg", frame, quality)[1] for frame in frames]
-        return np.stack([cv2.imdecode(code, cv2.IMREAD_COLOR) for code in coded]).astype(np.uint8)
+        return np.stack([cv2.imdecode(code, cv2.IMREAD_COLOR) for code in coded], dtype=np.uint8)
     if kind == 1:
         pixels = pixels + rng.normal(0, rng.uniform(1, 4), frames.shape)
     elif kind == 2:
@@ -142,7 +145,20 @@ def harmless(frames: UInt8Array, rng: np.random.Generator) -> UInt8Array:
     return changed
 
 
+def _check_sizes(models: WorldModels, episodes: Sequence[Episode]) -> None:
+    """Raises ValueError: pictures of another size than the model's."""
+    size = models.tokenizer.height, models.tokenizer.width
+    for episode in episodes:
+        if episode.images.shape[1:3] != size:
+            height, width = episode.images.shape[1:3]
+            raise ValueError(
+                f"an episode has pictures of {height} x {width} px, the world model sees {size[0]} x {size[1]} px; "
+                "name bags in its cameras"
+            )
+
+
 def _still_views(models: WorldModels, episodes: Sequence[Episode]) -> tuple[bool, ...]:
+    """Whether each view's outermost pixels stay as they are in the first episodes."""
     side, width = models.simulation.image_size, models.tokenizer.width
     changes = np.zeros(width // side)
     for episode in episodes[:20]:

@@ -15,7 +15,11 @@ from wm_nodes.world_model.dynamics import done_signal
 from wm_nodes.world_model.tokenizer import PROBE_NAMES, normalise_tokens
 
 BLOCK_PX = 8
-PLACES = {name: [i for i, found in enumerate(PROBE_NAMES) if found.startswith(name)] for name in ("object", "tool", "goal")}
+"""Side of the blocks whose mean error is compared."""
+PLACES = {
+    name: [i for i, found in enumerate(PROBE_NAMES) if found.startswith(name)] for name in ("object", "tool", "goal")
+}
+"""Columns of the position probe that are each thing's place."""
 LAST = 2
 """Frames at the end, of which the most done counts."""
 
@@ -50,7 +54,7 @@ def model_numbers(
     every = np.concatenate([reference[None], frames])
     latents = models.tokenizer.encode(every)[1:]
     redrawn = models.tokenizer.decode(latents)
-    shown = torch.from_numpy(frames).to(redrawn.device)
+    shown = torch.from_numpy(every[1:]).to(redrawn.device)
     missed = (redrawn.float() - shown.float()).abs().mean(3)
     places = models.probe.read(every)
     start, places = places[0], places[1:]
@@ -67,14 +71,16 @@ def model_numbers(
     goal = places[:, PLACES["goal"]]
     per_frame = missed.mean((1, 2))
     numbers = {
-        "redrawn": per_frame.mean(), "redrawn_worst": _blocks(missed).max(), "redrawn_change": per_frame.diff().abs().max(),
+        "redrawn": per_frame.mean(), "redrawn_worst": _blocks(missed).max(),
+        "redrawn_change": per_frame.diff().abs().max(),
         "unexpected": error.mean(), "unexpected_most": error.mean(1).max(), "unexpected_token": error.max(),
-        "unexpected_place": surprise.max(), 
+        "unexpected_place": surprise.max(),
         "worse_than_still": torch.log((error.mean() + 1e-3) / (still.mean() + 1e-3)),
         "object_alone_m": (moved * np.clip((np.minimum(gap[:-1], gap[1:]) - 0.06) / 0.05, 0, 1)).sum(),
         "object_step_m": moved.max(), "object_faster_m": (moved - went).max(),
         "object_expected_m": np.linalg.norm(miss, axis=1).max(), "object_expected_sum_m": np.linalg.norm(miss.sum(0)),
-        "tool_step_m": went.max(), "tool_jerk_m": np.abs(np.diff(went)).max(initial=0.0), "tool_low_m": -tool[:, 2].min(),
+        "tool_step_m": went.max(), "tool_jerk_m": np.abs(np.diff(went)).max(initial=0.0),
+        "tool_low_m": -tool[:, 2].min(),
         "goal_moves_m": np.linalg.norm(goal - np.median(goal, 0), axis=1).max(),
         "start_place_m": np.linalg.norm(start - places[0]),
     }

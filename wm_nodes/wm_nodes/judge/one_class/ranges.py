@@ -28,7 +28,7 @@ WRONGLY_DONE = 0.02
 LEAST = 100
 """Recordings that are needed."""
 LEAST_SPREAD = {"_m": 0.01, "_px": 1.0, "": 0.05}
-"""A number's spread is at least this, by the end of its name: m, px, and shares or grey levels."""
+"""A number's spread is at least this, by its unit: m, px, and shares or grey levels."""
 PIXELS = {
     "thing_moves_alone", "thing_jump", "thing_far_of_robot", "robot_jump", "thing_twice", "robot_apart", "stranger",
     "shifted",
@@ -66,7 +66,7 @@ class NormalRanges:
     def limit(self, kept: float = KEPT) -> float:
         """The score that a share `kept` of new recordings like these stays within (RA-27)."""
         place = min(len(self.scores), math.ceil(kept * (len(self.scores) + 1)))
-        return self.scores[place - 1]
+        return self.scores[max(place, 1) - 1]
 
     def strangeness(self, numbers: Mapping[str, float]) -> dict[str, float]:
         """Each number in spreads above its median."""
@@ -83,9 +83,15 @@ def file_of(folder: Path, stride: int) -> Path:
     return folder / f"normal_ranges_{stride}.json"
 
 
+def strides_of(folder: Path) -> list[int]:
+    """Of which a world model's folder has ranges."""
+    names = (path.stem.removeprefix("normal_ranges_") for path in folder.glob("normal_ranges_*.json"))
+    return sorted(int(name) for name in names if name.isdecimal())
+
+
 def has_ranges(folder: Path) -> bool:
     """Whether a world model's folder is a judge."""
-    return any(folder.glob("normal_ranges_*.json"))
+    return bool(strides_of(folder))
 
 
 def save_ranges(folder: Path, ranges: NormalRanges) -> Path:
@@ -104,19 +110,30 @@ def load_ranges(folder: Path, stride: int) -> NormalRanges:
     path, remedy = file_of(folder, stride), f"make it: wm judge calibrate {folder} BAG --stride {stride}"
     content = read_json(path, remedy)
     try:
-        if content.pop("format") != FORMAT or set(content["middle"]) != set(NAMES):
+        if content.pop("format") != FORMAT or any(set(content[part]) != set(NAMES) for part in ("middle", "spread")):
             raise ValueError("it is of another version")
+        if content["stride"] != stride or not _usable(content):
+            raise ValueError("it is damaged")
         pairs = {name: tuple(content[name]) for name in ("lengths", "still", "origin", "scores", "words")}
         return NormalRanges(**{**content, **pairs})
     except (KeyError, TypeError, ValueError) as error:
         raise ModelFolderError(f"{path} cannot be used: {error}; {remedy}") from None
 
 
+def _usable(content: Mapping[str, Any]) -> bool:
+    """Whether a score can be formed and has a limit."""
+    scores, spread = content["scores"], content["spread"].values()
+    finite = all(math.isfinite(value) for value in [*scores, *spread, *content["middle"].values()])
+    return finite and bool(scores) and min(spread) > 0 and list(scores) == sorted(scores)
+
+
 def fit(rows: Sequence[Mapping[str, float]], recordings: Sequence[int], seed: int) -> dict[str, Any]:
     """Return middle, spread and scores of NormalRanges.
 
     Args:
-        rows: the numbers of each clip. recordings: of each row, the recording that it is a form of.
+        rows: the numbers of each clip.
+        recordings: of each row, the recording that it is a form of.
+        seed: decides which recordings are of which half.
 
     Raises:
         ValueError: fewer than LEAST recordings.
