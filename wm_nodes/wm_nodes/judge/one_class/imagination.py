@@ -105,9 +105,9 @@ def _next_frames(
     caches = model.trunk.new_ring_caches(1, latents_TSD.device)
     imagined, done = list[Tensor](), list[Tensor]()
     for t in range(len(step)):
-        current = latents_TSD[t : t + 1]
+        current, row = latents_TSD[t : t + 1], slice(t, t + 1)
         for i in range(stride):
-            current, logits = model.advance(current, actions[t : t + 1], states[i, t : t + 1], states[i + 1, t : t + 1], caches)
+            current, logits = model.advance(current, actions[row], states[i, row], states[i + 1, row], caches)
         imagined.append(current[0])
         done.append(logits[0])
     return torch.stack(imagined), torch.stack(done)
