@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import ModelFolderError, read_json
@@ -23,7 +24,9 @@ COMPONENTS = {**pictures.COMPONENTS, **imagination.COMPONENTS}
 NAMES = tuple(sorted(COMPONENTS))
 KEPT = 0.97
 """Share of the recordings, in every form, whose strangest number stays within the limit."""
-WRONGLY_DONE = 0.02
+WITHIN = 0.98
+"""Share of the recordings whose largest value of a number is within its spread."""
+WRONGLY_DONE = 0.05
 """Share of undone recordings that is said to be done."""
 LEAST = 100
 """Recordings that are needed."""
@@ -127,7 +130,7 @@ def _usable(content: Mapping[str, Any]) -> bool:
     return finite and bool(scores) and min(spread) > 0 and list(scores) == sorted(scores)
 
 
-def fit(rows: Sequence[Mapping[str, float]], recordings: Sequence[int], seed: int) -> dict[str, Any]:
+def fit(rows: Sequence[Mapping[str, float]], recordings: ArrayLike, seed: int) -> dict[str, Any]:
     """Return middle, spread and scores of NormalRanges.
 
     Args:
@@ -138,6 +141,7 @@ def fit(rows: Sequence[Mapping[str, float]], recordings: Sequence[int], seed: in
     Raises:
         ValueError: fewer than LEAST recordings.
     """
+    recordings = np.asarray(recordings)
     known, values = np.unique(recordings), np.array([[row[name] for name in NAMES] for row in rows])
     if len(known) < LEAST:
         raise ValueError(f"normal ranges need at least {LEAST} recordings, got {len(known)}; name more bags")
@@ -145,10 +149,11 @@ def fit(rows: Sequence[Mapping[str, float]], recordings: Sequence[int], seed: in
     first = np.isin(recordings, order[: len(order) // 2])
     middle = np.median(values[first], axis=0)
     least = np.array([LEAST_SPREAD["_px" if n in PIXELS else "_m" if n.endswith("_m") else ""] for n in NAMES])
-    spread = np.maximum(values[first].max(0) - middle, least)
+    worst = np.stack([values[recordings == recording].max(0) for recording in order[: len(order) // 2]])
+    spread = np.maximum(np.quantile(worst, WITHIN, axis=0) - middle, least)
     strangest = ((values - middle) / spread).max(1)
     others = order[len(order) // 2 :]
-    scores = sorted(float(strangest[np.asarray(recordings) == recording].max()) for recording in others)
+    scores = sorted(float(strangest[recordings == recording].max()) for recording in others)
     return {
         "middle": dict(zip(NAMES, middle.tolist())), "spread": dict(zip(NAMES, spread.tolist())),
         "scores": tuple(scores),
