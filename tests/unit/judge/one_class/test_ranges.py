@@ -11,7 +11,17 @@ from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.one_class import imagination, pictures
 from wm_nodes.judge.one_class.ranges import (
-    COMPONENTS, LEAST, NAMES, PIXELS, NormalRanges, done_threshold, file_of, fit, has_ranges, load_ranges, save_ranges,
+    COMPONENTS,
+    LEAST,
+    NAMES,
+    PIXELS,
+    NormalRanges,
+    done_threshold,
+    file_of,
+    fit,
+    has_ranges,
+    load_ranges,
+    save_ranges,
     strides_of,
 )
 
