@@ -131,6 +131,14 @@ def test_clips_of_another_size_length_or_reference_are_not_judged() -> None:
     assert judge().unfit_reason(frames.shape) == ""
 
 
+def test_clips_of_a_frame_rate_without_ranges_are_not_judged_and_of_a_near_one_they_are() -> None:
+    frames = clean().job.clip.frames
+    for fps in (1e-6, 0.6, 30.0, 1e9):
+        verdict = judged(*of_frames(frames, fps))
+        assert verdict.status is Status.ABSTAIN and f"{fps:g} frames per second, judged are 5" in verdict.reason
+    assert judged(*of_frames(frames, 6.0)).status is Status.OK
+
+
 def test_every_vote_and_the_next_read_get_the_same_answer() -> None:
     first, again = read("interaction", votes=3), read("interaction", votes=3)
     assert [r.vote.index for r in first] == [0, 1, 2]
