@@ -30,6 +30,8 @@ REVISION = "1"
 """Raised whenever the same ranges give other answers, so that two versions have two identities."""
 CACHED_CLIPS = 64
 """Clips whose numbers are kept, for the stages of one verdict."""
+FAR_RATE = 1.5
+"""A clip whose frame rate is so many times another than that of the nearest ranges is not judged."""
 STEEPNESS = 40.0
 """Of the failure probability around the limit: 0.5 there, 0.98 a tenth above it."""
 FAIL_LEVEL, PASS_LEVEL = 1, 4
@@ -183,7 +185,11 @@ class OneClassJudge:
 
     def unfit_reason(self, shape: tuple[int, ...], fps: float | None = None) -> str:
         """Why no clip of this shape (frames, height, width, 3) can be judged, or "". fps: None: of the first ranges."""
-        ranges = self.ranges_for(fps or self._models.simulation.control_hz / min(self._ranges))
+        control_hz = self._models.simulation.control_hz
+        ranges = self.ranges_for(fps or control_hz / min(self._ranges))
+        if fps and abs(math.log(ranges.stride * fps / control_hz)) > math.log(FAR_RATE):
+            rates = ", ".join(f"{control_hz / stride:g}" for stride in self._ranges)
+            return f"{fps:g} frames per second, judged are {rates}; for others: wm judge calibrate ... --stride"
         height, width = self._models.tokenizer.height, self._models.tokenizer.width
         if tuple(shape[1:3]) != (height, width):
             return f"{shape[1]} x {shape[2]} px, judged are {height} x {width} px"
