@@ -450,16 +450,6 @@ def erring_rows() -> Rows:
         yield row(errors, one["way"], *cells, signed.format(found["calls"][0]))
 
 
-def imagined_rows() -> Rows:
-    for task, run in runs("judge_imagined_vs_real.jsonl").items():
-        for one in run["agreement"]:
-            judged, quality = f"{one['judged']} of {one['n']}", f"{one['auroc']:.3f}"
-            yield row(task, one["kind"], judged, quality, share(one), percent(one["balanced"]))
-        done = run["done_signal"]
-        quality = f"{done['auroc']:.3f}"
-        yield row(task, "done signal", "200 of 200", quality, percent(done["accuracy"]), percent(done["balanced"]))
-
-
 # --- speed.md ---------------------------------------------------------------------------------------------------
 def speed_summary_rows() -> Rows:
     for name, run in runs("speed.jsonl").items():
@@ -571,20 +561,6 @@ def video_model_rows() -> Rows:
         yield row(text, *(f"{found[key]:.{digits}f}" for key in (name, f"copy_{name}")))
 
 
-def judge_rows() -> Rows:
-    both = [json.loads((SHIPPED / name / "judge.json").read_text()) for name in ("clip_judge", "policy_judge")]
-    for name in ("interaction", "deformation", "geometry", "task_completion", "planning", "hack/physics"):
-        yield row(
-            name,
-            *(
-                f"{one[key]:.3f}" if key == "auroc" else percent(one[key])
-                for judge in both
-                for one in [judge["validation"][name]]
-                for key in ("balanced_accuracy", "auroc")
-            ),
-        )
-
-
 TABLES: dict[str, list[Callable[[], Rows]]] = {
     "policy_rl": [
         likelihood_rows, study_rows, exploiting_rows, control_rows_of_scenes,
@@ -598,11 +574,11 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         model_pair_rows,
     ],
     "judge": [
-        table_rows, pattern_rows, hacked_rows, erring_rows, imagined_rows,
+        table_rows, pattern_rows, hacked_rows, erring_rows,
     ],
     "speed": [speed_summary_rows, stage_rows],
     "../devices": [device_rows],
-    "shipped_models": [world_model_rows, scenes_model_rows, done_rows, video_model_rows, judge_rows],
+    "shipped_models": [world_model_rows, scenes_model_rows, done_rows, video_model_rows],
 }
 
 
