@@ -27,7 +27,7 @@ PROBED = 12
 """Clips about which the same is asked twice."""
 
 
-class RecordingJudge:
+class KeepingJudge:
     """A Judge that passes everything on and keeps the reads."""
 
     def __init__(self, judge: Judge) -> None:
@@ -148,7 +148,7 @@ class _Check:
 
     async def _ask_twice(self, clip: LabelledClip) -> None:
         """The first stage's components, each by an answer with reasons and by a letter."""
-        judge, (clip_ref, task) = RecordingJudge(self._twice.judge), (clip.job.clip, clip.job.task)
+        judge, (clip_ref, task) = KeepingJudge(self._twice.judge), (clip.job.clip, clip.job.task)
         stage, described = next(iter(self._run.rubric.stages.items()))
         votes = (first_vote(self._seed), next_vote(1, self._seed))
         media = profile_media(clip_ref, task, described.profile)
@@ -162,7 +162,7 @@ class _Check:
         self._keep(judge)
 
     async def _judge(self, clip: LabelledClip, mode: Mode) -> None:
-        judge, settings = RecordingJudge(self._opened.judge), self._settings
+        judge, settings = KeepingJudge(self._opened.judge), self._settings
         agent = RewardAgent(
             judge, self._run.rubric, mode=mode, seed=self._seed, max_reads=settings.max_reads,
             budget_s=settings.clip_budget_s, call_plan=settings.call_plan,
@@ -178,6 +178,6 @@ class _Check:
         fresh = all(read.cost.wall_s > 0 for read in judge.reads if read.cost.calls)
         self._run.judged.append(Judged(clip, mode, verdict, fresh))
 
-    def _keep(self, judge: RecordingJudge) -> None:
+    def _keep(self, judge: KeepingJudge) -> None:
         self._run.reads += judge.reads
         self._run.failures += judge.failures

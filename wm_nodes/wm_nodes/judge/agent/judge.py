@@ -1,7 +1,7 @@
 """The interface of a judge: what it is asked, what it answers, what it costs."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal, Protocol
 
 from wm_nodes.judge.agent.types import ClipRef, Component, Profile, Stage, Status, TaskSpec
@@ -162,6 +162,15 @@ class Health:
     available: bool
     reason: str = ""
     details: Mapping[str, float] = field(default_factory=dict)
+
+
+def reads_of(request: ReadRequest, cost: Cost, answer: Callable[[Component], Read]) -> list[Read]:
+    """The reads of a judge that answers every vote of a component alike; the first one carries the cost."""
+    reads = list[Read]()
+    for name in request.components:
+        said = answer(name)
+        reads += [replace(said, component=name, vote=vote, cost=Cost()) for vote in request.votes]
+    return [replace(reads[0], cost=cost), *reads[1:]] if reads else []
 
 
 class JudgeError(Exception):

@@ -12,7 +12,6 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -20,7 +19,7 @@ import numpy as np
 
 from wm_nodes.config.shipped import PRETRAINED
 from wm_nodes.core.types import FloatArray
-from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest, reads_of
 from wm_nodes.judge.agent.levels import first_vote, p_fail_of
 from wm_nodes.judge.agent.types import PLANNING, ClipRef, Component, Evidence, Stage, Status, TaskSpec
 from wm_nodes.judge.evidence.clip import clip_evidence
@@ -106,11 +105,7 @@ class EmbeddedJudge:
         except ValueError as error:
             raise JudgeError(f"no evidence: {error}") from error
         cost = Cost(calls=1, images=len(request.media), wall_s=time.monotonic() - started)
-        reads: list[Read] = []
-        for name in request.components:
-            for vote in request.votes:
-                answer = self._answer(prefix + name, request.task, foreign, evidence)
-                reads.append(replace(answer, component=name, vote=vote, cost=cost if not reads else Cost()))
+        reads = reads_of(request, cost, lambda name: self._answer(prefix + name, request.task, foreign, evidence))
         self._num_reads += len(reads)
         self._num_abstained += sum(read.status is Status.ABSTAIN for read in reads)
         return reads

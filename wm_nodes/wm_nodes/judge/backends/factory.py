@@ -13,15 +13,16 @@ from wm_nodes.judge.agent import topreward
 from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import Stage
+from wm_nodes.judge.backends import one_class
 from wm_nodes.judge.backends.cache import VerdictCache
 from wm_nodes.judge.backends.calls import OWN_FIELDS, ChatOptions, Exchange
 from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit_reason
-from wm_nodes.judge.backends.one_class import OneClassJudge
 from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.routed import RoutedJudge
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
 from wm_nodes.judge.evidence.head import load_head
 from wm_nodes.judge.one_class.ranges import has_ranges
+from wm_nodes.world_model.folder import read_world_manifest
 
 AnyJudge = TypeVar("AnyJudge", JudgeConfig, OtherJudge, StageJudge)
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -138,7 +139,10 @@ def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
 
 def _unfit_reason(folder: Path, shape: tuple[int, ...]) -> str:
     """Why the embedded judge of a folder cannot judge clips of this shape, or ""."""
-    return OneClassJudge(folder).unfit_reason(shape) if has_ranges(folder) else unfit_reason(load_head(folder), shape)
+    if not has_ranges(folder):
+        return unfit_reason(load_head(folder), shape)
+    manifest = read_world_manifest(folder)
+    return one_class.unfit_reason(one_class.ranges_of(folder, manifest), manifest, shape)
 
 
 def judge_name(settings: JudgeConfig) -> str:
@@ -185,7 +189,7 @@ def _open(
 ) -> OpenedJudge:
     """The judge itself, whatever its routes."""
     if settings.kind == "embedded" and has_ranges(_folder(settings)):
-        return OpenedJudge(OneClassJudge(_folder(settings), settings.conformal, device), _close_nothing)
+        return OpenedJudge(one_class.OneClassJudge(_folder(settings), settings.conformal, device), _close_nothing)
     if settings.kind == "embedded":
         head = load_head(_folder(settings), compute_device(device))
         return OpenedJudge(EmbeddedJudge(head, settings.conformal), _close_nothing)

@@ -10,14 +10,16 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wm_nodes.core.device import CPU, compute_device
-from wm_nodes.core.model_folder import ModelFolderError
-from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest
+from wm_nodes.core.model_folder import ModelFolderError, files_sha256
+from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest, reads_of
 from wm_nodes.judge.agent.levels import first_vote
 from wm_nodes.judge.agent.types import NUM_LEVELS, PLANNING, ClipRef, Component, Stage, Status, TaskSpec
 from wm_nodes.judge.one_class.calibration import words_of
@@ -42,6 +44,8 @@ PATTERNS: Mapping[str, tuple[Component, ...]] = {
     "physics": ("interaction", "deformation", "geometry"),
 }
 """Components whose failure is each hacking pattern's."""
+KNOWN = frozenset({*COMPONENTS.values(), *PATTERNS, PLANNING, TASK_COMPLETION})
+"""Everything that it reads."""
 WHOLE_PICTURE = ("clarity", "brightness", "color", "temporal")
 """Components whose failure makes a clip poor; that of another one, fair."""
 
@@ -82,13 +86,7 @@ class OneClassJudge:
             raise ValueError(f"judge.conformal must be below {KEPT}, the share that the limit keeps, got {conformal}")
         self._folder = folder
         self._models: WorldModels = load_model_folder(folder, compute_device(device))
-        self._ranges = {stride: load_ranges(folder, stride) for stride in strides_of(folder) or (1,)}
-        for ranges in self._ranges.values():
-            if ranges.world_model != self._models.sha256:
-                raise ModelFolderError(
-                    f"{file_of(folder, ranges.stride)} was made for another world model; make it anew: "
-                    f"wm judge calibrate {folder} BAG --stride {ranges.stride}"
-                )
+        self._ranges = ranges_of(folder, self._models.manifest)
         self._conformal = conformal
         self._sure = {
             stride: ranges.limit(conformal) if conformal else math.inf for stride, ranges in self._ranges.items()
@@ -100,13 +98,11 @@ class OneClassJudge:
     @property
     def capabilities(self) -> Capabilities:
         """What it reads, and who it is."""
-        known = {*COMPONENTS.values(), *PATTERNS, PLANNING, TASK_COMPLETION}
         return Capabilities(
-            self.name, "embedded", f"one-class {self.sha256[:12]}", REVISION, frozenset(known), deterministic=True,
-            card=self.card,
+            self.name, "embedded", f"one-class {self.sha256[:12]}", REVISION, KNOWN, deterministic=True, card=self.card
         )
 
-    @property
+    @cached_property
     def sha256(self) -> str:
         """Of the ranges, which name the world model."""
         return min(self._ranges.items())[1].sha256
@@ -130,7 +126,7 @@ class OneClassJudge:
 
     async def read(self, request: ReadRequest) -> list[Read]:
         """Answer every component once per vote. Raises JudgeError: an unmeasurable clip, or an unknown component."""
-        if unknown := set(request.components) - (self.capabilities.components or frozenset()):
+        if unknown := set(request.components) - KNOWN:
             raise JudgeError(f"the embedded judge does not read {', '.join(sorted(unknown))}")
         started = time.monotonic()
         try:
@@ -138,11 +134,8 @@ class OneClassJudge:
         except ValueError as error:
             raise JudgeError(f"no numbers: {error}") from error
         cost = Cost(calls=1, images=len(request.media), wall_s=time.monotonic() - started)
-        reads: list[Read] = []
-        for name in request.components:
-            for vote in request.votes:
-                answer = self._answer(name, request.stage is Stage.HACK, request.task, ranges, finding)
-                reads.append(replace(answer, vote=vote, cost=cost if not reads else Cost()))
+        is_hack = request.stage is Stage.HACK
+        reads = reads_of(request, cost, lambda name: self._answer(name, is_hack, request.task, ranges, finding))
         self._num_reads += len(reads)
         self._num_abstained += sum(read.status is Status.ABSTAIN for read in reads)
         return reads
@@ -162,7 +155,7 @@ class OneClassJudge:
             return self._cache[key]
 
     def _measure(self, clip: ClipRef, task: TaskSpec) -> tuple[NormalRanges, Finding]:
-        ranges = self.ranges_for(clip.fps)
+        ranges = nearest_ranges(self._ranges, self._models.manifest, clip.fps)
         reason = self.unfit_reason(clip.frames.shape, clip.fps)
         if not reason and task.reference_frame.shape != clip.frames.shape[1:]:
             height, width = task.reference_frame.shape[:2]
@@ -178,24 +171,9 @@ class OneClassJudge:
             worst[component] = max(worst.get(component, (-math.inf, "")), (strange[name], name))
         return ranges, Finding("", worst, done, self._naming(task, ranges))
 
-    def ranges_for(self, fps: float) -> NormalRanges:
-        """The ranges of clips with so many frames per second; the nearest where there are none."""
-        stride = self._models.simulation.control_hz / fps
-        return self._ranges[min(self._ranges, key=lambda known: abs(math.log(known / stride)))]
-
     def unfit_reason(self, shape: tuple[int, ...], fps: float | None = None) -> str:
-        """Why no clip of this shape (frames, height, width, 3) can be judged, or "". fps: None: of the first ranges."""
-        control_hz = self._models.simulation.control_hz
-        ranges = self.ranges_for(fps or control_hz / min(self._ranges))
-        if fps and abs(math.log(ranges.stride * fps / control_hz)) > math.log(FAR_RATE):
-            rates = ", ".join(f"{control_hz / stride:g}" for stride in self._ranges)
-            return f"{fps:g} frames per second, judged are {rates}; for others: wm judge calibrate ... --stride"
-        height, width = self._models.tokenizer.height, self._models.tokenizer.width
-        if tuple(shape[1:3]) != (height, width):
-            return f"{shape[1]} x {shape[2]} px, judged are {height} x {width} px"
-        if not ranges.lengths[0] <= shape[0] <= ranges.lengths[1]:
-            return f"{shape[0]} frames, judged are {ranges.lengths[0]} to {ranges.lengths[1]}"
-        return ""
+        """As the function of this name."""
+        return unfit_reason(self._ranges, self._models.manifest, shape, fps)
 
     def _naming(self, task: TaskSpec, ranges: NormalRanges) -> tuple[Status, str]:
         """Whether every coloured thing that the instruction names is in the reference frame."""
@@ -265,6 +243,45 @@ class OneClassJudge:
     def _p_fail(self, score: float, ranges: NormalRanges) -> float:
         """Of a score in spreads."""
         return 1 / (1 + math.exp(min(50.0, STEEPNESS * (1 - score / ranges.limit()))))
+
+
+def ranges_of(folder: Path, manifest: Mapping[str, Any]) -> dict[int, NormalRanges]:
+    """The ranges of a world model's folder by stride; the weights are not read.
+
+    Raises:
+        ModelFolderError: there are none, they are damaged, or they are of another world model.
+    """
+    found = {stride: load_ranges(folder, stride) for stride in strides_of(folder) or (1,)}
+    for stride, ranges in found.items():
+        if ranges.world_model != files_sha256(manifest):
+            raise ModelFolderError(
+                f"{file_of(folder, stride)} was made for another world model; make it anew: "
+                f"wm judge calibrate {folder} BAG --stride {stride}"
+            )
+    return found
+
+
+def nearest_ranges(known: Mapping[int, NormalRanges], manifest: Mapping[str, Any], fps: float) -> NormalRanges:
+    """The ranges of clips with so many frames per second; the nearest where there are none."""
+    wanted = manifest["simulation"]["control_hz"] / fps
+    return known[min(known, key=lambda stride: abs(math.log(stride / wanted)))]
+
+
+def unfit_reason(
+    known: Mapping[int, NormalRanges], manifest: Mapping[str, Any], shape: tuple[int, ...], fps: float | None = None
+) -> str:
+    """Why no clip of this shape (frames, height, width, 3) can be judged, or "". fps: None: of the first ranges."""
+    control_hz = manifest["simulation"]["control_hz"]
+    ranges = nearest_ranges(known, manifest, fps or control_hz / min(known))
+    if fps and abs(math.log(ranges.stride * fps / control_hz)) > math.log(FAR_RATE):
+        rates = ", ".join(f"{control_hz / stride:g}" for stride in known)
+        return f"{fps:g} frames per second, judged are {rates}; for others: wm judge calibrate ... --stride"
+    height, width = manifest["height"], manifest["width"]
+    if tuple(shape[1:3]) != (height, width):
+        return f"{shape[1]} x {shape[2]} px, judged are {height} x {width} px"
+    if not ranges.lengths[0] <= shape[0] <= ranges.lengths[1]:
+        return f"{shape[0]} frames, judged are {ranges.lengths[0]} to {ranges.lengths[1]}"
+    return ""
 
 
 def _abstention(name: Component, reason: str) -> Read:

@@ -54,7 +54,7 @@ def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, 
         rng = numpy_stream(seed, f"normal ranges/{index}")
         words |= {" ".join(pair) for pair in pairwise(words_of(episode.instruction))}
         steps = _end(episode, stride, rng)
-        longest = max(longest, len(episode.images[: steps + 1 : stride]))
+        longest = max(longest, steps // stride + 1)
         for shown in _forms(models, episode, steps, stride, rng):
             reference = episode.images[0]
             seen = pictures.picture_numbers(shown, reference, models.simulation.image_size, still)
@@ -65,9 +65,8 @@ def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, 
                 rows.ends.setdefault(task, []).append((signals[task], done))
     return NormalRanges(
         world_model=models.sha256, stride=stride, lengths=(SHORTEST - 1, 2 * longest), still=still,
-        origin=(float(origin[0]), float(origin[1]), float(origin[2])), done={
-            task: done_threshold(*zip(*ends)) for task, ends in sorted(rows.ends.items())
-        }, words=tuple(sorted(words)),
+        origin=(float(origin[0]), float(origin[1]), float(origin[2])), words=tuple(sorted(words)),
+        done={task: done_threshold(*zip(*ends)) for task, ends in sorted(rows.ends.items())},
         **fit(rows.numbers, rows.recording, seed),
         story={"recordings": len(recorded), "clips": len(rows.numbers), "seed": seed},
     )

@@ -63,8 +63,7 @@ def model_numbers(
     error = (imagined - latents[1:]).square().mean(2)
     still = (latents[1:] - latents[:-1]).square().mean(2)
     drawn = models.tokenizer.decode(imagined)
-    things = slice(PLACES["object"][0], PLACES["object"][-1] + 1)
-    miss = models.probe.read(drawn)[:, things] - models.probe.read(redrawn[1:])[:, things]
+    miss = (models.probe.read(drawn) - models.probe.read(redrawn[1:]))[:, PLACES["object"]]
     surprise = _blocks((drawn.float() - redrawn[1:].float()).abs().mean(3))
     moved, went = np.linalg.norm(np.diff(thing, axis=0), axis=1), np.linalg.norm(np.diff(tool.numpy(), axis=0), axis=1)
     gap = np.linalg.norm(tool.numpy()[:, :2] - thing, axis=1)
