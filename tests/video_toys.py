@@ -10,9 +10,9 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from wm_nodes.config.load import load_video_config
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import AdvantageConfig, GrpoConfig, KlConfig
-from wm_nodes.judge.backends.embedded import shipped_heads
-from wm_nodes.judge.evidence.head import load_head, save_head
+from wm_nodes.judge.one_class.ranges import load_ranges, save_ranges, strides_of
 from wm_nodes.training.ranks import Ranks
 from wm_nodes.video_model import (
     Condition,
@@ -160,9 +160,17 @@ def video_learner_rank(rank: int, size: int, folder: str, settings: GrpoConfig) 
 
 
 def far_sighted_judge(folder: Path) -> Path:
-    """The shipped judge of the loops' pictures, told that it was trained on clips as short as the tiny loop's, and that
-    none is foreign."""
+    """The shipped judge, told that clips as short as the tiny loop's are normal, and that nothing is strange."""
+    return changed_judge(folder, lengths=(2, 25), scores=(1e9,))
+
+
+def changed_judge(folder: Path, **ranges: Any) -> Path:
+    """A copy of the shipped judge of the cube with other ranges."""
     folder.mkdir()
-    head = load_head(shipped_heads()[1])
-    known = replace(head.familiarity, limit=1e9)
-    return save_head(folder, replace(head, lengths=(2, 25), familiarity=known))
+    shipped = shipped_model("push_cube")
+    for path in shipped.iterdir():
+        if path.is_file():
+            (folder / path.name).write_bytes(path.read_bytes())
+    for stride in strides_of(shipped):
+        save_ranges(folder, replace(load_ranges(shipped, stride), **ranges))
+    return folder

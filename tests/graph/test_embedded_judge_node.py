@@ -1,8 +1,7 @@
-"""The node of loop 2 with the embedded judge alone, no server and no GPU, and with a world model's evidence."""
+"""The node of loop 2 with the embedded judge alone, no server and no GPU."""
 
 import functools
 import json
-import math
 from pathlib import Path
 
 import pytest
@@ -23,14 +22,13 @@ from wm_nodes.video_rl.reference_reward import load_probe
 pytestmark = [pytest.mark.graph, pytest.mark.alone]
 
 
-def test_a_round_is_judged_in_the_node_without_any_server_and_with_the_evidence_of_the_world_model(
+def test_a_round_is_judged_in_the_node_without_any_server_as_in_one_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spec = functools.partial(make_spec, instruction="push the red cube into the blue target")
+    spec = functools.partial(make_spec, instruction="push the cube into the target")
     monkeypatch.setattr("graph.video_loop.make_spec", spec)
-    rubric = tmp_path / "bands.yaml"
-    bands = {"tokenizer_error": {"component": "clarity", "high": 1e-6}, "sharpness_min": {"component": "clarity"}}
-    rubric.write_text(json.dumps({"extends": "robot", "name": "bands", "evidence": bands}))
+    rubric = tmp_path / "own.yaml"
+    rubric.write_text(json.dumps({"extends": "robot", "name": "own"}))
     config = settings(**{
         "rewards": {"agent": 1.0}, "judge.kind": "embedded", "judge.folder": str(far_sighted_judge(tmp_path / "judge")),
         "judge.rubric": str(rubric),
@@ -49,19 +47,17 @@ def test_a_round_is_judged_in_the_node_without_any_server_and_with_the_evidence_
             wait_until("verdicts", lambda: len(verdicts) == 6)
             for verdict in verdicts:
                 assert verdict.status == ClipVerdict.OK and 0 <= verdict.reward <= 1, verdict.reason
-                assert verdict.judge_id.startswith("embedded:") and verdict.rubric_version.startswith("bands-1-")
+                assert verdict.judge_id.startswith("embedded:") and verdict.rubric_version.startswith("own-1-")
             judge = verdicts[0].judge_id
             wait_until("diagnostics", lambda: probe.value("/wm/reward_evaluator", "verdicts") == "6")
             assert probe.value("/wm/reward_evaluator", "judge") == judge
             assert probe.value("/wm/reward_evaluator", "abstained") == "0"
-            assert f"embedded judge {judge.removeprefix('embedded:')}" in graph.log("/wm/clip_evaluator")
+            assert f"one-class judge {judge.removeprefix('embedded:')}" in graph.log("/wm/clip_evaluator")
         finally:
             probe.close()
             assert set(graph.stop().values()) == {0}
         entries = read_record(graph.folder / "audit").judged()
-        evidence = [entry.evidence for entry in entries]
-        assert len(evidence) == 6 and all(set(found) == set(bands) for found in evidence)
-        assert all(math.isfinite(value) for found in evidence for value in found.values())
+        assert [entry.evidence for entry in entries] == [{}] * 6, "its own numbers are no second opinion"
         folder, contexts = load_video_folder(loop.model), load_clips([loop.bag], STRIDE)
         with JudgedContexts(folder, contexts, config, load_probe(MODEL_DIR), clip_fps(loop.bag, STRIDE)) as source:
             request = source.request(0, 0)
@@ -69,8 +65,3 @@ def test_a_round_is_judged_in_the_node_without_any_server_and_with_the_evidence_
         in_graph = {verdict.clip_id: (verdict.audit_id, verdict.reward) for verdict in verdicts}
         assert in_graph == {verdict.clip_id: (verdict.audit_id, verdict.reward) for verdict in source.verdicts}
         assert buffer.rewards["total"].tolist() == [verdict.reward for verdict in source.verdicts], "as in one process"
-        assert any(len(score.votes) > 1 for entry in entries for score in scores_of(entry.verdict, "clarity"))
-
-
-def scores_of(verdict: object, component: str) -> list[object]:
-    return [score for stage in verdict.stages for score in stage.components if score.component == component]  # type: ignore[attr-defined]

@@ -33,16 +33,11 @@ OPTIONS = {
     "judge calibrate": "model_dir bags --stride --seed --device",
     "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
     "--limit-clips --seed --reads --json --pictures",
-    "audit": "verify recover sample view agree people replay adopt",
-    "build-judge-dataset": "folder --tasks --episodes --edits --stacks --seed --shapes --recipes --development "
-    "--diverse --policy-view --stride --device --benchmark --check",
-    "train-judge": "out sets --seed --segmenter-steps --readers --reader-epochs --trees --device --threads "
-    "--policy-view --measure",
-    "normal-ranges": "model_dir bags --check --output --rubric --stride --tail --device",
+    "audit": "verify recover sample view agree people replay",
     "benchmark speed": "--json --quick --preset --model-dir --untrained --seed",
     "benchmark environments": "trained-in ranking speed",
     "benchmark video-rl": "base diversity learning ablations hacking cost clips clip-learning resolution",
-    "benchmark judge": "table efficiency comparisons imagined-vs-real speed fault-visibility pai-bench",
+    "benchmark judge": "erring success-clips",
 }
 
 

@@ -19,12 +19,7 @@ MODEL = str(shipped_model("push_cube"))
         ["train-policy", "--preset", "smoke", "--from-scratch", "--run-dir", "run"],
         ["train-video-model", "--preset", "smoke", "--run-dir", "run"],
         ["seed-study", "--preset", "smoke", "--out", "study"],
-        ["train-judge", "judge", "set"],
-        ["train-judge", "judge", "set", "--measure", "test"],
-        ["normal-ranges", MODEL, "bag", "--output", "bands.yaml"],
-        ["build-judge-dataset", "set", "--policy-view"],
-        ["benchmark", "judge", "imagined-vs-real", "episodes"],
-        ["benchmark", "judge", "speed", "--cores", "1", "--clips", "1"],
+        ["judge", "calibrate", MODEL, "bag"],
     ],
     ids=" ".join,
 )

@@ -14,7 +14,7 @@ import torch
 from graph.video_loop import STRIDE, make_video_folder, settings, write_contexts
 from recording_samples import make_spec
 from torch.testing import assert_close
-from video_toys import far_sighted_judge
+from video_toys import changed_judge, far_sighted_judge
 
 from benchmarks.video_rl.judged import JudgedContexts, open_judge
 from wm_nodes.config.load import load_config, load_video_config
@@ -27,8 +27,7 @@ from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.precheck import precheck
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_heads
-from wm_nodes.judge.evidence.head import load_head
+from wm_nodes.judge.backends.one_class import OneClassJudge
 from wm_nodes.judge.service import ClipJob, TrainingPaused, buffer_jobs
 from wm_nodes.video_model.clips import Clips, load_clips
 from wm_nodes.video_model.folder import load_video_folder
@@ -45,7 +44,7 @@ HIDDEN = {"groups.hide_actions": True, "model.training.hide_actions": 0.5}
 @pytest.fixture
 def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Clips, dict[str, Any]]:
     """An untrained video model, recorded contexts, and settings that judge its clips."""
-    spec = functools.partial(make_spec, instruction="push the red cube into the blue target")
+    spec = functools.partial(make_spec, instruction="push the cube into the target")
     monkeypatch.setattr("graph.video_loop.make_spec", spec)
     contexts = load_clips([write_contexts(tmp_path / "bag")], STRIDE)
     folder = load_video_folder(make_video_folder(tmp_path / "video", contexts))
@@ -62,7 +61,7 @@ def test_the_agents_reward_is_mixed_with_others_and_is_what_the_service_says_of_
         found, again = source.score(request, clips), source.score(request, clips)
         references, frames = source.references(request), folder.codec.decode(clips.rollout.latents)
         jobs = buffer_jobs(frames, references, hashlib.sha256(clips.to_bytes()).hexdigest(), config, given=1, fps=FPS)
-        judge = open_judge(config, contexts)
+        judge = open_judge(config, contexts, FPS)
         alone = judge.judge(jobs)
         judge.close()
     assert [verdict.audit_id for verdict in source.verdicts] == [verdict.audit_id for verdict in alone]
@@ -109,9 +108,9 @@ def test_recorded_actions_are_not_what_a_clip_of_hidden_actions_should_show(give
     assert all(job.task.actions is None and job.task.task_id == "push_cube" for job in jobs(**HIDDEN))
 
 
-def test_without_weight_nobody_is_asked_and_a_round_without_verdicts_pauses(given: Any) -> None:
+def test_without_weight_nobody_is_asked_and_a_round_without_verdicts_pauses(given: Any, tmp_path: Path) -> None:
     folder, contexts, values = given
-    foreign = {"judge.kind": "embedded", "judge.folder": str(shipped_heads()[0])}  # of other pictures
+    foreign = {"judge.kind": "embedded", "judge.folder": str(changed_judge(tmp_path / "long", lengths=(40, 50)))}
     with pytest.raises(ValueError, match="cannot judge clips of 3 frames, 64 x 128 px"):
         JudgedContexts(folder, contexts, settings(**foreign, rewards={"agent": 1.0}), load_probe(MODEL_DIR), FPS)
     with JudgedContexts(folder, contexts, settings(**foreign), load_probe(MODEL_DIR), FPS) as source:
@@ -124,7 +123,7 @@ def test_without_weight_nobody_is_asked_and_a_round_without_verdicts_pauses(give
             source.score(request, source.sample(request))
 
 
-PACKS = ("robot", "robot_no_physics", "robot_no_planning", "robot_single_read", "robot_soft_gates", "robot_open_gates")
+PACKS = ("robot", "robot_no_physics", "robot_no_planning", "robot_single_read", "robot_open_gates")
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +139,7 @@ def verdicts(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], 
         clips[name] = codec.decode(codec.encode(recorded.frames))[0].numpy(), recorded
     frames, recorded = clips["success"]
     clips["vanished"] = np.concatenate([frames[:-3], [without_blue(frame) for frame in frames[-3:]]]), recorded
-    judge = EmbeddedJudge(load_head(shipped_heads()[1]))
+    judge = OneClassJudge(MODEL_DIR)
     return {
         (name, pack): asyncio.run(RewardAgent(judge, load_rubric(pack)).evaluate(job.clip, job.task))
         for name, (shown, source) in clips.items()
@@ -162,7 +161,7 @@ def test_a_success_earns_nearly_one_by_every_pack_and_a_failure_less_the_later_i
     verdicts: dict[tuple[str, str], Verdict]
 ) -> None:
     assert all(verdict.valid for verdict in verdicts.values())
-    assert all(verdicts["success", pack].reward > 0.95 for pack in PACKS)
+    assert all(verdicts["success", pack].reward > 0.9 for pack in PACKS)
     fails = {pack: verdicts["failure", pack].reward for pack in PACKS}
     assert not verdicts["failure", "robot"].stages[2].passed
     assert all(reward < 0.85 for reward in fails.values())
@@ -173,6 +172,6 @@ def test_a_success_earns_nearly_one_by_every_pack_and_a_failure_less_the_later_i
 @pytest.mark.rendering
 def test_without_physics_a_vanished_cube_is_paid_as_if_it_were_there(verdicts: dict[tuple[str, str], Verdict]) -> None:
     whole, hackable = verdicts["vanished", "robot"], verdicts["vanished", "robot_no_physics"]
-    assert whole.reward < verdicts["success", "robot"].reward - 0.15
-    assert hackable.reward > verdicts["success", "robot_no_physics"].reward - 0.05
+    assert whole.reward < verdicts["success", "robot"].reward - 0.25
+    assert hackable.reward > verdicts["success", "robot_no_physics"].reward - 0.2
     assert any(flag.pattern == "physics" and flag.confirmed for flag in whole.hack_flags)

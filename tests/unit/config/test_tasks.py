@@ -12,17 +12,16 @@ from own_packages import write_package
 import wm_nodes
 from wm_nodes.apps import cli
 from wm_nodes.config.load import ConfigError, default_task, load_config
-from wm_nodes.config.tasks import VARIABLE, clip_rules, get_task, model_tasks, recorded_task, shares_scene, task_names
+from wm_nodes.config.tasks import VARIABLE, get_task, model_tasks, recorded_task, shares_scene, task_names
 from wm_nodes.core.specs import simulation_spec
 
 TASKS = ("pull_cube", "push_cube", "reach")
 IN_SCENES = ("move_to_aim", "pick_place", "pull", "push", "reach_object")
 ALL = "all_tasks"
 """Those of the procedural scenes, and the one whose episodes are of all of them."""
-NAMED_IN = {"launching/scenarios.py", "environments/maniskill/objects.py", "judge/dataset/build.py",
-            "judge/clip_files.py", "apps/judge_clips.py", "policy_rl/train.py"}
-"""The default task of launch files, those that share a model, the tasks of a fixed set of clips, two lines of
-clips.jsonl, an example."""
+NAMED_IN = {"launching/scenarios.py", "environments/maniskill/objects.py", "judge/clip_files.py", "apps/judge_clips.py",
+            "policy_rl/train.py"}
+"""The default task of launch files, those that share a model, two lines of clips.jsonl, an example."""
 
 
 @pytest.mark.parametrize(
@@ -56,12 +55,6 @@ def test_a_task_belongs_to_its_model_and_its_seeds_are_its_own(task: str) -> Non
     assert task in model_tasks(task) and {model_tasks(other) for other in model_tasks(task)} == {model_tasks(task)}
     numbers = [policy.number for other in model_tasks(task) for policy in get_task(other).weak_policies]
     assert len(numbers) == len(set(numbers)) > 0
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_the_shares_of_a_tasks_clips_are_complete(task: str) -> None:
-    for shares in (clip_rules(task).behaviours, clip_rules(task).policy_behaviours):
-        assert sum(shares.values()) == pytest.approx(1)
 
 
 def test_no_module_but_its_file_knows_a_task_by_its_name() -> None:
@@ -124,14 +117,3 @@ def test_a_wrong_task_file_is_one_clear_error(
     monkeypatch.setenv(VARIABLE, package)
     with pytest.raises(ValueError, match=error):
         get_task(next(iter(files or ["blank"])) if package != "double_tasks" else "unheard")
-
-
-def test_a_task_without_rules_for_the_judge_says_what_its_file_lacks(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    text = "from dataclasses import replace\n\nfrom wm_nodes.config.tasks import get_task\n\n"
-    write_package(tmp_path, "ruleless_tasks", wave=f"{text}TASK = replace(get_task('reach'), clips=None)\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv(VARIABLE, "ruleless_tasks")
-    with pytest.raises(ValueError, match=r"'wave' has no rule to label clips by; give its file clips=ClipRules"):
-        clip_rules("wave")

@@ -11,7 +11,6 @@ from wm_nodes.core.statistics import (
     effective_size,
     expected_calibration_error,
     kappa,
-    recall_at,
     wilson_interval,
     wilson_of_share,
 )
@@ -82,9 +81,3 @@ def test_weighted_share_has_wilsons_interval_at_its_effective_size() -> None:
     assert share == 0.75
     assert (low, high) == pytest.approx(wilson_interval(0.75 * 1.6, 1.6))
     assert wilson_of_share([])[1:] == (0.0, 1.0)
-
-
-def test_recall_at_five_percent_false_positives_is_read_off_the_curve() -> None:
-    others = [i / 100 for i in range(40)]  # two of them may be above: the threshold is .37
-    assert recall_at([True] * 4 + [False] * 40, [0.9, 0.38, 0.37, 0.1, *others], 0.05) == 0.5
-    assert np.isnan(recall_at([True], [0.5], 0.05))

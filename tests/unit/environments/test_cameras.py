@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sapien
 from model_folders import make_model_folder
 from numpy.typing import NDArray
 from safetensors.numpy import save_file
+from transforms3d.euler import euler2quat
 
 from wm_nodes.config.load import load_config
 from wm_nodes.core.cameras import CameraModel
@@ -51,9 +53,10 @@ def outlines(env: ManiSkillEnvironment, place: int) -> tuple[NDArray[np.float64]
 @pytest.mark.rendering
 def test_the_cubes_corners_project_onto_the_edges_of_its_picture(env: ManiSkillEnvironment) -> None:
     env.reset(seeds=np.array([4], np.uint64))
-    off = []
+    off, height = [], float(env.scene.obj.pose.raw_pose[0, 2])
     for x, y in ((0.08, -0.12), (0.11, -0.08), (0.14, -0.03), (0.17, 0.03), (0.2, 0.06)):
-        env.lay_out((x, y), 0.3)
+        env.scene.obj.set_pose(sapien.Pose([x, y, height], euler2quat(0, 0, 0.3)))
+        env._start(0)  # so that it is drawn
         found, expected = outlines(env, 0)
         np.testing.assert_allclose(found, expected, atol=1.2)
         off.append((found - expected).reshape(2, 2).mean(0))

@@ -1,5 +1,6 @@
-"""A fourth task is one file: written to a package of its own, it is simulated, recorded and labelled."""
+"""A further task is one file: written to a package of its own, it is simulated, recorded and judged."""
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,17 +9,32 @@ import pytest
 from own_packages import own_package
 
 from wm_nodes.config.load import load_config
-from wm_nodes.config.tasks import VARIABLE, clip_rules, get_task, model_tasks
+from wm_nodes.config.seed_ranges import MODEL_EPISODES
+from wm_nodes.config.tasks import VARIABLE, get_task, model_tasks, success
+from wm_nodes.core.types import UInt8Array
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import planned_episode, scripted_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
-from wm_nodes.environments.record import collect_plan, demonstration_plan
-from wm_nodes.judge.dataset.build import LabelledClipSource
-from wm_nodes.judge.dataset.edits.truth import tc_level
+from wm_nodes.environments.record import collect_plan, demonstration_plan, scripted_plan
+from wm_nodes.judge.agent.machine import RewardAgent
+from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.types import Status, TaskSpec, clip_ref
+from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.backends.one_class import OneClassJudge
+from wm_nodes.judge.decisions import accepts
+from wm_nodes.judge.one_class import ranges
+from wm_nodes.judge.one_class.calibration import calibrate
+from wm_nodes.judge.one_class.ranges import save_ranges
 from wm_nodes.recording import read_episodes
+from wm_nodes.recording.episode_arrays import stack_episodes
+from wm_nodes.recording.reader import read_spec
+from wm_nodes.world_model import load_model_folder, save_model_folder
 from wm_nodes.world_model.tokenizer import PROBE_NAMES
-from wm_nodes.world_model.training.tokenizer import probe_targets
+from wm_nodes.world_model.training.dynamics import train_action_model
+from wm_nodes.world_model.training.position_probe import train_position_probe
+from wm_nodes.world_model.training.tokenizer import probe_targets, train_tokenizer
 
+RECORDINGS = 16
 pytestmark = pytest.mark.rendering
 NUDGE = '''
 """Move the cube a centimetre, in a scene whose goal disc is small."""
@@ -26,7 +42,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from wm_nodes.config.tasks import ClipRules, TaskRule
 from wm_nodes.environments.maniskill import table_top
 from wm_nodes.environments.maniskill.tasks import push_cube
 
@@ -59,9 +74,8 @@ TASK = replace(
     success=lambda truth: truth[..., 0] > 0.01,
     waypoints=lambda truth: push_cube.push_waypoints(truth[1:]),
     script=script,
-    settings={"sft.num_demonstrations": 2, "judge.rubric": "robot_push_cube", "data.behaviours": {"expert": 1.0}},
+    settings={"sft.num_demonstrations": 2, "judge.rubric": "robot_no_physics", "data.behaviours": {"expert": 1.0}},
     model_tasks=(),
-    clips=ClipRules(TaskRule("object", 1e-3), behaviours={"short": 1.0}, policy_behaviours={"random": 1.0}),
 )
 '''
 
@@ -75,7 +89,7 @@ def task_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 def test_its_settings_lie_over_the_presets_and_its_model_serves_it_alone() -> None:
     config = load_config("cpu", {"task": "nudge", "data.behaviours.noisy": 0.5})
-    assert (config.task, config.sft.num_demonstrations, config.judge.rubric) == ("nudge", 2, "robot_push_cube")
+    assert (config.task, config.sft.num_demonstrations, config.judge.rubric) == ("nudge", 2, "robot_no_physics")
     assert config.data.behaviours == {"expert": 1.0, "noisy": 0.5}
     assert load_config("cpu", {"task": "nudge"}).data.behaviours == {"expert": 1.0}, "the file's own value changed"
     assert model_tasks("nudge") == ("nudge",)
@@ -104,9 +118,35 @@ def test_its_demonstrations_are_recorded_and_what_a_world_model_probes_is_found_
     np.testing.assert_array_equal(probed[:, PROBE_NAMES.index("object_x")], episode.ground_truth[:, 1])
 
 
-def test_the_judge_draws_and_labels_its_clips_by_its_own_rule() -> None:
-    source = LabelledClipSource("nudge", load_config("cpu").simulation)
-    clip = source.clip(1)
-    source.close()
-    assert clip.clip.origin.behaviour == "short" and clip.clip.instruction.startswith("nudge the ")
-    assert clip.labels.tc_level == 2 and tc_level(clip.clip.states, clip_rules("push_cube").label) == 4
+def test_a_judge_of_its_recordings_decides_whether_it_is_done_and_refuses_what_they_never_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ranges, "LEAST", RECORDINGS)
+    small = {
+        "task": "nudge", "data.behaviours": {"expert": 0.5, "random": 0.5}, "tokenizer.num_iterations": 40,
+        "tokenizer.probe_iterations": 60, "world_model.num_iterations": 15, "world_model.rollout_steps": [3],
+    }
+    config = load_config("smoke", small)
+    bags = collect_plan(scripted_plan(config, RECORDINGS, MODEL_EPISODES), config, tmp_path / "bags")
+    recorded = [episode for bag in bags for episode in read_episodes(bag)]
+    episodes = stack_episodes(recorded, ("nudge",), success)
+    tokenizer, _ = train_tokenizer(episodes, config, 0, None)
+    action, _ = train_action_model(tokenizer, episodes, config, 0, None)
+    probe, _ = train_position_probe(episodes, config, 0, None)
+    folder = tmp_path / "model"
+    save_model_folder(folder, tokenizer, action, None, config, tasks=("nudge",), story={"made": {}}, probe=probe)
+    save_ranges(folder, calibrate(load_model_folder(folder), recorded, stride=1, seed=0))
+
+    def judged(frames: UInt8Array) -> Verdict:
+        episode = max(recorded, key=lambda episode: episode.success[-1])
+        task = TaskSpec(episode.instruction, "nudge", "panda", episode.images[0], actions=episode.actions)
+        agent = RewardAgent(OneClassJudge(folder), load_rubric("robot_no_physics"), mode="benchmark")
+        return asyncio.run(agent.evaluate(clip_ref("clip", frames, 1 / recorded_s), task))
+
+    recorded_s = read_spec(bags[0]).control_period_s
+    shown = max(recorded, key=lambda episode: episode.success[-1]).images
+    clean, grey = judged(shown), judged(np.concatenate([shown[:4], shown[4:] // 3]))
+    assert clean.valid and grey.valid, (clean.reason, grey.reason)
+    names = {score.component: score for stage in clean.stages for score in stage.components}
+    assert names["task_completion"].status is Status.OK
+    assert accepts(grey) is False and grey.reward <= clean.reward

@@ -16,14 +16,17 @@ from scripted_judge import make_clip, make_task
 
 from wm_nodes.config.load import ConfigError, default_judge, dump_config, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.judge.agent.contract import check_one_judge, pause_reason
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.reading import read_record, verify
-from wm_nodes.judge.backends.embedded import shipped_heads
-from wm_nodes.judge.backends.factory import check_clips, check_judge, for_clips, judges_of
+from wm_nodes.judge.backends.factory import check_clips, check_judge, for_task, judges_of
 from wm_nodes.judge.backends.limits import CircuitBreaker
+from wm_nodes.judge.backends.one_class import OneClassJudge
+from wm_nodes.judge.check_set import load_check_set
 from wm_nodes.judge.episode_reward import EpisodeReward, check_agent
+from wm_nodes.judge.one_class.ranges import COMPONENTS
 from wm_nodes.judge.service import ClipJob, JudgeService
 
 FIRST, SECOND = "openai-chat:first", "openai-chat:second"
@@ -196,40 +199,51 @@ def test_a_round_is_judged_again_by_the_judge_that_is_named(servers: Servers) ->
 
 def test_the_embedded_judge_takes_a_round_of_clips_of_its_size_and_keeps_what_it_cannot_tell(servers: Servers) -> None:
     servers[0].down = True
-    frames = np.random.default_rng(0).integers(0, 256, (2, 16, 96, 96, 3), np.uint8)
+    frames = np.random.default_rng(0).integers(0, 256, (2, 16, 64, 128, 3), np.uint8)
     some = [
         replace(job, clip=replace(job.clip, frames=clip), task=replace(job.task, reference_frame=clip[0]))
         for job, clip in zip(jobs(2), frames, strict=True)
     ]
-    embedded = settings(servers, fallbacks=[{"kind": "embedded"}])
-    check_clips(embedded, (16, 96, 96, 3))
+    folder = str(shipped_model("push_cube"))
+    embedded = settings(servers, fallbacks=[{"kind": "embedded", "folder": folder}])
+    check_clips(embedded, (16, 64, 128, 3), 5.0)
     with closing(JudgeService(embedded, seed=0)) as judge:
         verdicts = judge.judge(some)
         assert judge.judge_id.startswith("embedded:") and judges(verdicts) == {judge.judge_id}
         (card,) = judge.cards
-        assert judge.judge_id.removeprefix("embedded:") in card and "task_completion  balanced accuracy" in card
-    assert {verdict.status for verdict in verdicts} == {Status.ABSTAIN}, "noise is unlike all it has seen"
+        assert judge.judge_id.removeprefix("embedded:") in card and "recordings" in card
+    assert {verdict.status for verdict in verdicts} == {Status.ABSTAIN}, "its recordings have no such words"
     asked = [len(server.requests) for server in servers]
     fallback = {"endpoints": [servers[1].url], "model": "second"}
-    with closing(JudgeService(settings(servers, kind="embedded", fallbacks=[fallback]), seed=0)) as judge:
+    first = settings(servers, kind="embedded", folder=folder, fallbacks=[fallback])
+    with closing(JudgeService(first, seed=0)) as judge:
         stays = judge.judge(some)
     assert judges(stays) == judges(verdicts) and [len(server.requests) for server in servers] == asked, (
         "a judge that cannot say has answered: nobody else is asked"
     )
-    check_clips(embedded, (16, 64, 128, 3))  # by the judge of the loops' pictures
     with pytest.raises(ValueError, match=r"cannot judge clips of 8 frames, 32 x 64 px.* Name a server"):
         check_clips(embedded, (8, 32, 64, 3))
 
 
-def test_an_embedded_judge_that_is_not_named_is_the_shipped_one_of_such_pictures_and_others_stay() -> None:
+def test_beside_a_server_the_world_models_normal_ranges_are_evidence(servers: Servers, tmp_path: Path) -> None:
+    clip = next(one for one in load_check_set() if one.truth.part == "policy")
+    folder = shipped_model("push_cube")
+    with closing(JudgeService(settings(servers), seed=0, audit=tmp_path, model_dir=folder)) as judge:
+        judge.judge([clip.job, *jobs(1)])
+    known, other = read_record(tmp_path).judged()
+    assert set(known.evidence) == set(COMPONENTS.values()) and other.evidence == {}, "of other pictures there is none"
+    assert known.evidence == OneClassJudge(folder).evidence(clip.job.clip, clip.job.task)
+
+
+def test_an_embedded_judge_that_is_not_named_is_the_shipped_one_of_the_task_and_others_stay() -> None:
     nobody, here = {"kind": "embedded"}, {"kind": "embedded", "folder": "mine"}
     other, server = {**here, "stages": ["TC"]}, {"endpoints": ["http://b/v1"], "model": "first"}
     values = {**default_judge().model_dump(), **nobody, "routes": [other], "fallbacks": [nobody, server]}
-    for size, folder in zip(((96, 96), (64, 128)), shipped_heads(), strict=True):
-        found = for_clips(JudgeConfig.model_validate(values), (17, *size, 3))
-        assert [found.folder, found.fallbacks[0].folder] == [str(folder)] * 2
-        assert found.routes[0].folder == "mine" and found.fallbacks[1].folder == ""
-    assert for_clips(JudgeConfig.model_validate(values), (17, 9, 9, 3)).folder == str(shipped_heads()[0])
+    found, shipped = for_task(JudgeConfig.model_validate(values), "push_cube"), str(shipped_model("push_cube"))
+    assert [found.folder, found.fallbacks[0].folder] == [shipped] * 2
+    assert found.routes[0].folder == "mine" and found.fallbacks[1].folder == ""
+    with pytest.raises(ValueError, match=r"no judge is shipped for task 'pull_cube' .*judge calibrate"):
+        for_task(JudgeConfig.model_validate(values), "pull_cube")
 
 
 @pytest.mark.parametrize(

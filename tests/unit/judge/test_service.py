@@ -17,15 +17,16 @@ from judge_server import PickyServer
 from recording_samples import make_spec
 from rl_toys import toy_policy, toy_ppo, toy_rollout
 from scripted_judge import make_clip, make_task
+from video_toys import changed_judge
 
 from wm_nodes.apps.cli import main
 from wm_nodes.config.load import default_judge, dump_config, judge_overrides, load_config, load_video_config
 from wm_nodes.config.schema import JudgeConfig
+from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.named_files import NamedFiles, OutsideFolders
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.reading import read_record
-from wm_nodes.judge.backends.embedded import shipped_head
 from wm_nodes.judge.backends.factory import check_judge
 from wm_nodes.judge.episode_reward import EpisodeReward, EpisodeStep, PendingReward, check_horizon, unjudged_reason
 from wm_nodes.judge.service import ClipJob, JudgeService
@@ -291,7 +292,8 @@ def test_the_command_refuses_an_embedded_judge_that_cannot_read_its_clips_before
 ) -> None:
     bags = [write_contexts(tmp_path / "contexts")]
     monkeypatch.setattr("wm_nodes.apps.train_video_model._data", lambda *given: (bags, bags))
-    embedded = ["--reward", "agent", "--judge", str(shipped_head()), "--from-scratch"]
+    long = changed_judge(tmp_path / "long", lengths=(40, 50))
+    embedded = ["--reward", "agent", "--judge", str(long), "--from-scratch"]
     run_dir = tmp_path / "run"
     assert main(["train-video-model", "--preset", "smoke", *embedded, "--run-dir", str(run_dir)]) == 2
     said = capsys.readouterr().err
@@ -306,15 +308,18 @@ def test_the_command_refuses_an_embedded_judge_that_cannot_read_its_clips_before
         (["--judge-model", "judge"], "judge.model would change nothing without --reward agent"),
         (["--reward", "agent", *JUDGE, "--set", "ppo.num_steps=15"], "ppo.num_steps is 15"),
         (["--reward", "agent", *JUDGE, "--rubric", "nowhere"], "nowhere"),
-        (["--reward", "agent", "--judge", str(shipped_head())], "cannot judge clips of 17 frames, 64 x 128 px"),
-        (["--reward", "agent", "--judge", str(shipped_head())], "Name a server"),
+        (["--reward", "agent", "--judge", "LONG"], "cannot judge clips of 17 frames, 64 x 128 px"),
+        (["--reward", "agent", "--judge", "LONG"], "Name a server"),
+        (["--reward", "agent", "--task", "pull_cube", "--from-scratch"], "no judge is shipped for task 'pull_cube'"),
     ],
-    ids=["nobody", "judge_alone", "cut_off", "no_rubric", "size", "remedy"],
+    ids=["nobody", "judge_alone", "cut_off", "no_rubric", "length", "remedy", "other_task"],
 )
 def test_the_main_job_refuses_an_agent_that_could_not_judge_before_anything_is_made(
     options: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run_dir = tmp_path / "run"
+    if "LONG" in options:
+        options = [*options[:-1], str(changed_judge(tmp_path / "long", lengths=(40, 50)))]
     given = ["--preset", "smoke", "--set", "ppo.num_steps=16", "--run-dir", str(run_dir), *options]
     assert main(["train-policy", *given]) == 2
     assert words in capsys.readouterr().err and not run_dir.exists()
@@ -334,7 +339,8 @@ def test_launch_arguments_bring_the_agent_into_both_loops(tmp_path: Path) -> Non
     assert isinstance(topics, list) and "reward/verdict" in topics
     assert load_config(values["config_file"]).judge.endpoints == ["http://localhost:1/v1"]
     clips = {**given, "video_preset": "smoke", "video_model_dir": "m", "context_bags": "b"}
-    for name, folder in (("embedded", ""), (str(shipped_head()), str(shipped_head()))):
+    shipped, long = str(shipped_model("push_cube")), str(changed_judge(tmp_path / "long", lengths=(40, 50)))
+    for name, folder in (("embedded", ""), (shipped, shipped)):
         _, values = launch_arguments.prepare("world_model_rl", {**clips, "reward": "agent", "judge": name})
         here = load_video_config(values["config_file"]).judge
         assert (here.kind, here.folder, here.endpoints) == ("embedded", folder, [])
@@ -346,10 +352,9 @@ def test_launch_arguments_bring_the_agent_into_both_loops(tmp_path: Path) -> Non
     ):
         _, values = launch_arguments.prepare(scenario, {**arguments, "reward": "agent"})
         assert load(values["config_file"]).judge.kind == "embedded", "nobody is named: the one that needs nothing"
-    wide = str(shipped_head())
     refusals = [
         ("online_training", {**policies, "reward": "agent", "judge_model": "judge"}, "needs a judge"),
-        ("online_training", {**policies, "reward": "agent", "judge": wide}, "cannot judge clips of .* 64 x 128"),
+        ("online_training", {**policies, "reward": "agent", "judge": long}, "cannot judge clips of .* 64 x 128"),
         ("online_training", {**policies, "judge": "http://localhost:1/v1"}, "would change nothing without"),
         ("online_training", {**given, **judge, "config_file": values["config_file"]}, "belong into it"),
         ("online_training", {**policies, **judge, "preset": "smoke"}, r"ppo\.num_steps is 6"),

@@ -29,7 +29,8 @@ from wm_nodes.judge.agent.machine import RewardAgent
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.check_set import CHECK_SET, LabelledClip, load_check_set
-from wm_nodes.judge.decisions import FAIR_LEVEL, accepts
+from wm_nodes.judge.decisions import accepts
+from wm_nodes.judge.paper_table import FAIR_LEVEL
 from wm_nodes.reports.console_table import estimate, make_table
 
 AGENT = "agent"

@@ -15,6 +15,7 @@ log p(True) with time, 0 where all are equal. Nothing is downloaded. Clips witho
 import argparse
 import csv
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -33,6 +34,7 @@ from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.statistics import auroc, bootstrap_mean, wilson_interval
 from wm_nodes.judge.agent import topreward
+from wm_nodes.judge.agent.types import ClipRef, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.clip_files import ClipLine, read_job
 from wm_nodes.judge.decisions import accepts
@@ -40,6 +42,8 @@ from wm_nodes.judge.service import ClipJob, JudgeService
 
 METADATA, TABLE, TEST, COLUMNS = "metadata.jsonl", "labels.csv", "test", {"file", "instruction", "label"}
 TOP_SCORE, ROBOT, DRAWS = 5, "not told", 1000
+NUM_PREFIXES = 15
+"""Of a curve, as published."""
 
 
 class LabelledVideo(NamedTuple):
@@ -132,10 +136,25 @@ def _bootstrapped(statistic: Callable[[Any, Any], float], one: Any, other: Any, 
     return [statistic(one, other), float(low), float(high)]
 
 
+def prefixes(clip: ClipRef, count: int) -> list[ClipRef]:
+    """`count` prefixes of a clip, the last one whole; fewer of a short one, because each has 2 frames or more."""
+    ends = sorted({int(end) for end in np.linspace(2, len(clip.frames), count).round()})
+    return [clip_ref(f"{clip.clip_id}[:{end}]", clip.frames[:end], clip.fps, clip.source) for end in ends]
+
+
+def log_p_true(verdict: Verdict) -> float:
+    """log p("True"), not normalised over both words. NaN without a number, -inf where p is 0."""
+    reads = [read for stage in verdict.stages for score in stage.components for read in score.votes]
+    if not verdict.valid or not reads:
+        return math.nan
+    p_true = reads[0].levels[-1] * reads[0].label_mass
+    return math.log(p_true) if p_true > 0 else -math.inf
+
+
 def voc(judge: JudgeService, job: ClipJob, count: int) -> float:
     """Value-order correlation of a clip's progress; NaN where a prefix has no number."""
-    jobs = [ClipJob(clip, job.task) for clip in topreward.prefixes(job.clip, count)]
-    values = [topreward.log_p_true(verdict) for verdict in judge.judge(jobs)]
+    jobs = [ClipJob(clip, job.task) for clip in prefixes(job.clip, count)]
+    values = [log_p_true(verdict) for verdict in judge.judge(jobs)]
     if np.isnan(values).any():
         return float("nan")
     return 0.0 if len(set(values)) == 1 else spearman(values, range(len(values)), seed=0, draws=0)[0]
@@ -146,7 +165,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", choices=FORMATS, required=True)
     parser.add_argument("--mode", choices=("reward", topreward.MODE), default="reward", help="of the judge")
     parser.add_argument("--clips", type=positive, help="the first so many; default: all")
-    parser.add_argument("--prefixes", type=positive, metavar="K", help=f"as published: {topreward.NUM_PREFIXES}")
+    parser.add_argument("--prefixes", type=positive, metavar="K", help=f"as published: {NUM_PREFIXES}")
     parser.add_argument("--reads", type=Path, help="folder that keeps a server's answers")
     add_judge(parser)
     add_device(parser)

@@ -9,8 +9,7 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.judge.agent.contract import check_one_judge, pause_reason
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.factory import check_clips, for_clips
-from wm_nodes.judge.evidence_of_clip import ClipEvidence
+from wm_nodes.judge.backends.factory import check_clips, for_task
 from wm_nodes.judge.service import JudgeService, TrainingPaused, agent_scores, buffer_jobs
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips
@@ -38,7 +37,7 @@ class JudgedContexts(RecordedContexts):
     ) -> None:
         super().__init__(folder, contexts, config, probe)
         self.fps, self.verdicts = fps, tuple[Verdict, ...]()
-        self._judge = open_judge(config, contexts) if config.rewards.get(AGENT) else None
+        self._judge = open_judge(config, contexts, fps) if config.rewards.get(AGENT) else None
 
     def __enter__(self) -> Self:
         return self
@@ -66,10 +65,8 @@ class JudgedContexts(RecordedContexts):
         return attach_rewards(clips, scores, mix_rewards(scores, rewards))
 
 
-def open_judge(config: VideoRlConfig, clips: Clips) -> JudgeService:
+def open_judge(config: VideoRlConfig, clips: Clips, fps: float) -> JudgeService:
     """The judge of such clips that the reward_evaluator node would ask; close it in the end. Raises ValueError."""
-    shape = tuple(clips.frames.shape[1:])
-    settings = for_clips(judge_or_embedded(config.judge), shape)
-    check_clips(settings, shape)
-    evidence = ClipEvidence(shipped_model(config.task), config.device)
-    return JudgeService(settings, seed=config.seed, evidence=evidence, device=config.device)
+    settings, models = for_task(judge_or_embedded(config.judge), config.task), shipped_model(config.task)
+    check_clips(settings, tuple(clips.frames.shape[1:]), fps)
+    return JudgeService(settings, seed=config.seed, model_dir=models, device=config.device)

@@ -52,15 +52,12 @@ GROUPS = {
         "judge calibrate": "the embedded judge, on recordings in which nothing is wrong",
         "judge hack": "whether a judge can be hacked on clips of your own",
         "audit": "verify, label, replay and compare the judge's logs",
-        "build-judge-dataset": "clips with known labels, from the simulator",
-        "train-judge": "the embedded judge, from such clips; or measure it",
-        "normal-ranges": "of the world model's evidence, for a rubric",
     },
     "benchmarks, where the repository is": {
         "benchmark speed": "how fast graph, world model and simulator are; or a GPU (--device)",
         "benchmark environments": "what models are worth as the environment of a policy",
         "benchmark video-rl": "DynDiff-GRPO against its rivals",
-        "benchmark judge": "the reward agent against labels, and its speed",
+        "benchmark judge": "the reward agent under a judge that errs; labelled episodes of others",
     },
 }
 VERBS = {name: about for verbs in GROUPS.values() for name, about in verbs.items()}

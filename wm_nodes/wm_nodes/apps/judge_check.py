@@ -31,6 +31,7 @@ from wm_nodes.judge.backends.factory import check_judge, judge_name
 from wm_nodes.judge.check_report import CheckReport, Share, report
 from wm_nodes.judge.check_run import MODES, choose, run_check
 from wm_nodes.judge.check_set import load_check_set
+from wm_nodes.judge.paper_table import paper_table
 from wm_nodes.reports.console_table import make_table, percent, percent_interval
 
 
@@ -76,25 +77,15 @@ def run(arguments: argparse.Namespace) -> int:
         written = {"judge": judge_name(judge), "command": arguments.command, **numbers.numbers()}
         write_atomic(arguments.json, (json.dumps(written, indent=1) + "\n").encode())
     print(numbers.sentence)
-    return numbers.exit_code
+    return int(bool(numbers.misses))
 
 
 def show(numbers: CheckReport) -> None:
     """Print everything but the last sentence."""
     for what, measured in _answers(numbers):
         print(f"{what + ':':40} {measured}")
-    console = Console()
-    console.print(make_table(
-        "accuracy in the layout of the paper's Table 2, mode benchmark",
-        ("row", "paper", "n", "silent", "accuracy (95 % Wilson)", "fails", "balanced"),
-        (
-            (row.name, "-" if row.paper is None else f"{row.paper:.0f}", row.n, row.silent,
-             f"{percent(row.match.accuracy)} ({percent_interval(row.match.low, row.match.high)})",
-             percent(row.match.prevalence), percent(row.match.balanced))
-            for row in numbers.rows
-        ),
-        no_wrap=("row", "accuracy (95 % Wilson)"),
-    ))
+    console = Console(width=None if sys.stdout.isatty() else 180)
+    console.print(paper_table("accuracy in the layout of the paper's Table 2, mode benchmark", numbers.rows))
     console.print(make_table(
         "paid in mode reward; of clean and benign successes: kept",
         ("clips", "near cameras", "policy's", "all", "percent (95 % Wilson)"),

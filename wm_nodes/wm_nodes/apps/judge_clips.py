@@ -26,7 +26,7 @@ from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.factory import for_clips
+from wm_nodes.judge.backends.factory import for_task
 from wm_nodes.judge.clip_files import AT_ONCE, read_job, read_list
 from wm_nodes.judge.decisions import accepts
 from wm_nodes.judge.service import ClipJob, JudgeService
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     path = arguments.json or arguments.clips / VERDICTS
     settings = judge_or_embedded(config.judge)
     if first := next((job for line in lines if not (job := read_job(arguments.clips, line)).problem), None):
-        settings = for_clips(settings, first.clip.frames.shape)
+        settings = for_task(settings, first.task.task_id)
     judge = JudgeService(settings, seed=config.seed, reads=arguments.reads, audit=arguments.audit, device=config.device)
     with closing(judge), path.open("a+", encoding="utf-8") as written:
         asked = {"judge_id": judge.judge_ids[0], "rubric": judge.version}

@@ -33,7 +33,7 @@ from wm_nodes.apps.options import add_device, add_json, add_judge, add_seed, dev
 from wm_nodes.config.load import judge_or_embedded, load_config
 from wm_nodes.core.files import write_atomic
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
-from wm_nodes.judge.backends.factory import for_clips
+from wm_nodes.judge.backends.factory import for_task
 from wm_nodes.judge.clip_files import LIST, read_job, read_list
 from wm_nodes.judge.hacking.attack import PER_CLIP, Attack
 from wm_nodes.judge.hacking.edits import BENIGN, EDITS, GROSS, PATTERNS, STEPS
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = load_config(arguments.config, judge_settings(arguments) | device_settings(arguments))
     settings = judge_or_embedded(config.judge)
     if first := next((job for job in _jobs(arguments.clips, settings.robot) if not job.problem), None):
-        settings = for_clips(settings, first.clip.frames.shape)
+        settings = for_task(settings, first.task.task_id)
     judge = JudgeService(settings, seed=arguments.seed, reads=arguments.reads, device=config.device)
     with closing(judge):
         attack = Attack(judge, arguments.least, arguments.seed)

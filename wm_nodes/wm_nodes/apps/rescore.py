@@ -31,9 +31,8 @@ from wm_nodes.core.files import write_atomic
 from wm_nodes.core.progress import tqdm
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.factory import for_clips
+from wm_nodes.judge.backends.factory import for_task
 from wm_nodes.judge.episode_reward import episode_judge
-from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.rejudge import judge_bag
 from wm_nodes.judge.service import READS, JudgeService, agent_scores, buffer_jobs, clip_fps
 from wm_nodes.policy_rl.rescoring import recorded_model, rescore_bag
@@ -108,12 +107,10 @@ def _judge_episodes(arguments: argparse.Namespace, bag: Path) -> tuple[bool, dic
     file = arguments.config or (str(saved) if saved.is_file() else "cpu")
     config = load_config(file, judge_settings(arguments) | device_settings(arguments))
     own, kept = run_dir / "model", Path(file).parent / READS
-    evidence = ClipEvidence(
-        arguments.model_dir or (own if own.is_dir() else shipped_model(config.task)), config.device
-    )
+    model_dir = arguments.model_dir or (own if own.is_dir() else shipped_model(config.task))
     judge = JudgeService(
         episode_judge(config), seed=config.seed, reads=arguments.reads or (kept if kept.is_dir() else None),
-        audit=arguments.audit, evidence=evidence, device=config.device,
+        audit=arguments.audit, model_dir=model_dir, device=config.device,
     )
     with closing(judge):
         found = judge_bag(bag, judge, namespace=arguments.namespace)
@@ -172,10 +169,9 @@ def _clip_judge(config: VideoRlConfig, run_dir: Path, contexts: Clips, fps: floa
         found = judge.judge(jobs, by=recorded.judge_id if recorded.judge_id in judge.judge_ids else "")
         return JudgedBuffer(agent_scores(found), tuple(verdict_row(verdict) for verdict in found))
 
-    evidence = ClipEvidence(shipped_model(config.task), config.device)
-    settings = for_clips(judge_or_embedded(config.judge), tuple(contexts.frames.shape[1:]))
+    settings = for_task(judge_or_embedded(config.judge), config.task)
     judge = JudgeService(
-        settings, seed=config.seed, reads=run_dir / READS, evidence=evidence, device=config.device
+        settings, seed=config.seed, reads=run_dir / READS, model_dir=shipped_model(config.task), device=config.device
     )
     with closing(judge):
         yield verdicts

@@ -34,7 +34,8 @@ from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.progress import tqdm
 from wm_nodes.environments.record import collect_plan, scripted_plan
-from wm_nodes.judge.backends.factory import check_clips, check_judge
+from wm_nodes.judge.backends.factory import check_clips, check_judge, for_task
+from wm_nodes.judge.service import clip_fps
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph_client import GraphClient
 from wm_nodes.launching.runner import Runner
@@ -112,7 +113,8 @@ def _run(arguments: argparse.Namespace, config: VideoRlConfig, run_dir: Path) ->
     stage("video model: " + ("the shipped one" if shipped else "flow matching"))
     clips = load_clips(bags, config.model.stride, config.clip_steps)
     if config.rewards.get(AGENT):
-        check_clips(config.judge, clips.frames.shape[1:])
+        judge, fps = for_task(config.judge, config.task), clip_fps(bags[0], config.model.stride)
+        check_clips(judge, tuple(clips.frames.shape[1:]), fps)
     make_video_model(config, clips, heldout, probe, run_dir, shipped=shipped, command=arguments.command)
     version, done = progress(run_dir)
     if done < config.iterations:

@@ -100,7 +100,7 @@ def judge_overrides(endpoints: str = "", model: str = "", api_key_env: str = "",
     """Return the dotted settings of the judge for command-line values; empty values set nothing.
 
     Args:
-        endpoints: base URLs, separated by commas; EMBEDDED, or the folder of a trained judge, for one without a server.
+        endpoints: base URLs, separated by commas; or, for a judge in this process, EMBEDDED or a world-model folder.
         rubric: a pack's name, or a file, from then on by its full path.
     """
     embedded: dict[str, str] = {}

@@ -202,9 +202,10 @@ class JudgeConfig(SettingsSection):
     api_key_env: str
     """openai: name of the environment variable that holds the key; empty: the server wants none."""
     folder: str
-    """embedded: folder of the trained judge; empty: the shipped one that reads such pictures."""
+    """embedded: folder of a world model with normal ranges (wm judge calibrate); empty: the shipped one of the task."""
     conformal: Annotated[float, Field(ge=0, lt=1)]
-    """embedded: abstain where the answer is not sure at this coverage (0.8, 0.9, 0.95 or 0.98); 0: always decide."""
+    """embedded: abstain on what is stranger than this share of the recordings and not beyond the limit; below 0.97; 0:
+    always decide."""
     rubric: str
     """Rubric pack: a name, or a .yaml file."""
     mode: Literal["reward", "benchmark", "topreward"]

@@ -49,39 +49,15 @@ class WeakPolicy:
 
 
 @dataclass(frozen=True)
-class TaskRule:
-    """When a clip shows the task done, and how far it got before."""
+class Goal:
+    """What has to get where, for the reward `outcome` of loop 2."""
 
     mover: Literal["object", "tool"]
     """What has to reach the goal."""
     radius_m: float
     """How near it has to be."""
     above_thing_m: float | None = None
-    """The goal is this far above thing 0, whatever the states' goal is; None: it is the states'."""
-    max_lift_m: float | None = None
-    """The thing may be this far above the table at the end; None: anywhere."""
-    flags: tuple[str, ...] = ()
-    """Sub-flags that must hold at the end."""
-    half: float = 0.3
-    nearly: float = 0.8
-    """Progress from which levels 2 and 3 begin; 1 is the edge of the goal."""
-    started_m: float = 0.03
-    """An approach by this much is level 1."""
-
-
-@dataclass(frozen=True)
-class ClipRules:
-    """How the judge's data sets record and label clips of the task."""
-
-    label: TaskRule
-    behaviours: Mapping[str, float]
-    """Shares of the scripted behaviours, seen by the near cameras; they add up to 1."""
-    policy_behaviours: Mapping[str, float]
-    """The same for the policy's camera: more of those who miss, as a policy in training does."""
-    any_height: bool = True
-    """False where the end state depends on the height of the object, which then is always the cube."""
-    any_heading: bool = False
-    """The way from the object to the goal may be turned, see behaviours.turned."""
+    """The goal is this far above the object; None: it is the goal of the ground truth."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +86,10 @@ class Task:
     """What an action is, see core/action_spaces.py: translation, A = S = 3, or pose, 7 with rotation and gripper."""
     instruct: Callable[[Scene], str] | None = None
     """The instruction in one scene; None: the task has a scene of its own, and simulation.scenes is empty."""
-    clips: ClipRules | None = None
-    """None: the judge's data sets have no clips of this task."""
+    goal: Goal | None = None
+    """None: loop 2's reward `outcome` has no number for this task."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Dotted settings of loop 1 laid over base.yaml, below the preset and the command line; thresholds, and the rubric
-    pack of the judge (judge.rubric) where the task has one."""
+    """Dotted settings of loop 1 laid over base.yaml, below the preset and the command line."""
     demonstrator: str = "expert"
     """The scripted behaviour whose successes teach the text model."""
     shows_goal: bool = True
@@ -201,14 +176,6 @@ def instruction(task: str, scenes: str) -> str:
         needs = "needs simulation.scenes, e.g. train" if what.instruct else "has a scene of its own; leave it empty"
         raise ValueError(f"simulation.scenes is {scenes!r}, but task {task!r} {needs}")
     return what.instruct(known[0]) if what.instruct and len(known) == 1 else what.instruction
-
-
-def clip_rules(name: str) -> ClipRules:
-    """Raises ValueError for a task of which the judge's data sets have no clips."""
-    rules = get_task(name).clips
-    if rules is None:
-        raise ValueError(f"task {name!r} has no rule to label clips by; give its file clips=ClipRules(...)")
-    return rules
 
 
 def _files() -> dict[str, str]:

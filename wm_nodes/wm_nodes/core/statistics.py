@@ -195,19 +195,6 @@ def auroc(labels: ArrayLike, scores: ArrayLike) -> float:
     return float((ranks[truth].sum() - passes * (passes + 1) / 2) / (passes * fails))
 
 
-def recall_at(present: ArrayLike, scores: ArrayLike, false_positives: float) -> float:
-    """The largest share of present ones above a threshold that at most a share of the others exceeds; NaN without both.
-
-    Args:
-        present: bool (N,). scores: (N,), higher where something is thought to be there. false_positives: in [0, 1).
-    """
-    there, values = np.asarray(present, np.bool_), np.asarray(scores, np.float64)
-    positives, others = values[there], np.sort(values[~there])[::-1]
-    if not len(positives) or not len(others):
-        return NAN
-    return float((positives > others[int(false_positives * len(others))]).mean())
-
-
 def effective_size(weights: ArrayLike) -> float:
     """Kish's (sum w)^2 / sum w^2: how many equally weighted decisions tell as much; 0 without any."""
     values = np.asarray(weights, np.float64)

@@ -12,13 +12,13 @@ from wm_nodes.core.statistics import newcombe_difference, wilson_interval
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.check_run import MODES, CheckRun, Judged
 from wm_nodes.judge.check_set import BENIGN, CLEAN, ClipTruth
-from wm_nodes.judge.decisions import OVERALL, PAPER, Decision, Match, accepts, decisions_of, match, row_names
+from wm_nodes.judge.decisions import OVERALL, accepts, decisions_of, row_names
+from wm_nodes.judge.paper_table import TableRow, measure_row
+from wm_nodes.reports.summary import plain
 
 MIN_KEPT, MAX_PAID, MAX_INVALID, MIN_BALANCED = 0.95, 0.15, 0.10, 0.80
 """Limits of a reward: share of clean and benign successes that it pays, of faults that it pays, of clips that it gives
 no number, and balanced accuracy of "overall"."""
-GOOD, NOT_GOOD = 0, 1
-"""Exit codes."""
 UNDONE = "task not done"
 """Clean and benign clips that no reward should pay."""
 
@@ -38,20 +38,6 @@ class Share:
     def interval(self) -> tuple[float, float]:
         """95 %, Wilson's."""
         return wilson_interval(self.count, self.of)
-
-
-@dataclass(frozen=True)
-class Row:
-    """One row of Table 2."""
-
-    name: str
-    n: int
-    """Clips with a known label that the judge decided."""
-    silent: int
-    """Clips with a known label that it did not decide."""
-    match: Match
-    paper: float | None
-    """The paper's accuracy, percent."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +64,7 @@ class CheckReport:
     """The same of a clip in mode reward, with `concurrency` clips under way."""
     cost: dict[str, dict[str, float]]
     """Means per clip, by mode."""
-    rows: list[Row]
+    rows: list[TableRow]
     """Of mode benchmark."""
     paid: dict[str, dict[str, Share]]
     """Family to "near", "policy", "all" to the share that mode reward pays."""
@@ -120,16 +106,10 @@ class CheckReport:
             return f"good enough for a second look, not for {why}"
         return f"good enough for nothing: not for {why}, nor for a second look (no better than passing every clip)"
 
-    @property
-    def exit_code(self) -> int:
-        return NOT_GOOD if self.misses else GOOD
-
     def numbers(self) -> dict[str, Any]:
         """All of it as JSON values."""
-        plain = asdict(self) | {"sentence": self.sentence, "misses": self.misses}
-        plain["rows"] = [{**asdict(row), "match": row.match._asdict()} for row in self.rows]
-        cleaned: dict[str, Any] = _without_nan(plain)
-        return cleaned
+        numbers: dict[str, Any] = plain(asdict(self) | {"sentence": self.sentence, "misses": self.misses})
+        return numbers
 
 
 def report(run: CheckRun) -> CheckReport:
@@ -157,21 +137,18 @@ def report(run: CheckRun) -> CheckReport:
         rows=rows, paid=_families(rewards),
         invalid=Share(sum(one.verdict.status is not Status.OK for one in rewards), len(rewards)),
         kept=good, paid_faults=_paid([one for one in rewards if one.clip.truth.is_fault]),
-        balanced=next(row.match.balanced for row in rows if row.name == OVERALL),
+        balanced=next(row.balanced for row in rows if row.name == OVERALL),
         separates=newcombe_difference(good.count, good.of, bad.count, bad.of)[0] > 0,
         reasons=reasons.most_common(3),
     )
 
 
-def _table(run: CheckRun, judged: Sequence[Judged]) -> list[Row]:
+def _table(run: CheckRun, judged: Sequence[Judged]) -> list[TableRow]:
     decided = [(one.clip.truth.rows(run.rubric), decisions_of(one.verdict)) for one in judged]
     rows = []
     for name in row_names(run.rubric):
         known = [(truth[name], decisions.get(name)) for truth, decisions in decided]
-        pairs = [(label, decision) for label, decision in known if label is not None]
-        said: list[tuple[bool | int, Decision]] = [(label, one) for label, one in pairs if one is not None]
-        agreement = match(name, [label for label, _ in said], [decision for _, decision in said])
-        rows.append(Row(name, len(said), len(pairs) - len(said), agreement, PAPER.get(name)))
+        rows.append(measure_row(name, [(label, said) for label, said in known if label is not None]))
     return rows
 
 
@@ -206,11 +183,3 @@ def _quantiles(values: Sequence[float]) -> tuple[float, float]:
         return math.nan, math.nan
     median, high = np.percentile(values, (50, 95))
     return float(median), float(high)
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _without_nan(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -17,7 +17,7 @@ from wm_nodes.judge.agent.profiles import profile_media
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Stage, Status
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.factory import check_clips, for_clips, make_judge
+from wm_nodes.judge.backends.factory import check_clips, for_task, make_judge
 from wm_nodes.judge.check_set import LabelledClip
 
 Mode = Literal["reward", "benchmark"]
@@ -109,10 +109,10 @@ def _by_judge(
     """The clips by the judge that reads them: a server reads all, an embedded one those of its size."""
     groups: dict[str, tuple[JudgeConfig, list[LabelledClip]]] = {}
     for clip in clips:
-        shape = clip.job.clip.frames.shape
-        chosen = for_clips(settings, shape)
+        shown = clip.job.clip
         try:
-            check_clips(chosen, shape)
+            chosen = for_task(settings, clip.job.task.task_id)
+            check_clips(chosen, shown.frames.shape, shown.fps)
         except ValueError as refusal:
             run.not_judged[clip.truth.clip_id] = str(refusal)
             for _ in MODES:

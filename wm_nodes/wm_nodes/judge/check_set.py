@@ -1,8 +1,8 @@
 """The shipped set of labelled clips that any judge is checked on: pretrained/judge_check.
 
-clips.jsonl and its pictures are read as clip_files reads a user's; labels.jsonl has a line per clip in the same order;
-manifest.json says where they come from and names the SHA-256 of every file. Two parts: near cameras of three tasks,
-96 x 96 px, and the whole picture of the policy's cameras side by side, 64 x 128 px.
+clips.jsonl and its pictures are read as clip_files reads a user's; labels.jsonl has a line per clip in the same order
+(RA-21); manifest.json says where they come from and names the SHA-256 of every file. Two parts: near cameras of three
+tasks, 96 x 96 px, and the whole picture of the policy's cameras side by side, 64 x 128 px.
 """
 
 import hashlib

@@ -5,29 +5,14 @@ passes, except TC, which passes from level 3 on, because its gate asks for visib
 every gate passed and the task is completed (RA-24): our choice, the paper does not define it.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from wm_nodes.core.statistics import balanced_accuracy, expected_calibration_error, kappa, wilson_of_share
 from wm_nodes.judge.agent.rubric import Rubric
-from wm_nodes.judge.agent.types import PLANNING, Stage, Status
+from wm_nodes.judge.agent.types import PLANNING, TASK_COMPLETION, Stage, Status
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.dataset.edits.clips import TC
 
 OVERALL = "overall"
 STAGES = (Stage.VQ, Stage.IF, Stage.PC)
-PAPER: Mapping[str, float] = {
-    PLANNING: 98.0, "VQ": 96.0, "clarity": 100.0, "brightness": 100.0, "color": 96.0, "temporal": 96.0, "IF": 90.0,
-    "background": 95.0, "objective": 85.0, "robot": 88.0, "viewpoint": 100.0, "PC": 82.0, "interaction": 85.0,
-    "deformation": 82.0, "geometry": 86.0, TC: 87.0, OVERALL: 91.0,
-}
-"""Table 2 of the paper, accuracy in percent on 100 clips."""
-FAIR_LEVEL = 2
-"""A planning label below this counts as a fail in the prevalence."""
 
 
 @dataclass(frozen=True)
@@ -36,42 +21,6 @@ class Decision:
 
     value: bool | int
     p_pass: float
-
-
-class Match(NamedTuple):
-    """Agreement of decisions with labels; NaN where all labels are equal."""
-
-    accuracy: float
-    """Share of equal decisions."""
-    low: float
-    high: float
-    """95 % Wilson interval of the accuracy."""
-    prevalence: float
-    """Share of failing labels; of planning, of levels below 2."""
-    balanced: float
-    """Balanced accuracy; of planning, the mean recall of its levels."""
-    kappa: float
-    calibration: float
-    """Expected calibration error of p_pass; of planning, of the chosen level."""
-
-
-def match(
-    name: str, labels: Sequence[bool | int], decisions: Sequence[Decision], weights: ArrayLike | None = None
-) -> Match:
-    """Measure the agreement of the row `name`. weights: of each decision; kappa and level recall are unweighted."""
-    values, p_pass = [decision.value for decision in decisions], [decision.p_pass for decision in decisions]
-    right, planning = [label == value for label, value in zip(labels, values, strict=True)], name == PLANNING
-    failing = [label < FAIR_LEVEL if planning else not label for label in labels]
-    return Match(
-        *wilson_of_share(right, weights), wilson_of_share(failing, weights)[0],
-        _level_recall(labels, right) if planning else balanced_accuracy(labels, values, weights),
-        kappa(labels, values), expected_calibration_error(right if planning else labels, p_pass, weights),
-    )
-
-
-def _level_recall(labels: Sequence[int], right: Sequence[bool]) -> float:
-    recalls = [np.mean([ok for label, ok in zip(labels, right) if label == level]) for level in set(labels)]
-    return float(np.mean(recalls)) if len(recalls) > 1 else float("nan")
 
 
 def row_names(rubric: Rubric) -> list[str]:
@@ -102,7 +51,8 @@ def decisions_of(verdict: Verdict) -> dict[str, Decision]:
         decisions[PLANNING] = Decision(0, 1.0)
     accepted = accepts(verdict)
     if accepted is not None:
-        parts = [decision.p_pass for name, decision in decisions.items() if name in (TC, *map(str, STAGES))]
+        rows = {TASK_COMPLETION, *map(str, STAGES)}
+        parts = [decision.p_pass for name, decision in decisions.items() if name in rows]
         decisions[OVERALL] = Decision(accepted, min(parts, default=0.0))
     return decisions
 
@@ -115,7 +65,7 @@ def accepts(verdict: Verdict) -> bool | None:
     if verdict.status is Status.ERROR:
         return None
     read = [stage for stage in verdict.stages if stage.status is Status.OK]
-    completion = [score for stage in read for score in stage.components if score.component == TC]
+    completion = [score for stage in read for score in stage.components if score.component == TASK_COMPLETION]
     if any(not stage.passed for stage in read) or any(not score.passed for score in completion):
         return False
     return len(read) == len(verdict.stages) if verdict.status is Status.OK else None

@@ -23,7 +23,7 @@ from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.factory import check_clips, check_judge, for_clips
+from wm_nodes.judge.backends.factory import check_clips, check_judge, for_task
 from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.reward import SUCCESS_UNKNOWN, RewardResult
 from wm_nodes.reward.base import version_of
@@ -119,12 +119,12 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
     spec = _scene(config)
     if trains:
         check_horizon(config.ppo.num_steps, spec.max_episode_steps)
-    check_clips(config.judge, _longest_clip(spec))
+    check_clips(for_task(config.judge, config.task), _longest_clip(spec), 1 / spec.control_period_s)
 
 
 def episode_judge(config: RunConfig) -> JudgeConfig:
-    """The judge's settings for episodes of the configured scene, see judge_or_embedded and for_clips."""
-    return for_clips(judge_or_embedded(config.judge), _longest_clip(_scene(config)))
+    """The judge's settings for episodes of the configured scene, see judge_or_embedded and for_task."""
+    return for_task(judge_or_embedded(config.judge), config.task)
 
 
 def _scene(config: RunConfig) -> EnvironmentSpec:

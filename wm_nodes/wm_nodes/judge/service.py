@@ -32,8 +32,7 @@ from wm_nodes.judge.agent.types import GATED, ClipRef, Status, TaskSpec, clip_re
 from wm_nodes.judge.agent.verdict import Provenance, Verdict, content_hash
 from wm_nodes.judge.audit.log import AuditLog
 from wm_nodes.judge.audit.recording import AuditedAgent, write_exchange
-from wm_nodes.judge.backends.factory import OpenedJudge, check_judge, judges_of, make_judge
-from wm_nodes.judge.evidence_of_clip import ClipEvidence
+from wm_nodes.judge.backends.factory import OpenedJudge, check_judge, evidence_judge, judges_of, make_judge
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.video_model.clips import Clips
 
@@ -127,20 +126,20 @@ class JudgeService:
     Args:
         reads: folder that keeps the judge's answers; None: none are kept.
         audit: folder of the audit log that every question, answer and verdict goes into; None: none is written.
-        evidence: measures what the rubric's bands name; None: pixels only.
+        model_dir: world model whose normal ranges say how strange a clip is beside a server's answers; None: none does.
         device: the setting `device` (core/device.py), where embedded judges compute.
 
     Raises:
-        ValueError, MissingPackageError: as make_judge, and as ClipEvidence.check. ConfigError: the rubric is refused.
+        ValueError, MissingPackageError: as make_judge. ConfigError: the rubric is refused.
         AuditError: as AuditLog.
     """
 
     def __init__(
         self, settings: JudgeConfig, *, seed: int, reads: Path | None = None, audit: Path | None = None,
-        evidence: ClipEvidence | None = None, device: str = CPU,
+        model_dir: Path | None = None, device: str = CPU,
     ) -> None:
         self.settings, self._seed, self._reads, self._device = settings, seed, reads, device
-        self._evidence = evidence or ClipEvidence()
+        self._evidence = evidence_judge(settings, model_dir, device)
         self._log = None if audit is None else AuditLog(audit)
         self.pack, self.tally, self.health = settings.rubric, VerdictCounts(), Health(True, "not asked yet")
         self._slots = self._make_slots(load_rubric(settings.rubric))
@@ -185,8 +184,7 @@ class JudgeService:
         Raises:
             ConfigError: no such pack, or one that is refused; the rubric is then the one before.
             FileRefused, OSError: as files.read.
-            ValueError: the judge cannot read all of its components, max_reads does not cover them, or nobody measures
-                the evidence of its bands.
+            ValueError: the judge cannot read all of its components, or max_reads does not cover them.
         """
         rubric = load_rubric(pack, read=lambda name: files.read(name, RUBRIC))
         old, self._slots = self._slots, self._make_slots(rubric)
@@ -265,7 +263,6 @@ class JudgeService:
 
     def _make_slots(self, rubric: Rubric) -> list[_JudgeSlot]:
         check_judge(self.settings)
-        self._evidence.check(rubric)
         return [self._make_slot(settings, rubric) for settings in judges_of(self.settings)]
 
     def _make_slot(self, settings: JudgeConfig, rubric: Rubric) -> _JudgeSlot:
@@ -316,9 +313,8 @@ class JudgeService:
         left_s = None if deadline is None else deadline - time.monotonic()
         try:
             async with asyncio.timeout(left_s), self._semaphore:
-                bands = agent.rubric.evidence
-                measure = partial(self._evidence.measure, agent.rubric, job.clip, job.task)
-                evidence = await asyncio.to_thread(measure) if bands else {}
+                known = self._evidence
+                evidence = {} if known is None else await asyncio.to_thread(known.evidence, job.clip, job.task)
                 return await agent.evaluate(job.clip, job.task, evidence)
         except TimeoutError:
             return _unjudged(agent, job, self._seed, "no verdict by the round's deadline")

@@ -20,7 +20,7 @@ from wm_nodes.core.named_files import BUFFER, NamedFiles, shown
 from wm_nodes.judge.agent.contract import check_one_judge
 from wm_nodes.judge.agent.types import GATED
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.backends.factory import check_clips, for_clips
+from wm_nodes.judge.backends.factory import check_clips, for_task
 from wm_nodes.judge.service import agent_scores, buffer_jobs, clip_fps
 from wm_nodes.nodes.judge import services
 from wm_nodes.nodes.judge.services import JudgeServices, deadline_of
@@ -66,9 +66,8 @@ class ClipEvaluatorNode(ManagedNode):
         self._files = named_files(self)
         self._agent = None
         if self._config.rewards.get(AGENT):
-            shape = tuple(contexts.frames.shape[1:])
-            judge = for_clips(judge_or_embedded(self._config.judge), shape)
-            check_clips(judge, shape)
+            judge = for_task(judge_or_embedded(self._config.judge), self._config.task)
+            check_clips(judge, tuple(contexts.frames.shape[1:]), self._fps)
             self._agent = JudgeServices(self, judge, self._config, lambda: self._action.busy)
         self._scores = self.publish_on("clips/scores")
         self._action = WorkerAction(self, EvaluateClips, "clips/evaluate", self._evaluate)

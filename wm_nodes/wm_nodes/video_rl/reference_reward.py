@@ -131,15 +131,14 @@ def score_pictures(frames: Tensor, references: Clips, codec: Codec, num_conditio
 
 def distance_left(positions: FloatArray, truth: FloatArray, task: str) -> FloatArray:
     """Return how far what the task moves is from the edge of its goal, m, below 0 within it, (N,); NaN for a task
-    without rules for clips.
+    without a goal.
 
     Args:
         positions: read off a frame, (N, P) of PROBE_NAMES. truth: of the scene that the goal is in, the same.
     """
-    rules = get_task(task).clips
-    if rules is None:
+    rule = get_task(task).goal
+    if rule is None:
         return np.full(len(positions), np.nan, np.float32)
-    rule = rules.label
     if rule.above_thing_m is None:
         place, goal = positions[:, OBJECT if rule.mover == "object" else TOOL[:2]], truth[:, GOAL]
     else:

@@ -136,13 +136,13 @@ def test_at_a_middling_planning_level_everything_is_voted_on_the_focus_first(pla
 
 
 def test_evidence_causes_votes_but_never_adds_reward() -> None:
-    rubric = load_rubric(overrides={**PLAIN_OVERRIDES, "evidence": {"psnr_db": {"component": "clarity", "low": 20}}})
-    for value in (10.0, math.nan):
+    rubric = load_rubric(overrides=PLAIN_OVERRIDES)
+    for value in (1.2, math.nan):
         judge = ScriptedJudge(clean_table(rubric))
-        verdict = judge_clip(judge, rubric, evidence={"psnr_db": value})
+        verdict = judge_clip(judge, rubric, evidence={"clarity": value, "unread": value, "color": 0.9})
         assert judge.asked(Stage.VQ)[1:] == [(("clarity",), 1)] and verdict.reward == pytest.approx(1)
     judge = ScriptedJudge(clean_table(rubric))
-    judge_clip(judge, rubric, evidence={"psnr_db": 30.0})
+    judge_clip(judge, rubric, evidence={"clarity": -3.0})
     assert len(judge.asked(Stage.VQ)) == 1
 
 
@@ -178,7 +178,7 @@ def test_patterns_are_read_behind_a_closed_gate_in_audited_clips_only() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(reads_of(RUBRIC), st.sampled_from(["hard", "soft", "lexicographic", "open"]))
+@given(reads_of(RUBRIC), st.sampled_from(["hard", "open"]))
 def test_reading_patterns_behind_a_closed_gate_never_raises_the_reward(table: dict[str, Any], kind: str) -> None:
     shares = {"voting": {"audit_share": 1.0}, "reflection": {"audit_share": 0.0}, "reward": {"gate": kind}}
     read, unread = (load_rubric(overrides=shares | {"hack": {"enabled": enabled}}) for enabled in (True, False))
@@ -333,11 +333,9 @@ def test_each_reason_for_a_second_look(changed: dict[str, Any], mode: str, words
 
 
 def test_evidence_and_chance_are_reasons_for_a_second_look() -> None:
-    rubric = load_rubric(
-        overrides={"hack": {"enabled": False}, "evidence": {"flicker": {"component": "temporal", "high": 1}}, **QUIET}
-    )
-    verdict = judge_clip(ScriptedJudge(clean_table(rubric)), rubric, evidence={"flicker": 2.0})
-    assert verdict.reflections[0].triggers == ("temporal passed against evidence flicker 2",)
+    rubric = load_rubric(overrides={"hack": {"enabled": False}, **QUIET})
+    verdict = judge_clip(ScriptedJudge(clean_table(rubric)), rubric, evidence={"temporal": 2.0})
+    assert verdict.reflections[0].triggers == ("temporal passed against evidence 2",)
     always = load_rubric(overrides={"hack": {"enabled": False}, "reflection": {"audit_share": 1.0}})
     assert judge_clip(ScriptedJudge(clean_table(always)), always).reflections[0].triggers == ("drawn at random",)
 

@@ -1,8 +1,6 @@
 """The robot pack with a part taken away: what is still read and paid, and what a pack may leave out."""
 
 import asyncio
-import math
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -28,7 +26,6 @@ from wm_nodes.judge.agent.verdict import Verdict
 VARIANTS = [
     f"robot_{name}" for name in (
         "all_votes", "no_physics", "no_planning", "no_reflection", "no_votes", "open_gates", "single_read",
-        "soft_gates",
     )
 ]
 ROBOT = load_rubric()
@@ -102,17 +99,13 @@ def test_packs_take_away_votes_or_second_looks_alone_or_vote_on_everything() -> 
 
 
 @pytest.mark.parametrize("mode", ["reward", "benchmark"])
-def test_open_gates_pay_what_comes_after_a_failure_and_soft_ones_part_of_it(mode: str) -> None:
+def test_open_gates_pay_what_comes_after_a_failure(mode: str) -> None:
     failed = {"robot": UNUSABLE, "clarity": BORDERLINE}
-    (hard, _), (soft, _), (opened, asked) = (
-        judged(pack, mode, **failed) for pack in ("robot", "robot_soft_gates", "robot_open_gates")
-    )
+    (hard, _), (opened, asked) = (judged(pack, mode, **failed) for pack in ("robot", "robot_open_gates"))
     s_vq, s_if = 0.5 * 3.5 / 4 + 0.25, 0.5 * 0.75
     assert hard.reward == pytest.approx(0.1 * s_vq + 0.2 * s_if)
     assert opened.reward == pytest.approx(0.1 * s_vq + 0.2 * s_if + 0.7)
     assert asked.count(Stage.PC) == 1, "read in every mode"
-    gate = (1 + math.exp(-0.4 / 0.05)) / (1 + math.exp((0.6 - s_vq) / 0.05))
-    assert soft.reward == pytest.approx(0.1 * s_vq + 0.2 * s_if * gate), "a veto closes a soft gate"
 
 
 def test_a_confirmed_pattern_takes_its_stage_away_behind_open_gates_too() -> None:
@@ -133,10 +126,3 @@ def test_a_confirmed_pattern_takes_its_stage_away_behind_open_gates_too() -> Non
 def test_a_stage_is_left_out_with_all_that_hangs_on_it(overrides: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         load_rubric(overrides=overrides)
-
-
-def test_a_lexicographic_reward_of_three_stages_has_three_parts() -> None:
-    rubric = load_rubric("robot_no_physics", {"reward": {"gate": "lexicographic"}, "voting": {"audit_share": 0}})
-    judge, clip = ScriptedJudge(clean_table(rubric, task_completion=BORDERLINE)), make_clip()
-    verdict = asyncio.run(RewardAgent(judge, rubric).evaluate(clip, replace(make_task(clip), actions=None)))
-    assert verdict.reward == pytest.approx((2 + 0.5) / 3)

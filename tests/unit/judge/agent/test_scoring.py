@@ -14,11 +14,11 @@ from wm_nodes.config.load import ConfigError
 from wm_nodes.judge.agent.judge import ComponentScore, Read
 from wm_nodes.judge.agent.levels import first_vote, score
 from wm_nodes.judge.agent.rubric import Rubric, load_rubric
-from wm_nodes.judge.agent.scoring import apply_caps, gate, plan_weights, reward, skipped_stage, stage_score
+from wm_nodes.judge.agent.scoring import apply_caps, plan_weights, reward, skipped_stage, stage_score
 from wm_nodes.judge.agent.types import GATED, Stage, Status
 from wm_nodes.judge.agent.verdict import StageScore
 
-RUBRICS = {kind: load_rubric(overrides={"reward": {"gate": kind}}) for kind in ("hard", "soft", "lexicographic")}
+RUBRICS = {kind: load_rubric(overrides={"reward": {"gate": kind}}) for kind in ("hard", "open")}
 ROBOT = RUBRICS["hard"]
 VQ, IF, TC, PC = GATED
 Levels = tuple[float, ...]
@@ -82,20 +82,11 @@ def test_reward_worked_by_hand_for_every_kind_of_gate() -> None:
     s_pc = 0.5 * 2.5 / 3 + 0.5 * 0.5
     assert reward_of(table) == pytest.approx(0.6 + 0.4 * s_pc)
     assert reward_of(table, FAIR) == pytest.approx(0.8 + 0.2 * s_pc)
-    assert reward_of(table, rubric=RUBRICS["lexicographic"]) == pytest.approx((3 + s_pc) / 4)
-    assert reward_of(table, rubric=RUBRICS["soft"]) == pytest.approx(0.6 + 0.4 * s_pc)
+    assert reward_of(table, rubric=RUBRICS["open"]) == pytest.approx(0.6 + 0.4 * s_pc)
     failed = everywhere(CLEAN, robot=UNUSABLE)
     s_if = 0.5 * 0.75
     assert reward_of(failed) == pytest.approx(0.1 + 0.2 * s_if)
-    assert reward_of(failed, rubric=RUBRICS["lexicographic"]) == pytest.approx((1 + s_if) / 4)
-
-
-def test_a_soft_gate_is_half_open_at_its_threshold_and_closed_far_below() -> None:
-    soft, stage = RUBRICS["soft"], stages_of(everywhere(CLEAN))[0]
-    assert gate(stage, soft) == 1
-    assert gate(replace(stage, s=0.60), soft) == pytest.approx(0.5, abs=1e-3)
-    assert gate(replace(stage, s=0.65), soft) == pytest.approx(1 / (1 + math.exp(-1)), abs=1e-3)
-    assert gate(replace(stage, s=0.3), soft) == 0 and gate(replace(stage, vetoed_by="clarity"), soft) == 0
+    assert reward_of(failed, rubric=RUBRICS["open"]) == pytest.approx(0.1 + 0.2 * s_if + 0.7)
 
 
 def test_planning_weights_are_soft() -> None:
@@ -121,18 +112,17 @@ def test_reward_is_monotone_in_every_component(
 
 
 @settings(max_examples=60)
-@given(tables, tables, plans, gates, st.sampled_from([VQ, IF, TC]))
+@given(tables, tables, plans, st.sampled_from([VQ, IF, TC]))
 def test_behind_a_failed_gate_no_score_counts(
-    table: dict[str, Levels], other: dict[str, Levels], p_level: Levels, kind: str, failed: Stage
+    table: dict[str, Levels], other: dict[str, Levels], p_level: Levels, failed: Stage
 ) -> None:
-    rubric = RUBRICS[kind]
-    table = table | dict.fromkeys(rubric.stages[failed].components, WRONG)
-    behind = [name for stage in GATED[GATED.index(failed) + 1 :] for name in rubric.stages[stage].components]
+    table = table | dict.fromkeys(ROBOT.stages[failed].components, WRONG)
+    behind = [name for stage in GATED[GATED.index(failed) + 1 :] for name in ROBOT.stages[stage].components]
     changed = table | {name: other[name] for name in behind}
-    assert reward_of(changed, p_level, rubric) == reward_of(table, p_level, rubric)
+    assert reward_of(changed, p_level) == reward_of(table, p_level)
     read = GATED[: GATED.index(failed) + 1]
-    unread = [s if s.stage in read else skipped_stage(s.stage) for s in stages_of(table, rubric)]
-    assert reward(plan_weights(p_level, rubric.planning), unread, rubric) == reward_of(table, p_level, rubric)
+    unread = [s if s.stage in read else skipped_stage(s.stage) for s in stages_of(table, ROBOT)]
+    assert reward(plan_weights(p_level, ROBOT.planning), unread, ROBOT) == reward_of(table, p_level)
 
 
 @pytest.mark.parametrize("kind", sorted(RUBRICS))
@@ -210,9 +200,10 @@ def test_the_version_differs_with_every_word() -> None:
         ({"stages": {"VQ": {"components": {"clarity": {"levels": ["bad", "good"]}}}}}, "clarity.levels"),
         ({"planning": {"weights": [[0.5, 0, 0, 0]] * 4}}, "sum to 0.5"),
         ({"voting": {"k": 4}}, "k must be odd"),
-        ({"evidence": {"psnr": {"component": "sharpness", "low": 1}}}, "unknown components sharpness"),
+        ({"hack": {"patterns": {"motion": {"cap": {"component": "sharpness"}}}}}, "unknown components sharpness"),
         ({"stages": {"IF": {"components": {"clarity": {}}}}}, "clarity"),
         ({"hack": {"patterns": {"motion": {"cap": {"stage": "PC"}}}}}, "either a component or"),
+        ({"reward": {"gate": "soft"}}, "reward.gate"),
         ({"thresholds": {}}, "thresholds"),
     ],
 )

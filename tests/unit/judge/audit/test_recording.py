@@ -28,14 +28,14 @@ from scripted_judge import (
 
 from wm_nodes.judge.agent.judge import Read, ReadRequest
 from wm_nodes.judge.agent.machine import RewardAgent
-from wm_nodes.judge.agent.rubric import load_rubric
+from wm_nodes.judge.agent.rubric import Rubric, load_rubric
 from wm_nodes.judge.agent.types import Status, clip_ref
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.audit.entries import plain
 from wm_nodes.judge.audit.log import FILE_NAME, AuditError, AuditLog, read_lines
-from wm_nodes.judge.audit.reading import read_record, verify
+from wm_nodes.judge.audit.reading import Record, read_record, verify
 from wm_nodes.judge.audit.recording import AuditedAgent, write_exchange
-from wm_nodes.judge.audit.replay import replay_evaluation
+from wm_nodes.judge.audit.replay import reaggregate, replay_evaluation
 from wm_nodes.judge.backends.cache import VerdictCache
 from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
@@ -152,30 +152,35 @@ def test_every_read_stands_on_a_line_of_its_own_with_its_reason_and_its_frames(t
     assert record.rubric(evaluation).version == RUBRIC.version
 
 
+def counted_again(record: Record, rubric: Rubric, folder: Path) -> Verdict:
+    """The one verdict of a log under another rubric."""
+    with AuditLog(folder) as log:
+        (verdict,) = asyncio.run(reaggregate(record, record.judged(), rubric, log))
+    return verdict
+
+
 def test_other_numbers_need_no_judge_and_other_words_do(tmp_path: Path) -> None:
     table = clean_table(RUBRIC, interaction=FLAWED)
     (verdict,) = judge_all(tmp_path, ScriptedJudge(table), clips(1), mode="benchmark")
     record = read_record(tmp_path)
-    (evaluation,) = record.judged()
     stricter = load_rubric("robot", {"revision": 2, "stages": {"PC": {"threshold": 0.95}}})
-    after = asyncio.run(replay_evaluation(record, evaluation, stricter)).after
-    assert after is not None and after.provenance.rubric_version == stricter.version
+    after = counted_again(record, stricter, tmp_path / "stricter")
+    assert after.provenance.rubric_version == stricter.version
     assert verdict.stages[3].passed and not after.stages[3].passed
     direct = asyncio.run(RewardAgent(ScriptedJudge(table), stricter, mode="benchmark").evaluate(*clips(1)[0]))
     assert after.audit_id == direct.audit_id
     words = load_rubric("robot", {"stages": {"PC": {"components": {"interaction": {"question": "Does it touch?"}}}}})
     with pytest.raises(AuditError, match="asks about interaction in other words"):
-        asyncio.run(replay_evaluation(record, evaluation, words))
+        counted_again(record, words, tmp_path / "words")
 
 
 def test_a_question_that_nobody_asked_is_an_error_that_names_it(tmp_path: Path) -> None:
     (verdict,) = judge_all(tmp_path, ScriptedJudge(clean_table(RUBRIC, clarity=(0.0, 0.75, 0.25, 0.0, 0.0))), clips(1))
     assert verdict.status is Status.OK and verdict.stages[1].status is Status.SKIPPED
     record = read_record(tmp_path)
-    (evaluation,) = record.judged()
     lenient = load_rubric("robot", {"stages": {"VQ": {"threshold": 0.1}}, "voting": {"veto": 1.0}})
-    after = asyncio.run(replay_evaluation(record, evaluation, lenient)).after
-    assert after is not None and after.status is Status.ERROR and math.isnan(after.reward)
+    after = counted_again(record, lenient, tmp_path / "lenient")
+    assert after.status is Status.ERROR and math.isnan(after.reward)
     assert "the log has no answer on background, vote 0" in after.reason
 
 
@@ -238,7 +243,7 @@ def test_a_secret_in_a_reason_is_replaced_and_the_verdict_still_replayed(
     assert "robot looks so" not in (tmp_path / FILE_NAME).read_text()
     record = read_record(tmp_path)
     (evaluation,) = record.judged()
-    assert evaluation.redacted and evaluation.verdict is not None
+    assert evaluation.redacted
     assert evaluation.verdict.audit_id == verdict.audit_id
     assert asyncio.run(replay_evaluation(record, evaluation)).equal
     assert verify(tmp_path).problems == []

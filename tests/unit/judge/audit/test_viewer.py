@@ -165,6 +165,21 @@ def test_clips_without_a_verdict_or_without_pictures_are_shown_as_such(tmp_path:
 
 
 @needs_browser
+def test_a_second_look_is_shown_with_what_it_changed_once_all_rows_are_labelled(tmp_path: Path, page: Page) -> None:
+    log = tmp_path / "log"
+    judge = ScriptedJudge(clean_table(RUBRIC, interaction=[WRONG, CLEAN]), second={"interaction": CLEAN})
+    (verdict,) = judge_all(log, judge, moving_squares(1))
+    assert verdict.reflections[0].accepted
+    assert main(["audit", "view", str(log)]) == 0
+    page.open(log / "view.html")
+    page.press(*["u"] * page.js("rows().length"))
+    shown = page.js("document.querySelector('main').textContent")
+    assert "Second look: task_completion passed while interaction failed" in shown
+    assert "interaction 0.25 → 1.00, accepted, frames 1 2" in shown and "cost: 22 reads" in shown
+    no_complaints(page)
+
+
+@needs_browser
 def test_many_clips_load_only_the_pictures_that_are_seen(tmp_path: Path, page: Page) -> None:
     log = tmp_path / "log"
     make_log(log, 4, num_frames=60)

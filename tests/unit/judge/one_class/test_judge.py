@@ -1,4 +1,4 @@
-"""The shipped one-class judge on the shipped clips: what it keeps, what it refuses, and when it abstains (RA-18)."""
+"""The shipped one-class judge on the shipped clips: what it keeps, what it refuses, and when it abstains (RA-27)."""
 
 import asyncio
 import functools
@@ -45,7 +45,7 @@ def clean() -> LabelledClip:
 
 
 def judged(clip: ClipRef, task: TaskSpec, conformal: float = 0.0) -> Verdict:
-    agent = RewardAgent(judge(conformal), load_rubric("robot_push_cube"), mode="benchmark")
+    agent = RewardAgent(judge(conformal), load_rubric("robot"), mode="benchmark")
     return asyncio.run(agent.evaluate(clip, task))
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wm_nodes.core.types import FloatArray
-from wm_nodes.environments.maniskill.table_top import CUBE, CUBE_HALF_SIZE_M, GOAL, TOOL, above_cube
+from wm_nodes.environments.maniskill.table_top import CUBE, CUBE_HALF_SIZE_M, GOAL, above_cube
 
 ROBOT_BASE = np.array([-0.615, 0.0, 0.0], np.float32)
 CLEARANCE_M = 0.045
@@ -82,34 +82,6 @@ def script(
         if largest > style.speed:
             step = step * (style.speed / largest)
         return np.clip(step + rng.normal(0, style.noise, 3), -1, 1).astype(np.float32)
-
-    return act
-
-
-def turned(
-    behaviour: str, truth: FloatArray, rng: np.random.Generator, max_action_m: float, heading_rad: float
-) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """script() for a goal that lies `heading_rad` from +x: it acts in a world turned back about the first cube."""
-    centre = truth[CUBE][:2].copy()
-    cos, sin = np.cos(heading_rad), np.sin(heading_rad)
-    out = np.array([[cos, -sin], [sin, cos]], np.float32)
-
-    def turn_back(places: FloatArray) -> FloatArray:
-        """Turn x y, m, back about the centre; further values stay."""
-        return np.concatenate([centre + (places[:2] - centre) @ out, places[2:]])
-
-    def turn_truth_back(truth_now: FloatArray) -> FloatArray:
-        turned_truth = truth_now.copy()
-        for places in (CUBE, TOOL, GOAL):
-            turned_truth[places] = turn_back(truth_now[places])
-        return turned_truth
-
-    scripted = script(behaviour, turn_truth_back(truth), rng, max_action_m)
-
-    def act(truth_now: FloatArray, state: FloatArray) -> FloatArray:
-        action = scripted(turn_truth_back(truth_now), turn_back(state + ROBOT_BASE) - ROBOT_BASE)
-        turned_action: FloatArray = np.clip(np.concatenate([out @ action[:2], action[2:]]), -1, 1).astype(np.float32)
-        return turned_action
 
     return act
 

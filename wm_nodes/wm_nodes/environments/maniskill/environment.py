@@ -3,12 +3,9 @@
 Shapes: N environments, A action, S state, P ground truth.
 """
 
-from collections.abc import Sequence
 
 import numpy as np
-import sapien
 from mani_skill.envs.sapien_env import BaseEnv
-from transforms3d.euler import euler2quat
 
 from wm_nodes.config.scenes import Scene, scene_of
 from wm_nodes.config.schema import SimulationConfig
@@ -105,18 +102,6 @@ class ManiSkillEnvironment:
             self._ended[i] = False
             self._start(i)
         return self.current()
-
-    def lay_out(self, cube_m: Sequence[float], heading_rad: float) -> None:
-        """After a reset, put the cube of slot 0 at x y, and the goal as far from it as it was, `heading_rad` from +x
-        to +y; the cube faces that way.
-        """
-        scene = self._scenes[0]
-        cube, goal = (actor.pose.raw_pose[0].numpy() for actor in (scene.obj, scene.goal_region))
-        away = float(np.linalg.norm(goal[:2] - cube[:2]))
-        ahead = np.array([np.cos(heading_rad), np.sin(heading_rad)])
-        scene.obj.set_pose(sapien.Pose([*cube_m, cube[2]], euler2quat(0, 0, heading_rad)))
-        scene.goal_region.set_pose(sapien.Pose([*(np.array(cube_m) + away * ahead), goal[2]], goal[3:]))
-        self._start(0)
 
     def step(self, actions: FloatArray) -> StepResult:
         check_actions(actions, self.spec)

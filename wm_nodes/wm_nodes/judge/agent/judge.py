@@ -57,7 +57,7 @@ class Read:
 
     component: Component
     levels: tuple[float, ...]
-    source: Literal["json", "label", "decision", "embedded", "human"]
+    source: Literal["json", "label", "embedded", "human"]
     vote: Vote
     label_mass: float = 1.0
     status: Status = Status.OK
@@ -138,8 +138,7 @@ class ReadRequest:
 @dataclass(frozen=True)
 class Capabilities:
     """What a judge can do. components: those it reads, None for all of the rubric. max_frames: images per call.
-    probabilities: label votes are not one-hot. reasons: it gives evidence texts. deterministic: equal requests get
-    equal answers. card: its measured abilities as text; "" without a measurement.
+    deterministic: equal requests get equal answers. card: its measured abilities as text; "" without a measurement.
     """
 
     judge_id: str
@@ -147,10 +146,7 @@ class Capabilities:
     model: str
     server_version: str
     components: frozenset[Component] | None = None
-    media: frozenset[Literal["image", "video"]] = frozenset({"image"})
     max_frames: int = 64
-    probabilities: bool = True
-    reasons: bool = True
     deterministic: bool = False
     card: str = ""
 

@@ -25,6 +25,7 @@ from wm_nodes.judge.agent.types import (
     GATED,
     NUM_PLAN_LEVELS,
     PLANNING,
+    TASK_COMPLETION,
     ClipRef,
     Component,
     Evidence,
@@ -70,7 +71,7 @@ class RewardAgent:
         self.max_reads, self.budget_s = max_reads, budget_s
         patterns = rubric.hack.patterns if rubric.hack.enabled else ()
         staged = mode != topreward.MODE
-        needed = {PLANNING, *rubric.component_names, *patterns} if staged else {topreward.COMPONENT}
+        needed = {PLANNING, *rubric.component_names, *patterns} if staged else {TASK_COMPLETION}
         can = judge.capabilities.components
         if can is not None and needed - can:
             raise ValueError(f"judge {judge.capabilities.judge_id} does not read {', '.join(sorted(needed - can))}")
@@ -88,7 +89,7 @@ class RewardAgent:
         return topreward.VERSION if self.mode == topreward.MODE else self.rubric.version
 
     async def evaluate(self, clip: ClipRef, task: TaskSpec, evidence: Evidence | None = None) -> Verdict:
-        """Judge one clip. evidence: endogenous signals by name; they cause votes and second looks, nothing else."""
+        """Judge one clip. evidence: causes votes and second looks, nothing else."""
         started, clock = time.time(), time.monotonic()
         run = _Run(self, clip, task, evidence or {})
         try:
@@ -172,7 +173,7 @@ class _Run:
         """One stage with one component whose s is p("True"); it gates nothing."""
         media = topreward.shown_frames(self.clip, self.agent.judge.capabilities.max_frames)
         vote = topreward.vote(self.agent.seed)
-        (read,) = await self._ask(Stage.TC, (topreward.COMPONENT,), vote, Profile.D, media=media)
+        (read,) = await self._ask(Stage.TC, (TASK_COMPLETION,), vote, Profile.D, media=media)
         score = self._score_read(read)
         self.stages = {Stage.TC: StageScore(Stage.TC, score.status, score.s, score.status is Status.OK, (score,))}
         return score.status, score.s, score.reason
@@ -192,7 +193,7 @@ class _Run:
                 reasons = [part.reason for part in score.components if part.status is score.status]
                 if score.status is Status.ERROR or (score.status is Status.ABSTAIN and self.agent.mode == "reward"):
                     raise _Stop(score.status, "; ".join(reasons))
-            if self.agent.mode == "reward" and scoring.gate(self.stages[stage], self.rubric) == 0:
+            if self.agent.mode == "reward" and not scoring.gate_is_open(self.stages[stage], self.rubric):
                 return
 
     async def _read_stage(self, stage: Stage, plan: PlanResult) -> StageScore:
@@ -225,8 +226,7 @@ class _Run:
         rules = self.rubric.voting
         if self._audited or plan.level in rules.levels:
             return set(reads)
-        conflicts = reflection.conflicting_evidence(self.rubric, self.evidence)
-        suspected = {self.rubric.evidence[name].component for name in conflicts}
+        suspected = set(reflection.conflicting(self.evidence))
         looks = {name: self._score_read(first) for name, (first,) in reads.items()}
         return {name for name, look in looks.items() if look.margin < rules.clear_margin or name in suspected}
 

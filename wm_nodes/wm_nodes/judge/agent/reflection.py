@@ -1,4 +1,4 @@
-"""When the agent reflects on a verdict, and which of the proposed changes count (RA-13, RA-14). Pure functions.
+"""When the agent reflects on a verdict, and which of the proposed changes count (RA-13, RA-14, RA-17). Pure functions.
 
 The second read sees new frames (profile D) and must cite frames; its change counts only if a fresh label read on those
 frames agrees.
@@ -53,21 +53,17 @@ def triggers(
         if lowest.margin < rules.margin:
             reason = f"{lowest.component} decided {stage.stage} with margin {lowest.margin:.2f}"
             result.append(Trigger(reason, (lowest.component,)))
-    for name in conflicting_evidence(rubric, evidence):
-        component = rubric.evidence[name].component
-        if component in scores and scores[component].passed:
-            result.append(Trigger(f"{component} passed against evidence {name} {evidence[name]:.3g}", (component,)))
+    for name in conflicting(evidence):
+        if name in scores and scores[name].passed:
+            result.append(Trigger(f"{name} passed against evidence {evidence[name]:.3g}", (name,)))
     if drawn:
         result.append(Trigger("drawn at random"))
     return result
 
 
-def conflicting_evidence(rubric: Rubric, evidence: Evidence) -> list[str]:
-    """Names of signals outside their calibrated band, NaN included."""
-    return [
-        name for name, band in rubric.evidence.items()
-        if name in evidence and not band.low <= evidence[name] <= band.high
-    ]
+def conflicting(evidence: Evidence) -> list[Component]:
+    """Components whose evidence is beyond its limit, NaN included."""
+    return [name for name, strangeness in evidence.items() if not strangeness <= 1]
 
 
 def suspects(reasons: Sequence[Trigger], stages: Sequence[StageScore], limit: int) -> tuple[Component, ...]:

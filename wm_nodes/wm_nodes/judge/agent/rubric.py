@@ -1,7 +1,7 @@
 """Rubric packs: components, level descriptions, weights and thresholds as versioned data (RA-4 to RA-14).
 
 A pack is a YAML file in rubrics/, or anywhere. `extends` lays it over another pack: mappings are merged name by name,
-so a new domain adds components, patterns or evidence without code, and `null` takes what it names away. Its version
+so a new domain adds components or patterns without code, and `null` takes what it names away. Its version
 names the resolved content.
 """
 
@@ -116,14 +116,6 @@ class HackRubric(RubricSection):
     patterns: dict[str, PatternRubric]
 
 
-class EvidenceBand(RubricSection):
-    """An endogenous signal outside [low, high] disagrees with a component that passes."""
-
-    component: Component
-    low: float = -float("inf")
-    high: float = float("inf")
-
-
 class Conflict(RubricSection):
     """Logically impossible: `done` passes while one of `needs` fails."""
 
@@ -144,10 +136,8 @@ class ReflectionRubric(RubricSection):
 
 
 class RewardRubric(RubricSection):
-    gate: Literal["hard", "soft", "lexicographic", "open"]
-    """hard: prod 1[S >= theta]. soft: logistic. lexicographic: one quarter of [0, 1] per stage. open: none closes."""
-    temperature: Annotated[float, Field(gt=0)]
-    """Of the soft gate, in units of S."""
+    gate: Literal["hard", "open"]
+    """hard: prod 1[S >= theta]. open: none closes."""
     mean_share: Share
     """Stage score = mean_share x weighted mean + (1 - mean_share) x minimum."""
 
@@ -159,7 +149,6 @@ class Rubric(RubricSection):
     stages: dict[Stage, StageRubric]
     voting: VotingRubric
     hack: HackRubric
-    evidence: dict[str, EvidenceBand]
     reflection: ReflectionRubric
     reward: RewardRubric
 
@@ -175,8 +164,7 @@ class Rubric(RubricSection):
         known = self.component_names
         if len(set(known)) != len(known):
             raise ValueError(f"a component is in two stages: {', '.join(known)}")
-        used = {band.component for band in self.evidence.values()}
-        used |= {name for rule in self.reflection.conflicts for name in (rule.done, *rule.needs)}
+        used = {name for rule in self.reflection.conflicts for name in (rule.done, *rule.needs)}
         used |= {pattern.cap.component for pattern in self.hack.patterns.values() if pattern.cap.component}
         if unknown := sorted(used - set(known)):
             raise ValueError(f"unknown components {', '.join(unknown)}; known: {', '.join(known)}")
@@ -208,7 +196,7 @@ def load_rubric(
     """Read a pack of rubrics/, or a YAML file, with what it extends.
 
     Args:
-        overrides: nested mapping laid on top, e.g. {"reward": {"gate": "soft"}}.
+        overrides: nested mapping laid on top, e.g. {"reward": {"gate": "open"}}.
         read: reads the YAML files; None: from anywhere.
 
     Raises:

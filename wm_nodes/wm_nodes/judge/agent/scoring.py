@@ -12,9 +12,6 @@ from wm_nodes.judge.agent.rubric import PlanningRubric, Rubric
 from wm_nodes.judge.agent.types import GATED, NUM_PLAN_LEVELS, Stage, Status
 from wm_nodes.judge.agent.verdict import PlanResult, StageScore
 
-OPEN_SOFT_GATE = 0.01
-"""A soft gate below this counts as closed: what comes after could add no more than this."""
-
 
 def skipped_stage(stage: Stage) -> StageScore:
     return StageScore(stage, Status.SKIPPED, math.nan, False)
@@ -54,24 +51,14 @@ def plan_weights(p_level: Sequence[float], planning: PlanningRubric) -> dict[Sta
     }
 
 
-def gate(score: StageScore, rubric: Rubric) -> float:
-    """What of the later stages counts, [0, 1]: 1 or 0; soft: sigma((S - theta) / t), 1 at S = 1; open: always 1."""
-    kind = rubric.reward.gate
-    if score.status is not Status.OK or (score.vetoed_by and kind != "open"):
-        return 0.0
-    if kind == "open":
-        return 1.0
-    if kind != "soft":
-        return float(score.passed)
-    theta, t = rubric.stages[score.stage].threshold, rubric.reward.temperature
-    value = (1 + math.exp((theta - 1) / t)) / (1 + math.exp((theta - score.s) / t))
-    return value if value >= OPEN_SOFT_GATE else 0.0
+def gate_is_open(score: StageScore, rubric: Rubric) -> bool:
+    """Whether the stages after this one are read and count: it passed, or the rubric's gates are open."""
+    return score.status is Status.OK and (score.passed or rubric.reward.gate == "open")
 
 
 def reward(weights: Mapping[Stage, float], stages: Sequence[StageScore], rubric: Rubric) -> float:
     """R in [0, 1] of VQ, IF, TC, PC, in this order; NaN where a stage that was looked at has no number.
 
-    lexicographic: (number of gates passed before the last stage + S of the next stage) / 4, times the planning ceiling.
     Stages that the rubric does not have count for nothing.
 
     Raises:
@@ -81,20 +68,13 @@ def reward(weights: Mapping[Stage, float], stages: Sequence[StageScore], rubric:
         raise ValueError(f"stages must be VQ, IF, TC, PC, got {', '.join(score.stage for score in stages)}")
     if any(score.status in (Status.ERROR, Status.ABSTAIN) for score in stages):
         return math.nan
-    total, open_share, num_passed = 0.0, 1.0, 0
-    for score in stages:
-        if open_share == 0:
-            break
-        if score.stage not in rubric.stages:
-            continue
+    total = 0.0
+    for score in (score for score in stages if score.stage in rubric.stages):
         if score.status is Status.SKIPPED:
             raise ValueError(f"{score.stage} was skipped though every gate before it is open")
-        if rubric.reward.gate == "lexicographic":
-            total = math.fsum(weights.values()) * (num_passed + score.s) / len(rubric.gated)
-            num_passed += 1
-        else:
-            total += weights[score.stage] * score.s * open_share
-        open_share *= gate(score, rubric)
+        total += weights[score.stage] * score.s
+        if not gate_is_open(score, rubric):
+            break
     return min(1.0, total)
 
 

@@ -2,30 +2,21 @@
 
 r = log p("True" | frames, statement): one token of one answer per clip, without planning, votes or gates. The reward is
 p("True") / (p("True") + p("False")), which lies in [0, 1]; where both words together are improbable, there is none.
-Progress is r of growing prefixes, min-max normalised per clip, and its rank correlation with time is VOC. The paper
-scores the bare text and gives a chat template as an option; a chat server always lays its template around it.
-Shapes: T frames, K prefixes.
+The paper scores the bare text and gives a chat template as an option; a chat server always lays its template around it.
 """
 
 import hashlib
-import math
 from collections.abc import Sequence
-
-import numpy as np
 
 from wm_nodes.judge.agent.judge import MediaItem, Vote
 from wm_nodes.judge.agent.profiles import cited_media, uniform
-from wm_nodes.judge.agent.types import NUM_LEVELS, ClipRef, clip_ref
-from wm_nodes.judge.agent.verdict import Verdict
+from wm_nodes.judge.agent.types import NUM_LEVELS, ClipRef
 
 MODE = "topreward"
-COMPONENT = "task_completion"
 WORDS = ("False", "True")
 """The answers, worst first."""
 NUM_FRAMES = 16
 """Of a clip that the model sees, evenly spaced."""
-NUM_PREFIXES = 15
-"""Of a curve, as published."""
 SYSTEM = "Answer with one word, True or False, and nothing else."
 STATEMENT = (
     "The above frames show a robot manipulation trajectory that completes the following task: {instruction}\n"
@@ -49,20 +40,3 @@ def levels_of(probabilities: Sequence[float]) -> tuple[float, ...]:
     """The probabilities of WORDS as a distribution over levels: False is the worst, True the best."""
     false, true = probabilities
     return (false, *(0.0,) * (NUM_LEVELS - 2), true)
-
-
-def prefixes(clip: ClipRef, count: int = NUM_PREFIXES) -> list[ClipRef]:
-    """K prefixes of a clip of T frames, the last one whole; fewer where T is small, because each has 2 frames or more.
-    Judging them as clips gives the curve.
-    """
-    ends = sorted({int(end) for end in np.linspace(2, len(clip.frames), count).round()})
-    return [clip_ref(f"{clip.clip_id}[:{end}]", clip.frames[:end], clip.fps, clip.source) for end in ends]
-
-
-def log_p_true(verdict: Verdict) -> float:
-    """r of a verdict of this mode: before it was normalised over WORDS. NaN without a number, -inf where p is 0."""
-    reads = [read for stage in verdict.stages for score in stage.components for read in score.votes]
-    if not verdict.valid or not reads:
-        return math.nan
-    p_true = reads[0].levels[-1] * reads[0].label_mass
-    return math.log(p_true) if p_true > 0 else -math.inf

@@ -20,6 +20,7 @@ from wm_nodes.core.types import FloatArray, UInt8Array
 NUM_LEVELS = 5
 NUM_PLAN_LEVELS = 4
 PLANNING = "planning"
+TASK_COMPLETION = "task_completion"
 """The one component of Stage.PLAN; its distribution has NUM_PLAN_LEVELS entries."""
 Component = str
 
@@ -100,8 +101,8 @@ class TaskSpec:
     reference_frame: UInt8Array
     goal_image: UInt8Array | None = None
     actions: FloatArray | None = None
-    camera_id: str = ""
 
 
-Evidence = Mapping[str, float]
-"""Endogenous signals by name (RA-17). They trigger a second look and never add reward."""
+Evidence = Mapping[Component, float]
+"""How strange a world model finds what each component speaks about (RA-17): normal to 1, outside above or NaN. It
+triggers votes and second looks, and never adds reward."""

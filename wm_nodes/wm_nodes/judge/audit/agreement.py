@@ -1,7 +1,7 @@
 """How well a judge's verdicts agree with what people say, row by row of Table 2 (RA-24)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,8 +15,9 @@ from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.audit.labels import HACK, ClipLabel, HumanLabels, annotators, find_evaluation, known_answers
 from wm_nodes.judge.audit.reading import Record, RecordedEvaluation
 from wm_nodes.judge.audit.sampling import Sample
-from wm_nodes.judge.decisions import PAPER, Decision, decisions_of, match, row_names
-from wm_nodes.reports.console_table import decimal, make_table, percent, percent_interval
+from wm_nodes.judge.decisions import Decision, decisions_of, row_names
+from wm_nodes.judge.paper_table import TableRow, measure_row, paper_table
+from wm_nodes.reports.console_table import decimal, percent
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,6 @@ class LabelledEvaluation:
     def decisions(self) -> dict[str, Decision]:
         """The judge's, those on hacking patterns included: p_pass is the probability that the pattern is absent."""
         verdict = self.evaluation.verdict
-        if verdict is None:
-            return {}
         flags = {
             HACK + flag.pattern: Decision(not flag.confirmed, 1 - flag.p_present)
             for flag in verdict.hack_flags
@@ -47,33 +46,19 @@ class LabelledEvaluation:
 
 
 @dataclass(frozen=True)
-class AgreementRow:
-    """One row of the report.
+class AgreementRow(TableRow):
+    """One row of the report, weighted as the clips are."""
 
-    n: labelled clips that the judge decided. silent: labelled ones that it did not. unsure: nobody was sure. accuracy,
-    low, high: weighted share of equal decisions with its 95 % Wilson interval. prevalence: weighted share of failing
-    labels (planning: of levels below 2). balanced: balanced accuracy, of planning the mean recall of its levels.
-    kappa: of judge and people. calibration: expected calibration error of p_pass, of planning of the chosen level.
-    people, kappa_people: clips that two people were sure of, and their kappa. reasons, reasons_right: explanations that
-    were judged, and the share that is right, whatever the answer was. paper: percent.
-    """
-
-    name: str
-    n: int
-    silent: int
     unsure: int
-    accuracy: float
-    low: float
-    high: float
-    prevalence: float
-    balanced: float
-    kappa: float
-    calibration: float
+    """Labelled clips of which nobody was sure."""
     people: int
+    """Clips that two people were sure of."""
     kappa_people: float
+    """Of these two."""
     reasons: int
+    """The judge's explanations that were judged."""
     reasons_right: float
-    paper: float | None
+    """Share of them that is right, whatever the answer was."""
 
 
 @dataclass(frozen=True)
@@ -143,19 +128,13 @@ def table(numbers: Report) -> Table:
         f"{second.helpful} for the better ({percent(second.before)} right before, {percent(second.after)} after, "
         f"n = {second.n}); per clip " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.cost.items())
     )
-    columns = ("row", "paper", "n", "silent", "unsure", "accuracy", "95 % Wilson", "fails", "balanced", "kappa", "ECE",
-               "people: n, kappa", "reasons: n, right")
-    cells = (
-        (
-            row.name, "-" if row.paper is None else f"{row.paper:.0f}", row.n, row.silent, row.unsure,
-            percent(row.accuracy), percent_interval(row.low, row.high), percent(row.prevalence),
-            percent(row.balanced), decimal(row.kappa), decimal(row.calibration),
-            f"{row.people}, {decimal(row.kappa_people)}", f"{row.reasons}, {percent(row.reasons_right)}",
-        )
-        for row in numbers.rows
-    )
+    more: dict[str, Callable[[AgreementRow], object]] = {
+        "unsure": lambda row: row.unsure,
+        "people: n, kappa": lambda row: f"{row.people}, {decimal(row.kappa_people)}",
+        "reasons: n, right": lambda row: f"{row.reasons}, {percent(row.reasons_right)}",
+    }
     title = f"agreement with people, {which}, {numbers.clips} clips"
-    return make_table(title, columns, cells, caption=caption, no_wrap=("row",))
+    return paper_table(title, numbers.rows, more, caption)
 
 
 def _agreement_row(name: str, clips: Sequence[LabelledEvaluation]) -> AgreementRow | None:
@@ -164,16 +143,15 @@ def _agreement_row(name: str, clips: Sequence[LabelledEvaluation]) -> AgreementR
     asked = [clip for clip in clips if any(name in known_answers(label, clip.rubric) for label in clip.by.values())]
     if not asked:
         return None
-    sure = [(clip, next(iter(answers.values())), clip.decisions().get(name)) for clip, answers in given if answers]
-    said = [(answer, decision, clip.weight) for clip, answer, decision in sure if decision is not None]
-    labels, decisions = [answer for answer, _, _ in said], [decision for _, decision, _ in said]
-    weights = [weight for _, _, weight in said]
+    sure = [(clip, next(iter(answers.values()))) for clip, answers in given if answers]
+    labelled = [(answer, clip.decisions().get(name)) for clip, answer in sure]
+    row = measure_row(name, labelled, [clip.weight for clip, _ in sure])
     pairs = [list(answers.values())[:2] for _, answers in given if len(answers) > 1]
     reasons = [ok for clip in clips if (ok := _reason(clip, name)) is not None]
     return AgreementRow(
-        name, len(said), len(sure) - len(said), len(asked) - len(sure), *match(name, labels, decisions, weights),
-        len(pairs), kappa([first for first, _ in pairs], [other for _, other in pairs]),
-        len(reasons), float(np.mean(reasons)) if reasons else math.nan, PAPER.get(name),
+        **vars(row), unsure=len(asked) - len(sure), people=len(pairs),
+        kappa_people=kappa([first for first, _ in pairs], [other for _, other in pairs]),
+        reasons=len(reasons), reasons_right=float(np.mean(reasons)) if reasons else math.nan,
     )
 
 
@@ -187,9 +165,7 @@ def _measure_reflection(clips: Sequence[LabelledEvaluation]) -> ReflectionEffect
     """Compare each component that a second look changed with what its votes had said before."""
     before, after = [], []
     for clip in clips:
-        verdict = clip.evaluation.verdict
-        scores = [] if verdict is None else [score for stage in verdict.stages for score in stage.components]
-        for score in scores:
+        for score in (score for stage in clip.evaluation.verdict.stages for score in stage.components):
             answers = clip.answers(score.component)
             if answers and score.status is Status.OK and score.decided_by == "reflection":
                 label = next(iter(answers.values()))
@@ -203,7 +179,7 @@ def _measure_reflection(clips: Sequence[LabelledEvaluation]) -> ReflectionEffect
 
 
 def _cost(clips: Sequence[LabelledEvaluation]) -> dict[str, float]:
-    costs = [clip.evaluation.verdict.cost for clip in clips if clip.evaluation.verdict]
+    costs = [clip.evaluation.verdict.cost for clip in clips]
     names: tuple[str, ...] = ("calls", "prompt_tokens", "cached_tokens", "completion_tokens", "images", "wall_s", "usd")
     known: dict[str, list[Any]] = {name: [getattr(cost, name) for cost in costs] for name in names}
     return {n: float(np.mean(v)) for n, v in known.items() if v and None not in v}

@@ -95,7 +95,7 @@ def clip_from(body: Mapping[str, Any], clip_id: str, store: MediaStore) -> ClipR
 def task_body(task: TaskSpec, store: MediaStore) -> dict[str, Any]:
     images = {"reference_frame": task.reference_frame, "goal_image": task.goal_image, "actions": task.actions}
     stored = {name: None if image is None else store.put(np.asarray(image)) for name, image in images.items()}
-    words = {name: getattr(task, name) for name in ("instruction", "task_id", "robot", "camera_id")}
+    words = {name: getattr(task, name) for name in ("instruction", "task_id", "robot")}
     return {**words, **stored}
 
 

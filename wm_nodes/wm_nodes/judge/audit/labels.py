@@ -1,7 +1,7 @@
-"""What people say of clips: the file that the viewer exports, for `agree` and `adopt`."""
+"""What people say of clips: the file that the viewer exports, for `agree` and `people`."""
 
 from codecs import BOM_UTF8
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -90,8 +90,7 @@ def find_evaluation(
 ) -> RecordedEvaluation:
     """The evaluation that a label or a sample means. Raises AuditError: the log holds none or another one there."""
     evaluation = evaluations.get(number)
-    verdict = None if evaluation is None else evaluation.verdict
-    if evaluation is None or verdict is None or verdict.audit_id != audit_id:
+    if evaluation is None or evaluation.outcome is None or evaluation.outcome.audit_id != audit_id:
         raise AuditError(f"{source}: evaluation {number} is another one in this log; name the log it is from")
     return evaluation
 
@@ -106,9 +105,3 @@ def annotators(files: Sequence[HumanLabels]) -> list[str]:
                 raise AuditError(f"{file.annotator} labelled evaluation {label.evaluation} twice; give the newest file")
             seen.add(key)
     return list(dict.fromkeys(file.annotator for file in files))
-
-
-def load_all(paths: Iterable[Path]) -> list[HumanLabels]:
-    files = [read_labels(path) for path in paths]
-    annotators(files)
-    return files

@@ -34,7 +34,7 @@ class HumanJudge:
     @property
     def capabilities(self) -> Capabilities:
         return Capabilities(
-            f"human:{self._sha}", "human", ", ".join(self._people), "", None, probabilities=False, reasons=False,
+            f"human:{self._sha}", "human", ", ".join(self._people), "", None,
             deterministic=True, card=f"labels of {', '.join(self._people)} on {len(self._said)} clips",
         )
 

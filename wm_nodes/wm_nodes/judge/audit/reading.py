@@ -48,7 +48,7 @@ class AgentLine:
 
 @dataclass
 class RecordedEvaluation:
-    """One clip being judged once. number: of its line, its name. verdict: None where the process died before.
+    """One clip being judged once. number: of its line, its name. outcome: None where the process died before.
     redacted: a secret in the verdict was replaced, so that it has another content than its audit id says.
     """
 
@@ -61,8 +61,15 @@ class RecordedEvaluation:
     evidence: Mapping[str, float]
     asks: list[Ask] = field(default_factory=list)
     exchanges: list[Mapping[str, Any]] = field(default_factory=list)
-    verdict: Verdict | None = None
+    outcome: Verdict | None = None
     redacted: bool = False
+
+    @property
+    def verdict(self) -> Verdict:
+        """The outcome. Raises AuditError: there is none."""
+        if self.outcome is None:
+            raise AuditError(f"evaluation {self.number} has no verdict: its process died before")
+        return self.outcome
 
 
 @dataclass
@@ -83,7 +90,7 @@ class Record:
     def judged(self, round_number: int | None = None) -> list[RecordedEvaluation]:
         """Evaluations that have a verdict; of one round, or of all."""
         chosen = (e for e in self.evaluations.values() if round_number in (None, e.round_number))
-        return [evaluation for evaluation in chosen if evaluation.verdict is not None]
+        return [evaluation for evaluation in chosen if evaluation.outcome is not None]
 
     def rubric(self, evaluation: RecordedEvaluation) -> Rubric:
         return self.rubrics[evaluation.agent.rubric_version]
@@ -140,7 +147,7 @@ def _add_line(record: Record, agents: dict[int, AgentLine], asks: dict[int, Ask]
         elif line.kind == "exchange":
             evaluation.exchanges.append(body)
         else:
-            evaluation.verdict, evaluation.redacted = typed(Verdict, body["verdict"]), "redacted" in body
+            evaluation.outcome, evaluation.redacted = typed(Verdict, body["verdict"]), "redacted" in body
 
 
 @dataclass(frozen=True)
@@ -175,7 +182,7 @@ def verify(folder: Path, *, pictures: bool = True, expected_head: str = "") -> V
     problems = list(_find_problems(record, pictures))
     if expected_head and all(line.hash != expected_head for line in read_lines(folder)):
         problems.append(f"no line has the hash {expected_head}: lines at the end were cut off, or it is another log")
-    ids = sorted(e.verdict.audit_id for e in record.judged() if e.verdict)
+    ids = sorted(e.verdict.audit_id for e in record.judged())
     return VerifyReport(
         problems, record.num_lines, len(record.evaluations), len(record.evaluations) - len(ids), record.head,
         hashlib.sha256("".join(ids).encode()).hexdigest(),
@@ -184,7 +191,7 @@ def verify(folder: Path, *, pictures: bool = True, expected_head: str = "") -> V
 
 def _find_problems(record: Record, pictures: bool) -> Iterator[str]:
     for evaluation in record.evaluations.values():
-        verdict = evaluation.verdict
+        verdict = evaluation.outcome
         about = f"evaluation {evaluation.number} of clip {evaluation.clip_id!r}"
         if verdict is not None and not evaluation.redacted and content_hash(verdict) != verdict.audit_id:
             yield f"{about}: its verdict is not what its audit id says"

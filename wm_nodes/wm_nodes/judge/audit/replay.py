@@ -85,22 +85,12 @@ class ReplayResult:
         return self.after is not None and self.after.audit_id == content_hash(self.before)
 
 
-async def replay_evaluation(
-    record: Record, evaluation: RecordedEvaluation, rubric: Rubric | None = None
-) -> ReplayResult:
-    """Work one verdict out again, under its own rubric or another one.
-
-    Raises:
-        AuditError: the evaluation has no verdict, a picture is missing, or `rubric` asks in other words.
-    """
-    if evaluation.verdict is None:
-        raise AuditError(f"evaluation {evaluation.number} has no verdict: its process died before")
+async def replay_evaluation(record: Record, evaluation: RecordedEvaluation) -> ReplayResult:
+    """Work one verdict out again. Raises AuditError: the evaluation has no verdict, or a picture is missing."""
     if any(ask.failure and ask.failure.error == "CancelledError" for ask in evaluation.asks):
         return ReplayResult(evaluation, evaluation.verdict, None)
-    if rubric is not None:
-        check_questions(record.rubric(evaluation), rubric)
     settings: Mapping[str, Any] = evaluation.agent.settings
-    agent = RewardAgent(ReplayJudge([evaluation]), rubric or record.rubric(evaluation), **settings)
+    agent = RewardAgent(ReplayJudge([evaluation]), record.rubric(evaluation), **settings)
     verdict = await agent.evaluate(record.clip(evaluation), record.task(evaluation), evaluation.evidence)
     return ReplayResult(evaluation, evaluation.verdict, verdict)
 

@@ -19,7 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.judge.agent.reflection import conflicting_evidence
+from wm_nodes.judge.agent.reflection import conflicting
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import Status
 from wm_nodes.judge.audit.log import AuditError
@@ -76,13 +76,13 @@ def draw(record: Record, round_number: int, *, seed: int = 0, size: int | None =
     Raises:
         AuditError: the round has no verdict. ValueError: size < 1.
     """
-    pool = sorted(record.judged(round_number), key=lambda e: (e.verdict.audit_id if e.verdict else "", e.number))
+    pool = sorted(record.judged(round_number), key=lambda e: (e.verdict.audit_id, e.number))
     if not pool:
         rounds = sorted({evaluation.round_number for evaluation in record.judged()})
         raise AuditError(f"{record.folder} has no verdict of round {round_number}; rounds: {rounds or 'none'}")
     if size is not None and size < 1:
         raise ValueError(f"size must be >= 1, got {size}")
-    rewards = [e.verdict.reward for e in pool if e.verdict and e.verdict.valid]
+    rewards = [e.verdict.reward for e in pool if e.verdict.valid]
     mean = float(np.mean(rewards)) if rewards else 0.0
     count = sample_size(mean, len(pool)) if size is None else min(size, len(pool))
     strata = [stratum_of(evaluation, record.rubric(evaluation)) for evaluation in pool]
@@ -91,7 +91,8 @@ def draw(record: Record, round_number: int, *, seed: int = 0, size: int | None =
     drawn, weights, sizes = draw_stratified(strata, count, rng)
     second = set(rng.permutation(drawn)[: round(SECOND_SHARE * len(drawn))].tolist())
     chosen = tuple(
-        SampledClip(pool[i].number, pool[i].clip_id, _id(pool[i]), strata[i], weights[i], i in second) for i in drawn
+        SampledClip(pool[i].number, pool[i].clip_id, pool[i].verdict.audit_id, strata[i], weights[i], i in second)
+        for i in drawn
     )
     return Sample(record.head, round_number, seed, len(pool), mean, sizes, chosen)
 
@@ -99,11 +100,10 @@ def draw(record: Record, round_number: int, *, seed: int = 0, size: int | None =
 def stratum_of(evaluation: RecordedEvaluation, rubric: Rubric) -> str:
     """conflict, reflection, near_gate or, for now, random: the highest rewards need all of the round."""
     verdict = evaluation.verdict
-    if verdict is None or verdict.status is Status.ERROR:
+    if verdict.status is Status.ERROR:
         return REST
     passed = {score.component for stage in verdict.stages for score in stage.components if score.passed}
-    contradicted = (rubric.evidence[name].component for name in conflicting_evidence(rubric, evaluation.evidence))
-    if verdict.status is Status.ABSTAIN or any(name in passed for name in contradicted):
+    if verdict.status is Status.ABSTAIN or passed & set(conflicting(evaluation.evidence)):
         return "conflict"
     if any(reflection.accepted for reflection in verdict.reflections):
         return "reflection"
@@ -142,14 +142,6 @@ def read_sample(path: Path) -> Sample:
 
 def _mark_top(pool: Sequence[RecordedEvaluation], strata: Sequence[str], count: int) -> list[str]:
     """The strata with the `count` highest rewards among the clips of none in top_reward."""
-    free = [i for i, e in enumerate(pool) if strata[i] == REST and e.verdict is not None and e.verdict.valid]
-    best = sorted(free, key=lambda i: (-_reward(pool[i]), i))[:count]
+    free = [i for i, e in enumerate(pool) if strata[i] == REST and e.verdict.valid]
+    best = sorted(free, key=lambda i: (-pool[i].verdict.reward, i))[:count]
     return ["top_reward" if i in set(best) else stratum for i, stratum in enumerate(strata)]
-
-
-def _reward(evaluation: RecordedEvaluation) -> float:
-    return evaluation.verdict.reward if evaluation.verdict else float("nan")
-
-
-def _id(evaluation: RecordedEvaluation) -> str:
-    return evaluation.verdict.audit_id if evaluation.verdict else ""

@@ -2,13 +2,15 @@
 
 import re
 from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from wm_nodes.config.schema import JudgeConfig, OtherJudge, StageJudge
-from wm_nodes.core.device import CPU, compute_device
+from wm_nodes.config.shipped import shipped_model
+from wm_nodes.core.device import CPU
 from wm_nodes.judge.agent import topreward
 from wm_nodes.judge.agent.judge import Judge
 from wm_nodes.judge.agent.rubric import Rubric
@@ -16,12 +18,11 @@ from wm_nodes.judge.agent.types import Stage
 from wm_nodes.judge.backends import one_class
 from wm_nodes.judge.backends.cache import VerdictCache
 from wm_nodes.judge.backends.calls import OWN_FIELDS, ChatOptions, Exchange
-from wm_nodes.judge.backends.embedded import EmbeddedJudge, shipped_head, shipped_heads, unfit_reason
+from wm_nodes.judge.backends.one_class import OneClassJudge
 from wm_nodes.judge.backends.openai_client import OpenAIJudge
 from wm_nodes.judge.backends.routed import RoutedJudge
 from wm_nodes.judge.backends.transport import ChatTransport, Endpoint, RetryPolicy
-from wm_nodes.judge.evidence.head import load_head
-from wm_nodes.judge.one_class.ranges import has_ranges
+from wm_nodes.judge.one_class.ranges import KEPT, has_ranges
 from wm_nodes.world_model.folder import read_world_manifest
 
 AnyJudge = TypeVar("AnyJudge", JudgeConfig, OtherJudge, StageJudge)
@@ -62,7 +63,7 @@ def check_judge(settings: JudgeConfig) -> None:
         raise ValueError(f"judge.routes names {', '.join(twice)} more than once; one judge reads a stage")
     seen = list[tuple[object, ...]]()
     for number, judge in enumerate(judges_of(settings)):
-        name = judge.model if judge.kind == "openai" else str(_folder(judge))
+        name = judge.model if judge.kind == "openai" else judge.folder
         identity = (judge.kind, name, judge.routes)
         if identity in seen:
             raise ValueError(
@@ -79,13 +80,13 @@ def _check_one(settings: JudgeConfig) -> None:
             f"(got judge.kind {settings.kind}), and leave judge.routes empty"
         )
     if settings.kind == "embedded":
-        if settings.folder and not Path(settings.folder).is_dir():
+        if settings.folder and not has_ranges(Path(settings.folder)):
             raise ValueError(
-                f"judge.folder {settings.folder!r} is no folder; name that of a trained judge (make one with "
-                "wm train-judge), or leave it empty for the shipped one"
+                f"judge.folder {settings.folder!r} holds no normal ranges; make a world-model folder a judge with wm "
+                "judge calibrate MODEL_DIR BAG, or leave judge.folder empty for the task's shipped one"
             )
-        if settings.conformal and not has_ranges(_folder(settings)):
-            load_head(_folder(settings)).conformal(settings.conformal)
+        if settings.conformal >= KEPT:
+            raise ValueError(f"judge.conformal must be below {KEPT}, what the limit keeps, got {settings.conformal}")
         return
     if not settings.endpoints or not settings.model:
         raise ValueError(
@@ -101,54 +102,74 @@ def _check_one(settings: JudgeConfig) -> None:
         raise ValueError(f"judge.extra_body sets {', '.join(taken)}, which the judge sets itself; leave it out")
 
 
-def for_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> JudgeConfig:
-    """The settings with the shipped judge of such pictures wherever an embedded one is not named; with the first
-    shipped one where there is none.
+def for_task(settings: JudgeConfig, task: str) -> JudgeConfig:
+    """The settings with the task's shipped world model wherever an embedded judge has no folder.
 
-    Args:
-        shape: (frames, height, width, 3).
+    Raises:
+        ValueError: no world model is shipped for the task, or it is no judge; names the remedy.
     """
-    fitting = (str(path) for path in shipped_heads() if load_head(path).picture_size == tuple(shape[1:3]))
-    folder = next(fitting, str(shipped_head()))
 
     def name_folder(judge: AnyJudge) -> AnyJudge:
-        return judge if judge.kind != "embedded" or judge.folder else judge.model_copy(update={"folder": folder})
+        if judge.kind != "embedded" or judge.folder:
+            return judge
+        return judge.model_copy(update={"folder": str(_shipped(task))})
 
     routes, fallbacks = [*map(name_folder, settings.routes)], [*map(name_folder, settings.fallbacks)]
     return name_folder(settings).model_copy(update={"routes": routes, "fallbacks": fallbacks})
 
 
-def check_clips(settings: JudgeConfig, shape: tuple[int, ...]) -> None:
-    """Refuse a judge that would abstain on every clip of this shape, (frames, height, width, 3); likewise routed ones
-    and fallbacks. Servers take any.
+def _shipped(task: str) -> Path:
+    """The folder of the judge that is shipped for a task. Raises ValueError."""
+    with suppress(FileNotFoundError):
+        if has_ranges(folder := shipped_model(task)):
+            return folder
+    raise ValueError(
+        f"no judge is shipped for task {task!r} (named in clips.jsonl, in bags or by --task); name a server (--judge "
+        "URL --judge-model NAME), or calibrate a world "
+        "model of your own (wm judge calibrate MODEL_DIR BAG, then --judge MODEL_DIR)"
+    )
+
+
+def check_clips(settings: JudgeConfig, shape: tuple[int, ...], fps: float | None = None) -> None:
+    """Refuse a judge that would abstain on every such clip; likewise routed ones and fallbacks. Servers take any.
+
+    Args:
+        settings: of for_task.
+        shape: (frames, height, width, 3).
+        fps: frames per second; None: those of its first ranges.
 
     Raises:
         ValueError: names the shape and the remedy; or the folder holds no judge.
     """
-    settings = for_clips(settings, shape)
     others: list[OtherJudge] = [*settings.routes, *settings.fallbacks]
     for judge in (settings, *(_single_judge(settings, other) for other in others)):
-        if judge.kind != "embedded" or not (reason := _unfit_reason(_folder(judge), shape)):
+        if judge.kind != "embedded":
             continue
-        raise ValueError(
-            f"the embedded judge {_folder(judge)} cannot judge clips of {shape[0]} frames, {shape[1]} x {shape[2]} "
-            f"px: {reason}. Name a server (judge.kind openai, judge.endpoints, judge.model), or in judge.folder a "
-            "judge that was trained on such clips (wm train-judge)"
-        )
+        folder = Path(judge.folder)
+        manifest = read_world_manifest(folder)
+        if reason := one_class.unfit_reason(one_class.ranges_of(folder, manifest), manifest, shape, fps):
+            raise ValueError(
+                f"the embedded judge {folder} cannot judge clips of {shape[0]} frames, {shape[1]} x {shape[2]} px: "
+                f"{reason}. Name a server (judge.kind openai, judge.endpoints, judge.model), or in judge.folder a "
+                "world model of such clips with normal ranges (wm judge calibrate)"
+            )
 
 
-def _unfit_reason(folder: Path, shape: tuple[int, ...]) -> str:
-    """Why the embedded judge of a folder cannot judge clips of this shape, or ""."""
-    if not has_ranges(folder):
-        return unfit_reason(load_head(folder), shape)
-    manifest = read_world_manifest(folder)
-    return one_class.unfit_reason(one_class.ranges_of(folder, manifest), manifest, shape)
+def evidence_judge(settings: JudgeConfig, model_dir: Path | None, device: str = CPU) -> OneClassJudge | None:
+    """The judge in this process whose numbers are the evidence beside a server's answers (RA-17); None where no server
+    judges, or the world model has no normal ranges.
+    """
+    judges: list[JudgeConfig | OtherJudge] = [settings, *settings.routes, *settings.fallbacks]
+    if model_dir is None or all(judge.kind == "embedded" for judge in judges) or not has_ranges(model_dir):
+        return None
+    return OneClassJudge(model_dir, device=device)
 
 
 def judge_name(settings: JudgeConfig) -> str:
     """Who judges, in words for people."""
     embedded = settings.kind == "embedded"
-    name = f"embedded judge {_folder(settings)}" if embedded else f"{settings.model} at {', '.join(settings.endpoints)}"
+    who = f"embedded judge {settings.folder or 'of the task'}"
+    name = who if embedded else f"{settings.model} at {', '.join(settings.endpoints)}"
     by = [f"{'+'.join(route.stages)} by {judge_name(_single_judge(settings, route))}" for route in settings.routes]
     return "; ".join([name, *by])
 
@@ -188,11 +209,10 @@ def _open(
     settings: JudgeConfig, rubric: Rubric, reads: Path | None, on_exchange: Callable[[Exchange], None], device: str
 ) -> OpenedJudge:
     """The judge itself, whatever its routes."""
-    if settings.kind == "embedded" and has_ranges(_folder(settings)):
-        return OpenedJudge(one_class.OneClassJudge(_folder(settings), settings.conformal, device), _close_nothing)
     if settings.kind == "embedded":
-        head = load_head(_folder(settings), compute_device(device))
-        return OpenedJudge(EmbeddedJudge(head, settings.conformal), _close_nothing)
+        if not settings.folder:
+            raise ValueError("judge.folder is empty; name a world-model folder with normal ranges, see for_task")
+        return OpenedJudge(OneClassJudge(Path(settings.folder), settings.conformal, device), _close_nothing)
     transport = ChatTransport(
         [Endpoint(url, settings.model, settings.api_key_env, settings.max_in_flight) for url in settings.endpoints],
         retry=RetryPolicy(settings.tries),
@@ -205,10 +225,6 @@ def _open(
     )
     cache = VerdictCache(reads) if reads is not None and settings.keep_reads else None
     return OpenedJudge(OpenAIJudge(transport, rubric, options, cache, on_exchange), transport.close)
-
-
-def _folder(settings: JudgeConfig) -> Path:
-    return Path(settings.folder) if settings.folder else shipped_head()
 
 
 async def _close_nothing() -> None:

@@ -21,7 +21,17 @@ from wm_nodes.core.device import CPU, compute_device
 from wm_nodes.core.model_folder import ModelFolderError, files_sha256
 from wm_nodes.judge.agent.judge import Capabilities, Cost, Health, JudgeError, Read, ReadRequest, reads_of
 from wm_nodes.judge.agent.levels import first_vote
-from wm_nodes.judge.agent.types import NUM_LEVELS, PLANNING, ClipRef, Component, Stage, Status, TaskSpec
+from wm_nodes.judge.agent.types import (
+    NUM_LEVELS,
+    PLANNING,
+    TASK_COMPLETION,
+    ClipRef,
+    Component,
+    Evidence,
+    Stage,
+    Status,
+    TaskSpec,
+)
 from wm_nodes.judge.one_class.calibration import words_of
 from wm_nodes.judge.one_class.imagination import model_numbers
 from wm_nodes.judge.one_class.pictures import HUES, picture_numbers, things_in
@@ -38,7 +48,6 @@ STEEPNESS = 40.0
 """Of the failure probability around the limit: 0.5 there, 0.98 a tenth above it."""
 FAIL_LEVEL, PASS_LEVEL = 1, 4
 """A component that fails is "clearly wrong", one that passes "clean"."""
-TASK_COMPLETION = "task_completion"
 PATTERNS: Mapping[str, tuple[Component, ...]] = {
     "occlusion": ("clarity",), "motion": ("temporal",), "background": ("background",),
     "physics": ("interaction", "deformation", "geometry"),
@@ -46,8 +55,6 @@ PATTERNS: Mapping[str, tuple[Component, ...]] = {
 """Components whose failure is each hacking pattern's."""
 KNOWN = frozenset({*COMPONENTS.values(), *PATTERNS, PLANNING, TASK_COMPLETION})
 """Everything that it reads."""
-WHOLE_PICTURE = ("clarity", "brightness", "color", "temporal")
-"""Components whose failure makes a clip poor; that of another one, fair."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +147,14 @@ class OneClassJudge:
         self._num_abstained += sum(read.status is Status.ABSTAIN for read in reads)
         return reads
 
+    def evidence(self, clip: ClipRef, task: TaskSpec) -> Evidence:
+        """How strange what each component speaks about is, 1 at the limit; {} of a clip that it cannot judge."""
+        try:
+            ranges, finding = self._find(clip, task)
+        except ValueError:
+            return {}
+        return {name: score / ranges.limit() for name, (score, _) in finding.worst.items()}
+
     async def health(self) -> Health:
         """Always available; details count the reads and the abstentions."""
         return Health(True, "", {"reads": float(self._num_reads), "abstained": float(self._num_abstained)})
@@ -223,13 +238,15 @@ class OneClassJudge:
         return _decision(name, self._p_fail(score, ranges), text)
 
     def _planning(self, ranges: NormalRanges, finding: Finding) -> Read:
-        """Poor by the whole picture's components, fair by any other; the failing ones are looked at first."""
+        """Always "good"; the failing components are looked at first.
+
+        A lower level would move weight to quality: of an undone task, a further fault would raise the reward.
+        """
         p_fail = {name: self._p_fail(score, ranges) for name, (score, _) in finding.worst.items()}
         if finding.naming[0] is Status.ERROR:
             p_fail["objective"] = 1.0
-        poor, some = max(p_fail[name] for name in WHOLE_PICTURE), max(p_fail.values())
         focus = tuple(sorted((name for name in p_fail if p_fail[name] >= 0.5), key=lambda name: -p_fail[name]))
-        return Read(PLANNING, (0.0, poor, some - poor, 1 - some), "embedded", first_vote(0), focus=focus)
+        return Read(PLANNING, (0.0, 0.0, 0.0, 1.0), "embedded", first_vote(0), focus=focus)
 
     def _completion(self, task: TaskSpec, ranges: NormalRanges, finding: Finding) -> Read:
         """Done at even odds where the done signal is at the task's threshold."""

@@ -60,9 +60,7 @@ class OpenAIJudge:
     def capabilities(self) -> Capabilities:
         components = frozenset({*self._rubric.component_names, *self._rubric.hack.patterns, PLANNING})
         return Capabilities(
-            f"{TRANSPORT}:{self._model}", TRANSPORT, self._model, "", components,
-            media=frozenset({"image", "video"} if self._options.video else {"image"}),
-            max_frames=self._options.max_images,
+            f"{TRANSPORT}:{self._model}", TRANSPORT, self._model, "", components, max_frames=self._options.max_images
         )
 
     async def read(self, request: ReadRequest) -> list[Read]:

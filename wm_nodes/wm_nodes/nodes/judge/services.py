@@ -21,7 +21,6 @@ from wm_nodes.judge.agent.contract import pause_reason
 from wm_nodes.judge.agent.types import GATED, Status
 from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.clip_files import AT_ONCE, list_sha256, read_job, read_list
-from wm_nodes.judge.evidence_of_clip import ClipEvidence
 from wm_nodes.judge.service import POLL_S, READS, ClipJob, JudgeService
 from wm_nodes.nodes.judge.verdict_message import verdict_msg
 from wm_nodes.ros import convert, diagnostics
@@ -38,8 +37,8 @@ PARAMS = (
 
 
 class JudgeServices:
-    """Owns the node's JudgeService until cleanup. The world model of the node's `model_dir` measures the evidence that
-    the rubric has bands of. Rounds are judged one after the other; the node calls stop when it is deactivated.
+    """Owns the node's JudgeService until cleanup. The world model of the node's `model_dir` gives the evidence beside a
+    server's answers. Rounds are judged one after the other; the node calls stop when it is deactivated.
 
     Args:
         config: of the run; its seed and device are taken.
@@ -56,7 +55,7 @@ class JudgeServices:
         audit, models = str(node.param("audit_dir")), str(node.param("model_dir"))
         self.judge = JudgeService(
             settings, seed=config.seed, reads=node.run_dir / READS, audit=node.run_dir / audit if audit else None,
-            evidence=ClipEvidence(Path(models) if models else None, config.device), device=config.device,
+            model_dir=Path(models) if models else None, device=config.device,
         )
         node.own(self.judge.close)
         self._files = named_files(node, *([settings.rubric] if settings.rubric.endswith((".yaml", ".yml")) else []))

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
-from wm_nodes.config.tasks import WeakPolicy, clip_rules
+from wm_nodes.config.tasks import WeakPolicy
 from wm_nodes.environments.maniskill.tasks import push_cube
 
 
@@ -15,5 +15,5 @@ def scene() -> Any:
 
 TASK = replace(
     push_cube.TASK, instruction="pull the blue cube into the red target", scene=scene, settings={}, model_tasks=(),
-    weak_policies=(WeakPolicy(4, 4, 0.3),), clips=replace(clip_rules("push_cube"), any_heading=False),
+    weak_policies=(WeakPolicy(4, 4, 0.3),),
 )

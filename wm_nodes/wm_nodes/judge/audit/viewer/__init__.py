@@ -7,9 +7,9 @@ never as markup, and the page's own policy lets nothing run but its own script.
 import base64
 import hashlib
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -22,12 +22,12 @@ from wm_nodes.judge.agent.levels import settle
 from wm_nodes.judge.agent.rubric import Rubric
 from wm_nodes.judge.agent.types import PLANNING
 from wm_nodes.judge.agent.verdict import Verdict
-from wm_nodes.judge.audit.labels import FORMAT, HACK
-from wm_nodes.judge.audit.log import AuditError
+from wm_nodes.judge.audit.labels import FORMAT, HACK, find_evaluation
 from wm_nodes.judge.audit.media import FOLDER
 from wm_nodes.judge.audit.reading import Record, RecordedEvaluation
 from wm_nodes.judge.audit.sampling import Sample, SampledClip
 from wm_nodes.judge.decisions import OVERALL, decisions_of
+from wm_nodes.reports.summary import plain
 
 FILE_NAME = "view.html"
 
@@ -47,7 +47,7 @@ def write_view(
     data = {
         "format": FORMAT, "head": record.head,
         "page": hashlib.sha256(json.dumps(names).encode()).hexdigest()[:16],
-        "media": quote(os.path.relpath(record.folder / FOLDER, path.parent)), "hack": HACK,
+        "media": quote(os.path.relpath(record.folder / FOLDER, path.parent)),
         "rubrics": {version: _describe_rubric(rubric) for version, rubric in record.rubrics.items()}, "clips": clips,
     }
     write_atomic(path, page(f"audit of {record.folder.resolve().name}", data).encode())
@@ -55,14 +55,14 @@ def write_view(
 
 
 def page(title: str, data: Mapping[str, Any]) -> str:
-    """The page. data: JSON values; what the script reads."""
+    """The page. data: what the script reads; numbers that are not finite are null there."""
     folder = resources.files("wm_nodes.judge.audit.viewer")
     style, script = ((folder / name).read_text(encoding="utf-8") for name in ("viewer.css", "viewer.js"))
     policy = (
         f"default-src 'none'; img-src 'self' file:; style-src {_source_expression(style)}; "
         f"script-src {_source_expression(script)}; base-uri 'none'; form-action 'none'"
     )
-    text = json.dumps(data, allow_nan=False)
+    text = json.dumps(plain(data), allow_nan=False)
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return (
@@ -93,34 +93,29 @@ def _describe_rubric(rubric: Rubric) -> dict[str, Any]:
 
 def _describe_clip(record: Record, evaluation: RecordedEvaluation, chosen: SampledClip | None) -> dict[str, Any]:
     verdict = evaluation.verdict
-    if verdict is None or (chosen is not None and chosen.audit_id != verdict.audit_id):
-        raise AuditError(f"evaluation {evaluation.number} has no verdict, or the sample is of another log")
+    if chosen is not None:
+        find_evaluation(chosen.evaluation, chosen.audit_id, record.evaluations, "sample")
     body, task = record.clips[evaluation.sha256], evaluation.task
     frames = body["frames"] if isinstance(body["frames"], list) else []
     return {
         "evaluation": evaluation.number, "clip_id": evaluation.clip_id, "sha256": evaluation.sha256,
         "audit_id": verdict.audit_id, "round": evaluation.round_number, "source": body["source"],
-        "fps": _number(body["fps"]), "frames": [_url(record, name) for name in frames],
+        "fps": float(body["fps"]), "frames": [_url(record, name) for name in frames],
         "reference": _picture(record, task["reference_frame"]), "goal": _picture(record, task["goal_image"]),
         "instruction": task["instruction"], "task": task["task_id"], "robot": task["robot"],
-        "camera": task["camera_id"], "stratum": chosen.stratum if chosen else "",
+        "stratum": chosen.stratum if chosen else "",
         "second": bool(chosen and chosen.second), "rubric": evaluation.agent.rubric_version,
         "judge": {"id": verdict.provenance.judge_id, "model": verdict.provenance.model},
-        "status": str(verdict.status), "reason": verdict.reason, "reward": _number(verdict.reward),
-        "weights": {str(stage): _number(w) for stage, w in verdict.plan.weights.items()} if verdict.plan else {},
+        "status": str(verdict.status), "reason": verdict.reason, "reward": verdict.reward,
+        "weights": {str(stage): w for stage, w in verdict.plan.weights.items()} if verdict.plan else {},
         "stages": [
-            {"stage": str(s.stage), "status": str(s.status), "s": _number(s.s), "passed": s.passed, "veto": s.vetoed_by}
+            {"stage": str(s.stage), "status": str(s.status), "s": s.s, "passed": s.passed, "veto": s.vetoed_by}
             for s in verdict.stages
         ],
         "rows": _describe_rows(evaluation, verdict, record.rubric(evaluation)),
-        "reflections": [
-            {"triggers": list(second.triggers), "changes": [
-                {"component": c.component, "before": _number(c.before), "after": _number(c.after), "reason": c.reason,
-                 "frames": list(c.frames), "accepted": c.accepted} for c in second.changed
-            ]} for second in verdict.reflections
-        ],
-        "evidence": {name: _number(value) for name, value in evaluation.evidence.items()},
-        "cost": {name: _number(value) for name, value in vars(verdict.cost).items() if value is not None},
+        "reflections": [asdict(second) for second in verdict.reflections],
+        "evidence": evaluation.evidence,
+        "cost": {name: value for name, value in vars(verdict.cost).items() if value is not None},
         "reads": verdict.num_reads,
     }
 
@@ -139,16 +134,15 @@ def _describe_rows(evaluation: RecordedEvaluation, verdict: Verdict, rubric: Rub
     }
     for score in (score for stage in verdict.stages for score in stage.components):
         rows[score.component] = {
-            "value": values.get(score.component), "s": _number(score.s), "p_fail": _number(score.p_fail),
-            "margin": _number(score.margin),
-            "why": score.evidence_text, "decided_by": score.decided_by, "reason": score.reason,
-            "frames": list(score.frames_cited), "votes": [_describe_vote(read) for read in score.votes],
+            "value": values.get(score.component), "s": score.s, "p_fail": score.p_fail,
+            "margin": score.margin, "why": score.evidence_text, "decided_by": score.decided_by, "reason": score.reason,
+            "frames": score.frames_cited, "votes": [_describe_vote(read) for read in score.votes],
         }
     for flag in verdict.hack_flags:
         reads = [read for stage, read in asked if stage == "HACK" and read.component == flag.pattern]
         looks = [settle([read], rubric.voting.min_label_mass) for read in reads]
         rows[HACK + flag.pattern] = {
-            "value": not flag.confirmed, "p_fail": _number(flag.p_present), "why": flag.evidence_text,
+            "value": not flag.confirmed, "p_fail": flag.p_present, "why": flag.evidence_text,
             "decided_by": "confirmed by a second read" if flag.confirmed else "not confirmed",
             "reason": "; ".join(look.reason for look in looks if look.reason), "frames": [],
             "votes": [_describe_vote(read) for read in reads],
@@ -160,15 +154,9 @@ def _describe_rows(evaluation: RecordedEvaluation, verdict: Verdict, rubric: Rub
 def _describe_vote(read: Read) -> dict[str, Any]:
     return {
         "index": read.vote.index, "kind": read.source, "polarity": read.vote.polarity, "status": str(read.status),
-        "levels": [_number(p) for p in read.levels], "mass": _number(read.label_mass), "why": read.evidence_text,
-        "reason": read.reason, "frames": list(read.frames_cited),
+        "levels": read.levels, "mass": read.label_mass, "why": read.evidence_text,
+        "reason": read.reason, "frames": read.frames_cited,
     }
-
-
-def _number(value: Any) -> float | None:
-    """None where it is not finite."""
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 def _url(record: Record, name: str) -> str:

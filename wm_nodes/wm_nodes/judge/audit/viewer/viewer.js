@@ -178,7 +178,7 @@ function drawClip() {
   ui.main.replaceChildren(...[
     el("h2", { className: "text", text: one.clip_id }),
     el("p", { className: "text", text: one.instruction }),
-    el("p", { className: "faint text", text: joined(one.task, one.robot, one.camera, one.source, `round ${one.round}`,
+    el("p", { className: "faint text", text: joined(one.task, one.robot, one.source, `round ${one.round}`,
       `judge ${one.judge.id}`, `rubric ${one.rubric}`) }),
     el("div", { className: "pictures" },
       el("figure", {}, ui.player, ui.playerText),
@@ -256,7 +256,7 @@ function details(one) {
   const parts = [el("p", { className: one.reward === null ? "bad" : "", text: `${reward}${drawn}` })];
   one.reflections.forEach((second) => {
     parts.push(el("h3", { text: `Second look: ${second.triggers.join("; ")}` }));
-    for (const change of second.changes) {
+    for (const change of second.changed) {
       const moved = `${change.component} ${number(change.before)} → ${number(change.after)}`;
       const taken = `${change.accepted ? "" : "not "}accepted, frames ${change.frames.join(" ")}`;
       parts.push(el("p", { className: "why", text: `${moved}, ${taken}: ${change.reason}` }));

@@ -1,1 +1,0 @@
-"""Training of the embedded judge: data, segmenter, temporal networks, heads."""
