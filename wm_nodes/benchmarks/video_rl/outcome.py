@@ -5,17 +5,20 @@ on held-out first frames, with scores that nothing was trained on.
 import argparse
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
+from torch import Tensor
 
 from benchmarks.video_rl import plots, tables
-from benchmarks.video_rl.judged import JudgedContexts
+from benchmarks.video_rl.judged import JudgedContexts, open_judge
 from benchmarks.video_rl.learning import train_sampler
 from benchmarks.video_rl.samplers import LearningPlan, SamplerSetup, outcome_samplers
 from benchmarks.video_rl.sources import TASK, config_of, reward_spread
@@ -35,9 +38,12 @@ from wm_nodes.apps.options import prepare_torch
 from wm_nodes.config.load import judge_or_embedded, load_config, load_video_config
 from wm_nodes.config.schema import AGENT
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.progress import tqdm
-from wm_nodes.judge.service import clip_fps
+from wm_nodes.core.types import FloatArray
+from wm_nodes.judge.decisions import accepts
+from wm_nodes.judge.service import buffer_jobs, clip_fps
 from wm_nodes.training.weights import load_weights_file, pack_weights
 from wm_nodes.video_model import RolloutBuffer
 from wm_nodes.video_model.clips import Clips, load_clips
@@ -181,7 +187,8 @@ def _yardstick(video_model: Path, heldout_bags: tuple[Path, ...], device: torch.
 
 def measure_weights(arguments: argparse.Namespace, weights: Path | None, seed: int) -> dict[str, float]:
     """Return means over the first MEASURED held-out first frames of metrics that were never trained on, of one ODE clip
-    each from the noise of `seed`: success by two readers and in the simulator, faults. weights: None: the base's.
+    each from the noise of `seed`: success by two readers and in the simulator, faults; `accepted`: as a success by the
+    embedded judge, `accepted_executed`: and a success in the simulator, too. weights: None: the base's.
 
     Raises:
         OSError: no weights are kept.
@@ -195,4 +202,17 @@ def measure_weights(arguments: argparse.Namespace, weights: Path | None, seed: i
     positions, given = by.probe.read(frames), folder.clip["num_conditioning"]
     metrics = measure_clips(frames, positions, heldout, by, given)
     metrics |= measure_executability(positions, heldout, by, folder.clip["stride"])
-    return {name: float(metrics[name].mean()) for name in METRICS}
+    accepted = _accepted(frames, heldout, config.with_values(judge=judge_or_embedded(config.judge)), given, arguments)
+    executed = metrics["executed_success"].numpy() * accepted
+    shares = {"accepted": float(accepted.mean()), "accepted_executed": float(executed.mean())}
+    return {name: float(metrics[name].mean()) for name in METRICS} | shares
+
+
+def _accepted(
+    frames: Tensor, heldout: Clips, config: VideoRlConfig, given: int, arguments: argparse.Namespace
+) -> FloatArray:
+    """1 where the judge takes a decoded clip for a success, (N,)."""
+    fps = clip_fps(arguments.heldout_bags[0], config.model.stride)
+    jobs = buffer_jobs(frames, heldout, "0" * 64, config, given=given, fps=fps)
+    with closing(open_judge(config, heldout, fps)) as judge:
+        return np.array([accepts(verdict) is True for verdict in judge.judge(jobs)], np.float32)
