@@ -111,7 +111,7 @@ def test_a_thing_of_another_colour_is_a_stranger() -> None:
 
 
 def test_light_and_tint_are_compared_with_the_reference() -> None:
-    dark, warm = pushed() // 2, np.clip(pushed().astype(int) + [20, 0, -20], 0, 255).astype(np.uint8)
+    dark, warm = pushed() // 2, np.clip(pushed() + np.array([20, 0, -20]), 0, 255).astype(np.uint8)
     clean = numbers(pushed())
     assert numbers(dark)["light"] > 60 > 1 > clean["light"] and numbers(warm)["tint"] > 0.1 > 0.01 > clean["tint"]
 
@@ -135,9 +135,8 @@ def test_a_camera_that_shifts_is_told_by_the_scenery_where_it_stands_still() -> 
     frames = np.clip(textured, 0, 255).astype(np.uint8)
     shifted = frames.copy()
     shifted[4:] = np.roll(frames[4:], 3, 2)
-    assert numbers(frames, frames[0])["shifted"] < 0.5 and numbers(shifted, frames[0])["shifted"] > 1.5
     assert numbers(shifted, frames[0])["scenery"] > 3 * numbers(frames, frames[0])["scenery"] + 1
-    assert numbers(shifted, frames[0], still=False)["shifted"] == 0, "of a camera that moves nothing is known"
+    assert numbers(shifted, frames[0], still=False)["scenery"] == 0, "of a camera that moves nothing is known"
 
 
 def test_of_two_views_the_stranger_one_counts() -> None:

@@ -104,6 +104,7 @@ def test_too_few_recordings_are_refused_however_many_clips() -> None:
         ({"scores": []}, "damaged"),
         ({"scores": [2.0, 1.0]}, "damaged"),
         ({"stride": 2}, "damaged"),
+        ({"height_m": float("nan")}, "damaged"),
         ({"scores": None}, "cannot be used"),
         ({"more": 1}, "unexpected keyword"),
     ],

@@ -30,7 +30,7 @@ LAST = 2
 COMPONENTS = {
     "redrawn_worst": "deformation", "redrawn_change": "temporal", "worse_than_still": "temporal",
     "tool_step_m": "temporal", "object_untouched_m": "interaction", "object_faster_m": "interaction",
-    "tool_inside": "geometry", "tool_through": "geometry", "tool_low_m": "geometry", "goal_moves_m": "background",
+    "tool_inside": "geometry", "tool_through": "geometry", "tool_low_m": "geometry", "goal_moves_m": "viewpoint",
 }
 """Each number, and the component of the rubric that it speaks about."""
 

@@ -35,7 +35,7 @@ NO_ROBOT_PX = 64.0
 RIM_PX = 2
 """Rows at the top of a picture in which no robot is looked for."""
 LEAST_SCENERY_PX = 50
-"""Pixels of the scenery that its numbers need; they are 0 of fewer."""
+"""Pixels of the scenery that its number needs; it is 0 of fewer."""
 FAINT, FULL = 0.2, 0.5
 """Share of a thing's colour below which a pixel shows none of it; from which it is of the thing."""
 NEAR = 8.0
@@ -47,7 +47,7 @@ COMPONENTS: Mapping[str, str] = {
     "blurred": "clarity", "thing_blurred": "clarity", "light": "brightness", "tint": "color",
     "scenery": "background", "stranger": "background",
     "start": "objective", "thing_lost_alone": "objective", "thing_end": "objective",
-    "robot_least": "robot", "shifted": "viewpoint",
+    "robot_least": "robot",
     "thing_moves_alone": "interaction", "thing_far_of_robot": "interaction",
     "thing_gained_alone": "deformation", "thing_shape": "deformation", "thing_long": "deformation",
 }
@@ -102,7 +102,7 @@ def _view(frames: UInt8Array, reference: UInt8Array, still: bool) -> dict[str, f
     grey = every.astype(np.float32).mean(-1)
     numbers = {"blurred": _blurred(grey, still)}
     if still:
-        numbers |= _light(grey, every) | _still_view(every, grey)
+        numbers |= _light(grey, every) | _still_view(every)
     return {name: float(value) for name, value in numbers.items()}
 
 
@@ -122,7 +122,7 @@ def _light(grey: Greys, every: UInt8Array) -> dict[str, float]:
     return {"light": np.abs(light[1:] - light[0]).max(), "tint": np.abs(tint[1:] - tint[0]).max()}
 
 
-def _still_view(every: UInt8Array, grey: Greys) -> dict[str, float]:
+def _still_view(every: UInt8Array) -> dict[str, float]:
     """Numbers that need a camera that stands still. every: (T + 1, H, W, 3), the reference, then the frames."""
     far = _far(every, every[0])
     hues = hue_masks(every) & far
@@ -133,7 +133,11 @@ def _still_view(every: UInt8Array, grey: Greys) -> dict[str, float]:
     moving = robots.any(0) | hues[there].any((0, 1)) if there else robots.any(0)
     scenery = cv2.erode((~moving).astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
     area = robots.sum((1, 2)).astype(float)
-    numbers = _scenery(every, grey, scenery) | {"robot_least": -(area[1:] / (area[0] + 20)).min()}
+    change = np.abs(every[1:].astype(np.int16) - every[0])
+    drift = change[:, scenery].mean((1, 2)) if scenery.sum() > LEAST_SCENERY_PX else np.zeros(1)
+    numbers = {
+        "scenery": drift.max(), "start": change[0].mean(), "robot_least": -(area[1:] / (area[0] + 20)).min(),
+    }
     new = (hues[i].sum((1, 2)) for i in range(len(HUES)) if i not in there)
     numbers["stranger"] = max((float(area[1:].max() - area[0]) for area in new), default=0.0)
     distances = [_distance(robot) for robot in robots]
@@ -141,16 +145,6 @@ def _still_view(every: UInt8Array, grey: Greys) -> dict[str, float]:
     for name in things[0] if things else ():
         numbers[name] = max(thing[name] for thing in things)
     return numbers
-
-
-def _scenery(every: UInt8Array, grey: Greys, scenery: BoolArray) -> dict[str, float]:
-    """Numbers of what should not change. scenery: (H, W), the pixels where there is never a robot or a thing."""
-    change = np.abs(every[1:].astype(np.int16) - every[0])
-    drift = change[:, scenery].mean((1, 2)) if scenery.sum() > LEAST_SCENERY_PX else np.zeros(len(change))
-    return {
-        "scenery": drift.max(), "start": change[0].mean(),
-        "shifted": max(_shift(grey[0], other, scenery) for other in grey[1:]),
-    }
 
 
 def _distance(robot: BoolArray) -> NDArray[np.float32]:
@@ -236,14 +230,3 @@ def _edge(shares: Greys) -> float:
     steps[:-1] = np.maximum(steps[:-1], np.abs(np.diff(shares, axis=0)))
     steepest = np.sort(steps[cv2.dilate((shares > FULL).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0])
     return float(steepest[-max(1, len(steepest) // 5) :].mean())
-
-
-def _shift(first: Greys, other: Greys, scenery: BoolArray) -> float:
-    """How far the scenery of two pictures is shifted, px."""
-    if scenery.sum() < LEAST_SCENERY_PX:
-        return 0.0
-    fill = np.float32(np.median(first))
-    blend = [np.where(scenery, picture, fill).astype(np.float32) for picture in (first, other)]
-    window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
-    (dx, dy), response = cv2.phaseCorrelate(blend[0], blend[1], window)
-    return float(np.hypot(dx, dy)) if response > 0.05 else 0.0

@@ -36,7 +36,7 @@ LEAST = 100
 """Recordings that are needed."""
 LEAST_SPREAD = {"_m": 0.01, "_px": 1.0, "": 0.05}
 """A number's spread is at least this, by its unit: m, px, and shares or grey levels."""
-PIXELS = {"thing_moves_alone", "thing_far_of_robot", "stranger", "shifted"}
+PIXELS = {"thing_moves_alone", "thing_far_of_robot", "stranger"}
 """Numbers in px."""
 
 
@@ -129,7 +129,8 @@ def load_ranges(folder: Path, stride: int) -> NormalRanges:
 def _usable(content: Mapping[str, Any]) -> bool:
     """Whether a score can be formed and has a limit."""
     scores, spread = content["scores"], content["spread"].values()
-    finite = all(math.isfinite(value) for value in [*scores, *spread, *content["middle"].values()])
+    values = [*scores, *spread, *content["middle"].values(), content["height_m"]]
+    finite = all(math.isfinite(value) for value in values)
     return finite and bool(scores) and min(spread) > 0 and list(scores) == sorted(scores)
 
 
