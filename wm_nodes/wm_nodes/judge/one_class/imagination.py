@@ -28,8 +28,9 @@ LAST = 2
 """Frames at the end, of which the most done counts."""
 
 COMPONENTS = {
-    "redrawn_worst": "deformation", "redrawn_change": "temporal", "worse_than_still": "temporal",
-    "tool_step_m": "temporal", "object_untouched_m": "interaction", "object_faster_m": "interaction",
+    "redrawn": "clarity", "redrawn_worst": "deformation", "redrawn_change": "temporal",
+    "worse_than_still": "temporal", "tool_step_m": "temporal",
+    "object_untouched_m": "interaction", "object_faster_m": "interaction",
     "tool_inside": "geometry", "tool_through": "geometry", "tool_low_m": "geometry", "goal_moves_m": "viewpoint",
 }
 """Each number, and the component of the rubric that it speaks about."""
@@ -52,16 +53,19 @@ def model_numbers(
     model = models.action
     if not isinstance(model, ActionModel) or models.probe is None:
         raise ValueError("the embedded judge needs a world model over continuous latents with a position probe")
+    frames = frames.copy()  # one that may be read backwards or only read
     latents = models.tokenizer.encode(frames)
     redrawn = models.tokenizer.decode(latents)
-    missed = (redrawn.float() - torch.tensor(frames, device=redrawn.device).float()).abs().mean(3)
+    missed = (redrawn.float() - torch.from_numpy(frames).to(redrawn.device).float()).abs().mean(3)
     places = models.probe.read(frames)
     tool, thing, goal = (places[:, PLACES[name]] for name in ("tool", "object", "goal"))
     imagined, logits = _next_frames(model, models, latents, torch.tensor(tool, device=latents.device), stride, origin)
     error, still = (imagined - latents[1:]).square().mean(), (latents[1:] - latents[:-1]).square().mean()
     moved, went = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (thing, tool))
+    per_frame = missed.mean((1, 2))
     numbers = {
-        "redrawn_worst": _blocks(missed).max(), "redrawn_change": missed.mean((1, 2)).diff().abs().max(),
+        "redrawn": per_frame.mean(), "redrawn_worst": _blocks(missed).max(),
+        "redrawn_change": per_frame.diff().abs().max(),
         "worse_than_still": torch.log((error + 1e-3) / (still + 1e-3)),
         "tool_step_m": went.max(), "object_faster_m": (moved - went).max(), "tool_low_m": -tool[:, 2].min(),
         "goal_moves_m": np.linalg.norm(goal - np.median(goal, 0), axis=1).max(),
@@ -84,7 +88,7 @@ def contact_numbers(tool: FloatArray, thing: FloatArray, height_m: float) -> dic
     untouched = np.clip((free - UNTOUCHED_M) / (FREE_M - UNTOUCHED_M), 0, 1)
     return {
         "tool_inside": -np.log(np.sort(np.concatenate([gap, ahead]))[1] + LEAST_M),
-        "tool_through": -np.log(ahead.min() + LEAST_M),
+        "tool_through": -np.log(np.maximum(ahead, _from_path(tool, place[:-1])).min() + LEAST_M),
         "object_untouched_m": np.linalg.norm((np.diff(calm, axis=0) * untouched[:, None]).sum(0)),
     }
 
