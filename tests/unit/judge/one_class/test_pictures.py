@@ -151,7 +151,9 @@ def test_things_are_named_by_colour_and_the_surface_is_none() -> None:
     assert hue_masks(pushed()).shape == (7, T, SIDE, SIDE)
 
 
-CLIPS = ("grey", "black", "white", "red", "noise", "no thing", "no robot", "thing vanishes at once", "one pixel wide")
+CLIPS = (
+    "grey", "black", "white", "red", "noise", "no thing", "no robot", "thing vanishes at once", "one pixel wide", "paler",
+)
 
 
 def odd_clip(name: str, frames: int, height: int, width: int) -> UInt8Array:
@@ -168,6 +170,9 @@ def odd_clip(name: str, frames: int, height: int, width: int) -> UInt8Array:
         clip[:, 5:11, 5:11] = RED
     elif name == "thing vanishes at once":
         clip[0, 5:11, 5:11] = RED
+    elif name == "paler":
+        clip[:] = (100, 30, 30)
+        clip[:, 5:11, 5:11] = (170, 100, 100)
     elif name == "one pixel wide":
         clip[:, 5:15, 5], clip[:, 5, 7:13] = RED, ROBOT
     return clip

@@ -177,13 +177,13 @@ def _colours(every: UInt8Array, views: Sequence[slice], still: Sequence[bool]) -
     own, start = every[:1, :, first], chroma[0, :, first]
     surface, found = np.median(start.reshape(-1, 3), 0), list[dict[str, float]]()
     for mask in (hue_masks(own) & _far(own, own[0]))[:, 0]:
-        if mask.sum() < SMALLEST_PX:
+        colour = np.median(start[mask], 0) - surface if mask.sum() >= SMALLEST_PX else np.zeros(3, np.float32)
+        if np.linalg.norm(colour) < FAR:  # only lighter or darker than the surface
             continue
-        colour = np.median(start[mask], 0) - surface
         shares = (chroma - surface) @ (colour / (colour @ colour))
         shares[shares < FAINT] = 0
         moving = [part for view, stays in zip(views, still) if not stays for part in shares[1:, :, view]]
-        whole = float(shares[0, :, first].sum())
+        whole = max(float(shares[0, :, first].sum()), 1.0)
         seen = np.stack([
             shares[1:, :, view].sum((1, 2)) / (max(whole, float(shares[0, :, view].sum())) if stays else NEAR * whole)
             for view, stays in zip(views, still)
