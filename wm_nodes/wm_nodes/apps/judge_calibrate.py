@@ -4,7 +4,7 @@
 
 The bags hold episodes in the model's cameras, done and undone, such as wm collect makes; 100 or more, better 500. Each
 is measured as recorded, as the model draws it, as the model imagines it and with a harmless change. What goes further
-than 95 % of them is refused; no fault is shown. The ranges are written into MODEL_DIR, which is then a judge:
+than 97 % of them is refused; no fault is shown. The ranges are written into MODEL_DIR, which is then a judge:
 --judge MODEL_DIR. A clip is judged by the ranges of its frame rate, so each stride needs its own.
 """
 
