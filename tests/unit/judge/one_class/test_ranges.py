@@ -31,7 +31,7 @@ def made(recordings: int = 2 * LEAST, seed: int = 0) -> NormalRanges:
     values = np.random.default_rng(seed).normal(size=(2 * recordings, len(NAMES)))
     rows = [dict(zip(NAMES, row.tolist())) for row in values]
     return NormalRanges(
-        world_model="0" * 64, stride=1, lengths=(3, 34), still=(True, False), origin=(0.1, 0.2, 0.3),
+        world_model="0" * 64, stride=1, lengths=(3, 34), still=(True, False), origin=(0.1, 0.2, 0.3), height_m=0.02,
         done={"push_cube": 0.2}, words=("blue cube", "red target"), story={"recordings": recordings},
         **fit(rows, [i // 2 for i in range(len(rows))], seed),
     )
@@ -58,18 +58,26 @@ def test_the_identity_is_of_what_decides_an_answer() -> None:
     assert replace(ranges, done={"push_cube": 0.3}).sha256 != ranges.sha256
 
 
-def test_a_number_lies_where_it_is_seen_and_goes_as_far_as_half_of_the_recordings() -> None:
+def test_a_number_lies_where_it_is_seen_and_goes_as_far_as_nearly_all_recordings() -> None:
     ranges = made()
-    assert all(abs(ranges.middle[name]) < 0.4 and 1.5 < ranges.spread[name] < 5 for name in NAMES)
-    assert len(ranges.scores) == LEAST and list(ranges.scores) == sorted(ranges.scores)
+    assert all(abs(ranges.middle[name]) < 0.4 and 2 < ranges.spread[name] < 5 for name in NAMES)
+    assert len(ranges.scores) == 2 * LEAST and list(ranges.scores) == sorted(ranges.scores)
     strange = ranges.strangeness({name: ranges.middle[name] + 2 * ranges.spread[name] for name in NAMES})
     assert strange == pytest.approx(dict.fromkeys(NAMES, 2.0))
+
+
+def test_a_recording_is_scored_by_the_ranges_of_others() -> None:
+    rows = [dict.fromkeys(NAMES, 0.0) for _ in range(LEAST)]
+    rows[7]["tool_step_m"] = 1.0
+    fitted = fit(rows, range(LEAST), 0)
+    assert fitted["scores"][-1] == pytest.approx(100), "the others go no further than the least spread, 0.01 m"
+    assert fitted["scores"][-2] == 0
 
 
 def test_numbers_that_never_change_have_a_least_spread_in_their_unit() -> None:
     rows = [dict.fromkeys(NAMES, 0.0)] * LEAST
     spread = fit(rows, range(LEAST), 0)["spread"]
-    assert (spread["tool_step_m"], spread["thing_jump"], spread["tint"]) == (0.01, 1.0, 0.05)
+    assert (spread["tool_step_m"], spread["stranger"], spread["tint"]) == (0.01, 1.0, 0.05)
 
 
 def test_the_limit_rises_with_the_share_that_is_kept() -> None:
@@ -96,6 +104,7 @@ def test_too_few_recordings_are_refused_however_many_clips() -> None:
         ({"scores": []}, "damaged"),
         ({"scores": [2.0, 1.0]}, "damaged"),
         ({"stride": 2}, "damaged"),
+        ({"height_m": float("nan")}, "damaged"),
         ({"scores": None}, "cannot be used"),
         ({"more": 1}, "unexpected keyword"),
     ],

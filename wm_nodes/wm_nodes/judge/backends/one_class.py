@@ -38,7 +38,7 @@ from wm_nodes.judge.one_class.pictures import HUES, picture_numbers, things_in
 from wm_nodes.judge.one_class.ranges import COMPONENTS, KEPT, NormalRanges, file_of, load_ranges, strides_of
 from wm_nodes.world_model import WorldModels, load_model_folder
 
-REVISION = "1"
+REVISION = "2"
 """Raised whenever the same ranges give other answers, so that two versions have two identities."""
 CACHED_CLIPS = 64
 """Clips whose numbers are kept, for the stages of one verdict."""
@@ -179,7 +179,7 @@ class OneClassJudge:
             return ranges, Finding(reason, {}, {}, (Status.OK, ""))
         side, origin = self._models.simulation.image_size, np.asarray(ranges.origin, np.float32)
         numbers = picture_numbers(clip.frames, task.reference_frame, side, ranges.still)
-        drawn, done = model_numbers(self._models, clip.frames, task.reference_frame, ranges.stride, origin)
+        drawn, done = model_numbers(self._models, clip.frames, ranges.stride, origin, ranges.height_m)
         strange = ranges.strangeness(numbers | drawn)
         worst: dict[Component, tuple[float, str]] = {}
         for name, component in COMPONENTS.items():

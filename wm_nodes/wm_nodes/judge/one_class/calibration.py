@@ -19,6 +19,8 @@ from wm_nodes.world_model.validation.open_loop import imagine
 
 SHORTEST = 4
 """Frames of a clip that ends with its success, at least."""
+TOUCHING = 0.25
+"""Share of the recordings in which the tool goes as low as to an object's middle, at least."""
 MOVES = 6.0
 """A view of which half of the pixels change by more grey levels at some time has a camera that moves."""
 
@@ -48,7 +50,7 @@ def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, 
     recorded = [episode for episode in episodes if episode.num_steps >= stride * (SHORTEST - 1)]
     _check_sizes(models, recorded)
     still = _still_views(models, recorded)
-    origin = _origin(models, recorded)
+    origin, height_m = _places(models, recorded)
     rows, longest, words = _Rows(), 0, set[str]()
     for index, episode in enumerate(tqdm(recorded, desc="measured", unit="episode")):
         rng = numpy_stream(seed, f"normal ranges/{index}")
@@ -58,14 +60,14 @@ def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, 
         for shown in _forms(models, episode, steps, stride, rng):
             reference = episode.images[0]
             seen = pictures.picture_numbers(shown, reference, models.simulation.image_size, still)
-            drawn, signals = imagination.model_numbers(models, shown, reference, stride, origin)
+            drawn, signals = imagination.model_numbers(models, shown, stride, origin, height_m)
             rows.numbers.append(seen | drawn)
             rows.recording.append(index)
             for task, done in done_at(models.tasks, episode, steps).items():
                 rows.ends.setdefault(task, []).append((signals[task], done))
     return NormalRanges(
         world_model=models.sha256, stride=stride, lengths=(SHORTEST - 1, 2 * longest), still=still,
-        origin=(float(origin[0]), float(origin[1]), float(origin[2])), words=tuple(sorted(words)),
+        origin=(float(origin[0]), float(origin[1]), float(origin[2])), height_m=height_m, words=tuple(sorted(words)),
         done={task: done_threshold(*zip(*ends)) for task, ends in sorted(rows.ends.items())},
         **fit(rows.numbers, rows.recording, seed),
         story={"recordings": len(recorded), "clips": len(rows.numbers), "seed": seed},
@@ -166,14 +168,13 @@ def _still_views(models: WorldModels, episodes: Sequence[Episode]) -> tuple[bool
     return tuple(bool(change < MOVES) for change in changes)
 
 
-def _origin(models: WorldModels, episodes: Sequence[Episode]) -> FloatArray:
-    """Median of the recorded states less the probe's tool positions, (3,)."""
+def _places(models: WorldModels, episodes: Sequence[Episode]) -> tuple[FloatArray, float]:
+    """Origin and height_m of NormalRanges, of the first recordings."""
     if models.probe is None:
         raise ValueError("the embedded judge needs a world model with a position probe; train it anew")
-    parts = [
-        episode.states[:, :3] - models.probe.read(episode.images)[:, imagination.PLACES["tool"]]
-        for episode in episodes[:50]
-    ]
-    if not parts:
+    tools = [models.probe.read(episode.images)[:, imagination.PLACES["tool"]] for episode in episodes[:50]]
+    if not tools:
         raise ValueError("the bags hold no episode that is long enough; name more bags")
-    return np.asarray(np.median(np.concatenate(parts), 0), np.float32)
+    lacks = [episode.states[:, :3] - tool for episode, tool in zip(episodes, tools)]
+    origin = np.asarray(np.median(np.concatenate(lacks), 0), np.float32)
+    return origin, float(np.quantile([tool[:, 2].min() for tool in tools], TOUCHING))

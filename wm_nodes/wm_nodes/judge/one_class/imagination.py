@@ -20,30 +20,32 @@ PLACES = {
     name: [i for i, found in enumerate(PROBE_NAMES) if found.startswith(name)] for name in ("object", "tool", "goal")
 }
 """Columns of the position probe that are each thing's place."""
+UNTOUCHED_M, FREE_M = 0.05, 0.08
+"""Distance of the tool's path from which an object's move begins to count as untouched, and wholly counts."""
+LEAST_M = 0.003
+"""Distances count from here on a scale of ratios."""
 LAST = 2
 """Frames at the end, of which the most done counts."""
 
 COMPONENTS = {
     "redrawn": "clarity", "redrawn_worst": "deformation", "redrawn_change": "temporal",
-    "unexpected": "interaction", "unexpected_most": "interaction", "unexpected_token": "interaction",
-    "unexpected_place": "interaction", "worse_than_still": "temporal",
-    "object_alone_m": "interaction", "object_step_m": "interaction", "object_faster_m": "interaction",
-    "object_expected_m": "interaction", "object_expected_sum_m": "interaction",
-    "tool_step_m": "robot", "tool_jerk_m": "temporal", "tool_low_m": "geometry", "goal_moves_m": "background",
-    "start_place_m": "objective",
+    "worse_than_still": "temporal", "tool_step_m": "temporal",
+    "object_untouched_m": "interaction", "object_faster_m": "interaction",
+    "tool_inside": "geometry", "tool_through": "geometry", "tool_low_m": "geometry", "goal_moves_m": "viewpoint",
 }
 """Each number, and the component of the rubric that it speaks about."""
 
 
 @torch.inference_mode()
 def model_numbers(
-    models: WorldModels, frames: UInt8Array, reference: UInt8Array, stride: int, origin: FloatArray
+    models: WorldModels, frames: UInt8Array, stride: int, origin: FloatArray, height_m: float
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the numbers of COMPONENTS, and the done signal at the end of each task that the model knows.
 
     Args:
-        frames: uint8 (T, H, W, 3), T >= 2, in the model's cameras. reference: (H, W, 3). stride: steps between frames.
+        frames: uint8 (T, H, W, 3), T >= 2, in the model's cameras. stride: steps between frames.
         origin: (3,), what the probe's tool positions lack to be the model's states, m.
+        height_m: of the object's middle.
 
     Raises:
         ValueError: frames of another size, a model over discrete tokens, or one without a position probe.
@@ -51,40 +53,52 @@ def model_numbers(
     model = models.action
     if not isinstance(model, ActionModel) or models.probe is None:
         raise ValueError("the embedded judge needs a world model over continuous latents with a position probe")
-    every = np.concatenate([reference[None], frames])
-    latents = models.tokenizer.encode(every)[1:]
+    frames = frames.copy()  # one that may be read backwards or only read
+    latents = models.tokenizer.encode(frames)
     redrawn = models.tokenizer.decode(latents)
-    shown = torch.from_numpy(every[1:]).to(redrawn.device)
-    missed = (redrawn.float() - shown.float()).abs().mean(3)
-    places = models.probe.read(every)
-    start, places = places[0], places[1:]
-    tool, thing = torch.from_numpy(places[:, PLACES["tool"]]), places[:, PLACES["object"]]
-    imagined, logits = _next_frames(model, models, latents, tool.to(latents.device), stride, origin)
-    error = (imagined - latents[1:]).square().mean(2)
-    still = (latents[1:] - latents[:-1]).square().mean(2)
-    drawn = models.tokenizer.decode(imagined)
-    miss = (models.probe.read(drawn) - models.probe.read(redrawn[1:]))[:, PLACES["object"]]
-    surprise = _blocks((drawn.float() - redrawn[1:].float()).abs().mean(3))
-    moved, went = np.linalg.norm(np.diff(thing, axis=0), axis=1), np.linalg.norm(np.diff(tool.numpy(), axis=0), axis=1)
-    gap = np.linalg.norm(tool.numpy()[:, :2] - thing, axis=1)
-    goal = places[:, PLACES["goal"]]
+    missed = (redrawn.float() - torch.from_numpy(frames).to(redrawn.device).float()).abs().mean(3)
+    places = models.probe.read(frames)
+    tool, thing, goal = (places[:, PLACES[name]] for name in ("tool", "object", "goal"))
+    imagined, logits = _next_frames(model, models, latents, torch.tensor(tool, device=latents.device), stride, origin)
+    error, still = (imagined - latents[1:]).square().mean(), (latents[1:] - latents[:-1]).square().mean()
+    moved, went = (np.linalg.norm(np.diff(path, axis=0), axis=1) for path in (thing, tool))
     per_frame = missed.mean((1, 2))
     numbers = {
         "redrawn": per_frame.mean(), "redrawn_worst": _blocks(missed).max(),
         "redrawn_change": per_frame.diff().abs().max(),
-        "unexpected": error.mean(), "unexpected_most": error.mean(1).max(), "unexpected_token": error.max(),
-        "unexpected_place": surprise.max(),
-        "worse_than_still": torch.log((error.mean() + 1e-3) / (still.mean() + 1e-3)),
-        "object_alone_m": (moved * np.clip((np.minimum(gap[:-1], gap[1:]) - 0.06) / 0.05, 0, 1)).sum(),
-        "object_step_m": moved.max(), "object_faster_m": (moved - went).max(),
-        "object_expected_m": np.linalg.norm(miss, axis=1).max(), "object_expected_sum_m": np.linalg.norm(miss.sum(0)),
-        "tool_step_m": went.max(), "tool_jerk_m": np.abs(np.diff(went)).max(initial=0.0),
-        "tool_low_m": -tool[:, 2].min(),
+        "worse_than_still": torch.log((error + 1e-3) / (still + 1e-3)),
+        "tool_step_m": went.max(), "object_faster_m": (moved - went).max(), "tool_low_m": -tool[:, 2].min(),
         "goal_moves_m": np.linalg.norm(goal - np.median(goal, 0), axis=1).max(),
-        "start_place_m": np.linalg.norm(start - places[0]),
+        **contact_numbers(tool, thing, height_m),
     }
     done = dict(zip(models.tasks, done_signal(logits)[0][-LAST:].amax(0).tolist()))
     return {name: float(value) for name, value in numbers.items()}, done
+
+
+def contact_numbers(tool: FloatArray, thing: FloatArray, height_m: float) -> dict[str, float]:
+    """Numbers of a tool in or through an object, and of an object that moves without it.
+
+    Args:
+        tool, thing: places (T, 3) and (T, 2), m. height_m: of the object's middle.
+    """
+    place = np.column_stack([thing, np.full(len(thing), height_m)])
+    gap, ahead = np.linalg.norm(tool - place, axis=1), _from_path(tool, place[1:])
+    calm = np.median(np.stack([place[[0, *range(len(place) - 1)]], place, place[[*range(1, len(place)), -1]]]), 0)
+    free = np.minimum(_from_path(tool, calm[1:]), _from_path(tool, calm[:-1]))
+    untouched = np.clip((free - UNTOUCHED_M) / (FREE_M - UNTOUCHED_M), 0, 1)
+    return {
+        "tool_inside": -np.log(np.sort(np.concatenate([gap, ahead]))[1] + LEAST_M),
+        "tool_through": -np.log(np.maximum(ahead, _from_path(tool, place[:-1])).min() + LEAST_M),
+        "object_untouched_m": np.linalg.norm((np.diff(calm, axis=0) * untouched[:, None]).sum(0)),
+    }
+
+
+def _from_path(path: FloatArray, points: FloatArray) -> FloatArray:
+    """Distance of each point (T - 1, 3) to the straight way between two neighbours of a path (T, 3), (T - 1,)."""
+    way = np.diff(path, axis=0)
+    at = ((points - path[:-1]) * way).sum(1) / np.maximum((way * way).sum(1), 1e-9)
+    distance: FloatArray = np.linalg.norm(path[:-1] + np.clip(at, 0, 1)[:, None] * way - points, axis=1)
+    return distance
 
 
 def _next_frames(

@@ -35,20 +35,21 @@ NO_ROBOT_PX = 64.0
 RIM_PX = 2
 """Rows at the top of a picture in which no robot is looked for."""
 LEAST_SCENERY_PX = 50
-"""Pixels of the scenery that its numbers need; they are 0 of fewer."""
+"""Pixels of the scenery that its number needs; it is 0 of fewer."""
+FAINT, FULL = 0.2, 0.5
+"""Share of a thing's colour below which a pixel shows none of it; from which it is of the thing."""
+NEAR = 8.0
+"""A thing is wholly seen where a moving camera shows so many times what the still one showed at the start."""
+LEAST_MIDDLE_PX, LEAST_SHAPE_PX = 4, 6
+"""Pixels that a place needs, and that a shape needs."""
 
 COMPONENTS: Mapping[str, str] = {
-    "blurred": "clarity", "noise": "clarity", "noise_change": "clarity",
-    "light": "brightness", "light_change": "brightness", "tint": "color", "thing_tone": "color",
-    "flicker": "temporal", "frozen": "temporal", "jump": "temporal", "turns_back": "temporal",
-    "views_disagree": "temporal", "one_view_still": "temporal",
-    "scenery": "background", "scenery_change": "background", "stranger": "background",
-    "start": "objective", "thing_lost": "objective", "thing_lost_alone": "objective", "thing_missing_end": "objective",
-    "robot_least": "robot", "robot_loss": "robot", "robot_gain": "robot", "robot_apart": "robot",
-    "robot_tone": "robot", "robot_jump": "robot", "shifted": "viewpoint",
-    "thing_moves_alone": "interaction", "thing_jump": "interaction", "thing_far_of_robot": "interaction",
-    "thing_grown": "deformation", "thing_twice": "deformation", "thing_gained_alone": "deformation",
-    "thing_shape": "deformation", "thing_shrunk": "deformation",
+    "blurred": "clarity", "thing_blurred": "clarity", "light": "brightness", "tint": "color",
+    "scenery": "background", "stranger": "background",
+    "start": "objective", "thing_lost_alone": "objective", "thing_end": "objective",
+    "robot_least": "robot",
+    "thing_moves_alone": "interaction", "thing_far_of_robot": "interaction",
+    "thing_gained_alone": "deformation", "thing_shape": "deformation", "thing_long": "deformation",
 }
 """Each number, and the component of the rubric that it speaks about."""
 
@@ -63,12 +64,8 @@ def picture_numbers(frames: UInt8Array, reference: UInt8Array, width: int, still
     views = [slice(first, first + width) for first in range(0, frames.shape[2], width)]
     parts = [_view(frames[:, :, view], reference[:, view], stays) for view, stays in zip(views, still, strict=True)]
     numbers = {name: max(part[name] for part in parts if name in part) for name in {n for p in parts for n in p}}
-    steps = np.stack([_steps(frames[:, :, view]) for view in views])
-    numbers["views_disagree"] = numbers["one_view_still"] = 0.0
-    if len(views) > 1:
-        ratio = np.log((steps[0] + 0.3) / (steps[1:].mean(0) + 0.3))
-        numbers["views_disagree"] = float(np.abs(ratio - np.median(ratio)).max())
-        numbers["one_view_still"] = float((steps.max(0) * (steps.min(0) < 0.05)).max())
+    if any(still):
+        numbers |= _colours(np.concatenate([reference[None], frames]), views, still)
     return {name: numbers.get(name, 0.0) for name in COMPONENTS}
 
 
@@ -99,55 +96,33 @@ def _far(frames: UInt8Array, reference: UInt8Array) -> BoolArray:
     return np.asarray(np.abs(frames.astype(np.int16) - surface).max(-1) > FAR)
 
 
-def _steps(frames: UInt8Array) -> Floats:
-    """Mean absolute change (T - 1,), grey levels."""
-    return np.asarray(np.abs(np.diff(frames.astype(np.int16), axis=0)).mean((1, 2, 3)), np.float64)
-
-
 def _view(frames: UInt8Array, reference: UInt8Array, still: bool) -> dict[str, float]:
     """Numbers of one view."""
     every = np.concatenate([reference[None], frames])
     grey = every.astype(np.float32).mean(-1)
-    numbers = _sharpness(grey, still) | _light(grey, every, still) | _changes(frames)
+    numbers = {"blurred": _blurred(grey, still)}
     if still:
-        numbers |= _still_view(every, grey)
+        numbers |= _light(grey, every) | _still_view(every)
     return {name: float(value) for name, value in numbers.items()}
 
 
-def _sharpness(grey: Greys, still: bool) -> dict[str, float]:
-    """Numbers of a view's detail. grey: (T + 1, H, W), of the reference, then the frames; likewise below."""
+def _blurred(grey: Greys, still: bool) -> float:
+    """How few edges the least sharp frame has. grey: (T + 1, H, W), of the reference and the frames; likewise below."""
     rows, columns = grey[:, :, 1:-1], grey[:, 1:-1]
     laplace = 4 * columns[:, :, 1:-1] - rows[:, :-2] - rows[:, 2:] - columns[:, :, :-2] - columns[:, :, 2:]
     laplace = np.abs(laplace).reshape(len(grey), -1)
     edges = np.sort(laplace, 1)[:, -laplace[0].size // 20 :].mean(1)  # of the sharpest 5 %
-    noise = np.median(laplace, 1)
-    return {
-        "blurred": -(edges[1:] / (edges[0] + 1)).min() if still else -edges[1:].min() / (edges[1:].mean() + 1),
-        "noise": noise[1:].max(), "noise_change": np.abs(np.diff(noise[1:])).max(),
-    }
+    return float(-(edges[1:] / (edges[0] + 1)).min() if still else -edges[1:].min() / (edges[1:].mean() + 1))
 
 
-def _light(grey: Greys, every: UInt8Array, still: bool) -> dict[str, float]:
-    """Numbers of a view's mean level and, where its camera stands still, of its distance to the reference's."""
+def _light(grey: Greys, every: UInt8Array) -> dict[str, float]:
+    """Numbers of how far the mean level and colour are from the reference's."""
     light = grey.mean((1, 2))
-    twice = np.abs(np.diff(light, 2)) if len(light) > 3 else np.zeros(1)
-    numbers = {
-        "light_change": np.abs(np.diff(light[1:])).max(), "flicker": twice[1:].max() if len(twice) > 1 else 0.0,
-    }
-    if not still:
-        return numbers
     tint = every.astype(np.float32).mean((1, 2)) / (light[:, None] + 1)
-    return numbers | {"light": np.abs(light[1:] - light[0]).max(), "tint": np.abs(tint[1:] - tint[0]).max()}
+    return {"light": np.abs(light[1:] - light[0]).max(), "tint": np.abs(tint[1:] - tint[0]).max()}
 
 
-def _changes(frames: UInt8Array) -> dict[str, float]:
-    """Numbers of how far a view changes from frame to frame."""
-    x, d = frames.astype(np.float32), _steps(frames)
-    back = [np.abs(x[t] - x[t - 2]).mean() / (d[t - 1] + 0.3) for t in range(2, len(x))]
-    return {"frozen": -np.median(d), "jump": d.max() / (np.median(d) + 0.5), "turns_back": -min(back, default=1.0)}
-
-
-def _still_view(every: UInt8Array, grey: Greys) -> dict[str, float]:
+def _still_view(every: UInt8Array) -> dict[str, float]:
     """Numbers that need a camera that stands still. every: (T + 1, H, W, 3), the reference, then the frames."""
     far = _far(every, every[0])
     hues = hue_masks(every) & far
@@ -157,24 +132,19 @@ def _still_view(every: UInt8Array, grey: Greys) -> dict[str, float]:
     there = [i for i in range(len(HUES)) if hues[i, 0].sum() >= SMALLEST_PX]
     moving = robots.any(0) | hues[there].any((0, 1)) if there else robots.any(0)
     scenery = cv2.erode((~moving).astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool)
-    numbers = _robot(robots, every) | _scenery(every, grey, scenery)
+    area = robots.sum((1, 2)).astype(float)
+    change = np.abs(every[1:].astype(np.int16) - every[0])
+    drift = change[:, scenery].mean((1, 2)) if scenery.sum() > LEAST_SCENERY_PX else np.zeros(1)
+    numbers = {
+        "scenery": drift.max(), "start": change[0].mean(), "robot_least": -(area[1:] / (area[0] + 20)).min(),
+    }
     new = (hues[i].sum((1, 2)) for i in range(len(HUES)) if i not in there)
     numbers["stranger"] = max((float(area[1:].max() - area[0]) for area in new), default=0.0)
     distances = [_distance(robot) for robot in robots]
-    things = [_thing(hues[i], distances, every) for i in there]
+    things = [_thing(hues[i], distances) for i in there]
     for name in things[0] if things else ():
         numbers[name] = max(thing[name] for thing in things)
     return numbers
-
-
-def _scenery(every: UInt8Array, grey: Greys, scenery: BoolArray) -> dict[str, float]:
-    """Numbers of what should not change. scenery: (H, W), the pixels where there is never a robot or a thing."""
-    change = np.abs(every[1:].astype(np.int16) - every[0])
-    drift = change[:, scenery].mean((1, 2)) if scenery.sum() > LEAST_SCENERY_PX else np.zeros(len(change))
-    return {
-        "scenery": drift.max(), "scenery_change": np.abs(np.diff(drift)).max(), "start": change[0].mean(),
-        "shifted": max(_shift(grey[0], other, scenery) for other in grey[1:]),
-    }
 
 
 def _distance(robot: BoolArray) -> NDArray[np.float32]:
@@ -184,44 +154,52 @@ def _distance(robot: BoolArray) -> NDArray[np.float32]:
     return np.asarray(cv2.distanceTransform((~robot).astype(np.uint8), cv2.DIST_L2, 3), np.float32)
 
 
-def _robot(robots: BoolArray, every: UInt8Array) -> dict[str, float]:
-    """Numbers of the robot, (T + 1, H, W)."""
-    area = robots.sum((1, 2)).astype(float)
-    usual = np.median(area) + 20
-    middles = [_middle(robot, 8) for robot in robots[1:]]
-    apart = [sum(parts) - max(parts, default=0.0) for parts in map(_parts, robots[1:])]
-    return {
-        "robot_least": -(area[1:] / (area[0] + 20)).min(), "robot_loss": max(area[:-1] - area[1:]) / usual,
-        "robot_gain": max(area[1:] - area[:-1]) / usual, "robot_apart": max(apart),
-        "robot_jump": float(_moves(middles).max()), "robot_tone": _largest_change(_tones(robots, every, 8)),
-    }
-
-
-def _thing(masks: BoolArray, distances: Sequence[NDArray[np.float32]], every: UInt8Array) -> dict[str, float]:
+def _thing(masks: BoolArray, distances: Sequence[NDArray[np.float32]]) -> dict[str, float]:
     """Numbers of one coloured thing, (T + 1, H, W), that the reference shows. distances: of its pixels, _distance."""
-    area = masks.sum((1, 2)).astype(float)
-    base = max(area[0], SMALLEST_PX)
-    middles = [_middle(mask, 4) for mask in masks]
+    area, lengths = masks.sum((1, 2)).astype(float), np.array([_length(mask) for mask in masks])
+    middles = [_middle(mask) for mask in masks]
     gap = _gaps(masks, middles, distances)
     nearer, free = np.minimum(gap[:-1], gap[1:]), (gap > TOUCH_PX + 2)[1:]
     alone = np.clip((nearer - TOUCH_PX) / (ALONE_PX - TOUCH_PX), 0, 1)
-    moves, change = _moves(middles), np.diff(area) / base
-    seconds = [sorted(parts)[-2] if len(parts) > 1 else 0.0 for parts in map(_parts, masks[1:])]
+    moves, change = _moves(middles), np.diff(area) / max(area[0], SMALLEST_PX)
     return {
-        "thing_tone": _largest_change(_tones(masks, every, 6)),
-        "thing_moves_alone": float((alone * moves).sum()), "thing_jump": float(moves.max()),
-        "thing_far_of_robot": float((moves * nearer).max()),
-        "thing_lost": float((-change).max()), "thing_lost_alone": float((alone * -change).max()),
-        "thing_gained_alone": float((alone * change).max()), "thing_missing_end": -float(area[-2:].mean() / base),
-        "thing_grown": float((area[1:] / base).max()),
-        "thing_shrunk": -float((area[1:] / base)[free].min(initial=1.0)), "thing_twice": max(seconds),
-        "thing_shape": _largest_change(np.array([_spread(mask) for mask in masks]), free),
+        "thing_moves_alone": float((alone * moves).sum()), "thing_far_of_robot": float((moves * nearer).max()),
+        "thing_lost_alone": float((alone * -change).max()), "thing_gained_alone": float((alone * change).max()),
+        "thing_shape": float((lengths[1:] / max(lengths[0], 1))[free].max(initial=1.0)),
     }
 
 
-def _middle(mask: BoolArray, least_px: int) -> Floats | None:
-    """Mean row and column, or None of fewer pixels."""
-    return np.asarray(np.argwhere(mask).mean(0)) if mask.sum() >= least_px else None
+def _colours(every: UInt8Array, views: Sequence[slice], still: Sequence[bool]) -> dict[str, float]:
+    """Numbers of the coloured things of the first still view by how much of their colour each view shows."""
+    first = views[still.index(True)]
+    chroma = every.astype(np.float32)
+    chroma -= chroma.mean(-1, keepdims=True)
+    own, start = every[:1, :, first], chroma[0, :, first]
+    surface, found = np.median(start.reshape(-1, 3), 0), list[dict[str, float]]()
+    for mask in (hue_masks(own) & _far(own, own[0]))[:, 0]:
+        colour = np.median(start[mask], 0) - surface if mask.sum() >= SMALLEST_PX else np.zeros(3, np.float32)
+        if np.linalg.norm(colour) < FAR:  # only lighter or darker than the surface
+            continue
+        shares = (chroma - surface) @ (colour / (colour @ colour))
+        shares[shares < FAINT] = 0
+        moving = [part for view, stays in zip(views, still) if not stays for part in shares[1:, :, view]]
+        whole = max(float(shares[0, :, first].sum()), 1.0)
+        seen = np.stack([
+            shares[1:, :, view].sum((1, 2)) / (max(whole, float(shares[0, :, view].sum())) if stays else NEAR * whole)
+            for view, stays in zip(views, still)
+        ]).max(0)
+        lengths = [_length(part > FULL) for part in moving]
+        edges = [_edge(part) for part in moving if (part > FULL).sum() >= LEAST_SHAPE_PX]
+        found.append({
+            "thing_end": -float(seen[-2:].mean()), "thing_blurred": -float(np.median(edges or 1)),
+            "thing_long": max(lengths, default=0.0) / max(_length(mask), 1),
+        })
+    return {name: max(thing[name] for thing in found) for name in found[0]} if found else {}
+
+
+def _middle(mask: BoolArray) -> Floats | None:
+    """Mean row and column, or None of fewer pixels than LEAST_MIDDLE_PX."""
+    return np.asarray(np.argwhere(mask).mean(0)) if mask.sum() >= LEAST_MIDDLE_PX else None
 
 
 def _moves(middles: Sequence[Floats | None]) -> Floats:
@@ -239,37 +217,16 @@ def _gaps(masks: BoolArray, middles: Sequence[Floats | None], distances: Sequenc
     return np.array(gaps)
 
 
-def _parts(mask: BoolArray) -> list[float]:
-    """Areas of the connected parts, px."""
-    areas: list[float] = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)[2][1:, 4].tolist()
-    return areas
-
-
-def _tones(masks: BoolArray, every: UInt8Array, least_px: int) -> Floats:
-    """Median colour in each picture (T + 1, 3), grey levels; NaN of fewer pixels."""
-    unseen = np.full(3, np.nan)
-    return np.stack([np.median(x[m], 0) if m.sum() >= least_px else unseen for x, m in zip(every, masks)])
-
-
-def _spread(mask: BoolArray) -> float:
-    """How far its pixels lie apart, for their number; NaN of fewer than six."""
+def _length(mask: BoolArray) -> float:
+    """Standard deviation of its pixels along its long axis, px; 0 of fewer than LEAST_SHAPE_PX."""
     place = np.argwhere(mask)
-    return float(place.std(0).sum() / np.sqrt(len(place))) if len(place) >= 6 else np.nan
+    return float(np.sqrt(np.linalg.eigvalsh(np.cov(place.T))[-1] + 1 / 12)) if len(place) >= LEAST_SHAPE_PX else 0.0
 
 
-def _largest_change(values: Floats, where: BoolArray | None = None) -> float:
-    """From the first to any later value, where both are known; 0 where there are none."""
-    change = np.abs(values[1:] - values[0])
-    known = change[np.isfinite(change)] if where is None else change[where & np.isfinite(change)]
-    return float(known.max(initial=0.0))
-
-
-def _shift(first: Greys, other: Greys, scenery: BoolArray) -> float:
-    """How far the scenery of two pictures is shifted, px."""
-    if scenery.sum() < LEAST_SCENERY_PX:
-        return 0.0
-    fill = np.float32(np.median(first))
-    blend = [np.where(scenery, picture, fill).astype(np.float32) for picture in (first, other)]
-    window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
-    (dx, dy), response = cv2.phaseCorrelate(blend[0], blend[1], window)
-    return float(np.hypot(dx, dy)) if response > 0.05 else 0.0
+def _edge(shares: Greys) -> float:
+    """How fast a colour ends: mean of the steepest fifth around it, shares per px."""
+    steps = np.zeros_like(shares)
+    steps[:, :-1] = np.abs(np.diff(shares, axis=1))
+    steps[:-1] = np.maximum(steps[:-1], np.abs(np.diff(shares, axis=0)))
+    steepest = np.sort(steps[cv2.dilate((shares > FULL).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0])
+    return float(steepest[-max(1, len(steepest) // 5) :].mean())

@@ -1,7 +1,7 @@
 """What the numbers of a clip are where nothing is wrong, and the limit that follows (RA-27).
 
-Half of the recordings says where each number lies and how far it goes; the other half, how far the strangest number of
-a recording goes, which gives the limit. No fault is ever shown. Shapes: N clips, F numbers.
+The recordings say where each number lies and how far it goes. How far a recording's strangest number goes in the ranges
+of the other parts of the recordings gives the limit. No fault is ever shown. Shapes: N clips, F numbers.
 """
 
 import hashlib
@@ -13,29 +13,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.model_folder import ModelFolderError, read_json
 from wm_nodes.judge.one_class import imagination, pictures
 
-FORMAT = "normal-ranges-1"
+Floats = NDArray[np.float64]
+
+FORMAT = "normal-ranges-2"
 COMPONENTS = {**pictures.COMPONENTS, **imagination.COMPONENTS}
 NAMES = tuple(sorted(COMPONENTS))
 KEPT = 0.97
 """Share of the recordings, in every form, whose strangest number stays within the limit."""
-WITHIN = 0.98
+WITHIN = 0.99
 """Share of the recordings whose largest value of a number is within its spread."""
 WRONGLY_DONE = 0.05
 """Share of undone recordings that is said to be done."""
+FOLDS = 5
+"""Parts of the recordings, each scored by the ranges of the others."""
 LEAST = 100
 """Recordings that are needed."""
 LEAST_SPREAD = {"_m": 0.01, "_px": 1.0, "": 0.05}
 """A number's spread is at least this, by its unit: m, px, and shares or grey levels."""
-PIXELS = {
-    "thing_moves_alone", "thing_jump", "thing_far_of_robot", "robot_jump", "thing_twice", "robot_apart", "stranger",
-    "shifted",
-}
+PIXELS = {"thing_moves_alone", "thing_far_of_robot", "stranger"}
 """Numbers in px."""
 
 
@@ -53,12 +54,14 @@ class NormalRanges:
     """Whether the camera of each view stands still."""
     origin: tuple[float, float, float]
     """What the position probe's tool lacks to be the model's state, m."""
+    height_m: float
+    """Of the object's middle: as low as the tool goes in a quarter of the recordings."""
     middle: Mapping[str, float]
     """Median of each number."""
     spread: Mapping[str, float]
     """How far each number goes above its median."""
     scores: tuple[float, ...]
-    """Of each recording of the other half, the strangest number of its strangest form, in spreads, sorted."""
+    """Of each recording the strangest number of its strangest form, in spreads of the other parts, sorted."""
     done: Mapping[str, float]
     """By task, the done signal from which it counts as done."""
     words: tuple[str, ...]
@@ -126,7 +129,8 @@ def load_ranges(folder: Path, stride: int) -> NormalRanges:
 def _usable(content: Mapping[str, Any]) -> bool:
     """Whether a score can be formed and has a limit."""
     scores, spread = content["scores"], content["spread"].values()
-    finite = all(math.isfinite(value) for value in [*scores, *spread, *content["middle"].values()])
+    values = [*scores, *spread, *content["middle"].values(), content["height_m"]]
+    finite = all(math.isfinite(value) for value in values)
     return finite and bool(scores) and min(spread) > 0 and list(scores) == sorted(scores)
 
 
@@ -136,7 +140,7 @@ def fit(rows: Sequence[Mapping[str, float]], recordings: ArrayLike, seed: int) -
     Args:
         rows: the numbers of each clip.
         recordings: of each row, the recording that it is a form of.
-        seed: decides which recordings are of which half.
+        seed: decides which recordings are of which part.
 
     Raises:
         ValueError: fewer than LEAST recordings.
@@ -145,19 +149,30 @@ def fit(rows: Sequence[Mapping[str, float]], recordings: ArrayLike, seed: int) -
     known, values = np.unique(recordings), np.array([[row[name] for name in NAMES] for row in rows])
     if len(known) < LEAST:
         raise ValueError(f"normal ranges need at least {LEAST} recordings, got {len(known)}; name more bags")
-    order = np.random.default_rng(seed).permutation(known)
-    first = np.isin(recordings, order[: len(order) // 2])
-    middle = np.median(values[first], axis=0)
-    least = np.array([LEAST_SPREAD["_px" if n in PIXELS else "_m" if n.endswith("_m") else ""] for n in NAMES])
-    worst = np.stack([values[recordings == recording].max(0) for recording in order[: len(order) // 2]])
-    spread = np.maximum(np.quantile(worst, WITHIN, axis=0) - middle, least)
-    strangest = ((values - middle) / spread).max(1)
-    others = order[len(order) // 2 :]
-    scores = sorted(float(strangest[recordings == recording].max()) for recording in others)
+    which = np.searchsorted(known, recordings)
+    scores = np.empty(len(known))
+    for part in np.array_split(np.random.default_rng(seed).permutation(len(known)), FOLDS):
+        own = np.isin(which, part)
+        middle, spread = _middle_and_spread(values[~own], which[~own])
+        scores[part] = _worst((values[own] - middle) / spread, which[own], part).max(1)
+    middle, spread = _middle_and_spread(values, which)
     return {
         "middle": dict(zip(NAMES, middle.tolist())), "spread": dict(zip(NAMES, spread.tolist())),
-        "scores": tuple(scores),
+        "scores": tuple(sorted(scores.tolist())),
     }
+
+
+def _middle_and_spread(values: Floats, recordings: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Of each number (F,); values: (N, F)."""
+    middle = np.median(values, axis=0)
+    least = [LEAST_SPREAD["_px" if n in PIXELS else "_m" if n.endswith("_m") else ""] for n in NAMES]
+    worst = _worst(values, recordings, np.unique(recordings))
+    return middle, np.maximum(np.quantile(worst, WITHIN, axis=0) - middle, least)
+
+
+def _worst(values: Floats, recordings: NDArray[np.intp], wanted: NDArray[np.intp]) -> Floats:
+    """The largest values of each wanted recording's forms, (len(wanted), F)."""
+    return np.stack([values[recordings == recording].max(0) for recording in wanted])
 
 
 def done_threshold(signals: Sequence[float], done: Sequence[bool]) -> float:
