@@ -415,20 +415,9 @@ def hacking_rows() -> Rows:
 
 
 # --- judge.md ---------------------------------------------------------------------------------------------------
-def table_rows() -> Rows:
-    for one in runs("judge_table.jsonl")["shipped"]["rows"]:
-        yield row(one["name"], f"{one['paper']:.0f}", one["n"], share(one), percent(one["balanced"]))
-
-
-def pattern_rows() -> Rows:
-    for one in runs("judge_table.jsonl")["shipped"]["patterns"]:
-        rates = (percent(one["false_positives"]), percent(one["best_recall"]))
-        yield row(one["pattern"], one["n"], share(one, "recall"), *rates)
-
-
 def hacked_rows() -> Rows:
     """By pattern, over its edits at the steps that anybody sees."""
-    for name in ("judge_hack_trees.json", "judge_hack.json"):
+    for name in ("judge_hack.json", "judge_hack_scenes.json"):
         for pattern in ("occlusion", "motion", "background", "physics", "benign"):
             steps = (1, 2, 3, 4) if pattern == "benign" else (3, 4)
             chosen = [one for one in read(name)["counts"] if one["pattern"] == pattern and one["step"] in steps]
@@ -574,7 +563,7 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         model_pair_rows,
     ],
     "judge": [
-        table_rows, pattern_rows, hacked_rows, erring_rows,
+        hacked_rows, erring_rows,
     ],
     "speed": [speed_summary_rows, stage_rows],
     "../devices": [device_rows],
