@@ -98,7 +98,7 @@ def show(numbers: CheckReport) -> None:
         print(f"no number, {count} times: {reason}")
     for reason in dict.fromkeys(numbers.not_judged.values()):
         names = [name for name, why in numbers.not_judged.items() if why == reason]
-        print(f"not judged, {len(names)} clips ({', '.join(names)}): {reason}")
+        print(f"not judged, {len(names)} clips ({names[0]} to {names[-1]}): {reason}")
 
 
 def _answers(numbers: CheckReport) -> list[tuple[str, str]]:
