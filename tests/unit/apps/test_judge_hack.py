@@ -46,11 +46,14 @@ def test_clips_that_are_not_paid_are_not_attacked_and_one_error_says_so(
 
 
 @pytest.mark.rendering
-def test_the_embedded_judge_is_attacked_on_the_episodes_of_a_bag(tmp_path: Path) -> None:
-    recorded = ["collect", str(tmp_path), "--tasks", "push_cube", "--episodes", "1", "--first-seed", "910000"]
+def test_the_shipped_judge_holds_on_the_episodes_of_a_bag(tmp_path: Path) -> None:
+    recorded = ["collect", str(tmp_path), "--tasks", "push_cube", "--episodes", "2", "--first-seed", "910000"]
     assert main([*recorded, "--set", "data.behaviours={expert: 1.0}"]) in (0, None)
     found = tmp_path / "hack.json"
-    assert main(["judge", "hack", str(tmp_path), "--judge", "embedded", "--json", str(found)]) in (0, 1)
+    attack = ["judge", "hack", str(tmp_path), "--judge", "embedded", "--limit", "0.3", "--json", str(found)]
+    assert main(attack) == 0
     rows = json.loads(found.read_text())["counts"]
-    assert len(rows) == PER_CLIP and sum(row["n"] for row in rows) > 0.9 * PER_CLIP
+    assert len(rows) == PER_CLIP and sum(row["n"] for row in rows) > 0.9 * 2 * PER_CLIP
+    physics = [row for row in rows if row["pattern"] == "physics" and row["step"] in (3, 4)]
+    assert sum(row["n"] * row["share"] for row in physics) <= 0.15 * sum(row["n"] for row in physics)
     assert all(row["share"] == 1 for row in rows if row["pattern"] == "benign")

@@ -427,6 +427,11 @@ def hacked_rows() -> Rows:
             yield row(pattern, n, f"{percent(paid / n)} [{percent(low)}, {percent(high)}]", percent(silent / n))
 
 
+def checked_rows() -> Rows:
+    for name, parts in read("judge_check.json")["paid"].items():
+        yield row(name, "{count} of {of}".format(**parts["policy"]))
+
+
 def erring_rows() -> Rows:
     for one in read("judge_erring.json")["ways"]:
         if (one["rate"], one["shared"]) != (0.1, 0.0):
@@ -563,7 +568,7 @@ TABLES: dict[str, list[Callable[[], Rows]]] = {
         model_pair_rows,
     ],
     "judge": [
-        hacked_rows, erring_rows,
+        hacked_rows, checked_rows, erring_rows,
     ],
     "speed": [speed_summary_rows, stage_rows],
     "../devices": [device_rows],

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from wm_nodes.apps.options import add_device, add_seed, positive
 from wm_nodes.core.device import CPU, compute_device
-from wm_nodes.judge.one_class.calibration import calibrate
+from wm_nodes.judge.one_class.calibration import MOVING, calibrate
 from wm_nodes.judge.one_class.ranges import KEPT, NAMES, save_ranges
 from wm_nodes.recording import read_episodes
 from wm_nodes.world_model import load_model_folder
@@ -24,6 +24,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model_dir", type=Path, help="world-model folder, with a position probe")
     parser.add_argument("bags", type=Path, nargs="+", help="recorded episodes in the model's cameras")
     parser.add_argument("--stride", type=positive, default=1, help="steps between two frames of a clip (default: 1)")
+    parser.add_argument(
+        "--moving", nargs="*", default=list(MOVING), metavar="CAMERA", help="cameras that move (default: wrist)"
+    )
     add_seed(parser)
     add_device(parser, CPU)
 
@@ -32,7 +35,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Write the ranges and print how far recordings go."""
     models = load_model_folder(arguments.model_dir, compute_device(arguments.device))
     episodes = [episode for bag in arguments.bags for episode in read_episodes(bag)]
-    ranges = calibrate(models, episodes, stride=arguments.stride, seed=arguments.seed)
+    ranges = calibrate(models, episodes, stride=arguments.stride, seed=arguments.seed, moving=arguments.moving)
     path = save_ranges(arguments.model_dir, replace(ranges, story={**ranges.story, "command": arguments.command}))
     print(
         f"{path}: {ranges.story['recordings']} recordings, {len(NAMES)} numbers; "

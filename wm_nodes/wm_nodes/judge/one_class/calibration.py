@@ -21,8 +21,8 @@ SHORTEST = 4
 """Frames of a clip that ends with its success, at least."""
 TOUCHING = 0.25
 """Share of the recordings in which the tool goes as low as to an object's middle, at least."""
-MOVES = 6.0
-"""A view of which half of the pixels change by more grey levels at some time has a camera that moves."""
+MOVING = ("wrist",)
+"""Cameras that move with the robot."""
 
 
 @dataclass
@@ -37,19 +37,22 @@ class _Rows:
     """By task the done signal at a clip's end, and whether the task is done there."""
 
 
-def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, seed: int) -> NormalRanges:
+def calibrate(
+    models: WorldModels, episodes: Iterable[Episode], *, stride: int, seed: int, moving: Sequence[str] = MOVING
+) -> NormalRanges:
     """Measure the normal ranges of a world model's clips.
 
     Args:
         episodes: recorded ones in the model's cameras, done and undone, of the tasks that shall be judged.
         stride: steps between two frames of a clip.
+        moving: names of the cameras that move; in the pictures of the others the scenery stays.
 
     Raises:
         ValueError: too few recordings, pictures of another size than the model's, or as model_numbers.
     """
     recorded = [episode for episode in episodes if episode.num_steps >= stride * (SHORTEST - 1)]
     _check_sizes(models, recorded)
-    still = _still_views(models, recorded)
+    still = tuple(name not in moving for name in models.simulation.cameras)
     origin, height_m = _places(models, recorded)
     rows, longest, words = _Rows(), 0, set[str]()
     for index, episode in enumerate(tqdm(recorded, desc="measured", unit="episode")):
@@ -154,18 +157,6 @@ def _check_sizes(models: WorldModels, episodes: Sequence[Episode]) -> None:
                 f"an episode has pictures of {height} x {width} px, the world model sees {size[0]} x {size[1]} px; "
                 "name bags in its cameras"
             )
-
-
-def _still_views(models: WorldModels, episodes: Sequence[Episode]) -> tuple[bool, ...]:
-    """Whether each view's pixels mostly stay as they are in the first episodes."""
-    side, width = models.simulation.image_size, models.tokenizer.width
-    changes = np.zeros(width // side)
-    for episode in episodes[:20]:
-        change = np.abs(episode.images[1:].astype(np.int16) - episode.images[0]).mean(3).max(0)
-        for view in range(len(changes)):
-            part = change[:, view * side : (view + 1) * side]
-            changes[view] += float(np.median(part)) / min(20, len(episodes))
-    return tuple(bool(change < MOVES) for change in changes)
 
 
 def _places(models: WorldModels, episodes: Sequence[Episode]) -> tuple[FloatArray, float]:
