@@ -30,7 +30,7 @@ OPTIONS = {
     "--json",
     "judge check": "judge --model --key-env --rubric --limit --reads --set --device --json",
     "judge serve-help": "--memory",
-    "judge calibrate": "model_dir bags --stride --seed --device",
+    "judge calibrate": "model_dir bags --stride --moving --seed --device",
     "judge hack": "clips --config --device --judge --judge-model --judge-key-env --rubric --least --limit "
     "--limit-clips --seed --reads --json --pictures",
     "audit": "verify recover sample view agree people replay",
