@@ -61,7 +61,6 @@ METRICS = (
     "impossible_tool_steps", "scenery_change",
 )
 MEASURED = 100
-RUBRICS = ("robot", "robot_no_physics", "robot_no_planning", "robot_single_read", "robot_open_gates")
 console = Console()
 
 
@@ -109,7 +108,7 @@ def run(arguments: argparse.Namespace) -> None:
     base = load_video_folder(arguments.video_model, arguments.device)
     plan = OutcomePlan(arguments.iterations, eval_contexts=arguments.eval_contexts)
     arms = with_rate(outcome_samplers(), arguments.learning_rate)
-    trials = [SamplerTrial(arm, plan) for arm in arms] + judge_trials(arms[0], plan)
+    trials = [SamplerTrial(arm, plan) for arm in arms] + [judge_trial(arms[0], plan)]
     of = {"sha256": base.manifest["sha256"]}
     rows = train_all(arguments, trials, partial(_train, arguments), of, arguments.workers)
     if arguments.weights:
@@ -123,13 +122,10 @@ def run(arguments: argparse.Namespace) -> None:
             plots.plot_proxy(rows, arguments.json.with_name(f"{arguments.json.stem}_proxy.png"))
 
 
-def judge_trials(sampler: SamplerSetup, plan: OutcomePlan) -> list[SamplerTrial[OutcomePlan]]:
-    """The same sampler, paid by the embedded judge alone: as it is shipped, and without a part of it each."""
+def judge_trial(sampler: SamplerSetup, plan: OutcomePlan) -> SamplerTrial[OutcomePlan]:
+    """The same sampler, paid by the embedded judge alone."""
     judged = replace(plan, rewards=((AGENT, 1.0),))
-    return [
-        SamplerTrial(replace(sampler, name=f"{sampler.name}, judge {rubric}"), replace(judged, rubric=rubric))
-        for rubric in RUBRICS
-    ]
+    return SamplerTrial(replace(sampler, name=f"{sampler.name}, judge {plan.rubric}"), judged)
 
 
 def _train(
