@@ -57,7 +57,7 @@ def calibrate(models: WorldModels, episodes: Iterable[Episode], *, stride: int, 
         longest = max(longest, steps // stride + 1)
         for shown in _forms(models, episode, steps, stride, rng):
             reference = episode.images[0]
-            seen = pictures.picture_numbers(shown, reference, models.simulation.image_size, still)
+            seen = pictures.picture_numbers(shown, reference, models.spec.height, still)
             drawn, signals = imagination.model_numbers(models, shown, reference, stride, origin)
             rows.numbers.append(seen | drawn)
             rows.recording.append(index)
@@ -156,7 +156,7 @@ def _check_sizes(models: WorldModels, episodes: Sequence[Episode]) -> None:
 
 def _still_views(models: WorldModels, episodes: Sequence[Episode]) -> tuple[bool, ...]:
     """Whether each view's pixels mostly stay as they are in the first episodes."""
-    side, width = models.simulation.image_size, models.tokenizer.width
+    side, width = models.spec.height, models.tokenizer.width
     changes = np.zeros(width // side)
     for episode in episodes[:20]:
         change = np.abs(episode.images[1:].astype(np.int16) - episode.images[0]).mean(3).max(0)
