@@ -36,9 +36,10 @@ def next_state(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -
 
 def next_commanded(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -> FloatArray:
     """next_state of the commanded values; the measured ones stay as they are, for a model to say how they change."""
-    if not spec.measured:
+    kept = commanded_columns(spec)
+    if kept and not spec.measured:
         return next_state(states, actions, spec)
-    moved, kept = states.astype(np.float32), commanded_columns(spec)
+    moved = states.astype(np.float32)
     if kept:
         moved[..., kept] = next_state(states[..., kept], actions, of_columns(spec, kept))
     return moved

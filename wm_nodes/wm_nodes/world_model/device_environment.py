@@ -160,10 +160,12 @@ class DeviceEnvironment:
 
     def _move(self, actions_NA: Tensor) -> Tensor:
         """States (N, P) that a step reaches: what is commanded, and what the model says of the rest."""
-        change, states = self._action.state_change, self.states_NP
-        if change is None:
+        change, states, kept = self._action.state_change, self.states_NP, self._commanded
+        if len(kept) and change is None:
             return next_state_tensor(states, actions_NA, self._scale, self._box, pose=moves_pose(self.spec))
-        moved, kept = states.clone(), self._commanded
+        moved = states.clone()
+        if change is None:
+            return moved
         if len(kept):
             box = None if self._box is None else self._box[:, kept]
             now = next_state_tensor(states[:, kept], actions_NA, self._scale, box, pose=moves_pose(self.spec))

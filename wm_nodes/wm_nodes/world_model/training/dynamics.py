@@ -203,8 +203,8 @@ def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> 
 
 
 def tool_moves(data: LatentEpisodes) -> Tensor:
-    """Bool (E, T), the recorded steps that change the commanded tool; all of an episode that has none."""
-    moves = ((data.states[:, 1:] - data.states[:, :-1]).abs().amax(-1) > MOVED) & data.step_mask
+    """Bool (E, T), the recorded steps that change the state; all of an episode that has none."""
+    moves = ((data.states[:, 1:] - data.states[:, :-1]).abs() > MOVED).any(-1) & data.step_mask
     return torch.where(moves.any(1, keepdim=True), moves, data.step_mask)
 
 
