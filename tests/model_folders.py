@@ -1,5 +1,6 @@
 """World-model folders with fresh weights: whoever needs a model's files and not its quality."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ from safetensors.torch import save_file
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.tasks import model_tasks
-from wm_nodes.core.specs import simulation_spec
+from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.video_model import NetworkSettings, VideoNetwork
 from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.folder import save_video_folder
@@ -27,9 +29,16 @@ def make_model_folder(folder: Path, config: RunConfig | None = None) -> Path:
         tokenizer = Tokenizer(config.tokenizer, 64, 128)
         action = action_model_class(config.tokenizer.kind)(
             config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
-            action_dim=spec.action_dim, state_dim=spec.state_dim, num_tasks=len(tasks),
+            action_dim=spec.action_dim, state_dim=spec.tool_dim, num_tasks=len(tasks),
         )
-    return save_model_folder(folder, tokenizer, action, None, config, tasks=tasks, story={"made": {"seed": 0}})
+    story = {"made": {"seed": 0}}
+    return save_model_folder(folder, tokenizer, action, None, config, spec=spec, tasks=tasks, story=story)
+
+
+def spec_of(config: RunConfig, tokenizer: Tokenizer) -> EnvironmentSpec:
+    """The spec of the configured task, in pictures of the tokenizer's size."""
+    spec = simulation_spec(config.task, config.simulation, 1)
+    return replace(spec, height=tokenizer.height, width=tokenizer.width)
 
 
 def make_stepped_folder(folder: Path, task: str = "push_cube", **clip: int) -> Path:

@@ -13,7 +13,7 @@ import wm_nodes
 from wm_nodes.apps import cli
 from wm_nodes.config.load import ConfigError, default_task, load_config
 from wm_nodes.config.tasks import VARIABLE, get_task, model_tasks, recorded_task, shares_scene, task_names
-from wm_nodes.core.specs import simulation_spec
+from wm_nodes.environments.maniskill.spec import simulation_spec
 
 TASKS = ("pull_cube", "push_cube", "reach")
 IN_SCENES = ("move_to_aim", "pick_place", "pull", "push", "reach_object")

@@ -11,9 +11,9 @@ from transforms3d.quaternions import quat2mat
 from wm_nodes.config.load import load_config
 from wm_nodes.core.action_spaces import MAX_TILT_RAD, MAX_YAW_RAD
 from wm_nodes.core.rotations import multiply, to_quaternion, to_vector
-from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import hold_actions, moves_pose, next_state, next_state_tensor
 from wm_nodes.core.types import FloatArray
+from wm_nodes.environments.maniskill.spec import simulation_spec
 
 SPEC = simulation_spec("push", load_config("cpu", {"task": "push"}).simulation, 1)
 REST = np.array([[0.6, 0.0, 0.1, 0.0, 0.0, 0.0, -1.0]], np.float32)

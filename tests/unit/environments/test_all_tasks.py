@@ -13,12 +13,12 @@ from model_folders import make_model_folder
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task, part_of, success
-from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import hold_actions, next_state
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import planned_or_scripted_episode
 from wm_nodes.environments.maniskill.objects import MODEL_TASKS
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.policy_rl.factories import make_imagined_environment, make_policy, models_of
 from wm_nodes.policy_rl.initial_policy import STARTS, write_starts
 from wm_nodes.policy_rl.pretraining import load_arrays

@@ -13,7 +13,6 @@ import pytest
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.tasks import get_task, success, task_names
-from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.environments.maniskill import backend
 from wm_nodes.environments.maniskill.backend import NoRendererError, render_backend
@@ -21,6 +20,7 @@ from wm_nodes.environments.maniskill.behaviours import sample_style
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
 from wm_nodes.environments.maniskill.episodes import EXTREME, HOLD_STEPS, planned_episode, scripted_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES
 from wm_nodes.environments.record import collect_plan, demonstration_plan
 from wm_nodes.recording import read_episodes

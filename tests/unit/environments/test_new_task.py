@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from model_folders import spec_of
 from own_packages import own_package
 
 from wm_nodes.config.load import load_config
@@ -134,7 +135,10 @@ def test_a_judge_of_its_recordings_decides_whether_it_is_done_and_refuses_what_t
     action, _ = train_action_model(tokenizer, episodes, config, 0, None)
     probe, _ = train_position_probe(episodes, config, 0, None)
     folder = tmp_path / "model"
-    save_model_folder(folder, tokenizer, action, None, config, tasks=("nudge",), story={"made": {}}, probe=probe)
+    save_model_folder(
+        folder, tokenizer, action, None, config, spec=spec_of(config, tokenizer), tasks=("nudge",), story={"made": {}},
+        probe=probe,
+    )
     save_ranges(folder, calibrate(load_model_folder(folder), recorded, stride=1, seed=0))
 
     def judged(frames: UInt8Array) -> Verdict:

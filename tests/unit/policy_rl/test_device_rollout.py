@@ -11,8 +11,8 @@ from model_folders import make_model_folder
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import Rollout
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.policy_rl.device_rollout import MOST_HASHED_STARTS, DeviceCollector, Step, rollout_starts
 from wm_nodes.policy_rl.factories import (
     make_device_environment,

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import torch
+from model_folders import spec_of
 from pretended_device import Device
 from pushing_scene import episode, success
 from safetensors.torch import save_file
@@ -38,12 +39,14 @@ def test_the_environment_has_about_65_million_parameters_and_1024_places() -> No
 
 
 def test_it_trains_a_model_and_a_policy_on_a_device(device: Device, tmp_path: Path) -> None:
-    config = load_config("gpu", {"task": "push_cube", "device": device.name} | TOY)
+    config = load_config("gpu", {"task": "push_cube", "device": device.name, "simulation.cameras": ["side"]} | TOY)
     tasks = ("push_cube", "reach")
     episodes = stack_episodes([episode(i, num_steps=4, size=128) for i in range(4)], tasks, success)
     tokenizer, _ = train_tokenizer(episodes, config, 0, None)
     action, _ = train_action_model(tokenizer, tokenise_episodes(tokenizer, episodes), config, 0, None)
-    folder = save_model_folder(tmp_path / "model", tokenizer, action, None, config, tasks=tasks, story={})
+    folder = save_model_folder(
+        tmp_path / "model", tokenizer, action, None, config, spec=spec_of(config, tokenizer), tasks=tasks, story={},
+    )
     starts = {"images": torch.from_numpy(episodes.images[:, 0].copy()),
               "states": torch.from_numpy(episodes.states[:, 0].copy())}
     save_file(starts, folder / "starts.safetensors")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from model_folders import spec_of
 from pretended_device import on_device
 from safetensors.torch import save_file
 
@@ -149,7 +150,9 @@ def run_loop1(device: str, kind: str, folder: Path, given: Rollout | None = None
         stage("refreshed model", train_action_model(tokenizer, episodes, longer, 1, None, model=refreshed)[0])
 
     model_dir = folder / "model"
-    save_model_folder(model_dir, tokenizer, action, text, config, tasks=TASKS, story={}, probe=probe)
+    save_model_folder(
+        model_dir, tokenizer, action, text, config, spec=spec_of(config, tokenizer), tasks=TASKS, story={}, probe=probe,
+    )
     firsts = {name: torch.from_numpy(getattr(episodes, name)[:, 0].copy()) for name in ("images", "states")}
     save_file(firsts, folder / "starts.safetensors")
     report = accept_world_model(models_of(model_dir, device), episodes, config, (1, 10), (1, 10))

@@ -61,7 +61,7 @@ def test_a_refresh_changes_the_action_model_and_nothing_else(
     old, new = load_model_folder(model_dir), load_model_folder(folder)
     assert new.tokenizer_sha256 == old.tokenizer_sha256 and new.sha256 != old.sha256
     assert (folder / "tokenizer.safetensors").read_bytes() == (model_dir / "tokenizer.safetensors").read_bytes()
-    kept = ("tasks", "simulation", "tokenizer", "world_model", "vocabulary")
+    kept = ("tasks", "spec", "tokenizer", "world_model", "vocabulary")
     assert all(new.manifest[name] == old.manifest[name] for name in kept)
     assert new.manifest["refreshed"][0]["source_sha256"] == old.sha256
     assert old.manifest["sha256"]["action"] != new.manifest["sha256"]["action"]

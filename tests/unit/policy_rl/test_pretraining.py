@@ -10,6 +10,7 @@ import torch
 from wm_nodes.config.load import load_config
 from wm_nodes.core.device import DeviceError
 from wm_nodes.environments.maniskill import collection
+from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl import pretraining
 from wm_nodes.policy_rl.pretraining import _make_tokenizer_folder, make_model
 from wm_nodes.recording import read_episodes
@@ -21,7 +22,7 @@ def test_the_untrained_model_beside_a_tokenizer_is_that_of_the_seed(tmp_path: Pa
     tokenizer = Tokenizer(config.tokenizer, 64, 128)
     for name in ("a", "b"):
         torch.rand(5)
-        folder = _make_tokenizer_folder(config, tmp_path / name, tokenizer)
+        folder = _make_tokenizer_folder(config, tmp_path / name, tokenizer, configured_spec(config))
         files.append((folder / "action_model.safetensors").read_bytes())
     assert files[0] == files[1]
 
@@ -104,12 +105,13 @@ def test_too_little_memory_in_training_names_the_batch_of_the_model(
 ) -> None:
     config = load_config("smoke", {"data.policy_episodes": 0, f"{section}.batch_size": 48})
 
-    def full(*arguments: object) -> None:
+    def full(*arguments: object, **more: object) -> None:
         raise torch.cuda.OutOfMemoryError("CUDA out of memory.\nTried to allocate 20.00 GiB.")
 
     skipped = {
-        "collect_scripted": {}, "load_arrays": None, "train_tokenizer": (None, {}), "train_position_probe": (None, {}),
-        "tokenise_episodes": None, "train_state_probe": {"loss": 0.0},
+        "collect_scripted": {"push_cube": ["bag"]}, "read_spec": configured_spec(config), "load_arrays": None,
+        "train_tokenizer": (None, {}), "train_position_probe": (None, {}), "tokenise_episodes": None,
+        "train_state_probe": {"loss": 0.0},
     }
     for name, answer in skipped.items():
         monkeypatch.setattr(pretraining, name, lambda *arguments, answer=answer: answer)

@@ -11,8 +11,9 @@ from safetensors.torch import load_file, save_file
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.model_folder import ModelFolderError
-from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Episode
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.environments.maniskill.table_top import GROUND_TRUTH_NAMES, TOOL, above_cube
 from wm_nodes.environments.record import collect_plan
 from wm_nodes.policy_rl.factories import make_device_environment, make_imagined_environment

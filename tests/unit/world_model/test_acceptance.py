@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from model_folders import spec_of
 from pushing_scene import episode, success
 from rich.console import Console
 
@@ -205,7 +206,7 @@ def untrained() -> WorldModels:
     small = config.world_model.model_copy(update={"width": 32, "depth": 1, "num_heads": 2})
     sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_tasks": len(TASKS)}
     action = ActionModel(small, action_dim=3, state_dim=3, **sizes).eval()
-    return WorldModels(tokenizer, action, None, TASKS, config.simulation, {})
+    return WorldModels(tokenizer, action, None, TASKS, spec_of(config, tokenizer), {})
 
 
 def test_an_untrained_model_does_not_pass(untrained: WorldModels, heldout: EpisodeArrays) -> None:

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from model_folders import spec_of
 from pushing_scene import MAX_ACTION_M, episode, success
 
 from wm_nodes.config.load import load_config
-from wm_nodes.core.specs import simulation_spec
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import WorldModels
 from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
@@ -37,7 +38,7 @@ def models() -> WorldModels:
     training = arrays(80)
     tokenizer, _ = train_tokenizer(training, CONFIG, 0, None)
     action, _ = train_action_model(tokenizer, tokenise_episodes(tokenizer, training), CONFIG, 0, None)
-    return WorldModels(tokenizer, action, None, ("push_cube",), CONFIG.simulation, {})
+    return WorldModels(tokenizer, action, None, ("push_cube",), spec_of(CONFIG, tokenizer), {})
 
 
 def test_commanded_states_are_those_recorded_where_the_actions_are() -> None:

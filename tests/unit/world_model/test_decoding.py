@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from model_folders import spec_of
 from pushing_scene import episode, success
 from torch import Tensor
 
@@ -153,7 +154,10 @@ def test_a_token_model_learns_a_scene_and_imagines_it_behind_the_environment_int
     data = tokenise_episodes(tokenizer, episodes)
     model, metrics = train_token_model(tokenizer, data, config, 0, tmp_path)
     assert metrics["accuracy"] > 0.5
-    folder = save_model_folder(tmp_path / "model", tokenizer, model, None, config, tasks=("push_cube",), story={})
+    folder = save_model_folder(
+        tmp_path / "model", tokenizer, model, None, config, spec=spec_of(config, tokenizer), tasks=("push_cube",),
+        story={},
+    )
     models = load_model_folder(folder)
     assert isinstance(models.action, TokenActionModel)
     results = evaluate_rollouts(models.tokenizer, models.action, episodes.select(range(8)))

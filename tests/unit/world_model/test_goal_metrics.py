@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from model_folders import spec_of
 from pushing_scene import episode, success
 from torch import Tensor
 
@@ -56,7 +57,7 @@ def models(tokenizer: Tokenizer, text: TextModel | None) -> WorldModels:
         CONFIG.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim, action_dim=3, state_dim=3,
         num_tasks=1,
     )
-    return WorldModels(tokenizer, action, text, ("push_cube",), CONFIG.simulation, {})
+    return WorldModels(tokenizer, action, text, ("push_cube",), spec_of(CONFIG, tokenizer), {})
 
 
 def won(episodes: EpisodeArrays) -> tuple[EpisodeArrays, np.ndarray, np.ndarray]:

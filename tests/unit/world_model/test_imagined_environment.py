@@ -49,11 +49,12 @@ def make_folder(folder: Path) -> Path:
     action = ActionModel(config.world_model, action_dim=3, state_dim=3, **sizes)
     text = TextModel(config.world_model, vocabulary=("push", "cube"), **sizes)
     torch.nn.init.normal_(action.change.weight, std=0.2)
-    return save_model_folder(folder, tokenizer, action, text, config, tasks=TASKS, story={"data": "none"})
+    return save_model_folder(folder, tokenizer, action, text, config, spec=spec, tasks=TASKS, story={"data": "none"})
 
 
 def spec_of() -> EnvironmentSpec:
-    return make_spec(NUM_ENVS, 32, 64, instruction="push cube", max_episode_steps=5)
+    commanded = ("target_x", "target_y", "target_z")
+    return make_spec(NUM_ENVS, 32, 64, instruction="push cube", max_episode_steps=5, state_names=commanded)
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +240,8 @@ def test_goals_belong_to_the_start_of_each_environment(models: WorldModels) -> N
 
 def test_a_loaded_folder_predicts_what_was_saved_up_to_half_precision(models: WorldModels, tmp_path: Path) -> None:
     again = save_model_folder(
-        tmp_path / "copy", models.tokenizer, models.action, models.text, config_of(), tasks=models.tasks, story={}
+        tmp_path / "copy", models.tokenizer, models.action, models.text, config_of(), spec=models.spec,
+        tasks=models.tasks, story={},
     )
     assert load_model_folder(again).sha256 == models.sha256
 

@@ -14,7 +14,7 @@ from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import get_task
-from wm_nodes.core.specs import simulation_spec
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.world_model import TextModel, Tokenizer, load_model_folder, load_starts
 from wm_nodes.world_model.dynamics import ActionModel, Prediction

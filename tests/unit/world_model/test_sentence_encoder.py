@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from model_folders import spec_of
 from torch.testing import assert_close
 
 from wm_nodes.config.load import load_config
@@ -59,7 +60,9 @@ def make_folder(folder: Path, encoder: Path) -> Path:
     sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_tasks": 1}
     action = ActionModel(config.world_model, action_dim=3, state_dim=3, **sizes)
     text = TextModel(config.world_model, vocabulary=("unused",), **sizes)
-    return save_model_folder(folder, tokenizer, action, text, config, tasks=("push_cube",), story={})
+    return save_model_folder(
+        folder, tokenizer, action, text, config, spec=spec_of(config, tokenizer), tasks=("push_cube",), story={},
+    )
 
 
 def test_words_are_read_in_their_sentence_and_shorter_rows_are_masked(encoder: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from model_folders import spec_of
 from pushing_scene import episode, success
 from torch.testing import assert_close
 
@@ -326,7 +327,10 @@ def test_a_decoder_for_rollouts_shows_them_closer_to_the_recording_and_leaves_th
     assert error(shown_by) < 0.9 * error(tokenizer)
 
     decoder = shown_by.decoder
-    folder = save_model_folder(tmp_path, tokenizer, model, None, config, tasks=TASKS, story={}, decoder=decoder)
+    folder = save_model_folder(
+        tmp_path, tokenizer, model, None, config, spec=spec_of(config, tokenizer), tasks=TASKS, story={},
+        decoder=decoder,
+    )
     refreshed = save_refreshed_folder(tmp_path / "refreshed", folder, model, {})
     for where, rollouts, meant in ((folder, True, shown_by), (refreshed, True, shown_by), (folder, False, tokenizer)):
         loaded = load_model_folder(where, rollout_decoder=rollouts).tokenizer

@@ -12,8 +12,9 @@ from benchmarks.speed.device_models import Model, Models, collector
 from benchmarks.speed.device_suite import SHIPPED, Plan, Point, Stopwatch
 from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.device import CPU
-from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import FloatArray, UInt8Array
+from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.factories import make_policy, models_of
 from wm_nodes.policy_rl.rollouts import action_noise
 from wm_nodes.world_model import DeviceEnvironment, WorldModels, load_starts
@@ -80,7 +81,7 @@ def agreement_points(plan: Plan, models: Models, device: str) -> Iterator[Point]
 def trajectory(model: Model, plan: Plan, precision: str, device: str) -> dict[str, Tensor]:
     """Columns (T, N, ...) on the CPU of a rollout on `device` by a policy with fresh weights."""
     config = model.config.model_copy(update={"device": device})
-    spec = simulation_spec(config.task, config.simulation, plan.agreement_envs)
+    spec = configured_spec(config, plan.agreement_envs)
     kind = Float32Environment if precision == FLOAT32 else DeviceEnvironment
     columns: dict[str, list[Tensor]] = {}
     with torch.backends.cudnn.flags(enabled=True, allow_tf32=precision != FLOAT32):

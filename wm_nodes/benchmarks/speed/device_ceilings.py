@@ -16,8 +16,9 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import CPU
 from wm_nodes.core.errors import RunError
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
+from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.device_rollout import rollout_starts
 from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy, PolicyOutput
@@ -112,7 +113,7 @@ def host_points(plan: Plan, config: RunConfig) -> Iterator[Point]:
 
     def measure(watch: Stopwatch, envs: int) -> list[float]:
         models = models_of(shipped_model(config.task))
-        env = FreeEnvironment(models, simulation_spec(config.task, config.simulation, envs), config)
+        env = FreeEnvironment(models, configured_spec(config, envs), config)
         policy = FreePolicy(ImageEncoder(lambda images: images, 1), TOOL_DIM, TOOL_DIM, config.policy)
         reward = RuleReward()
         work = partial(collect_rollout, env, policy, reward, plan.num_steps, config.seed, 1)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from wm_nodes.core.action_spaces import TRANSLATION
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Environment, FloatArray, UInt64Array
+from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.factories import models_of
 from wm_nodes.world_model import load_starts, save_model_folder
 from wm_nodes.world_model.dynamics import ActionModel
@@ -78,12 +79,15 @@ def random_model(config: RunConfig, folder: Path) -> Path:
     torch.manual_seed(stream_seed(config.seed, "benchmark_model") % 2**31)
     size, tasks = config.simulation.image_size, model_tasks(config.task)
     tokenizer = Tokenizer(config.tokenizer, size, size * len(config.simulation.cameras))
-    sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_tasks": len(tasks)}
+    sizes: dict[str, Any] = {
+        "num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_tasks": len(tasks),
+    }
     action = ActionModel(config.world_model, action_dim=3, state_dim=3, **sizes)
     words = vocabulary_of(tuple(get_task(task).instruction for task in tasks))
     text = TextModel(config.world_model, vocabulary=words, **sizes)
     return save_model_folder(
-        folder, tokenizer, action, text, config, tasks=tasks, story={"data": "none: random weights for benchmarks"}
+        folder, tokenizer, action, text, config, spec=configured_spec(config), tasks=tasks,
+        story={"data": "none: random weights for benchmarks"},
     )
 
 

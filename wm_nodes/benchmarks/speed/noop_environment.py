@@ -4,9 +4,10 @@ import numpy as np
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
+from wm_nodes.environments.registry import configured_spec
 
 
 class NoopEnvironment:
@@ -52,4 +53,4 @@ class NoopEnvironment:
 
 def make_noop_environment(config: RunConfig, num_envs: int, seed: int) -> NoopEnvironment:
     """backend_factory of the second environment node."""
-    return NoopEnvironment(simulation_spec(config.task, config.simulation, num_envs))
+    return NoopEnvironment(configured_spec(config, num_envs))

@@ -21,7 +21,7 @@ from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, st
 from wm_nodes.apps.run_options import open_run
 from wm_nodes.config.load import ConfigError, dump_config, judge_or_embedded, load_config, preset_names
 from wm_nodes.config.scenes import SCENES, splits
-from wm_nodes.config.schema import AGENT, RunConfig, SimulationConfig
+from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import part_of, parts_of, task_names
@@ -30,19 +30,20 @@ from wm_nodes.core.errors import ModelNotAcceptedError
 from wm_nodes.core.model_folder import AGAIN, MANIFEST, read_json
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import BoolArray
+from wm_nodes.environments.registry import configured_spec
 from wm_nodes.judge.backends.factory import judge_name
 from wm_nodes.judge.episode_reward import check_agent, episode_judge
 from wm_nodes.launching.scenarios import IMAGINED
 from wm_nodes.policy_rl.acceptance import accept_model
 from wm_nodes.policy_rl.exploit_meter import start_seeds
-from wm_nodes.policy_rl.factories import check_scene, load_policy, load_steppable
+from wm_nodes.policy_rl.factories import check_model, load_policy, load_steppable
 from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_files
 from wm_nodes.policy_rl.pretraining import make_model
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
 from wm_nodes.reports.summary import Summary, acceptance_outcome, as_first_made, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
-from wm_nodes.world_model.folder import read_world_manifest
+from wm_nodes.world_model.folder import model_spec, read_world_manifest
 
 ENDOGENOUS = "endogenous"
 ACCEPTANCE, FORMER_ACCEPTANCE = "acceptance.json", "gate.json"
@@ -187,8 +188,7 @@ def _check(arguments: argparse.Namespace, config: RunConfig) -> None:
         raise ConfigError(f"{arguments.model_dir} holds no {MANIFEST}; name the folder of a trained world model")
     if not arguments.from_scratch:
         model_dir = Path(arguments.model_dir or shipped_model(config.task))
-        made_in = SimulationConfig.model_validate(read_world_manifest(model_dir)["simulation"])
-        check_scene(config, model_dir, made_in)
+        check_model(configured_spec(config), model_dir, model_spec(model_dir, read_world_manifest(model_dir)))
     _check_environment(arguments, config)
     if config.exploit_meter.every and config.exploit_meter.episodes > num_starts(config):
         raise ConfigError(f"exploit_meter.episodes is {config.exploit_meter.episodes}, and this run has "

@@ -22,8 +22,9 @@ from wm_nodes.config.tasks import check_task, instruction
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
 
-TaskName = Annotated[str, AfterValidator(check_task)]
-"""Name of a task's file, see config/tasks.py."""
+TaskName = Annotated[str, AfterValidator(lambda name: name and check_task(name))]
+"""Name of a task's file, see config/tasks.py. Empty: there is none, and `simulation` is not read; everything follows
+the spec of the environment, of its recordings or of the model that was trained on them."""
 ScenesName = Annotated[str, AfterValidator(check_scenes)]
 """Name of a split or of a scene, see config/scenes.py."""
 DeviceName = Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")]
@@ -351,5 +352,6 @@ class RunConfig(SettingsSection):
 
     @model_validator(mode="after")
     def _check_scenes(self) -> Self:
-        instruction(self.task, self.simulation.scenes)
+        if self.task:
+            instruction(self.task, self.simulation.scenes)
         return self

@@ -129,13 +129,13 @@ def get_task(name: str) -> Task:
 
 
 def model_tasks(name: str) -> tuple[str, ...]:
-    """The tasks of the world model that serves this one."""
-    return get_task(name).model_tasks or (name,)
+    """The tasks of the world model that serves this one, with a file or without."""
+    return (get_task(name).model_tasks if name in task_names() else ()) or (name,)
 
 
 def parts_of(name: str) -> tuple[str, ...]:
-    """The tasks that an episode of this one may be of: those of Task.parts, or this one."""
-    return get_task(name).parts or (name,)
+    """The tasks that an episode of this one may be of: those of Task.parts, or this one, with a file or without."""
+    return (get_task(name).parts if name in task_names() else ()) or (name,)
 
 
 def part_of(name: str, seed: int) -> str:
@@ -153,9 +153,11 @@ def recorded_task(name: str) -> str:
 
 def shares_scene(task: str, other: str) -> bool:
     """Whether an episode that was recorded for one task shows whether the other is done. So it does where it is not
-    known what it was recorded for."""
+    known what it was recorded for; what has no file is shown by its own episodes alone."""
     known = task_names()
-    if task not in known or other not in known or get_task(task).scene is get_task(other).scene:
+    if other not in known:
+        return task == other
+    if task not in known or get_task(task).scene is get_task(other).scene:
         return True
     return task in get_task(other).parts
 

@@ -2,26 +2,29 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from wm_nodes.config.schema import SimulationConfig
-from wm_nodes.config.tasks import get_task, instruction
-from wm_nodes.core.action_spaces import SPACES
-
 SOURCE_IMAGINED, SOURCE_SIMULATOR, SOURCE_REAL, SOURCE_REPLAY = 0, 1, 2, 3
 
 TASK_PREFIX = "task_"
 """Of the names of those state values that say which task an episode is of."""
+TARGET = "target"
+"""In the name of a state value that is commanded: computed from the value before, the action and the box. What is named
+otherwise is measured: nobody knows it before it is there, and a model has to predict how it changes."""
 POLICY_FIELDS = (
     "height", "width", "channels", "encoding", "cameras", "action_names", "action_units", "action_scale", "state_names",
     "state_units", "control_period_s",
 )
 """What a policy depends on."""
+MODEL_FIELDS = (*POLICY_FIELDS, "state_low", "state_high")
+"""What imagining depends on."""
+PICTURES = ("height", "width", "channels", "encoding", "cameras")
+ROBOT = ("action_names", "action_units", "state_names", "state_units")
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,11 @@ class EnvironmentSpec:
         return sum(not name.startswith(TASK_PREFIX) for name in self.state_names)
 
     @property
+    def measured(self) -> tuple[int, ...]:
+        """Which values of a state are measured, see TARGET; the others are commanded, or say which task it is."""
+        return tuple(i for i, name in enumerate(self.state_names[: self.tool_dim]) if TARGET not in name)
+
+    @property
     def ground_truth_dim(self) -> int:
         return len(self.ground_truth_names)
 
@@ -88,25 +96,64 @@ def differences(
     return [row for row in rows if row[1] != row[2]]
 
 
+class SpecMismatch(ValueError):
+    """Two sides disagree on the environment."""
+
+
+def agree(
+    served: EnvironmentSpec, trained_with: EnvironmentSpec, whose: str, names: Sequence[str] = POLICY_FIELDS
+) -> None:
+    """Compare the environment that is served with the one that something was trained or recorded with.
+
+    Args:
+        whose: of the second, as the message says it, e.g. "the policy needs".
+
+    Raises:
+        SpecMismatch: names each field that differs, and the remedies that fit.
+    """
+    wrong = differences(served, trained_with, names)
+    if not wrong:
+        return
+    fields_, remedies = {name for name, *_ in wrong}, list[str]()
+    if fields_ & {*ROBOT}:
+        remedies.append("it is another robot: name the model and policy of this one, or record episodes of it and "
+                        "train a model on them")
+    elif fields_ & {*PICTURES}:
+        remedies.append("show the pictures that it was trained with, or record these and train a model on them")
+    if fields_ - {*ROBOT, *PICTURES}:
+        remedies.append("set actions, box and control period as they were")
+    text = "; ".join(f"{name} {is_!r}, {whose} {should!r}" for name, is_, should in wrong)
+    raise SpecMismatch(
+        f"environment {served.env_id} has {text}; {', and '.join(remedies)}; in a simulator, start both with the same "
+        "config_file"
+    )
+
+
 def _round_to_sent(value: Any) -> Any:
     if isinstance(value, float):
         return as_sent(value)
     return tuple(_round_to_sent(item) for item in value) if isinstance(value, (tuple, list)) else value
 
 
-def simulation_spec(task: str, config: SimulationConfig, num_envs: int) -> EnvironmentSpec:
-    """The spec of `task` in ManiSkill; the imagined environment shares all but env_id, source and ground truth."""
-    what = get_task(task)
-    space = SPACES[what.actions]
-    low, high = space.box(config)
-    codes = tuple(TASK_PREFIX + part for part in what.parts)
-    return EnvironmentSpec(
-        env_id=f"maniskill/{task}", task=task, instruction=instruction(task, config.scenes), source=SOURCE_SIMULATOR,
-        num_envs=num_envs, height=config.image_size, width=config.image_size * len(config.cameras),
-        cameras=tuple(config.cameras), action_names=space.action_names, action_units=space.units,
-        action_scale=space.scale(config), state_names=space.state_names + codes,
-        state_units=space.units + ("1",) * len(codes),
-        ground_truth_names=what.ground_truth_names, control_period_s=1.0 / config.control_hz,
-        max_episode_steps=config.max_episode_steps, state_low=low + (0.0,) * len(codes),
-        state_high=high + (1.0,) * len(codes),
+def spec_values(spec: EnvironmentSpec) -> dict[str, Any]:
+    """The fields of a spec as plain values, for JSON."""
+    return asdict(spec)
+
+
+def spec_of_values(values: Mapping[str, Any]) -> EnvironmentSpec:
+    """Return the spec of spec_values, with tuples for lists. Raises ValueError for other fields than a spec's."""
+    names = {field.name for field in fields(EnvironmentSpec)}
+    if set(values) != names:
+        raise ValueError(f"a spec has the fields {sorted(names)}; these are too many or missing: "
+                         f"{sorted(set(values) ^ names)}")
+    arguments: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+    return EnvironmentSpec(**arguments)
+
+
+def tool_spec(spec: EnvironmentSpec) -> EnvironmentSpec:
+    """The spec of one environment without the state values that say which task it is: what a world model is made of."""
+    tool = spec.tool_dim
+    return replace(
+        spec, num_envs=1, state_names=spec.state_names[:tool], state_units=spec.state_units[:tool],
+        state_low=spec.state_low[:tool], state_high=spec.state_high[:tool],
     )

@@ -1,5 +1,7 @@
 """The controller's rule, equal in every environment (RS-9): legal actions, and where they command the tool."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +32,29 @@ def next_state(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -
         high = np.maximum(np.asarray(spec.state_high, np.float32), states)
         moved = np.clip(moved, low, high)
     return moved.astype(np.float32)
+
+
+def next_commanded(states: FloatArray, actions: FloatArray, spec: EnvironmentSpec) -> FloatArray:
+    """next_state of the commanded values; the measured ones stay as they are, for a model to say how they change."""
+    kept = commanded_columns(spec)
+    if kept and not spec.measured:
+        return next_state(states, actions, spec)
+    moved = states.astype(np.float32)
+    if kept:
+        moved[..., kept] = next_state(states[..., kept], actions, of_columns(spec, kept))
+    return moved
+
+
+def commanded_columns(spec: EnvironmentSpec) -> list[int]:
+    """Which values of a state are not measured."""
+    return [i for i in range(spec.state_dim) if i not in spec.measured]
+
+
+def of_columns(spec: EnvironmentSpec, columns: Sequence[int]) -> EnvironmentSpec:
+    """The spec with these values of the state alone."""
+    names = ("state_names", "state_units", *(("state_low", "state_high") if spec.state_low else ()))
+    chosen: dict[str, Any] = {name: tuple(getattr(spec, name)[i] for i in columns) for name in names}
+    return replace(spec, **chosen)
 
 
 def next_state_tensor(

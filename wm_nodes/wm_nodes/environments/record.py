@@ -11,10 +11,10 @@ from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT, STARTS, SeedRange, demonstration_seeds
 from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.files import write_atomic
-from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import Episode
 from wm_nodes.environments.maniskill import collection
 from wm_nodes.environments.maniskill.collection import CollectionPlan, collect
+from wm_nodes.environments.maniskill.spec import simulation_spec
 from wm_nodes.recording import Bag, EpisodeBagWriter
 
 INDEX, PLAN = "index.csv", "plan.json"

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from wm_nodes.config.load import judge_or_embedded
 from wm_nodes.config.schema import AGENT, JudgeConfig, RunConfig
-from wm_nodes.core.specs import EnvironmentSpec, simulation_spec
+from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import BoolArray, FloatArray, Rollout, UInt8Array, UInt64Array
+from wm_nodes.environments.registry import configured_spec
 from wm_nodes.judge.agent.contract import MAX_INVALID_SHARE
 from wm_nodes.judge.agent.rubric import load_rubric
 from wm_nodes.judge.agent.types import TaskSpec, clip_ref
@@ -128,7 +129,7 @@ def episode_judge(config: RunConfig) -> JudgeConfig:
 
 
 def _scene(config: RunConfig) -> EnvironmentSpec:
-    return simulation_spec(config.task, config.simulation, 1)
+    return configured_spec(config)
 
 
 def _longest_clip(spec: EnvironmentSpec) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from wm_msgs.msg import ErrorCode
 from wm_nodes.config.schema import AGENT, RunConfig
-from wm_nodes.core.specs import EnvironmentSpec, differences, simulation_spec
+from wm_nodes.core.specs import EnvironmentSpec, SpecMismatch, agree
 from wm_nodes.core.types import Environment
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.training_run import Learner
@@ -96,17 +96,17 @@ def expected_spec(config: RunConfig, model_dir: str, policy_factory: str) -> Env
     """The robot and cameras that the policy of make_policy was made for; None for a factory's, which tells nothing."""
     if policy_factory or not model_dir:
         return None
-    return simulation_spec(config.task, config.simulation, 1)
+    from wm_nodes.policy_rl.factories import run_spec
+
+    return run_spec(config, Path(model_dir))
 
 
 def refuse_other(served: EnvironmentSpec, expected: EnvironmentSpec, whose: str) -> None:
-    """Raise WireError(SPEC_MISMATCH) unless both agree on cameras, sizes, actions and state."""
-    wrong = differences(served, expected)
-    if wrong:
-        text = "; ".join(f"{name} {is_!r}, {whose} {should!r}" for name, is_, should in wrong)
-        raise WireError(
-            ErrorCode.SPEC_MISMATCH, f"environment {served.env_id} has {text}; start both with the same config_file"
-        )
+    """Raise WireError(SPEC_MISMATCH) unless both agree, see core.specs.agree."""
+    try:
+        agree(served, expected, whose)
+    except SpecMismatch as error:
+        raise WireError(ErrorCode.SPEC_MISMATCH, str(error)) from None
 
 
 def make_learner(policy: ImagePolicy, config: RunConfig, factory: str = "", ranks: Ranks | None = None) -> Learner:

@@ -202,15 +202,15 @@ class PolicyNode(ManagedNode):
         return reset_seeds(goal.seed, version, step, spec.num_envs, self._envs_per_start)
 
     def _check_spec(self, spec: EnvironmentSpec) -> None:
+        if self._expected_spec is not None:
+            refuse_other(spec, self._expected_spec, "the policy needs")
         dims, expected = (spec.state_dim, spec.action_dim), (self._holder.state_dim, self._holder.action_dim)
         if dims != expected:
             raise WireError(
                 ErrorCode.SPEC_MISMATCH,
                 f"environment {spec.env_id} has {dims} state and action values, the policy {expected}; "
-                "start both with the same config_file",
+                "name a policy of this robot in policy_factory",
             )
-        if self._expected_spec is not None:
-            refuse_other(spec, self._expected_spec, "the policy needs")
         self._spec = spec
 
     def _await_version(self, version: int, work: Work) -> None:

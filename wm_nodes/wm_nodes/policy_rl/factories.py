@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -10,13 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wm_nodes.config.schema import RunConfig, SimulationConfig
+from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import CPU, compute_device, explain_memory
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.specs import simulation_spec
+from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec, agree, tool_spec
 from wm_nodes.core.types import FloatArray, Observation, UInt8Array
 from wm_nodes.environments.maniskill.cameras import hand_over, table_top_cameras
+from wm_nodes.environments.registry import configured_spec
 from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
 from wm_nodes.reward import EncoderDistance, EndogenousReward
 from wm_nodes.training.weights import load_weights_file
@@ -32,8 +34,8 @@ from wm_nodes.world_model import (
     load_start_instructions,
     load_starts,
 )
+from wm_nodes.world_model.folder import model_spec, read_world_manifest
 from wm_nodes.world_model.precision import compute_context
-from wm_nodes.world_model.tokenizer import PROBE_NAMES
 
 _Imagined = TypeVar("_Imagined", ImaginedEnvironment, DeviceEnvironment)
 
@@ -47,7 +49,7 @@ def models_of(model_dir: Path, device: str = CPU) -> WorldModels:
 def make_encoder(model_dir: Path, device: str = CPU, *, positions: bool = False) -> ImageEncoder:
     """Return the tokenizer as the policy's frozen image encoder, see Tokenizer.flatten."""
     models = models_of(Path(model_dir), device)
-    tokenizer, count = models.tokenizer, len(PROBE_NAMES) if positions else 0
+    tokenizer, count = models.tokenizer, models.tokenizer.num_positions if positions else 0
 
     def encode(images: Tensor) -> Tensor:
         latents = tokenizer.encode(images)
@@ -59,11 +61,21 @@ def make_encoder(model_dir: Path, device: str = CPU, *, positions: bool = False)
     )
 
 
+def run_spec(config: RunConfig, model_dir: Path) -> EnvironmentSpec:
+    """The environment of a run: of the configured task in its simulator, or without a task the one that the world model
+    was trained with. Raises ModelFolderError: the folder says none."""
+    return configured_spec(config) if config.task else model_spec(model_dir, read_world_manifest(model_dir))
+
+
 def make_policy(config: RunConfig, model_dir: Path) -> ImagePolicy:
-    """Return a policy with fresh weights."""
+    """Return a policy with fresh weights for run_spec. Measured states are shifted and scaled by what was recorded."""
     encoder = make_encoder(model_dir, config.device, positions=config.policy.positions)
-    spec = simulation_spec(config.task, config.simulation, 1)
-    policy = ImagePolicy(encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed)
+    spec = run_spec(config, model_dir)
+    recorded = models_of(Path(model_dir), config.device).action.condition if spec.measured else None
+    policy = ImagePolicy(
+        encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed,
+        state_range=None if recorded is None else (recorded.state_mean.tolist(), recorded.state_scale.tolist()),
+    )
     return policy.to(compute_device(config.device))
 
 
@@ -117,7 +129,7 @@ def make_imagined_environment(
         training: show frames with imagined_environment.picture_noise.
 
     Raises:
-        ValueError: the folder was trained for another scene than the configuration describes.
+        SpecMismatch: the folder was trained with another environment than the configuration describes.
     """
     settings = config.imagined_environment
     second = models_of(Path(settings.second_model), config.device) if settings.second_model else None
@@ -133,7 +145,7 @@ def make_video_environment(
 ) -> VideoEnvironment:
     """Return a video model as an environment for config.task. Raises as load_steppable."""
     folder, reader = load_steppable(config, video_model_dir)
-    spec = simulation_spec(config.task, config.simulation, num_envs)
+    spec = configured_spec(config, num_envs)
     with explain_memory(folder.device, ppo__num_envs=num_envs):
         environment = VideoEnvironment(
             folder, reader, spec, load_starts(Path(starts_file), config.task), config.reward, config.video_environment,
@@ -154,7 +166,7 @@ def load_steppable(config: RunConfig, video_model_dir: Path) -> tuple[VideoFolde
             raise ValueError(f"reward.{name} is {value}, and a video model gives no {missing}; set it to 0")
     device = compute_device(config.device)
     folder = load_video_folder(video_model_dir, device)
-    check_steppable(folder, simulation_spec(config.task, config.simulation, 1))
+    check_steppable(folder, configured_spec(config))
     return folder, load_success_reader(video_model_dir, config.task, device)
 
 
@@ -167,6 +179,8 @@ def make_device_environment(
 
 
 def _cameras(config: RunConfig, environment: ImaginedEpisodes) -> Sequence[CameraModel]:
+    if not config.task:
+        return ()
     return table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
 
 
@@ -174,11 +188,11 @@ def _imagine(
     make: Callable[..., _Imagined], config: RunConfig, model_dir: Path, starts_file: Path, num_envs: int
 ) -> _Imagined:
     models = models_of(Path(model_dir), config.device)
-    check_scene(config, model_dir, models.simulation)
-    spec = simulation_spec(config.task, config.simulation, num_envs)
+    spec = replace(run_spec(config, model_dir), num_envs=num_envs)
+    check_model(spec, model_dir, models.spec)
     with explain_memory(compute_device(config.device), ppo__num_envs=num_envs):
         return make(
-            models, spec, load_starts(Path(starts_file), config.task), config.reward, num_envs=num_envs,
+            models, spec, load_starts(Path(starts_file), spec.task), config.reward, num_envs=num_envs,
             instructions=load_start_instructions(Path(starts_file), spec), with_goals=config.reward.dense_weight > 0,
         )
 
@@ -194,17 +208,9 @@ def make_training_environment(
     return make_device_environment(config, model_dir, starts_file, num_envs=num_envs)
 
 
-def check_scene(config: RunConfig, model_dir: Path, simulation: SimulationConfig) -> None:
-    """Raise ValueError unless the model of `model_dir`, made in `simulation`, knows the configuration's scene."""
-    for name in (
-        "cameras", "image_size", "control_hz", "max_action_m", "max_action_rad", "workspace_low_m", "workspace_high_m",
-    ):
-        wanted, trained = getattr(config.simulation, name), getattr(simulation, name)
-        if wanted != trained:
-            raise ValueError(
-                f"{model_dir} was trained with simulation.{name} = {trained}, the configuration says {wanted}; change "
-                "the configuration, or train another model (--from-scratch)"
-            )
+def check_model(spec: EnvironmentSpec, model_dir: Path, trained_with: EnvironmentSpec) -> None:
+    """Raise SpecMismatch unless the model of `model_dir`, trained with another spec, knows this environment."""
+    agree(tool_spec(spec), trained_with, f"{model_dir} was trained with", MODEL_FIELDS)
 
 
 def policy_actor(

@@ -4,7 +4,7 @@ The encoder is frozen, shared with the world model, and not part of the weights:
 one message.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import cast
@@ -69,6 +69,7 @@ class ImagePolicy(nn.Module):
         state_dim: S. Of the size of one of core.action_spaces.SPACES, the state is of that one: positions are shifted
             by TOOL_CENTER_M and scaled by TOOL_SCALE_M, rotations by TURN_SCALE_RAD. What a larger state has after a
             pose says which task it is, and is taken as it is.
+        state_range: shift and scale of each value of the state (S,), instead.
         action_dim: A.
         config: sizes and the initial log standard deviation.
         seed: of the initial weights (stream `policy_init`).
@@ -76,6 +77,7 @@ class ImagePolicy(nn.Module):
 
     def __init__(
         self, encoder: ImageEncoder, state_dim: int, action_dim: int, config: PolicyConfig, *, seed: int = 0,
+        state_range: tuple[Sequence[float], Sequence[float]] | None = None,
     ) -> None:
         super().__init__()
         self.encoder = encoder
@@ -83,8 +85,10 @@ class ImagePolicy(nn.Module):
         sizes = {len(space.units): space.units for space in SPACES.values()}
         known = sizes.get(min(state_dim, max(sizes)), ())
         units = known + ("1",) * (state_dim - len(known))
-        center = [TOOL_CENTER_M[i] if unit == "m" else 0.0 for i, unit in enumerate(units)]
-        scale = [{"m": TOOL_SCALE_M, "rad": TURN_SCALE_RAD, "1": 1.0}[unit] for unit in units]
+        center: Sequence[float] = [TOOL_CENTER_M[i] if unit == "m" else 0.0 for i, unit in enumerate(units)]
+        scale: Sequence[float] = [{"m": TOOL_SCALE_M, "rad": TURN_SCALE_RAD, "1": 1.0}[unit] for unit in units]
+        if state_range is not None:
+            center, scale = state_range
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(stream_seed(seed, "policy_init"))
             self.actor = _Network(encoder, state_dim, action_dim, config, output_gain=0.01)

@@ -139,8 +139,7 @@ def refresh_model(config: RunConfig, model_dir: Path, bags: Sequence[Path], fold
     )
     training = config.model_copy(
         update={
-            "world_model": settings, "simulation": models.simulation,
-            "tokenizer": TokenizerConfig.model_validate(manifest["tokenizer"]),
+            "world_model": settings, "tokenizer": TokenizerConfig.model_validate(manifest["tokenizer"]),
         }
     )
     action = copy.deepcopy(models.action)

@@ -2,7 +2,7 @@
 
 import platform
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import date
 from functools import partial
 from itertools import chain
@@ -19,21 +19,22 @@ from wm_nodes.config.tasks import get_task, model_tasks, recorded_task
 from wm_nodes.core.device import compute_device, device_label, explain_memory
 from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.seeding import initial_weights
-from wm_nodes.core.specs import simulation_spec
+from wm_nodes.core.specs import EnvironmentSpec, tool_spec
 from wm_nodes.environments.maniskill.collection import POLICY_LABEL, CollectionPlan
 from wm_nodes.environments.maniskill.episodes import EXTREME
 from wm_nodes.environments.record import collect_plan, collect_scripted, demonstration_plan
 from wm_nodes.policy_rl.factories import policy_actor
 from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, STARTS, train_weak_policy, write_starts
-from wm_nodes.recording import read_episodes
+from wm_nodes.recording import BagReport, read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.reports.summary import plain
 from wm_nodes.world_model import ActionModel, Tokenizer, WorldModels, load_model_folder, save_model_folder
 from wm_nodes.world_model.folder import action_model_class
+from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.sentence_encoder import SentenceEncoder
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.training.decoder import train_decoder
-from wm_nodes.world_model.training.dynamics import tokenise_episodes, train_action_model
+from wm_nodes.world_model.training.dynamics import LatentEpisodes, tokenise_episodes, train_action_model
 from wm_nodes.world_model.training.position_probe import train_position_probe
 from wm_nodes.world_model.training.state_probe import train_state_probe
 from wm_nodes.world_model.training.text import demonstrators, train_text_model
@@ -67,35 +68,28 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         reader = SentenceEncoder(Path(config.world_model.text_encoder))
         print(f"instructions are read by {reader.folder}, sha256 {reader.sha256[:12]}", file=sys.stderr)
     bags = collect_scripted(config, config.data.num_episodes, MODEL_EPISODES, run_dir / "data" / "train")
+    spec = read_spec(next(chain(*bags.values())))
     episodes = load_arrays(chain(*bags.values()), config)
     with explain_memory(device, tokenizer__batch_size=config.tokenizer.batch_size):
         tokenizer, tokenizer_metrics = train_tokenizer(episodes, config, config.seed, run_dir)
     if config.data.policy_episodes:
-        policy_bags = _collect_policy_bags(config, run_dir, tokenizer)
+        policy_bags = _collect_policy_bags(config, run_dir, tokenizer, spec)
         episodes = EpisodeArrays.concatenate([episodes, load_arrays(policy_bags, config)])
     probe, probe_metrics = train_position_probe(episodes, config, config.seed, run_dir)
     data = tokenise_episodes(tokenizer, episodes)
     if config.tokenizer.probe_iterations:
         tokenizer_metrics["probe"] = train_state_probe(tokenizer, data, config.tokenizer, config.seed, run_dir)["loss"]
-    action: ActionModel | TokenActionModel
-    text, text_metrics, shown_by, decoder_metrics = None, dict[str, float](), tokenizer, dict[str, float]()
+    text, text_metrics = None, dict[str, float]()
     with explain_memory(device, world_model__batch_size=config.world_model.batch_size):
-        if config.tokenizer.kind == "lfq":
-            action, action_metrics = train_token_model(tokenizer, data, config, config.seed, run_dir)
-        else:
-            action, action_metrics = train_action_model(tokenizer, data, config, config.seed, run_dir)
-            if config.tokenizer.decoder_iterations:
-                shown_by, decoder_metrics = train_decoder(tokenizer, action, data, config, config.seed, run_dir)
+        action, shown_by, dynamics_metrics = _train_dynamics(tokenizer, data, spec, config, run_dir)
+        if isinstance(action, ActionModel):
             golden = episodes.select(np.flatnonzero(np.isin(episodes.behaviours, demonstrators())))
             texts = tuple(get_task(task).instruction for task in model_tasks(config.task))
             text, text_metrics = train_text_model(
                 tokenizer, action, golden, tokenise_episodes(tokenizer, golden), texts, config, config.seed, run_dir
             )
     story: dict[str, Any] = {
-        "made": {
-            "command": command, "date": date.today().isoformat(), "seed": config.seed, "torch": torch.__version__,
-            "machine": f"{platform.machine()}, {torch.get_num_threads()} threads", "device": device_label(device),
-        },
+        "made": _made(command, config),
         "data": {
             "episodes": len(episodes), "policy_episodes": episodes.behaviours.count(POLICY_LABEL),
             "training_seeds": seed_spans(episodes.seeds),
@@ -104,12 +98,11 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         },
         "success_threshold": config.reward.success_threshold,
         "training": {
-            "tokenizer": tokenizer_metrics, "decoder": decoder_metrics, "action": action_metrics, "text": text_metrics,
-            "probe": probe_metrics,
+            "tokenizer": tokenizer_metrics, **dynamics_metrics, "text": text_metrics, "probe": probe_metrics,
         },
     }
     tasks = model_tasks(config.task)
-    models = WorldModels(shown_by, action, text, tasks, config.simulation, {}, probe)
+    models = WorldModels(shown_by, action, text, tasks, tool_spec(spec), {}, probe)
     for name, (scenes, behaviour) in _heldout_sets(config).items():
         where = run_dir / "data" / name
         held = collect_scripted(scenes, config.data.num_heldout, HELDOUT, where, behaviour=behaviour)
@@ -120,16 +113,82 @@ def make_model(config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
         frames=config.data.start_frames, seed=config.seed,
     )
     decoder = shown_by.decoder if config.tokenizer.decoder_iterations else None
-    save_model_folder(folder, tokenizer, action, text, config, tasks=tasks, story=story, probe=probe, decoder=decoder)
+    save_model_folder(
+        folder, tokenizer, action, text, config, spec=spec, tasks=tasks, story=story, probe=probe, decoder=decoder
+    )
     load_model_folder(folder)
     return folder
 
 
+def model_from_recordings(bags: Sequence[Path], config: RunConfig, run_dir: Path, *, command: str = "") -> Path:
+    """Train tokenizer and action model on the recorded episodes of one environment, whichever it is, and measure them
+    on the last of these; returns run_dir/model, with first frames to imagine from.
+
+    Success is the task's rule, or without a task file the recorded flag. There is no text model, so no goals: set
+    reward.dense_weight to 0.
+
+    Raises:
+        BagError: bags of different cameras, sizes, actions or states. ValueError: fewer than two complete episodes.
+    """
+    spec = read_spec(bags[0])
+    recorded = [episode for bag in bags for episode in read_episodes(bag, expected=spec, report=BagReport())]
+    num_heldout = min(config.data.num_heldout, len(recorded) // 4 or 1)
+    if len(recorded) <= num_heldout:
+        raise ValueError(f"{len(recorded)} complete episodes in {', '.join(map(str, bags))}; record at least 2")
+    tasks, folder = model_tasks(spec.task), run_dir / "model"
+    episodes = stack_episodes(recorded, tasks, num_steps=spec.max_episode_steps)
+    seen, heldout = (episodes.select(range(len(recorded))[rows]) for rows in
+                     (slice(-num_heldout), slice(-num_heldout, None)))
+    with explain_memory(compute_device(config.device), tokenizer__batch_size=config.tokenizer.batch_size):
+        tokenizer, tokenizer_metrics = train_tokenizer(seen, config, config.seed, run_dir)
+    probe: PositionProbe | None = None
+    if tokenizer.num_positions:
+        probe, _ = train_position_probe(seen, config, config.seed, run_dir)
+    with explain_memory(compute_device(config.device), world_model__batch_size=config.world_model.batch_size):
+        data = tokenise_episodes(tokenizer, seen)
+        action, shown_by, dynamics_metrics = _train_dynamics(tokenizer, data, spec, config, run_dir)
+    models = WorldModels(shown_by, action, None, tasks, tool_spec(spec), {}, probe)
+    story = {
+        "made": _made(command, config), "data": {"episodes": len(seen)},
+        "success_threshold": config.reward.success_threshold,
+        "training": {"tokenizer": tokenizer_metrics, **dynamics_metrics},
+        "heldout": plain(model_metrics(models, heldout, config)),
+    }
+    write_starts(bags, folder / STARTS, MODEL_STARTS, frames=config.data.start_frames, seed=config.seed)
+    return save_model_folder(
+        folder, tokenizer, action, None, config, spec=spec, tasks=tasks, story=story, probe=probe,
+        decoder=shown_by.decoder if shown_by is not tokenizer else None,
+    )
+
+
+def _train_dynamics(
+    tokenizer: Tokenizer, data: LatentEpisodes, spec: EnvironmentSpec, config: RunConfig, run_dir: Path
+) -> tuple[ActionModel | TokenActionModel, Tokenizer, dict[str, dict[str, float]]]:
+    """Train the action model that goes with the tokenizer, and where asked for a decoder of its rollouts; returns it,
+    the tokenizer that shows what it imagines, and the metrics of both."""
+    if config.tokenizer.kind == "lfq":
+        tokens, found = train_token_model(tokenizer, data, config, config.seed, run_dir, measured=spec.measured)
+        return tokens, tokenizer, {"decoder": {}, "action": found}
+    action, found = train_action_model(tokenizer, data, config, config.seed, run_dir, measured=spec.measured)
+    shown_by, decoder_metrics = tokenizer, dict[str, float]()
+    if config.tokenizer.decoder_iterations:
+        shown_by, decoder_metrics = train_decoder(tokenizer, action, data, config, config.seed, run_dir)
+    return action, shown_by, {"decoder": decoder_metrics, "action": found}
+
+
+def _made(command: str, config: RunConfig) -> dict[str, Any]:
+    """How, when and where a model was made, for its manifest."""
+    return {
+        "command": command, "date": date.today().isoformat(), "seed": config.seed, "torch": torch.__version__,
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads",
+        "device": device_label(compute_device(config.device)),
+    }
+
+
 def heldout_metrics(models: WorldModels, episodes: EpisodeArrays, config: RunConfig, task: str) -> dict[str, Any]:
     """Metrics of rollouts of the recorded actions, of other actions, and of goals, over held-out episodes of a task."""
-    spec = simulation_spec(task, config.simulation, 1)
     metrics: dict[str, Any] = plain(
-        model_metrics(models, episodes, config) | controllability_metrics(models, episodes, spec)
+        model_metrics(models, episodes, config) | controllability_metrics(models, episodes, models.spec)
         | goal_metrics(models, episodes, config, task)
     )
     return metrics
@@ -146,7 +205,9 @@ def _heldout_sets(config: RunConfig) -> dict[str, tuple[RunConfig, str]]:
     }
 
 
-def _collect_policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer) -> list[Path]:
+def _collect_policy_bags(
+    config: RunConfig, run_dir: Path, tokenizer: Tokenizer, spec: EnvironmentSpec
+) -> list[Path]:
     """Collect simulator episodes of a few policies cloned from a few demonstrations, acting with exploration noise.
 
     They need the tokenizer only, so they are collected before the action model is trained and belong to its data.
@@ -156,7 +217,7 @@ def _collect_policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer)
     for policy, task in sorted(weak, key=lambda pair: pair[0].number):
         number, sft = policy.number, config.sft.model_copy(update={"num_demonstrations": policy.demonstrations})
         chosen = config.model_copy(update={"task": task, "sft": sft})
-        folder = _make_tokenizer_folder(config, run_dir, tokenizer)
+        folder = _make_tokenizer_folder(config, run_dir, tokenizer, spec)
         weights = run_dir / "policies" / f"weak_{number}.safetensors"
         if not weights.exists():
             plan = demonstration_plan(chosen, *policy.plan)
@@ -170,15 +231,16 @@ def _collect_policy_bags(config: RunConfig, run_dir: Path, tokenizer: Tokenizer)
     return bags
 
 
-def _make_tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenizer) -> Path:
+def _make_tokenizer_folder(config: RunConfig, run_dir: Path, tokenizer: Tokenizer, spec: EnvironmentSpec) -> Path:
     """Make a model folder for policies, which read the tokenizer alone: its action model is untrained."""
     folder = run_dir / "tokenizer_only"
     if not (folder / MANIFEST).exists():
-        tasks, spec = model_tasks(config.task), simulation_spec(config.task, config.simulation, 1)
+        tasks = model_tasks(config.task)
         with initial_weights(config.seed, "action_model_init"):
             untrained = action_model_class(config.tokenizer.kind)(
                 config.world_model, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
-                action_dim=spec.action_dim, state_dim=spec.state_dim, num_tasks=len(tasks),
+                action_dim=spec.action_dim, state_dim=spec.tool_dim, num_tasks=len(tasks),
+                num_positions=tokenizer.num_positions, measured=spec.measured,
             )
-        save_model_folder(folder, tokenizer, untrained, None, config, tasks=tasks, story={})
+        save_model_folder(folder, tokenizer, untrained, None, config, spec=spec, tasks=tasks, story={})
     return folder

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.config.tasks import get_task, shares_scene, success, task_names
+from wm_nodes.config.tasks import parts_of, shares_scene, success, task_names
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, UInt8Array
 
 TaskLabels = Callable[[str, FloatArray], BoolArray]
@@ -101,6 +101,8 @@ def stack_episodes(
 ) -> EpisodeArrays:
     """Stack episodes of one camera set-up; longer ones are cut to num_steps (None: the longest decides).
 
+    A task without a file is done where its recorded episodes say so; `labels` are those of the other tasks.
+
     Raises:
         ValueError: no episodes, episodes of different image, state or action sizes, or as check_finite.
     """
@@ -108,8 +110,8 @@ def stack_episodes(
     check_finite(listed)
     if not listed:
         raise ValueError("no episodes to train on; collect some first (data.num_episodes) or check the bag path")
-    known = {task: get_task(task).parts if task in task_names() else () for task in {e.task for e in listed}}
-    parts = [known[e.task] for e in listed]
+    known = {task: parts_of(task) for task in {e.task for e in listed}}
+    parts = [known[e.task] if known[e.task] != (e.task,) else () for e in listed]
     tool_states = [e.states[:, : e.states.shape[1] - len(own)] for e, own in zip(listed, parts, strict=True)]
     shapes = {(e.images.shape[1:], s.shape[1:], e.actions.shape[1:]) for e, s in zip(listed, tool_states, strict=True)}
     if len(shapes) > 1:
@@ -121,10 +123,14 @@ def stack_episodes(
     for row, episode in enumerate(listed):
         actions[row, : lengths[row]] = episode.actions[: lengths[row]]
     truth = np.stack([e.ground_truth[rows] for e, rows in zip(listed, frame_rows, strict=True)])
+    said = np.stack([e.success[rows] for e, rows in zip(listed, frame_rows, strict=True)])
+    with_rule = set(tasks) if labels is not success else set(tasks) & set(task_names())
     return EpisodeArrays(
         images=np.stack([e.images[rows] for e, rows in zip(listed, frame_rows, strict=True)]),
         states=np.stack([s[rows] for s, rows in zip(tool_states, frame_rows, strict=True)]), actions=actions,
-        ground_truth=truth, success=np.stack([np.asarray(labels(task, truth), bool) for task in tasks], -1),
+        ground_truth=truth, success=np.stack([
+            np.asarray(labels(task, truth) if task in with_rule else said, bool) for task in tasks
+        ], -1),
         lengths=lengths, tasks=tuple(tasks), instructions=tuple(e.instruction for e in listed),
         behaviours=tuple(e.behaviour for e in listed), recorded_tasks=tuple(
             own[int(e.states[0, -len(own) :].argmax())] if own else e.task for e, own in zip(listed, parts, strict=True)

@@ -204,8 +204,8 @@ class LockSteps:
             session=int(message.session), seq=int(message.seq), step_id=int(message.step_id), stamp_ns=now_ns,
             next_stamp_ns=next_ns, images=self._images.get(now_ns), next_images=self._images.get(next_ns),
             goals=self._stack_goals(goals) if any(goal is not None for goal in goals) else None,
-            actions=message.action.reshape(num_envs, -1), states=message.state.reshape(num_envs, -1),
-            next_states=message.next_state.reshape(num_envs, -1), logprobs=message.log_prob, values=message.value,
+            actions=_per_env(message.action, num_envs), states=_per_env(message.state, num_envs),
+            next_states=_per_env(message.next_state, num_envs), logprobs=message.log_prob, values=message.value,
             terminated=message.terminated.astype(bool), truncated=message.truncated.astype(bool),
             valid=message.valid.astype(bool), episode_id=message.episode_id, episode_step=message.episode_step,
             policy_version=message.policy_version, success_probability=message.success_probability,
@@ -229,6 +229,11 @@ class LockSteps:
         blank = np.zeros((self.spec.height, self.spec.width, self.spec.channels), np.uint8), False
         pairs = [goal if goal is not None else blank for goal in goals]
         return np.stack([image for image, _ in pairs]), np.array([is_found for _, is_found in pairs])
+
+
+def _per_env(values: FloatArray, num_envs: int) -> FloatArray:
+    """A message's values as (N, values of each), which may be none."""
+    return values.reshape(num_envs, len(values) // num_envs)
 
 
 def _reward_key(message: Any) -> tuple[int, int, int]:

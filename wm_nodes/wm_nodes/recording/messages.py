@@ -2,13 +2,13 @@
 P ground truth."""
 
 import json
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wm_nodes.core.specs import EnvironmentSpec, as_sent
+from wm_nodes.core.specs import EnvironmentSpec, as_sent, spec_of_values, spec_values
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.recording.errors import BagError
 from wm_nodes.recording.layout import Tiles
@@ -113,16 +113,14 @@ def spec_of(message: Any) -> tuple[EnvironmentSpec, Tiles]:
 
 
 def spec_to_json(spec: EnvironmentSpec) -> str:
-    return json.dumps(asdict(spec), sort_keys=True)
+    return json.dumps(spec_values(spec), sort_keys=True)
 
 
 def spec_from_json(text: str) -> EnvironmentSpec:
-    values = json.loads(text)
-    names = {field.name for field in fields(EnvironmentSpec)}
-    if set(values) != names:
-        raise BagError(f"wm.spec_json has fields {sorted(set(values) ^ names)} too many or too few for this version")
-    arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    return EnvironmentSpec(**arguments)
+    try:
+        return spec_of_values(json.loads(text))
+    except ValueError as error:
+        raise BagError(f"wm.spec_json: {error}; read the bag with the version that wrote it") from None
 
 
 def single(spec: EnvironmentSpec) -> EnvironmentSpec:

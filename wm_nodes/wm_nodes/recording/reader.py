@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wm_nodes.core.specs import POLICY_FIELDS, EnvironmentSpec, differences
+from wm_nodes.core.specs import POLICY_FIELDS, EnvironmentSpec, SpecMismatch, agree
 from wm_nodes.core.types import Episode, FloatArray, UInt8Array
 from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
@@ -91,13 +91,11 @@ def read_episodes(
 def check_spec(
     recorded: EnvironmentSpec, expected: EnvironmentSpec, *, where: str, names: Sequence[str] = EPISODE_FIELDS
 ) -> None:
-    """Raise BagError unless both agree on the named fields."""
-    wrong = [f"{name} {is_!r} instead of {should!r}" for name, is_, should in differences(recorded, expected, names)]
-    if wrong:
-        raise BagError(
-            f"{where} was recorded with {'; '.join(wrong)}; collect again with this configuration, or run with the "
-            "configuration that recorded the bag"
-        )
+    """Raise BagError unless both agree on the named fields, see core.specs.agree."""
+    try:
+        agree(recorded, expected, "expected here is", names)
+    except SpecMismatch as error:
+        raise BagError(f"{where} was recorded with another set-up: {error}") from None
 
 
 class _EpisodeJoiner:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.tool_control import moves_pose, next_state_tensor
+from wm_nodes.core.tool_control import commanded_columns, moves_pose, next_state_tensor
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import task_done_signal
 from wm_nodes.world_model.folder import WorldModels
@@ -78,6 +78,7 @@ class DeviceEnvironment:
         self._start_latents = encode_starts(models, images).clone()
         self._start_tasks = torch.from_numpy(task_indices(states, spec, models.task_index)).to(self.device)
         self._tool = spec.tool_dim
+        self._commanded = torch.tensor(commanded_columns(spec), dtype=torch.int64).to(self.device)
         self._scale = torch.tensor(spec.action_scale, dtype=torch.float32).to(self.device)
         box = torch.tensor((spec.state_low, spec.state_high), dtype=torch.float32)
         self._box = box.to(self.device) if spec.state_low else None
@@ -132,9 +133,7 @@ class DeviceEnvironment:
     def step(self, actions_NA: Tensor) -> DeviceStep:
         """Take one step with actions in [-1, 1] wherever the episode has not ended."""
         valid = ~self._ended_N
-        moved = next_state_tensor(
-            self.states_NP, actions_NA, self._scale, self._box, pose=moves_pose(self.spec)
-        )
+        moved = self._move(actions_NA)
         with self._autocast(exact=self._exact):
             latents, logits = self._action.advance(
                 self._latents, actions_NA, self.states_NP[:, : self._tool], moved[:, : self._tool], self._caches
@@ -158,6 +157,23 @@ class DeviceEnvironment:
 
     def close(self) -> None:
         return None
+
+    def _move(self, actions_NA: Tensor) -> Tensor:
+        """States (N, P) that a step reaches: what is commanded, and what the model says of the rest."""
+        change, states, kept = self._action.state_change, self.states_NP, self._commanded
+        if len(kept) and change is None:
+            return next_state_tensor(states, actions_NA, self._scale, self._box, pose=moves_pose(self.spec))
+        moved = states.clone()
+        if change is None:
+            return moved
+        if len(kept):
+            box = None if self._box is None else self._box[:, kept]
+            now = next_state_tensor(states[:, kept], actions_NA, self._scale, box, pose=moves_pose(self.spec))
+            moved = moved.index_copy(1, kept, now)
+        tool = self._tool
+        with self._autocast(exact=self._exact):
+            predicted = change.next_states(self._latents, actions_NA, states[:, :tool], moved[:, :tool])
+        return torch.cat([predicted, moved[:, tool:]], 1)
 
     def _autocast(self, *, exact: bool = False) -> torch.autocast:
         """As compute_context; the device was asked once. A captured graph cannot keep a cache of casts."""

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from wm_nodes.config.schema import WorldModelConfig
 from wm_nodes.world_model.conditions import ActionCondition
+from wm_nodes.world_model.state_change import StateChange
 from wm_nodes.world_model.tokenizer import PROBE_NAMES, normalise_tokens
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer, TemporalCache
 
@@ -92,7 +93,9 @@ class ConditionMap(nn.Module):
 class FrameModel(nn.Module):
     """Trunk and heads shared by the action model and the text model; they differ in their condition tokens."""
 
-    def __init__(self, config: WorldModelConfig, num_tokens: int, latent_dim: int, num_tasks: int) -> None:
+    def __init__(
+        self, config: WorldModelConfig, num_tokens: int, latent_dim: int, num_tasks: int, num_positions: int
+    ) -> None:
         super().__init__()
         self.condition_map: ConditionMap | None = None
         width = config.width
@@ -104,7 +107,7 @@ class FrameModel(nn.Module):
         self.change = nn.Linear(width, latent_dim)
         nn.init.zeros_(self.change.weight)
         nn.init.zeros_(self.change.bias)
-        self.done = DoneHeads(width, config.num_done_heads, num_tasks, len(PROBE_NAMES))
+        self.done = DoneHeads(width, config.num_done_heads, num_tasks, num_positions)
 
     def predict(
         self, latents_BTSD: Tensor, condition_BTND: Tensor, caches: Caches | None = None,
@@ -125,16 +128,17 @@ class FrameModel(nn.Module):
 
 
 class ActionModel(FrameModel):
-    """WM_act: the environment of the policy."""
+    """WM_act: the environment of the policy. state_change: None where the whole state is commanded."""
 
     def __init__(
         self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, action_dim: int, state_dim: int,
-        num_tasks: int,
+        num_tasks: int, num_positions: int = len(PROBE_NAMES), measured: tuple[int, ...] = (),
     ) -> None:
-        super().__init__(config, num_tokens, latent_dim, num_tasks)
+        super().__init__(config, num_tokens, latent_dim, num_tasks, num_positions)
         self.condition = ActionCondition(action_dim, state_dim, config.width)
         if config.condition_map:
             self.condition_map = ConditionMap(config.width, config.condition_map, num_tokens)
+        self.state_change = StateChange(action_dim, state_dim, latent_dim, measured) if measured else None
 
     def forward(
         self, latents_BTSD: Tensor, actions_BTA: Tensor, states_BTP: Tensor, next_states_BTP: Tensor,

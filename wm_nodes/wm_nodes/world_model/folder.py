@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import nn
 
-from wm_nodes.config.schema import RunConfig, SimulationConfig, TokenizerConfig, WorldModelConfig
+from wm_nodes.config.schema import RunConfig, TokenizerConfig, WorldModelConfig
 from wm_nodes.core.model_folder import (
     ModelFolderError,
     files_sha256,
@@ -19,13 +19,14 @@ from wm_nodes.core.model_folder import (
     read_model_file,
     write_model_folder,
 )
+from wm_nodes.core.specs import EnvironmentSpec, spec_of_values, spec_values, tool_spec
 from wm_nodes.training.weights import WeightsError, check_same_layout
 from wm_nodes.world_model.dynamics import ActionModel
 from wm_nodes.world_model.position_probe import PositionProbe
 from wm_nodes.world_model.sentence_encoder import SentenceCondition
 from wm_nodes.world_model.text import TextModel
 from wm_nodes.world_model.token_dynamics import TokenActionModel
-from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
 
 FILES = {
     "tokenizer": "tokenizer.safetensors",
@@ -34,19 +35,21 @@ FILES = {
     "text": "text_model.safetensors",
     "probe": "position_probe.safetensors",
 }
-FORMAT = 1
+FORMAT = 2
 
 
 @dataclass(frozen=True)
 class WorldModels:
     """tokenizer: with the decoder of rollouts, where the folder has one. tasks: the done head's outputs, in order. text
-    is None where no text model was trained. probe: the judge's, None where the model was saved without it."""
+    is None where no text model was trained. spec: of one of the environments that the model was trained on, see
+    core.specs.tool_spec; those of its other tasks differ in task, instruction and ground truth alone. probe: the
+    judge's, None where the model was saved without it."""
 
     tokenizer: Tokenizer
     action: ActionModel | TokenActionModel
     text: TextModel | None
     tasks: tuple[str, ...]
-    simulation: SimulationConfig
+    spec: EnvironmentSpec
     manifest: Mapping[str, Any]
     probe: PositionProbe | None = None
 
@@ -66,12 +69,13 @@ class WorldModels:
 
 def save_model_folder(
     folder: Path, tokenizer: Tokenizer, action: ActionModel | TokenActionModel, text: TextModel | None,
-    config: RunConfig, *, tasks: tuple[str, ...], story: Mapping[str, Any], probe: PositionProbe | None = None,
-    decoder: nn.Module | None = None,
+    config: RunConfig, *, spec: EnvironmentSpec, tasks: tuple[str, ...], story: Mapping[str, Any],
+    probe: PositionProbe | None = None, decoder: nn.Module | None = None,
 ) -> Path:
     """Write the models, made with `config`, as float16, and the manifest.
 
     Args:
+        spec: of the environment whose episodes the models were trained on.
         story: further entries of the manifest: data, seeds, commands, metrics, machine, date.
         decoder: of rollouts, see train_decoder; None: the tokenizer's.
     """
@@ -85,13 +89,9 @@ def save_model_folder(
         "format": FORMAT,
         "tasks": list(tasks),
         "vocabulary": list(text.condition.vocabulary) if text else [],
-        "action_dim": action.condition.scalars.weight.shape[0] - 2 * len(action.condition.state_mean),
-        "state_dim": len(action.condition.state_mean),
-        "height": tokenizer.height,
-        "width": tokenizer.width,
+        "spec": spec_values(tool_spec(spec)),
         "tokenizer": config.tokenizer.model_dump(),
         "world_model": config.world_model.model_dump(),
-        "simulation": config.simulation.model_dump(),
         "sha256": _hashes(packed),
         **story,
     }
@@ -127,11 +127,13 @@ def load_model_folder(
     manifest = read_world_manifest(folder)
     tokenizer_config = TokenizerConfig.model_validate(manifest["tokenizer"])
     config = WorldModelConfig.model_validate(manifest["world_model"])
-    num_tasks = len(manifest["tasks"])
-    tokenizer = Tokenizer(tokenizer_config, manifest["height"], manifest["width"])
-    sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim}
+    num_tasks, spec = len(manifest["tasks"]), model_spec(folder, manifest)
+    num_positions = num_positions_of(spec)
+    tokenizer = Tokenizer(tokenizer_config, spec.height, spec.width, num_positions)
+    sizes = {"num_tokens": tokenizer.num_tokens, "latent_dim": tokenizer.latent_dim, "num_positions": num_positions}
     action = action_model_class(tokenizer_config.kind)(
-        config, action_dim=manifest["action_dim"], state_dim=manifest["state_dim"], num_tasks=num_tasks, **sizes
+        config, action_dim=spec.action_dim, state_dim=spec.state_dim, num_tasks=num_tasks, measured=spec.measured,
+        **sizes
     )
     _load(folder, "tokenizer", tokenizer, manifest)
     if rollout_decoder and "decoder" in manifest["sha256"]:
@@ -143,13 +145,26 @@ def load_model_folder(
         _check_encoder(folder, text, manifest)
         _load(folder, "text", text, manifest)
     if "probe" in manifest["sha256"]:
-        probe = PositionProbe(manifest["height"], manifest["width"])
+        probe = PositionProbe(spec.height, spec.width)
         _load(folder, "probe", probe, manifest)
-    simulation = SimulationConfig.model_validate(manifest["simulation"])
     for module in (tokenizer, action, text, probe):
         if module is not None:
             module.to(device)
-    return WorldModels(tokenizer, action, text, tuple(manifest["tasks"]), simulation, manifest, probe)
+    return WorldModels(tokenizer, action, text, tuple(manifest["tasks"]), spec, manifest, probe)
+
+
+def model_spec(folder: Path, manifest: Mapping[str, Any]) -> EnvironmentSpec:
+    """The spec in a world model's manifest. Raises ModelFolderError: it has none, or another version's."""
+    try:
+        return spec_of_values(manifest["spec"])
+    except (KeyError, ValueError) as error:
+        raise ModelFolderError(f"{folder} has no usable spec in its manifest ({error}); train it anew with this "
+                               "version") from None
+
+
+def num_positions_of(spec: EnvironmentSpec) -> int:
+    """How many positions the models of an environment read off frames: none where it has no ground truth."""
+    return len(PROBE_NAMES) if spec.ground_truth_names else 0
 
 
 def action_model_class(kind: str) -> type[ActionModel] | type[TokenActionModel]:

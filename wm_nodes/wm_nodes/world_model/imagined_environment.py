@@ -12,6 +12,7 @@ from torch import Tensor
 from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.tool_control import next_commanded
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import ActionModel, task_done_signal
 from wm_nodes.world_model.folder import WorldModels
@@ -88,6 +89,12 @@ class ModelRollouts:
         self.latents = torch.where(begins[:, None, None], first, self.latents)
         for rows, caches in self._parts:
             caches[0].restart(begins[rows])
+
+    def next_states(self, acted: Tensor, before: Tensor, commanded: Tensor) -> Tensor:
+        """The states (N, P) that a step reaches, the measured values as the model predicts them."""
+        assert self._model.state_change is not None
+        with compute_context(self.latents.device, exact=self._exact):
+            return self._model.state_change.next_states(self.latents, acted, before, commanded)
 
     def step(
         self, acted: Tensor, before: Tensor, after: Tensor, valid: Tensor, show: Callable[[Tensor, slice], Tensor]
@@ -168,6 +175,13 @@ class ImaginedEnvironment(ImaginedEpisodes):
         begins, first = self._tensor(mask), self._start_latents[self._tensor(self._starts)]
         for rollouts in self._rollouts:
             rollouts.begin(begins, first)
+
+    def _move(self, actions: FloatArray) -> FloatArray:
+        moved, tool = next_commanded(self._states, actions, self.spec), self.spec.tool_dim
+        if self.spec.measured:
+            inputs = map(self._tensor, (actions, self._states[:, :tool], moved[:, :tool]))
+            moved[:, :tool] = self._rollouts[0].next_states(*inputs).cpu().numpy()
+        return moved
 
     def _predict(
         self, actions: FloatArray, moved: FloatArray, valid: BoolArray

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wm_nodes.config.schema import RewardConfig
-from wm_nodes.config.tasks import get_task, parts_of, shares_scene
+from wm_nodes.config.tasks import parts_of, shares_scene
 from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import explain_memory
 from wm_nodes.core.seeding import numpy_stream, stream_seed
@@ -45,7 +45,7 @@ def load_starts(path: Path, task: str = "") -> tuple[UInt8Array, FloatArray]:
         raise ValueError(f"{path} is no starts file: it must hold images and states of at least one first frame")
     rows = _rows(path, tensors, task)
     images, states = (tensors[name].numpy()[rows] for name in ("images", "states"))
-    if not task or not (parts := get_task(task).parts) or INSTRUCTIONS not in tensors:
+    if not task or (parts := parts_of(task)) == (task,) or INSTRUCTIONS not in tensors:
         return images, states
     told = _told(path, tensors)
     own = [told[row][0] for row in rows]
@@ -195,7 +195,7 @@ class ImaginedEpisodes(ABC):
     def step(self, actions: FloatArray) -> StepResult:
         check_actions(actions, self.spec)
         valid = ~self._ended
-        moved = next_state(self._states, actions, self.spec)
+        moved = self._move(actions)
         with explain_memory(self.device, ppo__num_envs=self.spec.num_envs):
             frames, signal, spread = self._predict(actions, moved, valid)
         self._states = np.where(valid[:, None], moved, self._states)
@@ -224,6 +224,14 @@ class ImaginedEpisodes(ABC):
 
     def close(self) -> None:
         return None
+
+    def _move(self, actions: FloatArray) -> FloatArray:
+        """States (N, S) that the actions command. Raises ValueError: some are measured, and this model says nothing of
+        them."""
+        if self.spec.measured:
+            names = ", ".join(self.spec.state_names[i] for i in self.spec.measured)
+            raise ValueError(f"{self.spec.env_id} does not predict the measured state ({names}); use a world model")
+        return next_state(self._states, actions, self.spec)
 
     @abstractmethod
     def _begin(self, mask: BoolArray) -> None:

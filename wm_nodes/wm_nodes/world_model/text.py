@@ -16,7 +16,7 @@ from wm_nodes.world_model.conditions import text_rows, word_mask
 from wm_nodes.world_model.dynamics import FrameModel, Prediction, task_done_signal
 from wm_nodes.world_model.precision import compute_context
 from wm_nodes.world_model.sentence_encoder import SentenceCondition, SentenceEncoder
-from wm_nodes.world_model.tokenizer import Tokenizer
+from wm_nodes.world_model.tokenizer import PROBE_NAMES, Tokenizer
 from wm_nodes.world_model.transformer import RingCache, TemporalCache
 
 MAX_WORDS = 12
@@ -62,9 +62,10 @@ class TextModel(FrameModel):
     """The same architecture as WM_act; its condition is a row's instruction, equal for all its frames."""
 
     def __init__(
-        self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, vocabulary: tuple[str, ...], num_tasks: int
+        self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, vocabulary: tuple[str, ...],
+        num_tasks: int, num_positions: int = len(PROBE_NAMES),
     ) -> None:
-        super().__init__(config, num_tokens, latent_dim, num_tasks)
+        super().__init__(config, num_tokens, latent_dim, num_tasks, num_positions)
         self.condition: InstructionCondition | SentenceCondition = (
             SentenceCondition(SentenceEncoder(Path(config.text_encoder)), config.width) if config.text_encoder
             else InstructionCondition(vocabulary, config.width)

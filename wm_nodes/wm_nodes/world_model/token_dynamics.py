@@ -17,6 +17,7 @@ from wm_nodes.config.schema import WorldModelConfig
 from wm_nodes.world_model.conditions import ActionCondition
 from wm_nodes.world_model.decoding import Logits, code_parts, code_targets, decode_frame
 from wm_nodes.world_model.dynamics import Caches, DoneHeads
+from wm_nodes.world_model.state_change import StateChange
 from wm_nodes.world_model.transformer import RingCache, SpatioTemporalTransformer
 
 
@@ -29,11 +30,12 @@ class TokenPrediction:
 
 
 class TokenActionModel(nn.Module):
-    """WM_act over discrete tokens; stands in for ActionModel in the imagined environment."""
+    """WM_act over discrete tokens; stands in for ActionModel in the imagined environment. It reads no positions,
+    whatever num_positions is."""
 
     def __init__(
         self, config: WorldModelConfig, *, num_tokens: int, latent_dim: int, action_dim: int, state_dim: int,
-        num_tasks: int,
+        num_tasks: int, num_positions: int = 0, measured: tuple[int, ...] = (),
     ) -> None:
         super().__init__()
         width = config.width
@@ -48,6 +50,7 @@ class TokenActionModel(nn.Module):
         self.copy_bias = nn.Parameter(torch.full((len(self.heads),), 2.0))
         self.done = DoneHeads(width, config.num_done_heads, num_tasks)
         self.condition = ActionCondition(action_dim, state_dim, width)
+        self.state_change = StateChange(action_dim, state_dim, latent_dim, measured) if measured else None
 
     def forward(
         self, bits_BTSD: Tensor, next_bits_BTSD: Tensor, decided_BTS: Tensor, condition_BTND: Tensor,

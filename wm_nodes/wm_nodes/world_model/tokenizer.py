@@ -40,7 +40,8 @@ class ResidualConv(nn.Module):
 
 
 class Tokenizer(nn.Module):
-    """Convolutional encoder and decoder around `latent_dim` values per token.
+    """Convolutional encoder and decoder around `latent_dim` values per token, and a probe that reads num_positions
+    values off them; none where they are 0.
 
     kind "continuous": each token is normalised to zero mean and unit variance, which bounds it and gives every token
     the same signal-to-noise ratio; training adds noise, so that nearby latents decode to nearby images.
@@ -50,7 +51,9 @@ class Tokenizer(nn.Module):
         ValueError: the image is not a multiple of patch_px, or patch_px is not a multiple of 4 and a power of two.
     """
 
-    def __init__(self, config: TokenizerConfig, height: int, width: int) -> None:
+    def __init__(
+        self, config: TokenizerConfig, height: int, width: int, num_positions: int = len(PROBE_NAMES)
+    ) -> None:
         super().__init__()
         patch = config.patch_px
         if height % patch or width % patch:
@@ -74,16 +77,19 @@ class Tokenizer(nn.Module):
         for previous, current in pairwise(channels[::-1]):
             up += [nn.Conv2d(previous, 4 * current, 1), nn.PixelShuffle(2), nn.SiLU(), ResidualConv(current)]
         self.decoder = nn.Sequential(*up, nn.Conv2d(channels[0], 48, 3, padding=1), nn.PixelShuffle(4))
-        probe: list[nn.Module] = [nn.Linear(self.num_tokens * config.latent_dim, 256), nn.SiLU()]
-        for _ in range(config.probe_depth - 1):
-            probe += [nn.Linear(256, 256), nn.SiLU()]
-        self.probe = nn.Sequential(*probe, nn.Linear(256, len(PROBE_NAMES)))
+        self.num_positions = num_positions
+        self.probe: nn.Sequential | None = None
+        if num_positions:
+            probe: list[nn.Module] = [nn.Linear(self.num_tokens * config.latent_dim, 256), nn.SiLU()]
+            for _ in range(config.probe_depth - 1):
+                probe += [nn.Linear(256, 256), nn.SiLU()]
+            self.probe = nn.Sequential(*probe, nn.Linear(256, num_positions))
         self.background: Tensor
         self.probe_mean: Tensor
         self.probe_std: Tensor
         self.register_buffer("background", torch.full((3, height, width), 0.5))
-        self.register_buffer("probe_mean", torch.zeros(len(PROBE_NAMES)))
-        self.register_buffer("probe_std", torch.ones(len(PROBE_NAMES)))
+        self.register_buffer("probe_mean", torch.zeros(num_positions))
+        self.register_buffer("probe_std", torch.ones(num_positions))
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @property
@@ -119,7 +125,8 @@ class Tokenizer(nn.Module):
         return self.read_state_normalised(latents_BSD) * self.probe_std + self.probe_mean
 
     def read_state_normalised(self, latents_BSD: Tensor) -> Tensor:
-        values: Tensor = self.probe(latents_BSD.flatten(1))
+        flat = latents_BSD.flatten(1)
+        values: Tensor = flat[:, :0] if self.probe is None else self.probe(flat)
         return values.float()
 
     def flatten(self, latents_BSD: Tensor, *, positions: bool) -> Tensor:

@@ -13,7 +13,6 @@ from safetensors.numpy import load_file
 from wm_nodes.apps import cli
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.seeding import numpy_stream
-from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.types import Episode
 from wm_nodes.judge.backends.one_class import OneClassJudge
 from wm_nodes.judge.one_class import ranges as ranges_module
@@ -35,10 +34,10 @@ def models() -> WorldModels:
 @functools.cache
 def episodes() -> list[Episode]:
     """As if recorded: what the world model imagines from the shipped first pictures after random actions."""
-    starts, spec = load_file(FOLDER / "starts.safetensors"), simulation_spec("push_cube", models().simulation, 1)
+    starts, spec = load_file(FOLDER / "starts.safetensors"), models().spec
     rng = np.random.default_rng(0)
     actions = np.repeat(rng.uniform(-1, 1, (EPISODES, 1, spec.action_dim)), STEPS, 1).astype(np.float32)
-    moved = np.cumsum(actions[..., :3] * models().simulation.max_action_m, 1)
+    moved = np.cumsum(actions[..., :3] * models().spec.action_scale[0], 1)
     first = starts["states"][:EPISODES]
     states = np.repeat(first[:, None], STEPS + 1, 1).astype(np.float32)
     states[:, 1:, :3] += moved
@@ -64,7 +63,7 @@ def test_the_command_makes_a_judge_of_a_world_model(
 ) -> None:
     folder = tmp_path / "model"
     shutil.copytree(FOLDER, folder, ignore=shutil.ignore_patterns("normal_ranges_*", "video_model*"))
-    spec = simulation_spec("push_cube", models().simulation, 1)
+    spec = models().spec
     with EpisodeBagWriter(tmp_path / "bag", spec, run_id="recordings", start_ns=1) as bag:
         for episode in episodes():
             bag.write(episode)
@@ -85,7 +84,7 @@ def test_equal_seeds_give_equal_ranges(few: None) -> None:
 
 
 def test_cameras_that_move_are_named_and_the_others_stand_still(few: None) -> None:
-    assert models().simulation.cameras == ["side", "wrist"]
+    assert models().spec.cameras == ("side", "wrist")
     assert calibrate(models(), episodes(), stride=1, seed=0).still == (True, False)
     assert calibrate(models(), episodes(), stride=1, seed=0, moving=()).still == (True, True)
 

@@ -13,12 +13,12 @@ from wm_nodes.config.seed_ranges import UNSEEDED
 from wm_nodes.config.tasks import get_task, part_of
 from wm_nodes.core.cameras import CameraModel, Matrix
 from wm_nodes.core.seeding import stream_seed
-from wm_nodes.core.specs import simulation_spec
 from wm_nodes.core.tool_control import check_actions, next_state
 from wm_nodes.core.types import BoolArray, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.environments.maniskill.cameras import table_top_cameras
 from wm_nodes.environments.maniskill.control import CONTROLS
 from wm_nodes.environments.maniskill.scenes import make_scene, render, renew_physics
+from wm_nodes.environments.maniskill.spec import simulation_spec
 
 
 class ManiSkillEnvironment:

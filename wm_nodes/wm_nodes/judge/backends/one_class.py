@@ -177,7 +177,7 @@ class OneClassJudge:
             reason = f"the reference frame is {height} x {width} px, the clip is not"
         if reason:
             return ranges, Finding(reason, {}, {}, (Status.OK, ""))
-        side, origin = self._models.simulation.image_size, np.asarray(ranges.origin, np.float32)
+        side, origin = self._models.spec.height, np.asarray(ranges.origin, np.float32)
         numbers = picture_numbers(clip.frames, task.reference_frame, side, ranges.still)
         drawn, done = model_numbers(self._models, clip.frames, ranges.stride, origin, ranges.height_m)
         strange = ranges.strangeness(numbers | drawn)
@@ -197,7 +197,7 @@ class OneClassJudge:
             first, second = pair.split()
             if first in HUES:
                 colours.setdefault(second, set()).add(first)
-        side = self._models.simulation.image_size
+        side = self._models.spec.height
         views = [task.reference_frame[:, i * side : (i + 1) * side] for i, stays in enumerate(ranges.still) if stays]
         seen = {colour for view in views for colour in things_in(view)}
         words = words_of(task.instruction)
@@ -280,7 +280,7 @@ def ranges_of(folder: Path, manifest: Mapping[str, Any]) -> dict[int, NormalRang
 
 def nearest_ranges(known: Mapping[int, NormalRanges], manifest: Mapping[str, Any], fps: float) -> NormalRanges:
     """The ranges of clips with so many frames per second; the nearest where there are none."""
-    wanted = manifest["simulation"]["control_hz"] / fps
+    wanted = 1 / (manifest["spec"]["control_period_s"] * fps)
     return known[min(known, key=lambda stride: abs(math.log(stride / wanted)))]
 
 
@@ -288,12 +288,12 @@ def unfit_reason(
     known: Mapping[int, NormalRanges], manifest: Mapping[str, Any], shape: tuple[int, ...], fps: float | None = None
 ) -> str:
     """Why no clip of this shape (frames, height, width, 3) can be judged, or "". fps: None: of the first ranges."""
-    control_hz = manifest["simulation"]["control_hz"]
+    control_hz = 1 / manifest["spec"]["control_period_s"]
     ranges = nearest_ranges(known, manifest, fps or control_hz / min(known))
     if fps and abs(math.log(ranges.stride * fps / control_hz)) > math.log(FAR_RATE):
         rates = ", ".join(f"{control_hz / stride:g}" for stride in known)
         return f"{fps:g} frames per second, judged are {rates}; for others: wm judge calibrate ... --stride"
-    height, width = manifest["height"], manifest["width"]
+    height, width = manifest["spec"]["height"], manifest["spec"]["width"]
     if tuple(shape[1:3]) != (height, width):
         return f"{shape[1]} x {shape[2]} px, judged are {height} x {width} px"
     if not ranges.lengths[0] <= shape[0] <= ranges.lengths[1]:

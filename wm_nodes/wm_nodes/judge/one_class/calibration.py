@@ -52,7 +52,7 @@ def calibrate(
     """
     recorded = [episode for episode in episodes if episode.num_steps >= stride * (SHORTEST - 1)]
     _check_sizes(models, recorded)
-    still = tuple(name not in moving for name in models.simulation.cameras)
+    still = tuple(name not in moving for name in models.spec.cameras)
     origin, height_m = _places(models, recorded)
     rows, longest, words = _Rows(), 0, set[str]()
     for index, episode in enumerate(tqdm(recorded, desc="measured", unit="episode")):
@@ -62,7 +62,7 @@ def calibrate(
         longest = max(longest, steps // stride + 1)
         for shown in _forms(models, episode, steps, stride, rng):
             reference = episode.images[0]
-            seen = pictures.picture_numbers(shown, reference, models.simulation.image_size, still)
+            seen = pictures.picture_numbers(shown, reference, models.spec.height, still)
             drawn, signals = imagination.model_numbers(models, shown, stride, origin, height_m)
             rows.numbers.append(seen | drawn)
             rows.recording.append(index)

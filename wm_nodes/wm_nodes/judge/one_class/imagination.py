@@ -105,9 +105,9 @@ def _next_frames(
     model: ActionModel, models: WorldModels, latents_TSD: Tensor, tool_T3: Tensor, stride: int, origin: FloatArray
 ) -> tuple[Tensor, Tensor]:
     """The next frame imagined from each true one, (T - 1, S, D), and done logits there (T - 1, heads, J)."""
-    action_dim, state_dim = models.manifest["action_dim"], models.manifest["state_dim"]
+    action_dim, state_dim = models.spec.action_dim, models.spec.state_dim
     step = tool_T3.diff(dim=0) / stride
-    actions = F.pad((step / models.simulation.max_action_m).clamp(-1, 1), (0, action_dim - 3))
+    actions = F.pad((step / models.spec.action_scale[0]).clamp(-1, 1), (0, action_dim - 3))
     between = torch.stack([tool_T3[:-1] + i * step for i in range(stride + 1)]) + torch.from_numpy(origin).to(tool_T3)
     states = F.pad(between, (0, state_dim - 3))
     if state_dim > 3:

@@ -22,6 +22,7 @@ from wm_nodes.training.background import BackgroundBatches
 from wm_nodes.training.loop import TrainingLoop
 from wm_nodes.world_model.dynamics import ActionModel, FrameModel, Prediction
 from wm_nodes.world_model.precision import compute_context, has_fast_bfloat16
+from wm_nodes.world_model.state_change import StateChange
 from wm_nodes.world_model.token_dynamics import TokenActionModel
 from wm_nodes.world_model.tokenizer import Tokenizer
 from wm_nodes.world_model.training.device_rollout import roll_out_on_device
@@ -103,19 +104,19 @@ def tokenise_episodes(tokenizer: Tokenizer, episodes: EpisodeArrays) -> LatentEp
 
 def train_action_model(
     tokenizer: Tokenizer, episodes: EpisodeArrays | LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None,
-    *, model: ActionModel | None = None, done_loss: str = "bce",
+    *, model: ActionModel | None = None, done_loss: str = "bce", measured: tuple[int, ...] = (),
 ) -> tuple[ActionModel, dict[str, float]]:
     """Train WM_act on episodes of any behaviour; returns the model (averaged weights) and its last metrics.
 
     Loss (RS-4): world_model.latent_weight * latents + world_model.done_weight * done + world_model.state_weight *
     positions (those the model says, and those the tokenizer's frozen probe reads off the predicted latents) +
     world_model.decoded_weight * decoded_losses, without recoded_state where state_weight is 0. `model` continues from
-    given weights (online rounds).
+    given weights (online rounds). measured: as new_model's; their loss is state_change_loss, with weight 1.
     """
     data = episodes if isinstance(episodes, LatentEpisodes) else tokenise_episodes(tokenizer, episodes)
     settings = config.world_model
     if model is None:
-        model = new_model(ActionModel, "action_model_init", tokenizer, data, settings, seed)
+        model = new_model(ActionModel, "action_model_init", tokenizer, data, settings, seed, measured)
     tokenizer.requires_grad_(False)
     trained = model
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
@@ -157,6 +158,9 @@ def train_action_model(
                 if settings.state_weight:
                     decoded = decoded + losses["recoded_state"]
                 losses["loss"] = losses["loss"] + settings.decoded_weight * decoded
+            if trained.state_change is not None:
+                losses["state_change"] = state_change_loss(trained.state_change, part)
+                losses["loss"] = losses["loss"] + losses["state_change"]
             return losses | {"rollout_steps": torch.tensor(float(steps))}
 
     loop = TrainingLoop("action_model", trained, settings.num_iterations, settings.learning_rate, run_dir)
@@ -164,18 +168,33 @@ def train_action_model(
 
 
 def new_model(
-    kind: type[M], stream: str, tokenizer: Tokenizer, data: LatentEpisodes, settings: WorldModelConfig, seed: int
+    kind: type[M], stream: str, tokenizer: Tokenizer, data: LatentEpisodes, settings: WorldModelConfig, seed: int,
+    measured: tuple[int, ...] = (),
 ) -> M:
-    """Return a model with first weights from `stream`, whose condition lets the data's states span [-1, 1]."""
+    """Return a model with first weights from `stream`, whose condition lets the data's states span [-1, 1].
+
+    measured: EnvironmentSpec.measured, of which the model predicts how they change."""
     with initial_weights(seed, stream):
         model = kind(
             settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
             action_dim=data.actions.shape[-1], state_dim=data.states.shape[-1], num_tasks=data.success.shape[-1],
+            num_positions=data.truth.shape[-1], measured=measured,
         )
     states = data.states.flatten(0, 1)
     model.condition.state_mean.copy_((states.amax(0) + states.amin(0)) / 2)
     model.condition.state_scale.copy_(((states.amax(0) - states.amin(0)) / 2).clamp_min(1e-3))
+    if model.state_change is not None:
+        before, after = data.states[:, :-1][data.step_mask], data.states[:, 1:][data.step_mask]
+        model.state_change.fit_scale(before, after - before)
     return model.to(tokenizer.device)
+
+
+def state_change_loss(change: StateChange, part: LatentEpisodes) -> Tensor:
+    """Mean Huber loss of the predicted changes of the measured values, from recorded frames and states."""
+    states, steps = part.states, part.step_mask.float().unsqueeze(-1)
+    found = change(part.latents[:, :-1], part.actions, states[:, :-1])
+    errors = F.huber_loss(found, change.wanted(states[:, :-1], states[:, 1:]), reduction="none")
+    return (errors * steps).sum() / (steps.sum() * errors.shape[-1]).clamp_min(1)
 
 
 def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> int:
@@ -184,8 +203,8 @@ def rollout_steps_at(iteration: int, num_iterations: int, stages: list[int]) -> 
 
 
 def tool_moves(data: LatentEpisodes) -> Tensor:
-    """Bool (E, T), the recorded steps that change the commanded tool; all of an episode that has none."""
-    moves = ((data.states[:, 1:] - data.states[:, :-1]).abs().amax(-1) > MOVED) & data.step_mask
+    """Bool (E, T), the recorded steps that change the state; all of an episode that has none."""
+    moves = ((data.states[:, 1:] - data.states[:, :-1]).abs() > MOVED).any(-1) & data.step_mask
     return torch.where(moves.any(1, keepdim=True), moves, data.step_mask)
 
 

@@ -37,6 +37,7 @@ def train_state_probe(
         read = tokenizer.read_state_normalised(shown + noise_std * noise.to(shown.device))
         return {"loss": probe_loss(tokenizer, read, truth_FP[index])}
 
+    assert tokenizer.probe is not None
     tokenizer.probe.requires_grad_(True)
     loop = TrainingLoop("state_probe", tokenizer.probe, config.probe_iterations, LEARNING_RATE, run_dir)
     metrics = loop.run(loss)

@@ -50,6 +50,7 @@ def train_text_model(
         model = TextModel(
             settings, num_tokens=tokenizer.num_tokens, latent_dim=tokenizer.latent_dim,
             vocabulary=vocabulary_of((*instructions, *episodes.instructions)), num_tasks=len(instructions),
+            num_positions=tokenizer.num_positions,
         )
     model.condition(row_instructions(episodes, rows, instructions))  # raises before a long training, not in it
     shared = {name: t for name, t in action_model.state_dict().items() if not name.startswith("condition.")}

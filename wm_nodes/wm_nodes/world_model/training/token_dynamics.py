@@ -21,6 +21,7 @@ from wm_nodes.world_model.training.dynamics import (
     done_losses,
     done_mask,
     new_model,
+    state_change_loss,
 )
 
 MAX_CORRUPTION = 0.2
@@ -29,11 +30,12 @@ the model meets errors of its own kind."""
 
 
 def train_token_model(
-    tokenizer: Tokenizer, data: LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None
+    tokenizer: Tokenizer, data: LatentEpisodes, config: RunConfig, seed: int, run_dir: Path | None,
+    *, measured: tuple[int, ...] = (),
 ) -> tuple[TokenActionModel, dict[str, float]]:
-    """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics."""
+    """Train WM_act over tokens (RS-2a, RS-3, RS-4); returns it with its last metrics. measured: as new_model's."""
     settings = config.world_model
-    model = new_model(TokenActionModel, "token_model_init", tokenizer, data, settings, seed)
+    model = new_model(TokenActionModel, "token_model_init", tokenizer, data, settings, seed, measured)
     heads = bootstrap_masks(len(data), settings.num_done_heads, seed).to(tokenizer.device)
 
     def loss(iteration: int) -> dict[str, Tensor]:
@@ -72,7 +74,11 @@ def token_losses(
         "done": done_losses(prediction.done_logits_BTKJ, labels, done_mask(data, index, steps, head_mask_BK)),
         "accuracy": (right * counted).sum() / count,
     }
-    return losses | {"loss": losses["tokens"] + done_weight * losses["done"]}
+    losses["loss"] = losses["tokens"] + done_weight * losses["done"]
+    if model.state_change is not None:
+        losses["state_change"] = state_change_loss(model.state_change, data.parts(index, index * 0, wanted.shape[1]))
+        losses["loss"] = losses["loss"] + losses["state_change"]
+    return losses
 
 
 def mask_tokens(shape: tuple[int, ...], generator: torch.Generator) -> Tensor:

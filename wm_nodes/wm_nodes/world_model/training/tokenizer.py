@@ -35,8 +35,8 @@ def train_tokenizer(
     """Train on every recorded frame; returns the tokenizer (averaged weights) and its last metrics.
 
     Loss: L1 + 2 L2 on pixels, foreground weighed 1 + tokenizer.foreground_weight; a probe that reads object and tool
-    positions off the latents (its gradient reaches the encoder, so small objects stay encoded); for lfq the entropy and
-    commitment terms.
+    positions off the latents (its gradient reaches the encoder, so small objects stay encoded), where the episodes have
+    ground truth; for lfq the entropy and commitment terms.
     """
     settings = config.tokenizer
     height, width = episodes.images.shape[2:4]
@@ -44,7 +44,7 @@ def train_tokenizer(
     images = episodes.images.reshape(-1, height, width, 3)
     truth = episode_targets(episodes).reshape(len(images), -1)
     with initial_weights(seed, "tokenizer_init"):
-        codec = Tokenizer(settings, height, width)
+        codec = Tokenizer(settings, height, width, truth.shape[-1])
     _set_statistics(codec, images[frames], truth[frames], seed)
     codec.to(compute_device(config.device))
 
@@ -108,7 +108,9 @@ def probe_targets(ground_truth: FloatArray, task: str) -> FloatArray:
 
 def episode_targets(episodes: EpisodeArrays) -> FloatArray:
     """probe_targets (E, T + 1, P) of episodes, each by the task that it was recorded for; by the first task where that
-    is none of `episodes.tasks`."""
+    is none of `episodes.tasks`. P is 0 where the environment has no ground truth."""
+    if not episodes.ground_truth.shape[-1]:
+        return episodes.ground_truth
     targets = probe_targets(episodes.ground_truth, episodes.tasks[0])
     for task in episodes.tasks[1:]:
         rows = [recorded == task for recorded in episodes.recorded_tasks]

@@ -144,17 +144,18 @@ def accept_world_model(
     """Measure whether a world model passes acceptance for config.task.
 
     Args:
-        heldout: real episodes with ground truth that the model was not trained on.
+        heldout: real episodes that the model was not trained on; without ground truth, positions are not judged.
         imagined, real: (successes, episodes) of the SFT policy in the model and in the simulator; None: not measured.
         clone: of the SFT policy; None: not measured.
 
     Raises:
-        ValueError: episodes without ground truth, or labelled for other tasks than the model's.
+        ValueError: some episodes without ground truth, or labelled for other tasks than the model's.
     """
+    config = config if config.task else config.model_copy(update={"task": models.spec.task})
     _check(models, heldout, config.task)
     metrics = model_metrics(models, heldout, config)
     criteria, notes = apply_criteria(metrics, config, heldout.num_steps, imagined, real, clone)
-    if config.reward.dense_weight > 0:
+    if config.reward.dense_weight > 0 and models.text is not None:
         for part in parts_of(config.task):
             goals = goal_metrics(models, heldout, config, part)
             criteria = (*criteria, *_goals(goals, config, part))
@@ -168,21 +169,10 @@ def apply_criteria(
 ) -> tuple[tuple[Criterion, ...], tuple[str, ...]]:
     """Return criteria and notes from the metrics of rollouts of up to num_steps steps; see accept_world_model."""
     limits, task = config.acceptance, config.task
-    notes = [
-        f"Errors are those of the full horizon over those of copying the first frame; the object's over the episodes "
-        f"in which it moved more than {100 * MOVED_M:g} cm; the probe alone errs by "
-        f"{_at(metrics, 'object_floor_cm', num_steps):.2f} cm (object) and "
-        f"{_at(metrics, 'tool_floor_cm', num_steps):.2f} cm (tool) on real frames."
-    ]
-    criteria = []
-    if not get_task(task).moves_object:
-        notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
-    for name, key, limit in (
-        ("object", "object_moved_ratio", limits.object_error_ratio), ("tool", "tool_ratio", limits.tool_error_ratio),
-    ):
-        if name == "tool" or get_task(task).moves_object:
-            ratio, *ends = (_at(metrics, f"{key}{end}", num_steps) for end in ("", "_low", "_high"))
-            criteria.append(_below(f"{name} error / copying, step {num_steps}", ratio, limit, _interval(*ends)))
+    if any(name.startswith("tool_") for name in metrics):
+        criteria, notes = _position_criteria(metrics, config, num_steps)
+    else:
+        criteria, notes = [], ["Positions were not judged: the environment has no ground truth to compare with."]
     for kind, threshold, remedy in (
         ("precision", limits.done_precision, MORE_NEAR_MISSES), ("recall", limits.done_recall, MORE_SUCCESSES),
     ):
@@ -192,6 +182,28 @@ def apply_criteria(
         criteria.append(Criterion(name, value, threshold, ">=", outcome, remedy, interval))
     policy, more = _policy_criteria(config, imagined, real, clone)
     return (*criteria, *policy), (*notes, *more)
+
+
+def _position_criteria(
+    metrics: Mapping[str, float | None], config: RunConfig, num_steps: int
+) -> tuple[list[Criterion], list[str]]:
+    """Criteria and notes of the errors of positions after num_steps steps."""
+    limits, task, criteria = config.acceptance, config.task, list[Criterion]()
+    notes = [
+        f"Errors are those of the full horizon over those of copying the first frame; the object's over the episodes "
+        f"in which it moved more than {100 * MOVED_M:g} cm; the probe alone errs by "
+        f"{_at(metrics, 'object_floor_cm', num_steps):.2f} cm (object) and "
+        f"{_at(metrics, 'tool_floor_cm', num_steps):.2f} cm (tool) on real frames."
+    ]
+    if not get_task(task).moves_object:
+        notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
+    for name, key, limit in (
+        ("object", "object_moved_ratio", limits.object_error_ratio), ("tool", "tool_ratio", limits.tool_error_ratio),
+    ):
+        if name == "tool" or get_task(task).moves_object:
+            ratio, *ends = (_at(metrics, f"{key}{end}", num_steps) for end in ("", "_low", "_high"))
+            criteria.append(_below(f"{name} error / copying, step {num_steps}", ratio, limit, _interval(*ends)))
+    return criteria, notes
 
 
 def accept_video_model(
@@ -331,9 +343,9 @@ def _check(models: WorldModels, heldout: EpisodeArrays, task: str) -> None:
             f"{', '.join(models.tasks)}; stack them with the tasks of the model's manifest"
         )
     unknown = int(np.isnan(heldout.ground_truth).reshape(len(heldout), -1).any(1).sum())
-    if heldout.ground_truth.shape[-1] == 0 or unknown:
+    if unknown:
         raise ValueError(
-            f"{unknown or len(heldout)} of {len(heldout)} held-out episodes carry no ground truth, so positions cannot "
+            f"{unknown} of {len(heldout)} held-out episodes carry no ground truth, so positions cannot "
             "be compared; measure on simulator episodes (environments/record.py), not on imagined or real-robot ones"
         )
 
