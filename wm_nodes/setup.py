@@ -7,7 +7,7 @@ NODES = (
     "video_model", "clip_evaluator", "video_learner",
 )
 
-KINDS = ("xml", "yaml", "json", "jsonl", "css", "js", "safetensors", "txt", "png")
+KINDS = ("xml", "yaml", "json", "jsonl", "css", "html", "js", "safetensors", "txt", "png")
 """Of data files."""
 
 setup(
@@ -22,7 +22,7 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/wm_nodes"]),
         ("share/wm_nodes", ["package.xml"]),
     ],
-    install_requires=["mcap", "numpy", "pydantic", "pyyaml", "rosbags", "safetensors", "setuptools", "torch"],
+    install_requires=["jinja2", "mcap", "numpy", "pydantic", "pyyaml", "rosbags", "safetensors", "setuptools", "torch"],
     zip_safe=False,
     entry_points={
         "console_scripts": [

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ from rich.table import Table
 
 from wm_nodes.reports.console_table import estimate, make_table
 from wm_nodes.reports.curves import Panel
-from wm_nodes.reports.html import Picture, figures, html_table, made_on, write_page
+from wm_nodes.reports.html import MARK, Picture, write_page
 
 TITLES = {
     "tracking": "tracking score", "object_cm": "object error, cm", "tool_cm": "tool error, cm", "psnr_db": "PSNR, dB",
@@ -135,18 +134,15 @@ def write_clip_report(
 ) -> Path:
     """Write <run_dir>/report.html and return its path. Raises FileNotFoundError: a picture does not exist."""
     title = f"{summary.task}: a video world model post-trained by GRPO"
-    body = [
-        f"<h1>{escape(title)}</h1>",
-        f'<p class="lead">{escape(clip_verdict(summary))}</p>',
-        f'<p class="faint">preset {escape(summary.preset)}, seed {summary.seed}, {summary.iterations} buffers, '
-        f"{summary.version} optimizer steps, {summary.minutes:.1f} minutes, {escape(summary.date)}</p>",
-        "<h2>Held-out contexts</h2>", _scores(summary),
-        "<h2>Reward hacking</h2>", *_hacking(summary),
-        *figures(pictures),
-        "<h2>Look closer, do it again</h2>", *_again(run_dir, summary),
-        *made_on(summary.machine, config_text),
-    ]
-    return write_page(run_dir, title, body)
+    classes = {"better": "good", "worse": "bad"}
+    scores = (
+        (name, *cells, MARK.format(classes.get(verdict, ""), verdict)) for name, verdict, cells in _rows(summary)
+    )
+    return write_page(
+        "clips.html", run_dir, summary, pictures, config_text, title=title, verdict=clip_verdict(summary),
+        scores=scores, hacking=hacking_text(summary),
+        alarms=[(alarm["step"], alarm["text"]) for alarm in summary.hacked or ()],
+    )
 
 
 def _rows(summary: ClipSummary) -> Iterable[tuple[str, str, tuple[str, str, str]]]:
@@ -157,42 +153,3 @@ def _rows(summary: ClipSummary) -> Iterable[tuple[str, str, tuple[str, str, str]
         yield ALL_TITLES[name] + n, change.verdict, (f"{change.before:.4f}", f"{change.after:.4f}", interval)
     for name, reason in summary.not_measured.items():
         yield ALL_TITLES[name], "", ("not measured", "not measured", reason)
-
-
-def _scores(summary: ClipSummary) -> str:
-    marks = {"better": "good", "worse": "bad"}
-    rows = (
-        (escape(title), *map(escape, cells), f'<span class="{marks.get(verdict, "")}">{verdict}</span>')
-        for title, verdict, cells in _rows(summary)
-    )
-    columns = ("score", "before", "after", "difference, 95 % interval", "")
-    return (
-        html_table(columns, rows, numbers=(1, 2, 3))
-        + f'<p class="faint">Means over {summary.contexts} contexts that nothing was trained on, one ODE clip each '
-        f"from the same noise; after: the {escape(summary.weights)} weights. Intervals: paired bootstrap over the "
-        "contexts. Positions are read off the pictures by a probe that shares nothing with the video model. Executed: "
-        "the clip's tool path, followed in the simulator from the same first state.</p>"
-    )
-
-
-def _hacking(summary: ClipSummary) -> Iterable[str]:
-    yield f'<p class="{"bad" if summary.hacked else ""}">{escape(hacking_text(summary))}</p>'
-    if not summary.hacked:
-        return
-    rows = ((str(alarm["step"]), escape(str(alarm["text"]))) for alarm in summary.hacked)
-    yield html_table(("buffers", "alarm"), rows, numbers=(0,))
-
-
-def _again(run_dir: Path, summary: ClipSummary) -> Iterable[str]:
-    bag = escape(summary.bag or "no bag was recorded")
-    yield (
-        f"<p>Run folder: <code>{escape(str(run_dir))}</code><br>Bag (clips, pictures, scores, versions): "
-        f"<code>{bag}</code></p><p>The command behind this page:</p><pre>{escape(summary.command)}</pre>"
-    )
-    if summary.bag:
-        script = "python3 launch_scripts/wm.py"
-        again = f"{script} rescore {run_dir}\n{script} retrain {run_dir}"
-        yield (
-            "<p>Score the recorded pictures again and compare bit for bit; train again from the kept buffers (all of "
-            f"them are needed: --keep-buffers):</p><pre>{escape(again)}</pre>"
-        )
