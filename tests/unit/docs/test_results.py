@@ -283,10 +283,17 @@ def executed_rows() -> Rows:
     yield f"judge {', '.join(f'{v:.2f}' for v in judge)}; probe {', '.join(f'{v:.2f}' for v in probe)}."
     change, (a, b) = mean(judge) - mean(probe), (variance(some) / len(some) for some in (judge, probe))
     freedom = (a + b) ** 2 / (a**2 / (len(judge) - 1) + b**2 / (len(probe) - 1))
-    assert int(freedom) == 15
-    half = 2.131 * (a + b) ** 0.5  # 97.5 % quantile of Student's t for 15 degrees of freedom
+    assert int(freedom) == 10
+    half = 2.228 * (a + b) ** 0.5  # 97.5 % quantile of Student's t for 10 degrees of freedom
     first = mean(judge) - mean(probe[: len(judge)])
     yield f"{interval(change, change - half, change + half, 3)} (Welch); on the first six alone {first:+.3f}"
+    shares = {
+        (when, name): mean(one[f"measured_{when}"][name] for one in rows if one["sampler"] == "CPS 0.4, judge robot")
+        for when in ("before", "after") for name in ("accepted", "accepted_executed")
+    }
+    real = [percent(shares[when, "accepted_executed"] / shares[when, "accepted"]) for when in ("before", "after")]
+    accepted = [percent(shares[when, "accepted"]) for when in ("before", "after")]
+    yield f"{accepted[0]} before, {accepted[1]} after; {' and '.join(real)} %"
 
 
 def closed_loop_rows() -> Rows:
@@ -422,7 +429,7 @@ def checked_rows() -> Rows:
 
 def erring_rows() -> Rows:
     for one in read("judge_erring.json")["ways"]:
-        if (one["rate"], one["shared"]) != (0.1, 0.0):
+        if (one["rate"], one["shared"]) != (0.1, 0.0) or one["way"] == "neither":
             continue
         found = one["difference"] or one
         numbers = (found[key] for key in ("accuracy", "faults_accepted", "successes_kept"))
