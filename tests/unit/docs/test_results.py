@@ -292,7 +292,8 @@ def executed_rows() -> Rows:
         for when in ("before", "after") for name in ("accepted", "accepted_executed")
     }
     real = [percent(shares[when, "accepted_executed"] / shares[when, "accepted"]) for when in ("before", "after")]
-    yield f"{percent(shares['before', 'accepted'])} before, {percent(shares['after', 'accepted'])} after; {' and '.join(real)} %"
+    accepted = [percent(shares[when, "accepted"]) for when in ("before", "after")]
+    yield f"{accepted[0]} before, {accepted[1]} after; {' and '.join(real)} %"
 
 
 def closed_loop_rows() -> Rows:
