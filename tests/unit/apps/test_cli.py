@@ -85,7 +85,7 @@ def test_every_experiment_explains_itself(suite: str, capsys: pytest.CaptureFixt
         (["rescore", "nothing-here"], "nothing-here holds no config.yaml; name the run folder"),
         (["train-policy", "--set", "ppo.updates=many"], "ppo.updates"),
         (["train-policy", "--preset", "nosuch"], "nosuch"),
-        (["train-policy", "--preset", "gpu", "--device", "cpu"], "image_size = 64, the configuration says 128"),
+        (["train-policy", "--preset", "gpu", "--device", "cpu"], "table_top_cube was trained with 64; width 256"),
         (["train-policy", "--environment", "video_model"], "--video-model DIR go together; give both, or none"),
         (["train-policy", "--video-model", "nothing-here"], "--video-model DIR go together; give both, or none"),
         (["train-policy", "--environment", "video_model", "--video-model", "nowhere"], "nowhere holds no manifest"),

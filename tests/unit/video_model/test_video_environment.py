@@ -18,14 +18,17 @@ from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.continuation import ClipLengths, continue_videos
 from wm_nodes.video_model.folder import VideoFolder
-from wm_nodes.video_model.video_environment import ROWS, VideoEnvironment
+from wm_nodes.video_model.video_environment import ROWS, VideoEnvironment, check_steppable
 
 NUM_ENVS, NUM_STARTS, HEIGHT, WIDTH = 3, 5, 16, 32
 CLIP = {"stride": 1, "num_conditioning": 1, "given_frames": 4, "new_frames": 2}
 
 
 def spec_of() -> EnvironmentSpec:
-    return make_spec(NUM_ENVS, HEIGHT, WIDTH, instruction="push cube", max_episode_steps=6)
+    commanded = ("target_x", "target_y", "target_z")
+    return make_spec(
+        NUM_ENVS, HEIGHT, WIDTH, instruction="push cube", max_episode_steps=6, state_names=commanded
+    )
 
 
 def starts() -> tuple[UInt8Array, FloatArray]:
@@ -242,3 +245,8 @@ def test_the_spec_says_imagined_and_names_the_model() -> None:
 def test_a_model_that_cannot_be_stepped_is_refused_and_the_remedy_named(folder: VideoFolder, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(folder)
+
+
+def test_a_measured_state_is_refused_which_no_video_model_predicts() -> None:
+    with pytest.raises(ValueError, match=r"does not predict the measured state \(x, y, z\); step a world model"):
+        check_steppable(make_folder(), make_spec(NUM_ENVS, HEIGHT, WIDTH))

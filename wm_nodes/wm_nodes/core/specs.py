@@ -101,12 +101,14 @@ class SpecMismatch(ValueError):
 
 
 def agree(
-    served: EnvironmentSpec, trained_with: EnvironmentSpec, whose: str, names: Sequence[str] = POLICY_FIELDS
+    served: EnvironmentSpec, trained_with: EnvironmentSpec, whose: str, names: Sequence[str] = POLICY_FIELDS, *,
+    simulated: str = "start both with the same config_file",
 ) -> None:
     """Compare the environment that is served with the one that something was trained or recorded with.
 
     Args:
         whose: of the second, as the message says it, e.g. "the policy needs".
+        simulated: the remedy where the environment is a simulator, which can be set up anew.
 
     Raises:
         SpecMismatch: names each field that differs, and the remedies that fit.
@@ -124,8 +126,7 @@ def agree(
         remedies.append("set actions, box and control period as they were")
     text = "; ".join(f"{name} {is_!r}, {whose} {should!r}" for name, is_, should in wrong)
     raise SpecMismatch(
-        f"environment {served.env_id} has {text}; {', and '.join(remedies)}; in a simulator, start both with the same "
-        "config_file"
+        f"environment {served.env_id} has {text}; {', and '.join(remedies)}; in a simulator, {simulated}"
     )
 
 

@@ -210,7 +210,8 @@ def make_training_environment(
 
 def check_model(spec: EnvironmentSpec, model_dir: Path, trained_with: EnvironmentSpec) -> None:
     """Raise SpecMismatch unless the model of `model_dir`, trained with another spec, knows this environment."""
-    agree(tool_spec(spec), trained_with, f"{model_dir} was trained with", MODEL_FIELDS)
+    remedy = "change simulation.* of the configuration, or train another model (--from-scratch)"
+    agree(tool_spec(spec), trained_with, f"{model_dir} was trained with", MODEL_FIELDS, simulated=remedy)
 
 
 def policy_actor(

@@ -138,3 +138,6 @@ def check_steppable(folder: VideoFolder, spec: EnvironmentSpec) -> None:
         raise ValueError(f"this video model was trained for the task {task}, not for {spec.task}; train one for it")
     if actions != spec.action_dim:
         raise ValueError(f"this video model takes {actions} action values, the robot {spec.action_dim}; train it anew")
+    if spec.measured:
+        names = ", ".join(spec.state_names[i] for i in spec.measured)
+        raise ValueError(f"a video model does not predict the measured state ({names}); step a world model instead")

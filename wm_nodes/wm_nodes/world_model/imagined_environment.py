@@ -12,7 +12,6 @@ from torch import Tensor
 from wm_nodes.config.schema import RewardConfig
 from wm_nodes.core.seeding import torch_stream
 from wm_nodes.core.specs import EnvironmentSpec
-from wm_nodes.core.tool_control import next_commanded
 from wm_nodes.core.types import BoolArray, FloatArray, UInt8Array
 from wm_nodes.world_model.dynamics import ActionModel, task_done_signal
 from wm_nodes.world_model.folder import WorldModels
@@ -177,7 +176,7 @@ class ImaginedEnvironment(ImaginedEpisodes):
             rollouts.begin(begins, first)
 
     def _move(self, actions: FloatArray) -> FloatArray:
-        moved, tool = next_commanded(self._states, actions, self.spec), self.spec.tool_dim
+        moved, tool = super()._move(actions), self.spec.tool_dim
         if self.spec.measured:
             inputs = map(self._tensor, (actions, self._states[:, :tool], moved[:, :tool]))
             moved[:, :tool] = self._rollouts[0].next_states(*inputs).cpu().numpy()

@@ -23,7 +23,7 @@ from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import explain_memory
 from wm_nodes.core.seeding import numpy_stream, stream_seed
 from wm_nodes.core.specs import SOURCE_IMAGINED, EnvironmentSpec
-from wm_nodes.core.tool_control import check_actions, next_state
+from wm_nodes.core.tool_control import check_actions, next_commanded
 from wm_nodes.core.types import BoolArray, Episode, FloatArray, Observation, StepResult, UInt8Array, UInt64Array
 from wm_nodes.training.checkpoint import read_tensors
 from wm_nodes.world_model.text import instruction_for
@@ -226,12 +226,8 @@ class ImaginedEpisodes(ABC):
         return None
 
     def _move(self, actions: FloatArray) -> FloatArray:
-        """States (N, S) that the actions command. Raises ValueError: some are measured, and this model says nothing of
-        them."""
-        if self.spec.measured:
-            names = ", ".join(self.spec.state_names[i] for i in self.spec.measured)
-            raise ValueError(f"{self.spec.env_id} does not predict the measured state ({names}); use a world model")
-        return next_state(self._states, actions, self.spec)
+        """States (N, S) that the actions command; measured values stay as they are."""
+        return next_commanded(self._states, actions, self.spec)
 
     @abstractmethod
     def _begin(self, mask: BoolArray) -> None:
