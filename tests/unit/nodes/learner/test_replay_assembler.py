@@ -140,5 +140,5 @@ def test_a_bag_of_another_camera_is_refused(tmp_path: Path) -> None:
     graph = recorded(STEPS)
     expected = make_spec(num_envs=NUM_ENVS, cameras=("front", "overhead"))
     bags = BagRollouts([write(tmp_path / "bag", graph)], Progress(), num_steps=STEPS, expected=expected)
-    with pytest.raises(BagError, match=r"cameras \('front', 'wrist'\) instead of \('front', 'overhead'\)"):
+    with pytest.raises(BagError, match=r"cameras \('front', 'wrist'\), expected here is \('front', 'overhead'\)"):
         bags.next()
