@@ -13,6 +13,7 @@ import pytest
 
 from wm_nodes.config.load import load_config
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import get_task
 from wm_nodes.core.model_folder import ModelFolderError
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.judge.agent.judge import JudgeError, Read, ReadRequest
@@ -24,7 +25,9 @@ from wm_nodes.judge.agent.verdict import Verdict
 from wm_nodes.judge.backends.factory import make_judge
 from wm_nodes.judge.backends.one_class import OneClassJudge
 from wm_nodes.judge.check_set import LabelledClip, load_check_set
-from wm_nodes.judge.one_class.ranges import KEPT, file_of
+from wm_nodes.judge.one_class.calibration import words_of
+from wm_nodes.judge.one_class.pictures import HUES
+from wm_nodes.judge.one_class.ranges import KEPT, file_of, load_ranges, strides_of
 
 FOLDER = shipped_model("push_cube")
 
@@ -194,3 +197,12 @@ def test_a_folder_without_ranges_or_with_those_of_another_model_is_refused_with_
         OneClassJudge(folder)
     for refused in (other, none):
         assert f"wm judge calibrate {folder} BAG --stride 1" in str(refused.value) and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("task", ["push_cube", "reach", "move_to_aim", "pick_place", "pull", "push", "reach_object"])
+def test_a_shipped_judge_knows_the_words_and_the_completion_of_each_task_of_its_model(task: str) -> None:
+    folder = shipped_model(task)
+    for stride in strides_of(folder):
+        ranges = load_ranges(folder, stride)
+        known = {word for pair in ranges.words for word in pair.split()}
+        assert set(words_of(get_task(task).instruction)) <= known | set(HUES) and task in ranges.done

@@ -54,10 +54,11 @@ def calibrate(
     _check_sizes(models, recorded)
     still = tuple(name not in moving for name in models.spec.cameras)
     origin, height_m = _places(models, recorded)
-    rows, longest, words = _Rows(), 0, set[str]()
+    known = [task for task in models.tasks if task in task_names()]
+    rows, longest, words = _Rows(), 0, set[str]().union(*(_pairs(get_task(task).instruction) for task in known))
     for index, episode in enumerate(tqdm(recorded, desc="measured", unit="episode")):
         rng = numpy_stream(seed, f"normal ranges/{index}")
-        words |= {" ".join(pair) for pair in pairwise(words_of(episode.instruction))}
+        words |= _pairs(episode.instruction)
         steps = _end(episode, stride, rng)
         longest = max(longest, steps // stride + 1)
         for shown in _forms(models, episode, steps, stride, rng):
@@ -75,6 +76,11 @@ def calibrate(
         **fit(rows.numbers, rows.recording, seed),
         story={"recordings": len(recorded), "clips": len(rows.numbers), "seed": seed},
     )
+
+
+def _pairs(instruction: str) -> set[str]:
+    """Its pairs of neighbouring words."""
+    return {" ".join(pair) for pair in pairwise(words_of(instruction))}
 
 
 def words_of(instruction: str) -> list[str]:
