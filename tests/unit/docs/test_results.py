@@ -429,7 +429,8 @@ def checked_rows() -> Rows:
 
 def erring_rows() -> Rows:
     for one in read("judge_erring.json")["ways"]:
-        if (one["rate"], one["shared"]) != (0.1, 0.0) or one["way"] == "neither":
+        few = ("neither",) if one["honest"] else ("neither", "no planning", "no gates", "no reflection")
+        if (one["rate"], one["shared"]) != (0.1, 0.0) or one["way"] in few:
             continue
         found = one["difference"] or one
         numbers = (found[key] for key in ("accuracy", "faults_accepted", "successes_kept"))
