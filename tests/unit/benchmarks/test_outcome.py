@@ -35,7 +35,7 @@ def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file
     assert [row["sampler"] for row in first] == ARMS
     for row in first:
         assert len(row["evaluations"]) == 2
-        assert set(row["measured_before"]) == set(row["measured_after"]) == set(METRICS)
+        assert set(row["measured_before"]) == set(row["measured_after"]) == {*METRICS, "accepted", "accepted_executed"}
         assert row["measured_before"] == first[0]["measured_before"], "all arms begin with the same model"
     assert first[0]["plan"]["rewards"] == [["outcome", 1.0]] and first[2]["plan"]["rewards"] == [["agent", 1.0]]
     assert {file.name for file in kept.iterdir()} == {

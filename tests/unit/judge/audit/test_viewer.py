@@ -83,8 +83,11 @@ def test_two_clips_are_labelled_with_keys_exported_and_compared(
         assert page.js("labelsOf(clip()).clarity.answer") == answer
     page.press("1", "e", "e", "ArrowUp", "ArrowUp", "2")  # and planning
     page.press("7", "a", "d", *["ArrowDown"] * 3, "4", "ArrowUp", "x")  # no such keys; temporal, taken back
-    page.js("new Promise((done) => setTimeout(done, 500))")  # the browser writes what it keeps behind the page's back
-    page.open(log / "view.html")  # again: the browser has kept the labels
+    for _ in range(100):  # the browser writes what it keeps behind the page's back
+        page.open(log / "view.html")  # again: the browser has kept the labels
+        if page.js("document.querySelector('header .faint').textContent") == "2 of 3 clips labelled":
+            break
+        page.js("new Promise((done) => setTimeout(done, 100))")
     assert page.js("document.querySelector('header .faint').textContent") == "2 of 3 clips labelled"
     page.press("s")
     assert "Type your name first" in page.js("document.querySelector('.banner').textContent")
