@@ -67,7 +67,7 @@ class EnvironmentSpec:
         """How many values of a state are the tool's; those that say which task it is come after them."""
         return sum(not name.startswith(TASK_PREFIX) for name in self.state_names)
 
-    @property
+    @cached_property
     def measured(self) -> tuple[int, ...]:
         """Which values of a state are measured, see TARGET; the others are commanded, or say which task it is."""
         return tuple(i for i, name in enumerate(self.state_names[: self.tool_dim]) if TARGET not in name)
@@ -153,8 +153,11 @@ def spec_of_values(values: Mapping[str, Any]) -> EnvironmentSpec:
 
 def tool_spec(spec: EnvironmentSpec) -> EnvironmentSpec:
     """The spec of one environment without the state values that say which task it is: what a world model is made of."""
-    tool = spec.tool_dim
-    return replace(
-        spec, num_envs=1, state_names=spec.state_names[:tool], state_units=spec.state_units[:tool],
-        state_low=spec.state_low[:tool], state_high=spec.state_high[:tool],
-    )
+    return of_columns(replace(spec, num_envs=1), range(spec.tool_dim))
+
+
+def of_columns(spec: EnvironmentSpec, columns: Sequence[int]) -> EnvironmentSpec:
+    """The spec with these values of the state alone."""
+    names = ("state_names", "state_units", *(("state_low", "state_high") if spec.state_low else ()))
+    chosen: dict[str, Any] = {name: tuple(getattr(spec, name)[i] for i in columns) for name in names}
+    return replace(spec, **chosen)

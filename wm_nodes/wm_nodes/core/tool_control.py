@@ -1,7 +1,5 @@
 """The controller's rule, equal in every environment (RS-9): legal actions, and where they command the tool."""
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +8,7 @@ from torch import Tensor
 
 from wm_nodes.core.action_spaces import POSE
 from wm_nodes.core.rotations import multiply, to_quaternion, to_vector
-from wm_nodes.core.specs import EnvironmentSpec
+from wm_nodes.core.specs import EnvironmentSpec, of_columns
 from wm_nodes.core.types import FloatArray
 
 
@@ -48,13 +46,6 @@ def next_commanded(states: FloatArray, actions: FloatArray, spec: EnvironmentSpe
 def commanded_columns(spec: EnvironmentSpec) -> list[int]:
     """Which values of a state are not measured."""
     return [i for i in range(spec.state_dim) if i not in spec.measured]
-
-
-def of_columns(spec: EnvironmentSpec, columns: Sequence[int]) -> EnvironmentSpec:
-    """The spec with these values of the state alone."""
-    names = ("state_names", "state_units", *(("state_low", "state_high") if spec.state_low else ()))
-    chosen: dict[str, Any] = {name: tuple(getattr(spec, name)[i] for i in columns) for name in names}
-    return replace(spec, **chosen)
 
 
 def next_state_tensor(

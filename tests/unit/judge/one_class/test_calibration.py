@@ -85,6 +85,13 @@ def test_equal_seeds_give_equal_ranges(few: None) -> None:
     assert first.spread["start"] > 0.05, "harmless changes start with another picture than the reference"
 
 
+def test_state_values_that_say_which_task_an_episode_is_of_change_nothing(few: None) -> None:
+    coded = [
+        replace(episode, states=np.pad(episode.states, ((0, 0), (0, 2)), constant_values=1)) for episode in episodes()
+    ]
+    assert calibrate(models(), coded, stride=1, seed=0) == calibrate(models(), episodes(), stride=1, seed=0)
+
+
 def test_cameras_that_move_are_named_and_the_others_stand_still(few: None) -> None:
     assert models().spec.cameras == ("side", "wrist")
     assert calibrate(models(), episodes(), stride=1, seed=0).still == (True, False)

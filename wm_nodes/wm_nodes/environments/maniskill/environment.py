@@ -3,7 +3,6 @@
 Shapes: N environments, A action, S state, P ground truth.
 """
 
-
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 

@@ -20,8 +20,9 @@ from wm_nodes.core.types import FloatArray, UInt8Array
 NUM_LEVELS = 5
 NUM_PLAN_LEVELS = 4
 PLANNING = "planning"
-TASK_COMPLETION = "task_completion"
 """The one component of Stage.PLAN; its distribution has NUM_PLAN_LEVELS entries."""
+TASK_COMPLETION = "task_completion"
+"""The one component of Stage.TC."""
 Component = str
 
 

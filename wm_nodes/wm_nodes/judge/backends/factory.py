@@ -125,8 +125,8 @@ def _shipped(task: str) -> Path:
             return folder
     raise ValueError(
         f"no judge is shipped for task {task!r} (named in clips.jsonl, in bags or by --task); name a server (--judge "
-        "URL --judge-model NAME), or calibrate a world "
-        "model of your own (wm judge calibrate MODEL_DIR BAG, then --judge MODEL_DIR)"
+        "URL --judge-model NAME), or calibrate a world model of your own (wm judge calibrate MODEL_DIR BAG, then "
+        "--judge MODEL_DIR)"
     )
 
 

@@ -116,9 +116,8 @@ def _forms(
     frames = episode.images[: steps + 1 : stride]
     decoded = models.tokenizer.decode(models.tokenizer.encode(frames)).cpu().numpy()
     decoded[0] = frames[0]
-    told = imagine(
-        models.tokenizer, models.action, frames[:1], episode.actions[None, :steps], episode.states[None, : steps + 1]
-    )
+    states = episode.states[None, : steps + 1, : models.spec.state_dim]  # without the values that say which task it is
+    told = imagine(models.tokenizer, models.action, frames[:1], episode.actions[None, :steps], states)
     imagined = np.concatenate([frames[:1], told.frames[0, stride - 1 :: stride]])
     return frames, decoded, imagined, harmless(frames, rng)
 
