@@ -38,8 +38,8 @@ def test_the_main_job_stops_at_acceptance_and_when_forced_leaves_summary_report_
     ros_domain: int, tmp_path: Path
 ) -> None:
     run_dir = tmp_path / "run"
-    arguments = ["--preset", "smoke", "--set", "acceptance.tool_error_ratio=0.001", "--run-dir", str(run_dir),
-                 "--set", "exploit_meter.every=2", "--set", "exploit_meter.episodes=3"]
+    arguments = ["--preset", "smoke", "--acceptance.tool_error_ratio", "0.001", "--run-dir", str(run_dir),
+                 "--exploit_meter.every", "2", "--exploit_meter.episodes", "3"]
     refused = start(arguments, ros_domain)
     assert refused.returncode == 3, refused.stdout + refused.stderr
     said = refused.stderr
@@ -81,7 +81,7 @@ def test_two_online_rounds_refresh_the_model_and_a_resumed_run_repeats_only_what
     model = make_model_folder(tmp_path / "model")
     write_some_starts(run_dir / "starts.safetensors")
     arguments = ["--preset", "smoke", "--force", "--rounds", "2", "--model-dir", str(model), "--run-dir", str(run_dir),
-                 "--set", "evaluation.episodes=2", "--set", "data.num_workers=1", "--compose"]
+                 "--evaluation.episodes", "2", "--data.num_workers", "1", "--compose"]
     done = start(arguments, ros_domain)
     assert done.returncode == 0, done.stdout + done.stderr
     assert {path.name for path in run_dir.iterdir()} <= RUN_ENTRIES, "a peer may write what is not listed there"
@@ -114,8 +114,8 @@ def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(ros
     run_dir = tmp_path / "run"
     write_some_starts(run_dir / "starts.safetensors")
     arguments = ["--preset", "smoke", "--force", "--model-dir", str(make_model_folder(tmp_path / "model")),
-                 "--run-dir", str(run_dir), "--set", "evaluation.episodes=2", "--set", "data.num_workers=1",
-                 "--set", "ppo.num_steps=16", "--set", "ppo.num_envs=3", "--compose"]
+                 "--run-dir", str(run_dir), "--evaluation.episodes", "2", "--data.num_workers", "1",
+                 "--ppo.num_steps", "16", "--ppo.num_envs", "3", "--compose"]
     with serving(PickyServer()) as server:
         agent = ["--reward", "agent", "--judge", server.url, "--judge-model", "judge"]
         done = start([*arguments, *agent], ros_domain)
@@ -139,10 +139,10 @@ def test_the_agent_pays_the_policy_and_the_run_goes_on_with_that_reward_only(ros
 
 
 def test_a_wrong_setting_ends_with_one_clear_line(ros_domain: int, tmp_path: Path) -> None:
-    done = start(["--set", "ppo.updates=many", "--run-dir", str(tmp_path)], ros_domain)
+    done = start(["--ppo.updates", "many", "--run-dir", str(tmp_path)], ros_domain)
     assert done.returncode == 2
     assert "ppo.updates" in done.stderr and "many" in done.stderr and "Traceback" not in done.stdout + done.stderr
-    meter = ["--set", "exploit_meter.every=1", "--set", "evaluation.episodes=3"]
+    meter = ["--exploit_meter.every", "1", "--evaluation.episodes", "3"]
     done = start([*meter, "--run-dir", str(tmp_path)], ros_domain)
     assert done.returncode == 2
     assert "exploit_meter.episodes is 32, and this run has 24 first frames" in done.stderr, done.stderr

@@ -225,7 +225,7 @@ def test_a_full_disk_ends_training_as_failed_with_one_error_and_the_last_checkpo
 def test_the_main_job_without_a_renderer_ends_with_one_line(tmp_path: Path) -> None:
     code = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-policy', *sys.argv[1:]]))"
     command = [sys.executable, "-c", code, "--preset", "smoke", "--run-dir", str(tmp_path / "run")]
-    command += ["--set", "simulation.render_device=cuda:77"]
+    command += ["--simulation.render_device", "cuda:77"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=180)
     assert done.returncode == 2, done.stdout + done.stderr
     assert "no renderer at cuda:77" in done.stderr

@@ -21,7 +21,7 @@ from benchmarks.environments.policies import (
 )
 from benchmarks.speed.results import write_results
 from wm_nodes.apps.options import add_json, add_preset, positive, prepare_torch, settings
-from wm_nodes.config.load import load_config, preset_names
+from wm_nodes.config.load import load_config
 from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.core.device import compute_device
@@ -41,7 +41,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for experiment in (trained, ranking, speed):
         experiment.add_argument("--video-models", type=Path, nargs="*", default=[], metavar="DIR",
                                 help="folders of video models that can be stepped")
-        add_preset(experiment, "cpu", preset_names())
+        add_preset(experiment, "cpu")
         experiment.add_argument("--task", default="push_cube")
         experiment.add_argument("--model-dir", type=Path, metavar="DIR", help="world model instead of the shipped one")
         experiment.add_argument("--work", type=Path, default=Path("runs/environments"), metavar="DIR",

@@ -20,8 +20,8 @@ from benchmarks.speed.inputs import Effort, console, prepare_model, random_model
 from benchmarks.speed.results import write_results
 from benchmarks.speed.simulator import IMAGINED_ENVS, measure_simulator
 from benchmarks.speed.stages import measure_stages
-from wm_nodes.apps.options import add_json, add_seed
-from wm_nodes.config.load import load_config, parse_override, preset_names
+from wm_nodes.apps.options import add_json, add_seed, add_settings
+from wm_nodes.config.load import load_config, preset_names
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.reports.console_table import make_table
@@ -42,10 +42,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     model = parser.add_mutually_exclusive_group()
     model.add_argument("--model-dir", type=Path, help="world model to measure instead of the shipped one")
-    model.add_argument(
-        "--untrained", nargs="*", metavar="SECTION.KEY=VALUE",
-        help="measure a model with random weights, of the preset's size but for these settings",
-    )
+    model.add_argument("--untrained", action="store_true", help="measure random weights, of the settings' size")
+    add_settings(parser)
     add_seed(parser)
     parser.set_defaults(plan=None)
 
@@ -57,19 +55,19 @@ def run(arguments: argparse.Namespace) -> int | None:
         ValueError: options that do not go together.
     """
     if arguments.device is not None:
-        if arguments.preset != "cpu" or arguments.model_dir or arguments.untrained is not None:
+        if arguments.preset != "cpu" or arguments.model_dir or arguments.untrained:
             raise ValueError("--device has models of its own; leave out --preset, --model-dir and --untrained")
         return run_device(arguments)
     if arguments.minutes is not None:
         raise ValueError("--minutes needs --device")
-    untrained = None if arguments.untrained is None else dict(map(parse_override, arguments.untrained))
-    config = load_config(arguments.preset, {**(untrained or {}), "seed": arguments.seed})
+    config = load_config(arguments.preset, {**arguments.settings, "seed": arguments.seed})
     with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as name:
         folder, model = Path(name), arguments.model_dir
-        if untrained is not None:
+        if arguments.untrained:
             model = random_model(config, folder / "model")
         results = measure(config, QUICK if arguments.quick else FULL, folder, model)
-    results |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
+    results |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed,
+                "untrained": arguments.settings if arguments.untrained else None}
     show(results)
     write_results(arguments, results, exact=True)
     return None

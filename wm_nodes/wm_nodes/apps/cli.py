@@ -27,6 +27,8 @@ EXIT_CODES = (
 )
 EXPECTED = (RunError, ValueError, OSError, ImportError, FloatingPointError)
 """Errors whose text says what to do; anything else is a fault of this program and shows its traceback."""
+TOP = ("--seed", "--task", "--device")
+"""Settings that are options of a verb, or cannot be given."""
 BENCHMARKS = "benchmarks"
 """Package beside this one in the repository, not installed with it."""
 NO_BENCHMARKS = "the benchmarks come with the repository and are not installed; start launch_scripts/wm.py there"
@@ -66,7 +68,24 @@ benchmarks.video_rl.cli."""
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser whose errors are one line."""
+    """An ArgumentParser whose errors are one line, and whose `settings` are the settings that were given by name."""
+
+    def parse(self, words: Sequence[str]) -> argparse.Namespace:
+        """Raises ConfigError for a setting without a value, and SystemExit as parse_args."""
+        from wm_nodes.config.load import SCHEMAS, split_settings
+
+        options = self._option_string_actions
+        schema = SCHEMAS.get(self.get_default("settings_of"))
+        names = [name for name in (schema.model_fields if schema else ()) if f"--{name}" not in {*options, *TOP}]
+        rest, settings = split_settings(words, names)
+        arguments, left = self.parse_known_args(rest)
+        taken = getattr(arguments, "settings_of", None)
+        left += [f"--{name}" for name in settings if not taken or (taken not in SCHEMAS and not name.startswith(taken))]
+        if left:
+            close = difflib.get_close_matches(left[0], [*options, *(f"--{name}" for name in names)], n=1)
+            self.error(f"unrecognized arguments: {' '.join(left)}{f'; did you mean {close[0]}?' if close else ''}")
+        arguments.settings = settings
+        return arguments
 
     def error(self, message: str) -> NoReturn:
         self.exit(ERROR, f"error: {message}; see {self.prog} --help\n")
@@ -108,7 +127,7 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
         os.environ.setdefault("TQDM_DISABLE", "1")  # bars of libraries; ours are lines then
     arguments = argparse.Namespace()
     try:
-        arguments = parser_of(name, program).parse_args(argv)
+        arguments = parser_of(name, program).parse(argv)
         arguments.command = shlex.join([*program.split(), *argv])
         run: Callable[[argparse.Namespace], int | None] = arguments.run
         return run(arguments) or DONE

@@ -17,8 +17,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from wm_nodes.config.load import dump_config
-from wm_nodes.config.saved import with_device
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.model_folder import AGAIN, files_sha256, read_json
@@ -34,6 +32,7 @@ from wm_nodes.policy_rl.initial_policy import num_starts
 from wm_nodes.policy_rl.training_run import POLICY_FILES
 from wm_nodes.reports.summary import SuccessRate
 from wm_nodes.training.checkpoint import RESTORE
+from wm_nodes.training.run_record import keep_config
 from wm_nodes.video_model.folder import read_video_manifest
 
 READY_S = 120.0
@@ -122,17 +121,13 @@ class WaitingGraph:
 
 def start_graph(job: RunContext, start: TrainingStart) -> WaitingGraph:
     """Start the processes of one training; the caller stops the runner."""
-    start.folder.mkdir(parents=True, exist_ok=True)
-    config_file = start.folder / "config.yaml"
-    kept = config_file.read_bytes() if config_file.exists() else dump_config(start.config).encode()
-    write_atomic(config_file, with_device(kept, start.config.device))
+    keep_config(start.config, start.folder)
     name = "_".join(["training", *start.label.split(), time.strftime("%H%M%S")])
     bag = job.run_dir / "bags" / name
     graph, _ = launch_arguments.prepare("online_training", {
-        "config_file": str(config_file), "reward": job.reward, "run_dir": str(start.folder),
+        "reward": job.reward, "run_dir": str(start.folder),
         "model_dir": str(start.model_dir), "starts_file": str(start.starts), "first_frames_file": str(job.starts),
-        "initial_policy": str(start.policy),
-        "seed": str(start.config.seed), "bag_uri": str(bag), "domain_id": job.domain_id,
+        "initial_policy": str(start.policy), "bag_uri": str(bag), "domain_id": job.domain_id,
         "compose": "true" if job.compose else "false", "autostart": "false", **job.environment,
     })
     job.stage("starting the graph: " + ", ".join(node.label for node in graph.nodes))

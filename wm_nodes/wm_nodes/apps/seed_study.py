@@ -21,7 +21,7 @@ from rich.table import Table
 from wm_nodes.apps.model_refresh_loop import round_config, split_updates
 from wm_nodes.apps.options import add_preset, add_threads, prepare_torch, settings
 from wm_nodes.apps.policy_run import success_rate
-from wm_nodes.config.load import default_task, dump_config, load_config, preset_names
+from wm_nodes.config.load import default_task, dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.tasks import model_tasks
@@ -46,8 +46,6 @@ from wm_nodes.reward import RewardModel, RuleReward
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.folder import read_world_manifest
 
-FORMER_NAMES = {"gate": "acceptance", "gate_passed": "accepted"}
-"""Of a row's values, in results written before they were renamed."""
 ARMS = ("world_model", "simulator")
 SIMULATOR_ENVS = 8
 IMAGINED_EPISODES = 256
@@ -68,7 +66,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tasks", nargs="+", default=model_tasks(default_task()))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
-    add_preset(parser, "cpu", preset_names())
+    add_preset(parser, "cpu")
     parser.add_argument("--model-dir", type=Path, help="world model; default: the shipped one")
     add_threads(parser)
     parser.add_argument("--out", type=Path, default=Path("runs/study"), help="folder; finished runs in it are kept")
@@ -106,7 +104,7 @@ def read_results(folder: Path) -> list[dict[str, Any]]:
         except ValueError as error:
             text = f"{path}, line {number} is cut short ({error}); delete the line to do its run again"
             raise ValueError(text) from None
-    return [{FORMER_NAMES.get(name, name): value for name, value in row.items()} for row in rows]
+    return rows
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:

@@ -12,9 +12,9 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class SettingsSection(BaseModel):
-    """Frozen, and every unknown key is an error."""
+    """Frozen, and every unknown key is an error; the string under a field is its `description`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     def with_values(self, **values: Any) -> Self:
         """A copy with other values, checked as those of a preset are."""
