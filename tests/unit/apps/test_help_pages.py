@@ -60,16 +60,15 @@ def test_in_a_fresh_copy_every_verb_explains_itself_within_a_second_and_begins_n
     for name in ("launch_scripts", "wm_nodes/wm_nodes", "requirements", "msgs_schema"):
         shutil.copytree(repository / name, copy / name, ignore=left_out)
     before = sorted(copy.rglob("*"))
-    environment = {"PATH": os.environ["PATH"], "PYTHONDONTWRITEBYTECODE": "1"}
 
     def cpu_s() -> float:
         used = resource.getrusage(resource.RUSAGE_CHILDREN)
         return used.ru_utime + used.ru_stime
 
     for verb in VERBS:
-        command = [sys.executable, "-S", "-E", "launch_scripts/wm.py", *verb.split(), "--help"]
+        command = [sys.executable, "-B", "-S", "-E", "launch_scripts/wm.py", *verb.split(), "--help"]
         began = cpu_s()
-        done = subprocess.run(command, env=environment, cwd=copy, capture_output=True, encoding="utf-8", check=False)
+        done = subprocess.run(command, cwd=copy, capture_output=True, encoding="utf-8", check=False)
         assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("usage: "), verb
         assert cpu_s() - began < 1, verb
     assert sorted(copy.rglob("*")) == before

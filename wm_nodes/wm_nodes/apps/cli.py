@@ -63,8 +63,8 @@ GROUPS = {
     },
 }
 VERBS = {name: about for verbs in GROUPS.values() for name, about in verbs.items()}
-"""What each verb does, by its name; `train-policy` is the module wm_nodes.apps.train_policy, `benchmark video-rl` is
-benchmarks.video_rl.cli."""
+"""What each verb does, by its name; `train-policy` is the module wm_nodes.apps.train_policy, `judge check` is
+wm_nodes.apps.judge.check, `benchmark video-rl` is benchmarks.video_rl.cli."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -145,7 +145,8 @@ def run_verb(name: str, argv: Sequence[str], program: str) -> int:
 
 def parser_of(name: str, program: str) -> Parser:
     """The parser of a verb, which imports its module. Its arguments' `run` does the verb."""
-    file, experiment = (words.replace("-", "_").replace(" ", "_") for words in (name, name.removeprefix("benchmark ")))
+    file = name.replace("-", "_").replace(" ", ".")
+    experiment = file.removeprefix("benchmark.")
     with leaving_when_interrupted():
         module = import_module(f"wm_nodes.apps.{file}" if experiment == file else f"{BENCHMARKS}.{experiment}.cli")
     parser = Parser(
@@ -159,7 +160,7 @@ def parser_of(name: str, program: str) -> Parser:
 
 def refuse_module(name: str) -> NoReturn:
     """End the process, as `python -m` with the module of a verb would do nothing."""
-    verb = name.rpartition(".")[2].replace("_", "-")
+    verb = name.removeprefix("wm_nodes.apps.").replace("_", "-").replace(".", " ")
     typed = f"wm {verb}" if verb in VERBS else "wm --help"
     raise SystemExit(_fail(f"{name} is not started by itself; type: {typed}"))
 

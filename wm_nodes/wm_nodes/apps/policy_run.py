@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
@@ -30,6 +29,7 @@ from wm_nodes.policy_rl.evaluation import evaluate
 from wm_nodes.policy_rl.factories import load_policy, make_imagined_environment, make_video_environment, models_of
 from wm_nodes.policy_rl.initial_policy import num_starts
 from wm_nodes.policy_rl.training_run import POLICY_FILES
+from wm_nodes.reports.stages import Stages
 from wm_nodes.reports.summary import SuccessRate
 from wm_nodes.training.checkpoint import RESTORE
 from wm_nodes.training.run_record import keep_config
@@ -38,38 +38,25 @@ from wm_nodes.video_model.folder import read_video_manifest
 READY_S = 120.0
 TRAINED = "trained.json"
 
-console = Console()
-
-
-class Stages:
-    """Prints what is being done, with the minutes since the start."""
-
-    def __init__(self) -> None:
-        self._started = time.monotonic()
-
-    @property
-    def minutes(self) -> float:
-        return (time.monotonic() - self._started) / 60
-
-    def __call__(self, text: str) -> None:
-        minutes, seconds = divmod(int(60 * self.minutes), 60)
-        console.print(f"[dim]{minutes:3d}:{seconds:02d}[/] {text}", highlight=False)
-
-
 @dataclass(frozen=True)
 class RunContext:
-    """What all trainings of a run share. starts: first frames to imagine from. reward: as the launch argument.
-    video_model: folder of the video model to train in; empty: the world model."""
+    """What all trainings of a run share."""
 
     config: RunConfig
     run_dir: Path
     starts: Path
+    """First frames to imagine from."""
     stage: Stages
     domain_id: str = ""
+    """ROS domain; empty: $ROS_DOMAIN_ID, else 0."""
     compose: bool = False
+    """All nodes in one process."""
     verbose: bool = False
+    """Show the nodes' logs."""
     reward: str = "endogenous"
+    """As the launch argument."""
     video_model: str = ""
+    """Folder of the video model to train in; empty: the world model."""
 
     @property
     def trained_in(self) -> str:
@@ -83,29 +70,34 @@ class RunContext:
 
 @dataclass(frozen=True)
 class TrainingStart:
-    """What one training begins with. folder: its own run folder. starts: frames to imagine from. label: for bags and
-    messages, e.g. "round 2"."""
+    """What one training begins with."""
 
     folder: Path
+    """Its own run folder."""
     model_dir: Path
     policy: Path
+    """Weights that it starts from."""
     config: RunConfig
     starts: Path
+    """Frames to imagine from."""
     label: str = ""
+    """For bags and messages, e.g. "round 2"."""
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """version: of the last weights. samples: transitions trained on. samples_per_s: of the last uninterrupted part.
-    stopped: why training ended before all updates; else empty.
-    """
+    """What one training gave."""
 
     version: int
+    """Of the last weights."""
     updates: int
     samples: int
+    """Transitions trained on."""
     samples_per_s: float
+    """Of the last uninterrupted part."""
     bag: str
     stopped: str = ""
+    """Why training ended before all updates; else empty."""
 
     def policy(self, folder: Path) -> Path:
         return folder / POLICY_FILES.uri(self.version)

@@ -21,13 +21,13 @@ from wm_nodes.apps.options import (
     prepare_torch,
     settings,
 )
-from wm_nodes.apps.policy_run import Stages
 from wm_nodes.apps.video_results import conclude
 from wm_nodes.config.load import VIDEO, load_video_config
 from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.core.device import compute_device
 from wm_nodes.core.progress import tqdm
+from wm_nodes.reports.stages import Stages
 from wm_nodes.training.run_record import CONFIG, Starter
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_model.folder import load_video_folder

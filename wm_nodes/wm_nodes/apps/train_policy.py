@@ -18,7 +18,7 @@ import numpy as np
 from wm_nodes.apps import options
 from wm_nodes.apps.model_refresh_loop import round_start, run_rounds
 from wm_nodes.apps.policy_pictures import write_pictures
-from wm_nodes.apps.policy_run import RunContext, Stages, console, is_trained, start_graph, success_rate
+from wm_nodes.apps.policy_run import RunContext, is_trained, start_graph, success_rate
 from wm_nodes.config.load import ConfigError, dump_config, load_config, with_judge
 from wm_nodes.config.scenes import SCENES, splits
 from wm_nodes.config.schema import AGENT, RunConfig
@@ -41,6 +41,7 @@ from wm_nodes.policy_rl.initial_policy import num_starts, prepare_start, start_f
 from wm_nodes.policy_rl.pretraining import make_model
 from wm_nodes.reports.html import write_report
 from wm_nodes.reports.machine import machine_facts
+from wm_nodes.reports.stages import Stages, console
 from wm_nodes.reports.summary import Summary, acceptance_outcome, as_first_made, read_readings, write_summary
 from wm_nodes.reports.tables import exploit_table, results_table, rounds_table, tasks_table
 from wm_nodes.training.run_record import Starter

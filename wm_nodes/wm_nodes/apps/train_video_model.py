@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_nodes.apps import options
-from wm_nodes.apps.policy_run import READY_S, Stages
+from wm_nodes.apps.policy_run import READY_S
 from wm_nodes.apps.video_results import conclude
 from wm_nodes.config.load import (
     REWARDS,
@@ -37,6 +37,7 @@ from wm_nodes.judge.service import clip_fps
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph_client import GraphClient
 from wm_nodes.launching.runner import Runner
+from wm_nodes.reports.stages import Stages
 from wm_nodes.training.run_record import Starter
 from wm_nodes.video_model.clips import load_clips
 from wm_nodes.video_rl.pretraining import make_video_model, shipped_video_model

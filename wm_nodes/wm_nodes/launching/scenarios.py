@@ -44,7 +44,7 @@ class LaunchArgument:
 ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("preset", "", "Settings to start from: a name or a .yaml file, e.g. config.yaml of another run; "
                    "empty: cpu, of the video model recommended"),
-    LaunchArgument("task", "", "Task; empty: the preset's", ("", *task_names())),
+    LaunchArgument("task", "", "Task; not given: the preset's; given as empty: none", ("", *task_names())),
     LaunchArgument("seed", "", "Root seed; empty: the preset's"),
     LaunchArgument("device", "", "Where models compute: cpu, cuda, cuda:N or auto; empty: the preset's"),
     LaunchArgument("run_dir", "", "Folder for settings, weights, bags and logs; an existing one goes on as it was "

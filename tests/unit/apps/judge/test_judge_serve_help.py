@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from wm_nodes.apps.cli import main
-from wm_nodes.apps.judge_serve_help import MODELS, server_line, set_options
+from wm_nodes.apps.judge.serve_help import MODELS, server_line, set_options
 from wm_nodes.config.load import load_config, split_settings
 from wm_nodes.judge.backends.factory import check_judge
 
