@@ -15,7 +15,7 @@ from wm_nodes.core.errors import ModelNotAcceptedError, RunError
 
 OPTIONS = {
     "train-policy": "--preset --SECTION.KEY --device --task --seed --run-dir --model-dir --from-scratch --force "
-    "--rounds --environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose "
+    "--environment --video-model --reward --judge --judge-model --judge-key-env --rubric --compose "
     "--domain-id --verbose",
     "train-video-model": "--preset --SECTION.KEY --seed --run-dir --from-scratch --bags --heldout-bags --keep-buffers "
     "--reward --judge --judge-model --judge-key-env --rubric --tensorboard --no-tensorboard --domain-id --verbose",

@@ -15,7 +15,8 @@ from wm_nodes.config.load import FREE, ConfigError, dump_config, load_config
 from wm_nodes.core.device import DeviceError
 from wm_nodes.core.run_lock import NAME
 
-BEGINNING = ["--preset", "smoke", "--ppo.updates", "3", "--seed", "4", "--task", "reach", "--rounds", "2",
+BEGINNING = ["--preset", "smoke", "--ppo.updates", "3", "--seed", "4", "--task", "reach",
+             "--model_refresh.num_rounds", "2",
              "--from-scratch", "--reward", "agent", "--judge", "http://a/v1,http://b/v1", "--judge-model", "judge",
              "--ppo.num_steps", "16", "--force"]
 
@@ -65,7 +66,7 @@ def test_each_option_that_differs_is_named_with_both_values_and_the_remedy(tmp_p
         assert part in text
     for words, part in (
         (["--preset", "cpu"], "--preset is 'smoke' in this run, 'cpu' is given"),
-        (["--task", "push_cube"], "--task is 'reach'"), (["--rounds", "3"], "--rounds is 2"),
+        (["--task", "push_cube"], "--task is 'reach'"), (["--model_refresh.num_rounds", "3"], "num_rounds is 2"),
         (["--judge", "http://c/v1"], "--judge is ['http://a/v1', 'http://b/v1']"),
         (["--judge-model", "other"], "--judge-model is 'judge' in this run, 'other' is given"),
         (["--model-dir", "/other"], "--model-dir is None in this run, '/other' is given"),

@@ -266,7 +266,8 @@ class StubLaunch:
 def test_both_faces_of_a_launch_file_start_the_same_processes(
     scenario: str, compose: dict[str, str], given: dict[str, str], repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    values = of(scenario, given) | compose
+    setting = {} if "judge" in SCENARIOS[scenario].arguments else {"judge.max_reads": "3"}
+    values = of(scenario, given) | compose | setting
     stub = StubLaunch(values)
     for name, module in stub.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
@@ -285,6 +286,7 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
     nodes = start.named["function"](Context({**defaults, **values}))
     record = read_record(Path(values["run_dir"]))
     assert record is not None and not {"run_dir", "domain_id", "respawn"} & set(record.options[scenario])
+    assert not setting or record.settings["judge"]["max_reads"] == 3
     (lock,) = launch_face.LOCKS
     with pytest.raises(DomainInUseError, match=r"ROS domain 7 is already in use .*domain_id:=8"):
         start.named["function"](Context({**defaults, **values}))
@@ -303,7 +305,7 @@ def test_both_faces_of_a_launch_file_start_the_same_processes(
         else:
             assert action.named["name"] == node.name
             assert action.named["parameters"] == ([dict(node.parameters)] if node.parameters else [])
-        assert ("on_exit" in action.named) == (not node.respawn) and node.required
+        assert ("on_exit" in action.named) == (not node.respawn)
         assert action.named.get("respawn", False) == node.respawn == (values.get("respawn") == "true")
         assert action.named["additional_env"]["ROS_DOMAIN_ID"] == str(runner.domain) == "7"
 

@@ -225,7 +225,7 @@ def _real(operator: GraphClient, job: RunContext, start: TrainingStart, label: s
             return operator.evaluate(
                 episodes=settings.episodes, seed=settings.first_seed, deterministic=settings.deterministic,
                 label=label, policy_uri=str(policy), on_progress=show,
-            ).success
+            )
 
     identity = {"policy_sha256": file_sha256(policy)}
     success = cached_success(start.folder / "evaluations" / f"real_{label}.json", identity, measure)

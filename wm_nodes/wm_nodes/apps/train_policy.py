@@ -20,7 +20,6 @@ from wm_nodes.apps.model_refresh_loop import round_start, run_rounds
 from wm_nodes.apps.policy_pictures import write_pictures
 from wm_nodes.apps.policy_run import RunContext, is_trained, start_graph, success_rate
 from wm_nodes.config.load import ConfigError, dump_config, load_config, with_judge
-from wm_nodes.config.scenes import SCENES, splits
 from wm_nodes.config.schema import AGENT, RunConfig
 from wm_nodes.config.seed_ranges import HELDOUT
 from wm_nodes.config.shipped import shipped_model
@@ -61,11 +60,6 @@ FREE = {"force": False, "compose": False}
 def add_options(parser: argparse.ArgumentParser) -> None:
     options.add_preset(parser, "cpu")
     parser.add_argument("--task", choices=task_names(), help="default: the preset's")
-    parser.add_argument(
-        "--scenes", metavar="NAME",
-        help=f"where the task has many: {', '.join(splits())}, or one scene such as {next(iter(SCENES))}; "
-        "default: train",
-    )
     options.add_seed(parser, None)
     options.add_run_dir(parser)
     parser.add_argument("--model-dir", type=Path, help="world model to use instead of the shipped one")
@@ -76,11 +70,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--video-model", type=Path, metavar="DIR", help="folder of the video model to train in")
     parser.add_argument("--from-scratch", action="store_true", help="collect data and train the world model too")
     parser.add_argument("--force", action="store_true", help="train even in a model that does not pass acceptance")
-    parser.add_argument(
-        "--rounds", type=int, metavar="N",
-        help="train, collect with the policy in the simulator, refresh the world model, N times; default: the preset's "
-        "(1: never refresh). The policy updates are split over the rounds",
-    )
     parser.add_argument(
         "--reward", choices=(ENDOGENOUS, AGENT),
         help="what the policy is paid for in the world model. endogenous: the model's own signal; agent: a judge's "
@@ -173,9 +162,7 @@ def _by_task(config: RunConfig, before: BoolArray, after: BoolArray) -> dict[str
 
 def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
     chosen = options.settings(arguments) | options.judge_settings(arguments)
-    chosen |= {"task": arguments.task} if arguments.task else {}
-    chosen |= {"simulation.scenes": arguments.scenes} if arguments.scenes else {}
-    return chosen | ({} if arguments.rounds is None else {"model_refresh.num_rounds": arguments.rounds})
+    return chosen | ({"task": arguments.task} if arguments.task else {})
 
 
 def _load(file: str, settings: dict[str, Any], chosen: Mapping[str, Any]) -> RunConfig:
@@ -206,7 +193,10 @@ def _check_environment(arguments: argparse.Namespace, config: RunConfig) -> None
     if arguments.video_model:
         load_steppable(config, Path(arguments.video_model))
         if (rounds := config.model_refresh.num_rounds) > 1:
-            raise ConfigError(f"--rounds {rounds} refreshes a world model, and a video model is trained in; give 1")
+            raise ConfigError(
+                f"model_refresh.num_rounds is {rounds}: that refreshes a world model, and a video model is trained in; "
+                "give 1"
+            )
 
 
 def _check_meter(config: RunConfig, starts: Path, stage: Stages) -> None:

@@ -82,8 +82,8 @@ def check_refreshable(model_dir: Path) -> None:
     kind = read_world_manifest(model_dir)["tokenizer"]["kind"]
     if kind != "continuous":
         raise ValueError(
-            f"{model_dir} has tokenizer.kind {kind}; rounds refresh continuous models only: use --rounds 1 or a model "
-            "made with tokenizer.kind=continuous"
+            f"{model_dir} has tokenizer.kind {kind}; rounds refresh continuous models only: set num_rounds to 1, or "
+            "take a model made with tokenizer.kind=continuous"
         )
 
 
@@ -250,7 +250,8 @@ def split_updates(updates: int, rounds: int) -> list[int]:
         ValueError: a round would make none.
     """
     if rounds > 1 and updates < rounds:
-        raise ValueError(f"ppo.updates is {updates}, fewer than {rounds} rounds; raise it or lower --rounds")
+        text = f"ppo.updates is {updates}, fewer than {rounds} rounds; raise it, or lower model_refresh.num_rounds"
+        raise ValueError(text)
     share, remainder = divmod(updates, rounds)
     return [share + (number < remainder) for number in range(rounds)]
 

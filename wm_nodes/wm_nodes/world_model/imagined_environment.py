@@ -153,7 +153,7 @@ class ImaginedEnvironment(ImaginedEpisodes):
         if second and (second.tokenizer_sha256, second.tasks) != (models.tokenizer_sha256, models.tasks):
             raise ValueError(
                 "imagined_environment.second_model has another tokenizer or other tasks than the world model; refresh "
-                "that model (--rounds), or leave it empty"
+                "that model (model_refresh.num_rounds), or leave it empty"
             )
         self._start_tasks = task_indices(starts[1], spec, models.task_index)
         self._tokenizer, action = models_to_infer(models, exact=exact)
