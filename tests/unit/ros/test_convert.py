@@ -146,9 +146,9 @@ def test_a_reply_survives_the_wire_and_takes_a_shown_mosaic_of_its_own_stamp_onl
     if shown_stamp_ns is not None:
         images = reply.images if shown_stamp_ns == reply.stamp_ns else np.zeros_like(reply.images)
         shown = convert.mosaic_msg(images, shown_stamp_ns, spec())
-    response = calls.fill_step_response(StepBatch.Response(), reply, spec(), shown)
+    response = calls.fill_response(StepBatch.Response(), reply, spec(), shown)
     assert (response.observation is shown) == (shown_stamp_ns == reply.stamp_ns)
-    found = calls.step_reply(response, spec(), 1)
+    found = calls.reply_of(response, spec(), 1)
     for name, value in vars(reply).items():
         np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
 
