@@ -3,8 +3,8 @@
     wm judge-clips CLIPS --judge http://host:8000/v1 --judge-model NAME --audit CLIPS/audit
     wm judge-clips CLIPS --judge embedded
 
-A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red cube into the green target", "task_id":
-"push_cube"}; also clip_id, robot, fps (of a .npy), reference (the picture that the clip had to start from), goal, and
+A line of clips.jsonl: {"file": "a.mp4", "instruction": "push the red bar away from the robot", "task_id":
+"push"}; also clip_id, robot, fps (of a .npy), reference (the picture that the clip had to start from), goal, and
 sha256, which is checked.
 Verdicts are appended to CLIPS/verdicts.jsonl (`accepted`: whether the clip is a success; null where the judge cannot
 tell); started again, it goes on with the clips that this judge, rubric and mode have not judged. A clip that cannot be

@@ -266,6 +266,12 @@ class PolicyConfig(SettingsSection):
     """Initial log standard deviation of the Gaussian, normalised action units."""
     positions: bool
     """Whether the policy also sees the positions that the tokenizer's probe reads off the latents, unprojected."""
+    position_center_m: tuple[float, float, float] = (0.6, 0.0, 0.15)
+    """Commanded positions (x, y, z) are shifted by it before the networks see them."""
+    position_scale_m: PositiveFloat = 0.2
+    """Commanded positions lie within about this of the centre, by which they are divided."""
+    rotation_scale_rad: PositiveFloat = 0.5
+    """Commanded angles are divided by it."""
 
 
 class SftConfig(SettingsSection):

@@ -57,8 +57,8 @@ def read_list(folder: Path, read: Read = read_regular) -> list[ClipLine]:
         content = text_lines(read(path, CLIP_LIST))
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(
-            f'{path} is missing: one line per clip, e.g. {{"file": "a.mp4", "instruction": "push the cube", "task_id": '
-            '"push_cube"}'
+            f'{path} is missing: one line per clip, e.g. {{"file": "a.mp4", "instruction": "lift the lid", "task_id": '
+            '"push"}'
         ) from None
     except UnicodeDecodeError as error:
         raise ValueError(f"{path} is no text in UTF-8: {error}; write the list again") from None
