@@ -35,6 +35,7 @@ class WeakPolicy:
     number: int
     """Decides the seeds; no two tasks of one world model have the same."""
     demonstrations: int
+    """That it is cloned from."""
     noise: float
     """Standard deviation of the exploration noise, normalised action units."""
 

@@ -37,9 +37,13 @@ class ClipLine(BaseModel):
     frames: Annotated[int, Field(ge=2)] | None = None
     """How many a .png holds; of no other file."""
     instruction: str
+    """What the clip should show."""
     clip_id: str = ""
+    """Empty: the file's name without its ending."""
     task_id: str = ""
+    """Name of the task, which chooses an embedded judge."""
     robot: str = "panda"
+    """Description for the prompt."""
     fps: Annotated[float, Field(gt=0)] = 5.0
     """Of a .npy or .png; a video has its own."""
     reference: str = ""

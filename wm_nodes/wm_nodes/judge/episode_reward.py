@@ -54,13 +54,18 @@ class EpisodeStep:
 
 @dataclass
 class _Episode:
-    """The collected part of an episode. fault: why it cannot be judged."""
+    """The collected part of an episode."""
 
     episode_id: int
+    """As in the messages."""
     frames: list[UInt8Array] = field(default_factory=list)
+    """uint8 (H, W, 3) each."""
     actions: list[FloatArray] = field(default_factory=list)
+    """(A,) each."""
     goal: UInt8Array | None = None
+    """The newest goal image."""
     fault: str = ""
+    """Why it cannot be judged."""
 
 
 @dataclass(frozen=True)

@@ -52,11 +52,14 @@ class TrainingPaused(Exception):
 
 @dataclass(frozen=True, eq=False)
 class ClipJob:
-    """A clip and what it should show. problem: why its pixels cannot be read; its verdict is then an ERROR."""
+    """A clip and what it should show."""
 
     clip: ClipRef
+    """To judge."""
     task: TaskSpec
+    """What it should show."""
     problem: str = ""
+    """Why its pixels cannot be read; its verdict is then an ERROR."""
 
 
 @dataclass
@@ -64,8 +67,11 @@ class VerdictCounts:
     """Number and cost of the verdicts since the start."""
 
     verdicts: int = 0
+    """All."""
     by_status: dict[Status, int] = field(default_factory=dict)
+    """Number of each status."""
     cost: Cost = field(default_factory=Cost)
+    """Of all together."""
 
     def add(self, verdict: Verdict) -> None:
         self.verdicts += 1

@@ -83,12 +83,14 @@ def filmed_scene(task: str, simulation: SimulationConfig, size: int) -> FilmedSc
 
 @dataclass(frozen=True)
 class Unrewarded:
-    """before, after: of UNREWARDED by name, a value per context; executed ones of the first contexts alone. missing: by
-    name why one is not measured."""
+    """What no reward knows, of two models."""
 
     before: dict[str, list[float]]
+    """Of UNREWARDED by name, a value per context; executed ones of the first contexts alone."""
     after: dict[str, list[float]]
+    """The same of the trained model."""
     missing: dict[str, str]
+    """By name why one is not measured."""
 
 
 def load_or_measure_unrewarded(

@@ -41,22 +41,25 @@ FULL_PSNR_DB = 40.0
 
 @dataclass(frozen=True)
 class ClipScores:
-    """Per clip, float64 (N,), in the host's memory. tracking: mean exp(-error / 3 cm) of object and tool over generated
-    frames, in (0, 1]. scenery: mean absolute error, [0, 1], where the recording stands still. psnr_db: of generated
-    frames. object_cm, tool_cm: mean position errors. motion: object path length, share of the recorded one, at most 2;
-    1 where the recorded object stands still. success: 1 where the task is done in the last frame. outcome:
-    exp(-d / 5 cm), d what is then left to the edge of the goal (DD-32). All but scenery and psnr_db are NaN where the
-    recording has no simulator state.
-    """
+    """Per clip, float64 (N,), in the host's memory. All but scenery and psnr_db are NaN where the recording has no
+    simulator state."""
 
     tracking: Tensor
+    """Mean exp(-error / 3 cm) of object and tool over generated frames, in (0, 1]."""
     scenery: Tensor
+    """Mean absolute error, [0, 1], where the recording stands still."""
     psnr_db: Tensor
+    """Of generated frames."""
     object_cm: Tensor
+    """Mean position error of the object."""
     tool_cm: Tensor
+    """Mean position error of the tool."""
     motion: Tensor
+    """Object path length, share of the recorded one, at most 2; 1 where the recorded object stands still."""
     success: Tensor
+    """1 where the task is done in the last frame."""
     outcome: Tensor
+    """exp(-d / 5 cm), d what is then left to the edge of the goal (DD-32)."""
 
     def named(self) -> dict[str, Tensor]:
         return dict(vars(self))

@@ -38,15 +38,14 @@ BATCH = 64
 
 @dataclass(frozen=True)
 class ImaginedEpisodes:
-    """Rollouts of recorded actions from recorded first frames.
-
-    frames: uint8 (E, T, H, W, 3), frames 1..T. signals: float32 (E, T, J), pessimistic done probability of frames 1..T.
-    uncertainty: float32 (E, T, J).
-    """
+    """Rollouts of recorded actions from recorded first frames."""
 
     frames: UInt8Array
+    """uint8 (E, T, H, W, 3), frames 1..T."""
     signals: FloatArray
+    """float32 (E, T, J), pessimistic done probability of frames 1..T."""
     uncertainty: FloatArray
+    """float32 (E, T, J)."""
 
 
 @torch.inference_mode()
