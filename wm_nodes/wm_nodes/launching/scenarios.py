@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.config.load import default_task
 from wm_nodes.config.tasks import task_names
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
 
@@ -41,7 +42,7 @@ class LaunchArgument:
 
 ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("preset", "cpu", "Settings to start from, when config_file is empty: a name or a .yaml file"),
-    LaunchArgument("task", "push_cube", "Task, when config_file is empty", task_names()),
+    LaunchArgument("task", default_task(), "Task, when config_file is empty", task_names()),
     LaunchArgument("config_file", "", "Resolved configuration (YAML) of an earlier run; empty: from preset and task"),
     LaunchArgument("run_dir", "", "Folder for settings, weights, bags and logs; an existing one goes on as it was "
                    "begun; empty: runs/<time>-<scenario>"),

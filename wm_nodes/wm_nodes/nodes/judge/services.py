@@ -123,14 +123,7 @@ class JudgeServices:
         return message
 
     def pause(self, verdicts: Sequence[Verdict]) -> str:
-        """Why training must pause after a round's verdicts, told to the diagnostics too; "" where it may go on. A round
-        that another judge than the first had to judge is a warning there.
-        """
-        if fallen_back := self.judge.fallen_back:
-            self._node.get_logger().warning(fallen_back)
-            self._node.diagnostics.set_condition("judge_fallback", diagnostics.WARN, fallen_back)
-        else:
-            self._node.diagnostics.clear_condition("judge_fallback")
+        """Why training must pause after a round's verdicts, told to the diagnostics too; "" where it may go on."""
         reason = pause_reason(verdicts)
         if reason:
             self._node.get_logger().error(reason)
@@ -159,7 +152,7 @@ class JudgeServices:
         if health.available:
             board.clear_condition("judge")
         else:
-            board.set_condition("judge", diagnostics.WARN, f"judge {judge.judge_ids[0]}: {health.reason}")
+            board.set_condition("judge", diagnostics.WARN, f"judge {judge.judge_id}: {health.reason}")
 
     def _on_set_rubric(self, request: SetRubric.Request, response: SetRubric.Response) -> SetRubric.Response:
         if request.pack and (self._busy() or self._action.busy):
