@@ -134,7 +134,7 @@ def test_a_window_makes_its_own_steps_stochastic_and_trains_as_many_as_the_other
 
 def test_guidance_and_resolution_of_an_evaluation_are_those_of_its_arm_and_plan() -> None:
     model, sampler = load_base(), sampler_setup("CPS", dyndiff(0.6))
-    guided = replace(sampler, rollout=replace(sampler.rollout, cfg=2.0))
+    guided = replace(sampler, rollout=sampler.rollout.with_values(cfg=2.0))
     plan = DiscPlan(eval_contexts=32)
 
     def evaluate(sampler: SamplerSetup, plan: DiscPlan) -> dict[str, float]:

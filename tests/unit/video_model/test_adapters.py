@@ -24,15 +24,14 @@ pytest.importorskip("peft")
 
 from pretended_device import Device  # noqa: E402
 from safetensors.torch import load_file  # noqa: E402
-from video_toys import grpo_config, kl_config  # noqa: E402
+from video_toys import grpo_config, kl_config, rollout_config, sampler_config  # noqa: E402
 
 from wm_nodes.apps.cli import main  # noqa: E402
+from wm_nodes.config.video import RolloutConfig  # noqa: E402
 from wm_nodes.core.model_folder import ModelFolderError  # noqa: E402
 from wm_nodes.video_model import (  # noqa: E402
     Condition,
     RolloutBuffer,
-    RolloutSettings,
-    SamplerSettings,
     StepContext,
     config_hash,
     guided_velocity,
@@ -221,7 +220,7 @@ def follow(model: PublicVelocity, times: Tensor, condition: Condition, cfg: floa
         for t, s in zip(times.double()[:-1], times.double()[1:]):
             v = guided_velocity(model, x, t.expand(1), condition, cfg)
             x = with_conditioning(
-                ode_step(x, v, t.expand(1), s.expand(1), context, SamplerSettings()).mean, condition.frames
+                ode_step(x, v, t.expand(1), s.expand(1), context, sampler_config()).mean, condition.frames
             )
     return x
 
@@ -247,7 +246,7 @@ class TestParityWithThePipelines:
             out = transformer(NOISE, told, TEXT, return_dict=False)[0]
             theirs = scheduler.step(out, scheduler.timesteps[2], NOISE, return_dict=False)[0]
             v = WanVelocity(transformer)(NOISE, t.expand(1), given())
-        ours = ode_step(NOISE, v, t.expand(1), s.expand(1), StepContext(given().frames, 0.9), SamplerSettings()).mean
+        ours = ode_step(NOISE, v, t.expand(1), s.expand(1), StepContext(given().frames, 0.9), sampler_config()).mean
         assert_close(ours, theirs, atol=1e-5, rtol=1e-5)
 
     def test_wan_fused_first_frame(self) -> None:
@@ -420,7 +419,7 @@ class TestText:
 
 
 def rollout_of(
-    model: PublicVelocity, condition: Condition, settings: RolloutSettings, version: int, iteration: int
+    model: PublicVelocity, condition: Condition, settings: RolloutConfig, version: int, iteration: int
 ) -> RolloutBuffer:
     """Two groups of two videos, rewarded by their mean brightness."""
     N = 4
@@ -449,7 +448,7 @@ class TestTraining:
         model = adapters()[kind]
         if lora:
             add_lora(model, 2, 4)
-        settings = RolloutSettings(num_steps=4, shift=3.0, cfg=2.0, micro_batch=4)
+        settings = rollout_config(num_steps=4, shift=3.0, cfg=2.0, micro_batch=4)
         anchor: Any = "lora_off" if lora else "frozen"
         learner = GrpoLearner(
             model,

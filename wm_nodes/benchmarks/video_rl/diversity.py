@@ -16,7 +16,6 @@ from torch import Tensor
 from benchmarks.video_rl.samplers import SamplerSetup
 from benchmarks.video_rl.sources import sample_scenes
 from wm_nodes.config.shipped import shipped_model
-from wm_nodes.config.video import RolloutConfig
 from wm_nodes.core.statistics import bootstrap_mean
 from wm_nodes.video_model import VideoNetwork
 from wm_nodes.video_rl import frame_features
@@ -70,8 +69,7 @@ def measure_clips(
     diversity, diversity_dynamic: DD-19 of whole pictures, and of what moves in the recording. object_spread_cm: rms
     distance of the last frames' object positions from their mean. reward, reward_std: of source.config.rewards.
     """
-    rollout = RolloutConfig.model_validate(sampler.rollout, from_attributes=True)
-    rollout = rollout.with_values(micro_batch=source.config.rollout.micro_batch)
+    rollout = sampler.rollout.with_values(micro_batch=source.config.rollout.micro_batch)
     config = source.config.with_values(rollout=rollout)
     source = RecordedContexts(source.folder, source.contexts, config, source.probe)
     found: dict[str, list[float]] = {}

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from benchmarks.video_rl.samplers import DiscPlan, LearningPlan, SamplerSetup
 from wm_nodes.config.load import load_video_config
-from wm_nodes.config.video import RolloutConfig, VideoRlConfig
+from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.video_model import RolloutBuffer, VideoNetwork
 from wm_nodes.video_model.clips import Clips
 from wm_nodes.video_model.folder import VideoFolder
@@ -86,7 +86,7 @@ def config_of(
     )
     return base.with_values(
         seed=seed, groups=groups, window=sampler.window, grpo=sampler.grpo,
-        rollout=RolloutConfig.model_validate(sampler.rollout, from_attributes=True),
+        rollout=sampler.rollout,
         evaluation=base.evaluation.with_values(contexts=plan.eval_contexts, num_steps=sampler.rollout.num_steps),
     )
 

@@ -52,7 +52,7 @@ class LoadSettings:
 
 @dataclass(frozen=True)
 class PublicVideoModel:
-    """velocity: the network, trainable. shift: RolloutSettings.shift of the model's own scheduler."""
+    """velocity: the network, trainable. shift: RolloutConfig.shift of the model's own scheduler."""
 
     velocity: PublicVelocity
     codec: VideoCodec

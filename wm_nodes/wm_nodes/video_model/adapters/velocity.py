@@ -61,7 +61,7 @@ class PublicVelocity(nn.Module):
             nn.init.zeros_(self.actions.bias)
 
     def normalised_cfg(self, guidance_scale: float) -> float:
-        """Return RolloutSettings.cfg for the scale that this model's card gives."""
+        """Return RolloutConfig.cfg for the scale that this model's card gives."""
         return normalised_cfg(guidance_scale, self.cfg_convention)
 
     def transformers(self) -> list[Any]:
