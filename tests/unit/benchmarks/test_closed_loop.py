@@ -142,8 +142,8 @@ def test_the_command_trains_every_arm_and_goes_on_where_its_file_stops(
     path, arms = tmp_path / "found.json", ["CPS 0.4", BEST, RECORDINGS]
     bags = ["--context-bags", str(bag), "--heldout-bags", str(bag), "--video-model", str(model)]
     size = ["--contexts", "2", "--eval-contexts", "2", "--iterations", "1"]
-    more = ["--learning-rate", "3e-3", "--arms", *arms, "--json", str(path)]
-    call = ["benchmark", "video-rl", "closed-loop", *bags, *size, *more, "--models", str(tmp_path / "kept")]
+    more = ["--learning-rate", "3e-3", "--samplers", *arms, "--json", str(path)]
+    call = ["benchmark", "closed-loop", *bags, *size, *more, "--models", str(tmp_path / "kept")]
     assert main([*call, "--seeds", "0"]) == 0
     rows = json.loads(path.read_text())["rows"]
     assert [row["sampler"] for row in rows] == arms and {row["learning_rate"] for row in rows} == {3e-3}

@@ -68,8 +68,9 @@ def bench(tmp_path: Path) -> Path:
 
 def measured(folder: Path, *options: str) -> dict[str, Any]:
     with serving(ByTask()) as server:
-        command = ["benchmark", "judge", "success-clips", str(folder), "--judge", server.url, "--judge-model", "judge"]
-        assert not main([*command, "--mode", "topreward", "--json", str(folder / "found.json"), *options])
+        command = ["benchmark", "success-clips", "--folder", str(folder), "--mode", "topreward"]
+        judge = ["--judge", server.url, "--judge-model", "judge"]
+        assert not main([*command, *judge, "--json", str(folder / "found.json"), *options])
     return dict(json.loads((folder / "found.json").read_text()))
 
 
@@ -143,6 +144,6 @@ def test_progress_is_the_log_of_what_the_token_true_had_before_normalising() -> 
 
 
 def test_prefixes_of_the_staged_agent_are_refused(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["benchmark", "judge", "success-clips", str(bench), "--format", "roboreward", "--prefixes", "3"]
+    command = ["benchmark", "success-clips", "--folder", str(bench), "--format", "roboreward", "--prefixes", "3"]
     assert main([*command, "--judge", "http://127.0.0.1:9/v1", "--judge-model", "m"]) == 2
     assert "--prefixes 3 needs --mode topreward" in capsys.readouterr().err

@@ -272,7 +272,7 @@ def test_the_benchmarks_measure_on_the_device(device: Device, tmp_path: Path) ->
     assert device.counts is None or device.counts.by_kind(WAITS)["synchronize"] > 20, "launches were timed"
     sizes = ["--iterations", "1", "--scenes", "1", "--eval-scenes", "2", "--seeds", "0", "--samplers", "CPS 0.6"]
     more = ["--device", device.name, "--json", str(tmp_path / "rows.json")]
-    assert main(["benchmark", "video-rl", "learning", *sizes, *more]) == 0
+    assert main(["benchmark", "learning", *sizes, *more]) == 0
     (row,) = json.loads((tmp_path / "rows.json").read_text())["rows"]
     assert row["seconds"]["train"] > 0 and len(row["after"]["obeyed"]) == 2
 

@@ -1,7 +1,5 @@
 """A judge against public sets of recorded episodes in a local folder, through the reward agent's own service.
 
-    wm benchmark judge success-clips FOLDER --format roboreward --judge http://host:8000/v1 --judge-model NAME
-
 roboreward: FOLDER is the data set teetone/RoboReward (RoboRewardBench is its part test) or one of its parts, as it is
 published: metadata.jsonl beside the videos, a line each {"file_name": "SOURCE/NAME.mp4", "task": "...", "reward": 1 to
 5}. Success is reward 5. The mean absolute error (MAE) is that of the score 1 + 4 R, as it is and rounded.
@@ -19,15 +17,16 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from benchmarks.environments.policies import spearman
-from benchmarks.speed.results import write_results
-from wm_nodes.apps.options import add_device, add_json, add_judge, add_seed, device_settings, judge_settings, positive
+from benchmarks.experiment import Count, OnDevice
+from wm_nodes.apps import options
 from wm_nodes.config.load import load_config
 from wm_nodes.core.files import text_lines
 from wm_nodes.core.progress import tqdm
@@ -42,17 +41,80 @@ from wm_nodes.judge.service import ClipJob, JudgeService
 
 METADATA, TABLE, TEST, COLUMNS = "metadata.jsonl", "labels.csv", "test", {"file", "instruction", "label"}
 TOP_SCORE, ROBOT, DRAWS = 5, "not told", 1000
-NUM_PREFIXES = 15
-"""Of a curve, as published."""
+
+
+@dataclass(kw_only=True)
+class SuccessClips(OnDevice):
+    """A judge against public sets of recorded episodes in a local folder, through the reward agent's own service.
+
+    roboreward: FOLDER is the data set teetone/RoboReward (RoboRewardBench is its part test) or one of its parts, as it
+    is published: metadata.jsonl beside the videos. rt1: episodes with a success label, the videos and labels.csv with
+    the columns file, instruction, label (1 or 0). Nothing is downloaded.
+    """
+
+    folder: Path
+    """Of the episodes."""
+    format: Literal["roboreward", "rt1"]
+    """Of the folder."""
+    mode: Literal["reward", "topreward"] = "reward"
+    """Of the judge."""
+    clips: Count | None = None
+    """The first so many; without, all."""
+    prefixes: Count | None = None
+    """With mode topreward: also read so many prefixes of every successful clip; as published: 15."""
+    reads: Path | None = None
+    """Folder that keeps a server's answers."""
+    seed: int = 0
+    """Of the judge, and of the bootstrap."""
+
+    @classmethod
+    def add_settings(cls, parser: argparse.ArgumentParser) -> None:
+        options.add_judge(parser)
+
+    @classmethod
+    def settings_of(cls, arguments: argparse.Namespace) -> dict[str, Any]:
+        return options.judge_settings(arguments)
+
+    def run(self) -> None:
+        """Judge the clips, print the numbers and write --json."""
+        if self.prefixes and self.mode != topreward.MODE:
+            raise ValueError(f"--prefixes {self.prefixes} needs --mode topreward")
+        config = load_config("cpu", {**self.settings, "device": self.device, "judge.mode": self.mode})
+        folder, videos = FORMATS[self.format](self.folder)
+        videos = videos[: self.clips]
+        rows, curves, size = list[Verdict](), list[float](), config.judge.concurrency
+        judge = JudgeService(config.judge, seed=self.seed, reads=self.reads, device=config.device)
+        with closing(judge), tqdm(total=len(videos), desc="judged", unit="clip") as bar:
+            for part in (videos[start : start + size] for start in range(0, len(videos), size)):
+                lines = [ClipLine(file=video.file, instruction=video.instruction, robot=ROBOT) for video in part]
+                jobs = [read_job(folder, line) for line in lines]
+                rows += judge.judge(jobs)
+                if self.prefixes:
+                    curves += [voc(judge, j, self.prefixes) for j, v in zip(jobs, part) if v.success and not j.problem]
+                bar.update(len(part))
+        results = _results(videos, rows, [value for value in curves if not np.isnan(value)], self.seed)
+        for name in ("clips", "statuses", "decided", "accuracy", "f1", "auroc", "mae", "mae_rounded", "voc"):
+            if name in results:
+                shown = results[name]
+                form = "{:.3f} ({:.3f} to {:.3f})"
+                print(f"{name:12} " + (form.format(*shown) if len(np.shape(shown)) else str(shown)))
+        self.write({
+            "experiment": "success-clips", "format": self.format, "judge": judge.judge_id, "mode": self.mode,
+            "rubric": judge.version, "seed": self.seed, **results,
+        })
 
 
 class LabelledVideo(NamedTuple):
-    """score: 1 to 5, None where only success is labelled."""
+    """An episode with what people say of it."""
 
     file: str
+    """Of the video, in the folder."""
     instruction: str
+    """Of the task."""
     success: bool
+    """Whether it was done."""
     score: int | None = None
+    """1 to 5, None where only success is labelled."""
 
 
 def read_roboreward(folder: Path) -> tuple[Path, list[LabelledVideo]]:
@@ -158,48 +220,6 @@ def voc(judge: JudgeService, job: ClipJob, count: int) -> float:
     if np.isnan(values).any():
         return float("nan")
     return 0.0 if len(set(values)) == 1 else spearman(values, range(len(values)), seed=0, draws=0)[0]
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--format", choices=FORMATS, required=True)
-    parser.add_argument("--mode", choices=("reward", topreward.MODE), default="reward", help="of the judge")
-    parser.add_argument("--clips", type=positive, help="the first so many; default: all")
-    parser.add_argument("--prefixes", type=positive, metavar="K", help=f"as published: {NUM_PREFIXES}")
-    parser.add_argument("--reads", type=Path, help="folder that keeps a server's answers")
-    add_judge(parser)
-    add_device(parser)
-    add_seed(parser)
-    add_json(parser)
-
-
-def run(arguments: argparse.Namespace) -> None:
-    """Judge the clips, print the numbers and write --json."""
-    if arguments.prefixes and arguments.mode != topreward.MODE:
-        raise ValueError(f"--prefixes {arguments.prefixes} needs --mode topreward")
-    chosen = judge_settings(arguments) | device_settings(arguments) | {"judge.mode": arguments.mode}
-    config = load_config("cpu", chosen)
-    folder, videos = FORMATS[arguments.format](arguments.folder)
-    videos = videos[: arguments.clips]
-    rows, curves, size = list[Verdict](), list[float](), config.judge.concurrency
-    judge = JudgeService(config.judge, seed=arguments.seed, reads=arguments.reads, device=config.device)
-    with closing(judge), tqdm(total=len(videos), desc="judged", unit="clip") as bar:
-        for part in (videos[start : start + size] for start in range(0, len(videos), size)):
-            lines = [ClipLine(file=video.file, instruction=video.instruction, robot=ROBOT) for video in part]
-            jobs = [read_job(folder, line) for line in lines]
-            rows += judge.judge(jobs)
-            if arguments.prefixes:
-                curves += [voc(judge, j, arguments.prefixes) for j, v in zip(jobs, part) if v.success and not j.problem]
-            bar.update(len(part))
-    results = _results(videos, rows, [value for value in curves if not np.isnan(value)], arguments.seed)
-    for name in ("clips", "statuses", "decided", "accuracy", "f1", "auroc", "mae", "mae_rounded", "voc"):
-        if name in results:
-            shown = results[name]
-            print(f"{name:12} " + ("{:.3f} ({:.3f} to {:.3f})".format(*shown) if len(np.shape(shown)) else str(shown)))
-    write_results(arguments, {
-        "experiment": "success-clips", "format": arguments.format, "judge": judge.judge_id, "mode": arguments.mode,
-        "rubric": judge.version, "seed": arguments.seed, **results,
-    })
 
 
 def _results(videos: Sequence[LabelledVideo], rows: list[Verdict], curves: list[float], seed: int) -> dict[str, Any]:

@@ -48,11 +48,14 @@ ITERATION = "_step"
 
 @dataclass(frozen=True)
 class Model:
-    """config: on the device, with episodes that never terminate, so that every step counts."""
+    """A model that rollouts are made in."""
 
     config: RunConfig
+    """On the device, with episodes that never terminate, so that every step counts."""
     folder: Path
+    """Of the weights."""
     starts: Path
+    """First frames."""
 
 
 class Models:

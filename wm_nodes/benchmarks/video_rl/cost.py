@@ -3,14 +3,19 @@ caching add to a rollout. DD-20.
 """
 
 import time
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
 
+from benchmarks.experiment import Count, OnDevice, console
+from benchmarks.video_rl import tables
 from benchmarks.video_rl.clock import clocked
-from benchmarks.video_rl.samplers import dyndiff, sampler_setup
+from benchmarks.video_rl.discs import base_of
+from benchmarks.video_rl.samplers import LEARNER, dyndiff, sampler_setup
 from benchmarks.video_rl.sources import sample_scenes
 from wm_nodes.config.load import load_video_config
 from wm_nodes.config.shipped import shipped_model
@@ -27,7 +32,7 @@ from wm_nodes.video_model import (
 from wm_nodes.video_model.buffer import config_hash
 from wm_nodes.video_model.folder import load_video_folder
 from wm_nodes.video_rl.grpo import GrpoLearner
-from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes
+from wm_nodes.video_rl.toy_scene import CHANNELS, FRAMES, SIDE, draw_scenes, load_base
 
 ANCHORS: tuple[Anchor, ...] = ("buffer", "frozen", "dual")
 PARTS = ("forward", "kl", "backward")
@@ -35,6 +40,29 @@ CACHING = ("keep_state", "keep_transition")
 SCENES, GROUP = 4, 8
 CLIP_FRAMES = 9
 """Of PushCube: every second of the 17 pictures of an episode."""
+
+
+@dataclass(kw_only=True)
+class Cost(OnDevice):
+    """Seconds and bytes of the KL anchors, and of mask and caching."""
+
+    repeats: Count = 7
+    """Turns, of which the median counts."""
+    base_model: Path | None = None
+    """Weights of another base model of the moving disc than the shipped one."""
+    seed: int = 0
+    """Of the buffers."""
+
+    def run(self) -> None:
+        model, repeats, seed = load_base(self.base_model, self.where), self.repeats, self.seed
+        rollouts = [toy_rollout(model, repeats, seed), pushcube_rollout(repeats, seed, self.where)]
+        rows = [
+            *measure_anchors("moving disc", model, toy_buffer(model, seed), LEARNER, repeats),
+            *measure_anchors("PushCube", *pushcube_buffer(seed, self.where), LEARNER, repeats),
+        ]
+        facts = {"seed": seed, "learner": LEARNER.model_dump(), **base_of(self.base_model)}
+        self.write({**facts, "rollouts": rollouts, "rows": rows})
+        console.print(tables.rollout_table(rollouts, repeats), tables.cost_table(rows, repeats))
 
 
 def measure_anchors(

@@ -11,6 +11,8 @@ NUM_STEPS, CLIP_STEPS, SHIFT = 10, 4, 3.0
 NFT_RATE = 2e-4
 """Learning rate of the objective nft on the moving disc, the better one of 1e-4 and 2e-4 on seed 0."""
 BASE = load_video_config("base")
+LEARNER = BASE.grpo.with_values(learning_rate=1e-4, micro_batch=64)
+"""Table 5's clip, advantage clip, KL and step fraction; a learning rate for 76 k parameters instead of billions."""
 CLIP_LEARNER = BASE.grpo.with_values(
     advantage=BASE.grpo.advantage.with_values(std_scope="global", best_of_n=4),
     kl=BASE.grpo.kl.with_values(mode="none"), trains="condition", logprob_weight="cps", updates_per_buffer=1,
@@ -22,39 +24,52 @@ clips of few steps, only the weights that carry the condition, no KL."""
 
 @dataclass(frozen=True)
 class LearningPlan:
-    """iterations: buffers of contexts x group_size videos. eval_contexts: held out, one video each by ODE, before,
-    every eval_every buffers, and at the end."""
+    """How long one training is, and how it is measured."""
 
     iterations: int = 8
+    """Buffers of contexts x group_size videos."""
     contexts: int = 16
+    """Of a buffer."""
     group_size: int = 8
+    """Videos of each context."""
     eval_contexts: int = 100
+    """Held out, one video each by ODE, before, every eval_every buffers, and at the end."""
     eval_every: int = 2
+    """Buffers."""
 
 
 @dataclass(frozen=True)
 class DiscPlan(LearningPlan):
-    """Of the moving disc. proxy: the score that trains, `reward` or one that can be hacked. side, eval_side: of the
-    videos that train and the held-out ones, px."""
+    """Of the moving disc."""
 
     iterations: int = 40
+    """Buffers."""
     contexts: int = 6
+    """Scenes of a buffer."""
     eval_every: int = 5
+    """Buffers."""
     proxy: Literal["reward", "consistency"] = "reward"
+    """The score that trains, `reward` or one that can be hacked."""
     side: int = SIDE
+    """Of the videos that train, px."""
     eval_side: int = SIDE
+    """Of the held-out ones, px."""
 
 
 @dataclass(frozen=True)
 class SamplerSetup:
-    """One sampler with the learner settings that belong to it. shared_noise: one initial noise for a whole group.
-    window: which of its steps are stochastic."""
+    """One sampler with the learner settings that belong to it."""
 
     name: str
+    """In the results."""
     rollout: RolloutConfig
+    """How it samples."""
     grpo: GrpoConfig
+    """How it is trained."""
     shared_noise: bool = False
+    """One initial noise for a whole group."""
     window: WindowConfig = BASE.window
+    """Which of its steps are stochastic."""
 
 
 def sampler_setup(name: str, sampler: SamplerConfig, grpo: GrpoConfig | None = None) -> SamplerSetup:
