@@ -24,11 +24,11 @@ from wm_nodes.policy_rl.factories import models_of
 
 TINY = ModelSize("tiny", "smoke", (64,))
 TOY = Plan(
-    models=(TINY,), envs=(4, 8), loop_envs=(4,), trained=(TINY,), batch_shares=(0.5,), ppo=(("smoke", 4),),
-    agreement_envs=4, num_steps=3, iterations=1, videos=("moving disc",), captured=False, threads=1, seconds=0.01,
+    models=(TINY,), envs=(4, 8), loop_envs=(4,), trained=(TINY,), batch_shares=(0.5,),
+    agreement_envs=4, num_steps=3, iterations=1, captured=False, threads=1, seconds=0.01,
 )
 CPU = torch.device("cpu")
-GROUPS = {"agreement", "models", "imagination", "training", "ppo", "grpo"}
+GROUPS = {"agreement", "models", "imagination", "training"}
 
 
 @pytest.fixture(autouse=True)
@@ -101,7 +101,7 @@ def test_what_would_begin_after_the_time_is_left_out_and_listed(
     code, found = run(tmp_path, replace(TOY, minutes=0.0))
     assert code == 0 and not any(found[group] for group in GROUPS)
     assert {left["reason"] for left in found["skipped"]} == {"the 0 minutes were over"}
-    assert "ppo: preset smoke, 4 environments" in [left["point"] for left in found["skipped"]]
+    assert "imagination: tiny, 64 px, 4 environments, eager" in [left["point"] for left in found["skipped"]]
     assert "left out (the 0 minutes were over)" in capsys.readouterr().out
 
 
@@ -147,10 +147,10 @@ def test_a_point_that_runs_out_of_memory_or_fails_does_not_end_the_others() -> N
         return watch.repeats(lambda: torch.ones(2) @ torch.ones(3))
 
     suite = Suite(CPU, TOY, lambda line: None)
-    suite.run([Point("ppo", {"envs": 4}, "ms", full, "envs")])
-    assert suite.skipped == [{"point": "ppo: 4 environments", "reason": "the memory of cpu is too small"}]
+    suite.run([Point("training", {"envs": 4}, "ms", full, "envs")])
+    assert suite.skipped == [{"point": "training: 4 environments", "reason": "the memory of cpu is too small"}]
     assert not suite.failed
-    suite.run([Point("ppo", {"envs": 4}, "ms", faulty), rows(1)])
+    suite.run([Point("training", {"envs": 4}, "ms", faulty), rows(1)])
     assert suite.failed and "faulty" in suite.skipped[1]["traceback"] and len(suite.results["imagination"]) == 1
 
 

@@ -21,7 +21,7 @@ from benchmarks.video_rl.cost import ANCHORS, toy_rollout
 from benchmarks.video_rl.learning import alarms, hacked, train_on_discs
 from benchmarks.video_rl.samplers import LEARNER, DiscPlan, SamplerSetup, dyndiff, learning_samplers, sampler_setup
 from benchmarks.video_rl.sources import DiscSource, group_spread, sample_scenes
-from benchmarks.video_rl.tables import _last, gain_table
+from benchmarks.video_rl.tables import gain_table
 from benchmarks.video_rl.trials import ablation_trials, hacking_trials
 from wm_nodes.apps.cli import main
 from wm_nodes.config.shipped import PRETRAINED
@@ -245,10 +245,6 @@ def test_a_file_of_another_experiment_is_refused(tmp_path: Path, capsys: pytest.
     path.write_text(json.dumps({"rows": [{"arm": "CPS 0.6", "seed": 0, "plan": {"scenes": 6}}]}))
     assert main(["benchmark", "learning", "--samplers", "CPS 0.6", "--json", str(path)]) == 2
     assert "holds rows of another experiment; take another file" in capsys.readouterr().err
-
-
-def test_the_last_buffer_that_was_trained_on_is_shown_and_none_is_not_a_number() -> None:
-    assert _last([0.1, 0.2, None]) == 0.2 and np.isnan(_last([None, None]))
 
 
 def test_an_unknown_arm_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:

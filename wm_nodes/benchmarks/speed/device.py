@@ -12,7 +12,7 @@ from rich.table import Table
 
 from benchmarks.experiment import NO_OPTION, Experiment, console
 from benchmarks.speed.device_agreement import COMPARED, agreement_points
-from benchmarks.speed.device_models import Models, imagination_points, ppo_points, training_points, video_points
+from benchmarks.speed.device_models import Models, imagination_points, training_points
 from benchmarks.speed.device_suite import CPU_PLAN, GPU_PLAN, INTERRUPTED, Plan, Point, Suite, number_text, spread_text
 from wm_nodes.apps.cli import DIFFERENT, DONE
 from wm_nodes.apps.cli import INTERRUPTED as STOPPED
@@ -26,7 +26,7 @@ NO_GPU = "nothing was measured on a GPU"
 @dataclass(kw_only=True)
 class DeviceSpeed(Experiment):
     """What a GPU makes of both loops, in five minutes and one process: imagined steps/s by number of environments and
-    size of model, training, PPO, GRPO, memory, and how far its numbers are from the CPU's.
+    size of model, training, memory, and how far its numbers are from the CPU's.
     """
 
     device: str = "auto"
@@ -82,7 +82,6 @@ def all_points(plan: Plan, models: Models, device: str) -> list[Point]:
     """In order of worth, since a time that ends leaves out the last ones."""
     return [
         *agreement_points(plan, models, device), *imagination_points(plan, models), *training_points(plan, models),
-        *ppo_points(plan, models), *video_points(plan, models),
     ]
 
 
@@ -110,14 +109,13 @@ def tables(results: Mapping[str, Sequence[Mapping[str, Any]]]) -> Iterator[Table
         )
     if rows := [row for row in results.get("agreement", ()) if "terminated_equal" in row]:
         yield agreement_table(rows)
-    if rows := [{**row, "group": group} for group in ("training", "ppo", "grpo") for row in results.get(group, ())]:
+    if rows := results.get("training"):
         yield make_table(
-            "training", ("", "what", "median", "unit", "n", "peak memory, MiB"),
+            "training", ("what", "median", "unit", "n", "peak memory, MiB"),
             (
-                (row["group"], row["point"], spread_text(row), row["unit"], row["n"], number_text(row["peak_mib"]))
-                for row in rows
+                (row["point"], spread_text(row), row["unit"], row["n"], number_text(row["peak_mib"])) for row in rows
             ),
-            left=("", "what", "unit"),
+            left=("what", "unit"),
         )
 
 

@@ -17,12 +17,8 @@ from wm_nodes.core.errors import RunError
 NOT_HERE = (RunError, DeviceError, OSError, ImportError)
 """Errors of a machine that lacks something, e.g. a renderer; any other is a fault, which the exit code tells."""
 MOST_REPEATS, FEWEST_REPEATS = 30, 3
-DISC = "moving disc"
-"""The small one of the shipped video models."""
 RUNNING, INTERRUPTED, FINISHED = "running", "interrupted", "finished"
-WORDS = {
-    "px": "{} px", "envs": "{} environments", "batch": "batch {}", "preset": "preset {}", "clips": "{} clips",
-}
+WORDS = {"px": "{} px", "envs": "{} environments", "batch": "batch {}"}
 """How a column of that name is put in words."""
 LAST_LINES = 2000
 """Characters of a failed point's traceback that are kept."""
@@ -56,10 +52,6 @@ class Plan:
     """Whose training is timed, at their presets' picture size."""
     batch_shares: tuple[float, ...]
     """Of their presets' batches."""
-    ppo: tuple[tuple[str, int], ...]
-    """PPO updates: preset and environments."""
-    videos: tuple[str, ...] = (DISC, "PushCube")
-    """Shipped video models, for loop 2."""
     agreement_envs: int = 64
     """Environments of the rollout that is compared with the CPU's."""
     num_steps: int = 16
@@ -82,11 +74,11 @@ SHIPPED = ModelSize("shipped", "cpu_full", (64, 128), shipped_px=64)
 LARGE, SMALL = ModelSize("gpu", "gpu", (64, 128)), ModelSize("smoke", "smoke", (64, 128))
 GPU_PLAN = Plan(
     models=(SHIPPED, LARGE), envs=(64, 256, 1024, 4096), loop_envs=(64,),
-    trained=(SHIPPED, LARGE), batch_shares=(0.25, 1.0), ppo=(("cpu", 64), ("gpu", 1024)),
+    trained=(SHIPPED, LARGE), batch_shares=(0.25, 1.0),
 )
 CPU_PLAN = Plan(
     models=(replace(SHIPPED, sizes_px=(64,)), SMALL), envs=(64,), loop_envs=(64,), trained=(SHIPPED, SMALL),
-    batch_shares=(0.125,), ppo=(("cpu", 64),), iterations=4, videos=(DISC,), captured=False, threads=1,
+    batch_shares=(0.125,), iterations=4, captured=False, threads=1,
 )
 """The same code where there is no GPU, or for a first look at one."""
 

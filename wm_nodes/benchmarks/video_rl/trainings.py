@@ -59,7 +59,7 @@ class Trainings(OnDevice, Generic[Plan]):
 
     def show(self, rows: list[dict[str, Any]], comparisons: list[SamplerComparison]) -> None:
         """Print the tables."""
-        console.print(tables.training_table(rows), tables.gain_table(rows), tables.comparison_table(comparisons))
+        console.print(tables.gain_table(rows), tables.comparison_table(comparisons))
 
     def run(self) -> None:
         """Train, compare, show."""

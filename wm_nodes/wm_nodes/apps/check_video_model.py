@@ -130,8 +130,6 @@ def _public(arguments: argparse.Namespace, config: VideoRlConfig, device: str) -
 
     loading = LoadSettings(dtype=arguments.dtype, device=device, offload=arguments.offload)
     public = load_public_model(arguments.public, loading)
-    if public.text is None:
-        raise ValueError(f"{arguments.public} has no text encoder; one is needed to embed the prompt")
     frames = torch.from_numpy(np.stack([_picture(arguments)] * arguments.frames))[None]
     C, F, H, W = public.codec.encode(frames).shape[1:]
     condition = public.condition(frames[:, :1], [arguments.prompt], F).repeat_interleave(VIDEOS)
