@@ -1,27 +1,23 @@
-"""Speed, side by side in one run: DDS against one process, the world model against the simulator, stage by stage.
-
-With --device: what a GPU makes of both loops, in five minutes and one process: kernels and copies, imagined steps/s by
-number of environments and size of model, training, PPO, GRPO, memory, and how far its numbers are from the CPU's.
-"""
+"""Speed, side by side in one run: DDS against one process, the world model against the simulator, stage by stage."""
 
 import argparse
 import os
 import platform
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from benchmarks.speed.device import run_device
+from benchmarks.experiment import Experiment, console
 from benchmarks.speed.graph import measure_graph
-from benchmarks.speed.inputs import Effort, console, prepare_model, random_model
-from benchmarks.speed.results import write_results
+from benchmarks.speed.inputs import Effort, prepare_model, random_model
 from benchmarks.speed.simulator import IMAGINED_ENVS, measure_simulator
 from benchmarks.speed.stages import measure_stages
-from wm_nodes.apps.options import add_json, add_seed
-from wm_nodes.config.load import load_config, parse_override, preset_names
+from wm_nodes.apps import options
+from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.allocator import keep_freed_memory
 from wm_nodes.reports.console_table import make_table
@@ -30,49 +26,50 @@ from wm_nodes.reports.machine import machine_facts
 FULL, QUICK = Effort(60, 5000, 5, 30), Effort(3, 500, 2, 8)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    add_json(parser)
-    parser.add_argument("--quick", action="store_true", help="a tenth of the work, for a first look; less exact")
-    parser.add_argument("--preset", default="cpu", help=f"model size: one of {', '.join(preset_names())}, or a .yaml")
-    device = parser.add_argument_group("on a device")
-    device.add_argument("--device", help="measure both loops there instead: cpu, cuda, cuda:N or auto")
-    device.add_argument(
-        "--minutes", type=float, metavar="M",
-        help="of --device: what would begin later is left out, and listed (default: 5)",
-    )
-    model = parser.add_mutually_exclusive_group()
-    model.add_argument("--model-dir", type=Path, help="world model to measure instead of the shipped one")
-    model.add_argument(
-        "--untrained", nargs="*", metavar="SECTION.KEY=VALUE",
-        help="measure a model with random weights, of the preset's size but for these settings",
-    )
-    add_seed(parser)
-    parser.set_defaults(plan=None)
+@dataclass(kw_only=True)
+class Speed(Experiment):
+    """Speed, side by side in one run: DDS against one process, the world model against the simulator, stage by stage.
 
-
-def run(arguments: argparse.Namespace) -> int | None:
-    """Measure, show the tables, write --json; with --device, return an exit code.
-
-    Raises:
-        ValueError: options that do not go together.
+    With settings, the model has random weights and the size that they say.
     """
-    if arguments.device is not None:
-        if arguments.preset != "cpu" or arguments.model_dir or arguments.untrained is not None:
-            raise ValueError("--device has models of its own; leave out --preset, --model-dir and --untrained")
-        return run_device(arguments)
-    if arguments.minutes is not None:
-        raise ValueError("--minutes needs --device")
-    untrained = None if arguments.untrained is None else dict(map(parse_override, arguments.untrained))
-    config = load_config(arguments.preset, {**(untrained or {}), "seed": arguments.seed})
-    with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as name:
-        folder, model = Path(name), arguments.model_dir
-        if untrained is not None:
-            model = random_model(config, folder / "model")
-        results = measure(config, QUICK if arguments.quick else FULL, folder, model)
-    results |= {"quick": arguments.quick, "preset": arguments.preset, "seed": arguments.seed, "untrained": untrained}
-    show(results)
-    write_results(arguments, results, exact=True)
-    return None
+
+    quick: bool = False
+    """A tenth of the work, for a first look; less exact."""
+    preset: str = "cpu"
+    """Model size: the name of a preset, or a .yaml."""
+    model_dir: Path | None = None
+    """World model to measure instead of the shipped one."""
+    untrained: bool = False
+    """Measure a model with random weights, of the preset's size but for the settings given."""
+    seed: int = 0
+    """Of every random number."""
+
+    @classmethod
+    def add_settings(cls, parser: argparse.ArgumentParser) -> None:
+        options.add_set(parser)
+
+    @classmethod
+    def settings_of(cls, arguments: argparse.Namespace) -> dict[str, Any]:
+        return options.settings(arguments)
+
+    def run(self) -> None:
+        """Measure, show the tables, write --json.
+
+        Raises:
+            ValueError: options that do not go together.
+        """
+        changes = {name: value for name, value in self.settings.items() if name != "seed"}
+        if (self.untrained and self.model_dir) or (changes and not self.untrained):
+            raise ValueError("settings and --untrained are of a model with random weights; leave out --model-dir")
+        config = load_config(self.preset, {**changes, "seed": self.seed})
+        with tempfile.TemporaryDirectory(prefix="wm_benchmark_") as name:
+            folder = Path(name)
+            model = random_model(config, folder / "model") if self.untrained else self.model_dir
+            results = measure(config, QUICK if self.quick else FULL, folder, model)
+        given = {"quick": self.quick, "preset": self.preset, "seed": self.seed}
+        results |= given | {"untrained": changes if self.untrained else None}
+        show(results)
+        self.write(results, exact=True)
 
 
 def measure(config: RunConfig, effort: Effort, folder: Path, model_dir: Path | None = None) -> dict[str, Any]:
