@@ -38,8 +38,6 @@ HOLD_ARRIVES = Duration(seconds=1)
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
-    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
-          read_only=True),
     Param("initial_policy", "", "Weights (safetensors) to act with before the learner announces any", read_only=True),
     Param("step_timeout_s", 10.0, "Deadline of one env/step or env/reset, retries included", "s",
           minimum=0.1, maximum=600.0),
@@ -71,7 +69,7 @@ class PolicyNode(ManagedNode):
         self._estop = False
 
     def configure(self) -> None:
-        given = self.run_config(), str(self.param("model_dir")), str(self.param("policy_factory"))
+        given = self.run_config(), str(self.param("model_dir"))
         self._holder, self._expected_spec = PolicyHolder(make_policy(*given)), expected_spec(*given)
         self._envs_per_start = given[0].ppo.envs_per_start
         self._files = named_files(self, str(self.param("initial_policy")))
@@ -209,7 +207,7 @@ class PolicyNode(ManagedNode):
             raise WireError(
                 ErrorCode.SPEC_MISMATCH,
                 f"environment {spec.env_id} has {dims} state and action values, the policy {expected}; "
-                "name a policy of this robot in policy_factory",
+                "name a policy of this robot in policy.factory",
             )
         self._spec = spec
 
