@@ -14,7 +14,8 @@ from graph.harness import Graph, Probe, own_domain
 from examples import own_environment
 from wm_msgs.action import Rollout, Train
 from wm_msgs.srv import StopRecording
-from wm_nodes.config.load import load_config
+from wm_nodes.apps.cli import main
+from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.specs import SpecMismatch, agree
 from wm_nodes.environments.registry import configured_spec
@@ -23,6 +24,7 @@ from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.pretraining import model_from_recordings
 from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
+from wm_nodes.reports.summary import read_summary
 from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.device_environment import DeviceEnvironment
 from wm_nodes.world_model.validation.acceptance import accept_world_model
@@ -139,6 +141,49 @@ def test_one_ppo_update_in_the_model_runs_over_dds(
     assert not any(codes.values()), codes
     made = {path.name: path.read_bytes() for path in (graph.folder / "policies").glob("*.safetensors")}
     assert made["policy_000001.safetensors"] != made["policy_000002.safetensors"]
+
+
+@of_the_arm
+@pytest.mark.slow
+@pytest.mark.parametrize("measured_in", ["none", "examples.own_environment:make"])
+def test_train_policy_needs_no_task_and_says_where_nothing_real_was_measured(
+    model_dir: Path, bag: Path, config: RunConfig, ros_domain: int, tmp_path: Path, measured_in: str,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    preset = tmp_path / "arm.yaml"
+    preset.write_text(dump_config(config), encoding="utf-8")
+    code = main([
+        "train-policy", "--preset", str(preset), "--model-dir", str(model_dir), "--demos", str(bag), "--force",
+        "--set", f"evaluation.environment={measured_in}", "--set", "sft.num_demonstrations=2",
+        "--run-dir", str(tmp_path / "run"), "--domain-id", str(ros_domain),
+    ])
+    said = capfd.readouterr()
+    assert code == 0, said.out + said.err
+    summary = read_summary(tmp_path / "run")
+    assert summary["task"] == "touch_the_post" and summary["imagined_after"]["episodes"] == 32
+    criteria = [row["name"] for row in summary["acceptance"]["criteria"]]
+    assert criteria[:2] == ["done precision on rollouts", "done recall on rollouts"]
+    report = (tmp_path / "run" / "report.html").read_text()
+    assert ("Nothing real was measured" in report) is (measured_in == "none")
+    assert (summary["real_after"] or {"episodes": None})["episodes"] == (None if measured_in == "none" else 4)
+
+
+@of_the_arm
+def test_train_policy_without_a_task_names_what_is_missing(
+    model_dir: Path, bag: Path, config: RunConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    preset = tmp_path / "arm.yaml"
+    preset.write_text(dump_config(config), encoding="utf-8")
+    begun = ["train-policy", "--preset", str(preset), "--run-dir", str(tmp_path / "run")]
+    for given, words in (
+        ([], "task is empty; name a model of your recordings with --model-dir"),
+        (["--model-dir", str(model_dir)], "task is empty; name recordings of demonstrations with --demos"),
+        (["--model-dir", str(model_dir), "--demos", str(bag)], "task is empty, and environment maniskill simulates"),
+        (["--model-dir", str(model_dir), "--demos", str(bag), "--rounds", "2", "--set", "evaluation.environment=none"],
+         "--rounds 2 collect in the simulator"),
+    ):
+        assert main([*begun, *given]) == 2
+        assert words in capsys.readouterr().err
 
 
 @of_the_arm

@@ -1,24 +1,18 @@
-"""A learner of your own, here regression on the actions that were paid best; see policy_rl/training_run.py:Learner.
+"""A learner of your own, regression on the actions that were paid best; see Learner in policy_rl/training_run.py.
 
-python -m wm_nodes.policy_rl.train --preset smoke --set learner.factory=examples.own_learner:make
+python -m wm_nodes.policy_rl.train --set learner.factory=examples.own_learner:BestActionsLearner
+    --preset smoke --updates 3 --set ppo.num_steps=16
 """
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.rollouts import Canceled
-from wm_nodes.training.checkpoint import (
-    optimizer_tensors,
-    read_checkpoint,
-    restore_optimizer,
-    section,
-    write_checkpoint,
-)
+from wm_nodes.training import checkpoint
 
 
 class BestActionsLearner:
@@ -34,17 +28,13 @@ class BestActionsLearner:
         states, actions = (torch.from_numpy(array[best]) for array in (rollout.states_TN, rollout.actions_TN))
         means = self._policy.distribution(self._policy.features(rollout.images_TN[best]), states).mean_BA
         self._optimizer.zero_grad()
-        loss: Tensor = (means - actions).square().mean()
-        loss.backward()  # type: ignore[no-untyped-call]
+        torch.autograd.backward((means - actions).square().mean())
         self._optimizer.step()
-        return {"loss": float(loss), "samples": float(best.sum())}
+        return {"samples": float(best.sum())}
 
     def save(self, path: Path) -> None:
-        write_checkpoint(path, {"optimizer": optimizer_tensors(self._optimizer)}, {})
+        checkpoint.write_checkpoint(path, {"optimizer": checkpoint.optimizer_tensors(self._optimizer)}, {})
 
     def load(self, path: Path) -> None:
-        restore_optimizer(self._optimizer, section(read_checkpoint(path)[0], "optimizer"))
-
-
-def make(policy: ImagePolicy, config: RunConfig) -> BestActionsLearner:
-    return BestActionsLearner(policy, config)
+        state = checkpoint.section(checkpoint.read_checkpoint(path)[0], "optimizer")
+        checkpoint.restore_optimizer(self._optimizer, state)

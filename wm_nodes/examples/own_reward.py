@@ -1,6 +1,7 @@
 """A reward of your own; see reward/base.py.
 
-python -m wm_nodes.policy_rl.train --preset smoke --set reward.factory=examples.own_reward:make
+python -m wm_nodes.policy_rl.train --set reward.factory=examples.own_reward:make
+    --preset smoke --updates 3 --set ppo.num_steps=16
 """
 import numpy as np
 

@@ -37,7 +37,7 @@ def _modules(name: str, variable: str) -> list[tuple[str, str]]:
     except ModuleNotFoundError:
         found = None
     if found is None:
-        raise ValueError(f"{variable} names {name!r}, which Python does not find; see PYTHONPATH")
+        raise ValueError(f"{variable} names {name!r}, no package or module that Python finds; see PYTHONPATH")
     if found.submodule_search_locations is None:
         return [(name.rpartition(".")[0], name.rpartition(".")[2])]
     modules = pkgutil.iter_modules(found.submodule_search_locations)
