@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from graph.harness import Graph, Probe, own_domain
+from graph.launched import train_policy
 
 from examples import own_environment
 from wm_msgs.action import Rollout, Train
@@ -147,18 +148,16 @@ def test_one_ppo_update_in_the_model_runs_over_dds(
 @pytest.mark.slow
 @pytest.mark.parametrize("measured_in", ["none", "examples.own_environment:make"])
 def test_train_policy_needs_no_task_and_says_where_nothing_real_was_measured(
-    model_dir: Path, bag: Path, config: RunConfig, ros_domain: int, tmp_path: Path, measured_in: str,
-    capfd: pytest.CaptureFixture[str],
+    model_dir: Path, bag: Path, config: RunConfig, ros_domain: int, tmp_path: Path, measured_in: str
 ) -> None:
     preset = tmp_path / "arm.yaml"
     preset.write_text(dump_config(config), encoding="utf-8")
-    code = main([
-        "train-policy", "--preset", str(preset), "--model-dir", str(model_dir), "--demos", str(bag), "--force",
+    done = train_policy([
+        "--preset", str(preset), "--model-dir", str(model_dir), "--demos", str(bag), "--force",
         "--set", f"evaluation.environment={measured_in}", "--set", "sft.num_demonstrations=2",
-        "--run-dir", str(tmp_path / "run"), "--domain-id", str(ros_domain),
-    ])
-    said = capfd.readouterr()
-    assert code == 0, said.out + said.err
+        "--run-dir", str(tmp_path / "run"),
+    ], ros_domain)
+    assert done.returncode == 0, done.stdout + done.stderr
     summary = read_summary(tmp_path / "run")
     assert summary["task"] == "touch_the_post" and summary["imagined_after"]["episodes"] == 32
     criteria = [row["name"] for row in summary["acceptance"]["criteria"]]
