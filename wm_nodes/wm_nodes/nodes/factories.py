@@ -8,11 +8,11 @@ from pathlib import Path
 
 from wm_msgs.msg import ErrorCode
 from wm_nodes.config.schema import AGENT, RunConfig
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec, SpecMismatch, agree
 from wm_nodes.core.types import Environment
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.reward import RewardModel
-from wm_nodes.ros.wire import WireError
 
 BACKENDS = ("world_model", "video_model", "environment", "evaluation")
 """environment, evaluation: that of environment.factory, and of evaluation.environment, in the configuration."""
