@@ -88,7 +88,7 @@ def test_a_node_without_a_renderer_ends_with_one_line(graph: Graph) -> None:
         update={"simulation": graph.config.simulation.model_copy(update={"render_device": "cuda:77"})}
     )
     graph = Graph(graph.domain, graph.folder, graph.config)
-    assert graph.start("environment", backend="maniskill").wait(90) == 1
+    assert graph.start("environment", backend="environment").wait(90) == 1
     log = graph.log("/wm/environment")
     assert "no renderer at cuda:77" in log
     assert "Traceback" not in log

@@ -42,9 +42,8 @@ MAX_MOSAIC_BYTES = 96 * 2**20
 """Largest env/image that was tried: it arrives, in about a second. Writer and readers keep up to 32 of them."""
 
 PARAMS = (
-    Param("backend", "world_model", "What is stepped", read_only=True, choices=BACKENDS),
-    Param("backend_factory", "", "module:callable(config, num_envs, seed) -> Environment, for backend factory; the "
-          "plug-in point for real robots", read_only=True),
+    Param("backend", "world_model", "What is stepped: a model, or by the configuration environment.factory, or "
+          "evaluation.environment", read_only=True, choices=BACKENDS),
     Param("model_dir", "", "World-model folder, for backend world_model", read_only=True),
     Param("video_model_dir", "", "Folder of a video model that is stepped, for backend video_model", read_only=True),
     Param("starts_file", "", "starts.safetensors: real first frames, for an imagining backend", read_only=True),
@@ -80,8 +79,7 @@ class EnvironmentNode(ManagedNode):
         environment = make_environment(
             str(self.param("backend")), self.run_config(), num_envs=int(self.param("num_envs")),
             seed=int(self.param("seed")), model_dir=str(self.param("model_dir")),
-            starts_file=str(self.param("starts_file")), factory=str(self.param("backend_factory")),
-            video_model_dir=str(self.param("video_model_dir")),
+            starts_file=str(self.param("starts_file")), video_model_dir=str(self.param("video_model_dir")),
         )
         if (size := mosaic_bytes(environment.spec)) > MAX_MOSAIC_BYTES:
             environment.close()

@@ -20,8 +20,6 @@ from wm_nodes.ros.worker import Work
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
-    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
-          read_only=True),
     Param("initial_policy", "", "Weights (safetensors) for goals without version and file, before any announcement",
           read_only=True),
     Param("env_namespace", "sim", "Relative namespace of the environment node to evaluate in", read_only=True),
@@ -41,9 +39,7 @@ class EvaluationNode(ManagedNode):
 
     def configure(self) -> None:
         self._config = self.run_config()
-        self._holder = PolicyHolder(
-            make_policy(self._config, str(self.param("model_dir")), str(self.param("policy_factory")))
-        )
+        self._holder = PolicyHolder(make_policy(self._config, str(self.param("model_dir"))))
         self._files = named_files(self, str(self.param("initial_policy")))
         self._newest: PolicyVersion | None = None
         self._environment = RosEnvironmentClient(

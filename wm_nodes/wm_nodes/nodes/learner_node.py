@@ -24,7 +24,7 @@ from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Environment, Rollout
 from wm_nodes.judge.episode_reward import check_horizon, unjudged_reason
 from wm_nodes.judge.service import TrainingPaused
-from wm_nodes.nodes.factories import expected_spec, make_learner, make_policy, refuse_other
+from wm_nodes.nodes.factories import expected_spec, make_policy, refuse_other
 from wm_nodes.nodes.learner.device_rollouts import DeviceRollouts
 from wm_nodes.nodes.learner.meter import LearnerMeter
 from wm_nodes.nodes.learner.report import LearnerReport
@@ -32,6 +32,7 @@ from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.nodes.learner.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
 from wm_nodes.nodes.policy.weights import load_initial
+from wm_nodes.policy_rl.factories import make_learner
 from wm_nodes.policy_rl.rollouts import Canceled
 from wm_nodes.policy_rl.tensor_rollout import TensorRollout
 from wm_nodes.policy_rl.training_run import PolicyTraining
@@ -50,10 +51,6 @@ MAX_CHUNK_BYTES = 4 << 20
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
-    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
-          read_only=True),
-    Param("learner_factory", "", "module:callable(policy, config) -> Learner instead of PPO, policy_rl.training_run",
-          read_only=True),
     Param("initial_policy", "", "Weights (safetensors) to start from, where the run folder has no checkpoint",
           read_only=True),
     Param("resume", True, "Continue exactly from the run folder's checkpoint", read_only=True),
@@ -102,9 +99,7 @@ class LearnerNode(TrainingNode):
         self._spec_session = 0
         self._refused: WireError | None = None
         """Why the newest spec on env/spec cannot be trained from: it ends a goal that waits for its rollouts."""
-        self._expected_spec = expected_spec(
-            self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
-        )
+        self._expected_spec = expected_spec(self._config, str(self.param("model_dir")))
         self._assembler, self._reward_name, self._max_episode_steps = RolloutAssembler(self._withhold), "", 0
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("env/image", self._on_image)
@@ -214,8 +209,7 @@ class LearnerNode(TrainingNode):
             return ReplayedRollouts(self, check, progress, self._assembler, self._replay, uris, num_steps=num_steps)
         if self._device_rollouts is not None:
             self._reward_name = "endogenous"
-            named = str(self.param("model_dir")), str(self.param("learner_factory"))
-            return self._device_rollouts.begin(check, self._training, self._config, *named)
+            return self._device_rollouts.begin(check, self._training, self._config, str(self.param("model_dir")))
         return LiveRollouts(
             self, work, check, progress, self._assembler, self._rollouts, num_steps=num_steps, seed=self._config.seed
         )
@@ -356,9 +350,9 @@ def make_run(values: Mapping[str, Any], run_dir: Path, ranks: Ranks) -> PolicyTr
     """The run that a node's parameters describe."""
     config = load_config(str(values["config_file"]))
     config = config.with_values(device=str(own_device(config.device)))
-    policy = make_policy(config, str(values["model_dir"]), str(values["policy_factory"]))
+    policy = make_policy(config, str(values["model_dir"]))
     load_initial(policy, str(values["initial_policy"]))
-    learner = make_learner(policy, config, str(values["learner_factory"]), ranks)
+    learner = make_learner(policy, config, ranks)
     return PolicyTraining(
         policy, learner, run_dir, resume=bool(values["resume"]), keep_versions=int(values["keep_versions"]),
         metadata={"tokenizer_sha256": policy.encoder.sha256}, ranks=ranks,

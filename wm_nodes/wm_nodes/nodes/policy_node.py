@@ -40,8 +40,6 @@ HOLD_ARRIVES = Duration(seconds=1)
 
 PARAMS = (
     Param("model_dir", "", "World-model folder; its tokenizer is the policy's encoder", read_only=True),
-    Param("policy_factory", "", "module:callable(config) -> ImagePolicy instead of the one of model_dir",
-          read_only=True),
     Param("initial_policy", "", "Weights (safetensors) to act with before the learner announces any", read_only=True),
     Param("step_timeout_s", 10.0, "Deadline of one env/step or env/reset, retries included", "s",
           minimum=0.1, maximum=600.0),
@@ -73,7 +71,7 @@ class PolicyNode(ManagedNode):
         self._estop = False
 
     def configure(self) -> None:
-        given = self.run_config(), str(self.param("model_dir")), str(self.param("policy_factory"))
+        given = self.run_config(), str(self.param("model_dir"))
         policy = make_policy(*given)
         load_initial(policy, str(self.param("initial_policy")))
         self._holder, self._expected_spec = PolicyHolder(policy), expected_spec(*given)
@@ -199,7 +197,7 @@ class PolicyNode(ManagedNode):
             raise WireError(
                 ErrorCode.SPEC_MISMATCH,
                 f"environment {spec.env_id} has {dims} state and action values, the policy {expected}; "
-                "name a policy of this robot in policy_factory",
+                "name a policy of this robot in policy.factory",
             )
         self._spec = spec
 

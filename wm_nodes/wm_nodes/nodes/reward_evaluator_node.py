@@ -35,7 +35,6 @@ from wm_nodes.ros.spin import run_node
 
 PARAMS = (
     Param("reward", "endogenous", "Reward model", read_only=True, choices=REWARDS),
-    Param("reward_factory", "", "module:callable(config) -> RewardModel instead of a built-in one", read_only=True),
     Param("model_dir", "", "World-model folder, for the endogenous reward's distance", read_only=True),
     Param("image_wait_s", 1.0, "A transition waits for its images and goals at most so long", "s",
           minimum=0.0, maximum=60.0),
@@ -53,16 +52,16 @@ class RewardEvaluatorNode(ManagedNode):
         self._agent: JudgeServices | None = None
 
     def configure(self) -> None:
-        config, kind, factory = self.run_config(), str(self.param("reward")), str(self.param("reward_factory"))
+        config, kind = self.run_config(), str(self.param("reward"))
         self._agent = None
         self._undecided: deque[tuple[float, LockStep, PendingReward]] = deque()
         self._model: RewardModel | EpisodeReward
-        if kind == AGENT and not factory:
+        if kind == AGENT and not config.reward.factory:
             agent = JudgeServices(self, episode_judge(config), config, lambda: bool(self._undecided))
             self._model = EpisodeReward(agent.judge)
             self._agent = agent
         else:
-            self._model = make_reward(kind, config, str(self.param("model_dir")), factory)
+            self._model = make_reward(kind, config, str(self.param("model_dir")))
         self._spec: EnvironmentSpec | None = None
         self._session = 0
         self._joiner = Joiner(with_goals=True)

@@ -36,10 +36,11 @@ POLICY_FILES = VersionFiles("policies/policy")
 
 
 class Learner(Protocol):
-    """What the learner node needs of an algorithm; ppo.PpoLearner is one."""
+    """What training needs of an algorithm; ppo.PpoLearner is one, learner.factory names another."""
 
-    def update(self, rollout: Rollout, *, should_stop: Callable[[], bool] | None = None) -> Any:
-        """Train on one rollout; return metrics, a mapping or a dataclass of numbers.
+    def update(self, rollout: Rollout | TensorRollout, *, should_stop: Callable[[], bool] | None = None) -> Any:
+        """Train on one rollout, of another learner than PPO a Rollout; return metrics, a mapping or a dataclass of
+        numbers.
 
         Raises rollouts.Canceled when should_stop returned True, and FloatingPointError when a loss, gradient or weight
         is not finite; the weights are then as they were before.
