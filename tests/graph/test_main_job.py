@@ -20,7 +20,7 @@ from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.summary import read_summary
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.world_model import load_model_folder
-from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS
+from wm_nodes.world_model.starts import INSTRUCTIONS
 
 pytestmark = pytest.mark.graph
 PROGRAM = "import sys; from wm_nodes.apps.cli import main; sys.exit(main(['train-policy', *sys.argv[1:]]))"

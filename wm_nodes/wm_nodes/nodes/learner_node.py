@@ -30,8 +30,7 @@ from wm_nodes.nodes.learner.report import LearnerReport
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.nodes.learner.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
-from wm_nodes.policy_rl.rollouts import Canceled
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import Canceled, TensorRollout
 from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name

@@ -16,8 +16,7 @@ from wm_nodes.policy_rl.factories import make_endogenous_reward, make_policy, ma
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.ppo import PpoLearner, PpoMetrics
-from wm_nodes.policy_rl.rollouts import Convergence, rollout_statistics
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import Convergence, TensorRollout, rollout_statistics
 from wm_nodes.reward import RewardModel
 from wm_nodes.world_model import DeviceEnvironment
 
