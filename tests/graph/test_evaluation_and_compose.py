@@ -31,7 +31,7 @@ from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.train import train_policy
 from wm_nodes.reports.summary import plain, read_readings
 from wm_nodes.training.weights import pack_weights, save_weights, unpack_weights
-from wm_nodes.world_model.imagined_episodes import start_of
+from wm_nodes.world_model.starts import start_of
 
 pytestmark = pytest.mark.graph
 

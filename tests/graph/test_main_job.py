@@ -18,7 +18,7 @@ from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.reports.summary import read_summary
 from wm_nodes.training.metrics import read_metrics
 from wm_nodes.world_model import load_model_folder
-from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS
+from wm_nodes.world_model.starts import INSTRUCTIONS
 
 pytestmark = pytest.mark.graph
 RATES = ("real_before", "real_after", "imagined_before", "imagined_after")

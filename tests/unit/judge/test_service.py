@@ -34,8 +34,7 @@ from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import GraphError
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.rollouts import terminate_at_episode_end
-from wm_nodes.policy_rl.tensor_rollout import tensors_of
+from wm_nodes.policy_rl.rollouts import tensors_of, terminate_at_episode_end
 
 JUDGE = ("--judge", "http://127.0.0.1:9/v1", "--judge-model", "judge")
 SPEC = make_spec(num_envs=2, height=8, width=8)

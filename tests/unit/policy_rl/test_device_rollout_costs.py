@@ -19,8 +19,7 @@ from wm_nodes.policy_rl.factories import (
 )
 from wm_nodes.policy_rl.initial_policy import STARTS
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.rollouts import rollout_statistics
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import TensorRollout, rollout_statistics
 from wm_nodes.world_model import DeviceEnvironment
 
 MODEL = shipped_model("reach")

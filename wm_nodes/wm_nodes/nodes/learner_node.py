@@ -33,8 +33,7 @@ from wm_nodes.nodes.learner.rollout_sources import BagRollouts, LiveRollouts, Re
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
 from wm_nodes.nodes.policy.weights import load_initial
 from wm_nodes.policy_rl.factories import make_learner
-from wm_nodes.policy_rl.rollouts import Canceled
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import Canceled, TensorRollout
 from wm_nodes.policy_rl.training_run import PolicyTraining
 from wm_nodes.recording.messages import images_of, time_ns
 from wm_nodes.recording.reader import read_spec

@@ -25,7 +25,7 @@ from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording import BagReport, read_episodes
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.folder import read_world_manifest
-from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS, join_starts, pack_instructions
+from wm_nodes.world_model.starts import INSTRUCTIONS, join_starts, pack_instructions
 
 MADE_OF = "starts.json"
 MAX_STARTS, MODEL_STARTS = 512, 64
