@@ -55,7 +55,7 @@ def main(argv):
 
 
 def _every_test(fast):
-    """Run the tests without deadlines, then those with them unless `fast` leaves them out, and what failed once more."""
+    """Run the tests without deadlines, then, unless `fast`, those with them, and once more what failed."""
     forget()
     codes = [_pytest(["-m", " and ".join(["not alone", *fast]), *BY_FILE, *LONG_FIRST])]
     if not fast:
