@@ -1,7 +1,11 @@
-"""Times that the product promises, on a machine that does other things, too."""
+"""How long tests wait, and times that the product promises, on a machine that does other things, too."""
 
 import os
 from pathlib import Path
+
+PATIENCE_S = 120.0
+"""What comes is waited for so long at most, however busy the machine is: this ends a test that hangs, and is no promise
+of ours."""
 
 
 def within(seconds: float) -> float:

@@ -17,6 +17,7 @@ from typing import IO, Any, ClassVar
 
 import rclpy
 from action_msgs.msg import GoalStatusArray
+from deadlines import PATIENCE_S
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph.forked import ForkedNode, fork_node
 from left_over import remove_left_over
@@ -35,9 +36,6 @@ DOMAINS = range(20, 90)
 PORT, FIRST_PORT, PORTS_PER_DOMAIN = "fastrtps_port", 7400, 250
 """Of Fast DDS: names of files in /dev/shm, and the numbers of DDS."""
 TOY_FOLDER = Path(__file__).parent
-PATIENCE_S = 120.0
-"""What comes is waited for so long at most, however busy the machine is: this ends a test that hangs, and is no promise
-of ours (see deadlines.within)."""
 LOST_S = 5.0
 """A killed node is reported as lost after so much silence at most."""
 MATCH_S = 0.5
