@@ -65,6 +65,7 @@ def work(tmp_path: Path) -> Workplace:
     return work
 
 
+@pytest.mark.slow
 @pytest.mark.rendering
 def test_the_control_is_trained_and_measured_in_the_simulator(work: Workplace) -> None:
     row, ppo = train_in(work, SIMULATOR), work.config.ppo

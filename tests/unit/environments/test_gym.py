@@ -76,6 +76,7 @@ def test_every_task_is_registered_and_settings_are_checked() -> None:
         gymnasium.make("wm/push-v0", color=1)
 
 
+@pytest.mark.slow
 def test_naming_the_module_is_enough_to_make_one() -> None:
     code = (
         "import gymnasium; env = gymnasium.make('wm_nodes.environments.gym:wm/reach-v0'); "

@@ -124,6 +124,7 @@ np.save(sys.argv[1], np.concatenate(pictures))
 """
 
 
+@pytest.mark.slow
 def test_pictures_without_the_reflection_table_are_those_of_the_installed_shaders(
     env: ManiSkillEnvironment, tmp_path: Path
 ) -> None:

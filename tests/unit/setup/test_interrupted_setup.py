@@ -89,6 +89,7 @@ def test_torn_packages_and_a_torn_build_are_made_again_in_an_environment_whose_o
     assert (checkout.venv / "mine.txt").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_lost_tf2_msgs_is_built_again_and_one_that_the_environment_has_is_left_alone(
     tmp_path: Path, repository: Path
 ) -> None:
