@@ -6,7 +6,7 @@ python3 launch_scripts/run_tests.py --fast     # without the tests marked slow o
 python3 launch_scripts/run_tests.py tests/unit -k setup    # other arguments go to pytest; the checks still run
 python3 launch_scripts/run_tests.py --device cuda          # only the tests of a CUDA device, on the GPU that is here
 
-Tests run three at a time, since those of graphs wait more than they compute, and those with deadlines after the others.
+Tests run three at a time and those with deadlines after them, four at a time: graphs wait more than they compute.
 A graph test that fails so, or that hangs inside DDS, is run once more by itself, which the output says: deadlines are
 promised where nothing else keeps the machine busy.
 """
@@ -24,11 +24,11 @@ from setup.entry import ensure, interruptible
 
 ROOT = Path(__file__).resolve().parents[1]
 FAILED, CRASHED = (Path(".pytest_cache/v") / name for name in ("cache/lastfailed", "wm/crashed"))
-MOST_AGAIN = 24
+MOST_AGAIN = 8
 """More failed tests than this are no accident: neither of their neighbours, nor of a process that hung inside DDS."""
 MOST_CRASHES = 2
 """After more ended processes pytest-xdist stops, and tests are left out."""
-BY_FILE = ("-n", "3", "--dist", "loadfile", "--no-loadscope-reorder", f"--max-worker-restart={MOST_CRASHES}")
+BY_FILE = ("-n3", "--dist", "loadfile", "--no-loadscope-reorder", f"--max-worker-restart={MOST_CRASHES}")
 LONG_FIRST = ("tests/graph", "tests/parity", "tests/unit", "tests/contracts")
 WITH_DEADLINES = ("tests/graph",)  # tests/conftest.py sees to it that there are no others
 CHECKS = {
@@ -59,7 +59,7 @@ def _every_test(fast):
     forget()
     codes = [_pytest(["-m", " and ".join(["not alone", *fast]), *BY_FILE, *LONG_FIRST])]
     if not fast:
-        codes.append(_pytest(["-m", "alone", *BY_FILE, *WITH_DEADLINES]))
+        codes.append(_pytest(["-m", "alone", *BY_FILE, "-n4", *WITH_DEADLINES]))
     return repeated() if max(codes) == 1 else max(codes)
 
 
