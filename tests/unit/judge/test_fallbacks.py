@@ -88,6 +88,7 @@ def judges(verdicts: list[Verdict]) -> set[str]:
     return {verdict.provenance.judge_id for verdict in verdicts}
 
 
+@pytest.mark.slow
 def test_an_outage_gives_the_whole_round_to_the_next_judge_and_the_round_after_to_the_first_again(
     servers: Servers, tmp_path: Path, wait_for_probe: Callable[[], None]
 ) -> None:
