@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from deadlines import PATIENCE_S
 from graph.video_loop import write_contexts
 from judge_server import PickyServer
 from recording_samples import make_spec
@@ -144,7 +145,7 @@ def step(number: int, *, ended: tuple[bool, bool] = (False, False), ids: tuple[i
 
 
 def wait_for(pending: PendingReward) -> PendingReward:
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE_S
     while not pending.done:
         assert time.monotonic() < deadline
         time.sleep(0.01)

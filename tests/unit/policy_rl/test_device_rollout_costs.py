@@ -56,6 +56,7 @@ def test_the_devices_rollout_has_the_cpus_numbers(device: Device) -> None:
     assert (np.abs(found.pictures().astype(int) - expected.pictures()).mean()) < 1.0
 
 
+@pytest.mark.slow
 def test_a_lock_step_waits_for_nothing_and_a_rollout_copies_the_same_however_long(device: Device) -> None:
     config = load_config("cpu", {"task": "reach", "device": device.name, "reward.dense_weight": 1.0})
     policy = make_policy(config, MODEL)

@@ -167,7 +167,7 @@ def test_the_same_tests_hold_with_checked_fields() -> None:
         pytest.skip("this is the run with checked fields")
     command = [sys.executable, "-m", "pytest", "-q", "--rootdir", str(Path(__file__).parents[3]), __file__]
     done = subprocess.run(
-        command, env={**os.environ, "ROS_PYTHON_CHECK_FIELDS": "1"}, capture_output=True, text=True, timeout=120
+        command, env={**os.environ, "ROS_PYTHON_CHECK_FIELDS": "1"}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout[-2000:]
 
