@@ -30,8 +30,8 @@ from wm_nodes.training.metrics import join_metrics
 from wm_nodes.world_model import load_model_folder
 
 RESULT = "result.json"
-Judge = Callable[[BoolArray, BoolArray], None]
-"""(imagined, real success of the starting policy) -> None; may raise to refuse the training."""
+Judge = Callable[[BoolArray, BoolArray | None], None]
+"""(imagined, real success of the starting policy) -> None; may raise to refuse the training. None: not measured."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class ModelRefreshLoop:
     """The weights after the last round."""
     model_dir: Path
     """What they were trained in."""
-    real_before: BoolArray
-    real_after: BoolArray
-    """Success in the simulator."""
+    real_before: BoolArray | None
+    real_after: BoolArray | None
+    """Success in evaluation.environment; None where that is none."""
     imagined_before: BoolArray
     imagined_after: BoolArray
     """Success in the model."""
@@ -99,7 +99,8 @@ def run_rounds(
         join_metrics([start.folder for start in starts], job.run_dir)
     return ModelRefreshLoop(
         trainings[-1].policy(last.folder), last.model_dir,
-        read_success(first.folder, "real_before"), read_success(last.folder, "real_after"),
+        read_success(first.folder, "real_before") if job.measures else None,
+        read_success(last.folder, "real_after") if job.measures else None,
         read_success(first.folder, "imagined_before"), read_success(last.folder, "imagined_after"),
         sum(trained.samples for trained in trainings),
         sum(trained.samples_per_s for trained in trainings) / len(trainings), trainings[-1].bag, tuple(table),

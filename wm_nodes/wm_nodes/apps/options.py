@@ -21,7 +21,7 @@ NOT_GIVEN: tuple[Any, ...] = (None, "", [])
 OPTION_OF = {
     "seed": "--seed", "task": "--task", "rewards": "--reward", "judge.kind": "--judge", "judge.endpoints": "--judge",
     "judge.folder": "--judge", "judge.model": "--judge-model", "judge.api_key_env": "--judge-key-env",
-    "judge.rubric": "--rubric", "run_folder": "run",
+    "judge.rubric": "--rubric", "sft.bags": "--demos", "run_folder": "run",
 }
 """What the user calls settings that have an option of their own, and what is no option."""
 

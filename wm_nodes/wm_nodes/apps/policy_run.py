@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.config.environments import NO_ENVIRONMENT
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.core.files import file_sha256, write_atomic
 from wm_nodes.core.model_folder import AGAIN, files_sha256, read_json
@@ -57,6 +58,11 @@ class RunContext:
     """As the launch argument."""
     video_model: str = ""
     """Folder of the video model to train in; empty: the world model."""
+
+    @property
+    def measures(self) -> bool:
+        """Whether policies are measured in an environment, and not only in the model."""
+        return self.config.evaluation.environment != NO_ENVIRONMENT
 
     @property
     def trained_in(self) -> str:
@@ -133,12 +139,13 @@ def is_trained(start: TrainingStart) -> bool:
 
 
 def train_round(
-    job: RunContext, start: TrainingStart, judge: Callable[[BoolArray], None] | None = None,
+    job: RunContext, start: TrainingStart, judge: Callable[[BoolArray | None], None] | None = None,
     waiting: WaitingGraph | None = None,
 ) -> TrainingResult:
-    """Train start.policy in start.model_dir and measure it in the simulator; finished parts are kept.
+    """Train start.policy in start.model_dir and measure it in evaluation.environment; finished parts are kept.
 
-    judge: called with the starting policy's real success before any update; may raise to refuse the training.
+    judge: called with the starting policy's real success (None: not measured) before any update; may raise to refuse
+        the training.
     waiting: this training's processes, where they run already; stopped at the end.
     """
     marker = start.folder / TRAINED
@@ -151,7 +158,7 @@ def train_round(
         os.environ.update(runner.environment)
         with GraphClient(alive=runner.check) as operator:
             if judge is not None:
-                judge(_real(operator, job, start, "before", start.policy))
+                judge(_real(operator, job, start, "before", start.policy) if job.measures else None)
             before, began = _progress(start.folder), time.monotonic()
             remaining = max(0, start.config.ppo.updates - int(before["updates"]))
             job.stage(f"training the policy in the {job.trained_in}: {remaining} updates")
@@ -162,7 +169,8 @@ def train_round(
             samples = int(after["samples"]) - int(before["samples"])
             version, updates, total = (int(after[name]) for name in ("version", "updates", "samples"))
             trained = TrainingResult(version, updates, total, samples / seconds, str(waiting.bag), stopped)
-            _real(operator, job, start, "after", trained.policy(start.folder))
+            if job.measures:
+                _real(operator, job, start, "after", trained.policy(start.folder))
     write_atomic(marker, json.dumps(asdict(trained), indent=1).encode())
     return trained
 
@@ -204,6 +212,11 @@ def cached_success(path: Path, identity: Mapping[str, str], measure: Callable[[]
     content = {"identity": dict(identity), "success": success.astype(int).tolist(), "low": rate.low, "high": rate.high}
     write_atomic(path, json.dumps(content).encode())
     return success
+
+
+def measured_rate(success: BoolArray | None) -> SuccessRate | None:
+    """None for what was not measured."""
+    return None if success is None else success_rate(success)
 
 
 def success_rate(success: BoolArray) -> SuccessRate:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.config.environments import NO_ENVIRONMENT
 from wm_nodes.config.load import (
     VIDEO,
     judge_overrides,
@@ -24,6 +25,8 @@ from wm_nodes.config.shipped import shipped_model
 from wm_nodes.config.video import VideoRlConfig
 from wm_nodes.launching.graph import Graph, GraphError, compose
 from wm_nodes.launching.scenarios import (
+    IMAGINED,
+    REAL,
     argument_table,
     build_graph,
     is_setting,
@@ -146,7 +149,7 @@ def _check_judge(
         check_judge(config.judge)
     except ValueError as error:
         raise GraphError(f"{error}; as arguments: judge:=<url> judge_model:=<name>") from None
-    if isinstance(config, RunConfig) and values.get("backend") != "factory" and "num_envs" in values:
+    if isinstance(config, RunConfig) and values.get("backend") != REAL and "num_envs" in values:
         try:
             check_agent(config, trains="learner_ranks" in values)
         except ValueError as error:
@@ -159,11 +162,14 @@ def _resolve(scenario: str, values: Mapping[str, str], config: RunConfig | Video
     filled = {**values, "seed": str(config.seed)}
     if values["params_file"]:
         _check_params(values["params_file"])
-    if isinstance(config, RunConfig) and values.get("num_envs") == "0":
-        filled["num_envs"] = str(config.ppo.num_envs)
-    if "model_dir" in values:
+    if isinstance(config, RunConfig):
+        if values.get("num_envs") == "0":
+            filled["num_envs"] = str(config.ppo.num_envs)
+        if config.evaluation.environment == NO_ENVIRONMENT and "simulator" in values:
+            filled["simulator"] = "false"
+    if "model_dir" in values and (values["model_dir"] or config.task or values.get("backend") in IMAGINED):
         filled["model_dir"] = _model_dir(values["model_dir"], config.task)
-    if values.get("starts_file") == "":
+    if values.get("starts_file") == "" and filled["model_dir"]:
         filled["starts_file"] = str(Path(filled["model_dir"]) / "starts.safetensors")
     if scenario == "replay_offline":
         _check_played(values["bag_uri"])

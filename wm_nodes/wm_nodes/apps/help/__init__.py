@@ -18,7 +18,7 @@ SETTINGS = re.compile(r"one of the (\w+)\s+settings below")
 
 
 def page_file(words: Sequence[str]) -> Path:
-    """The file of a verb, or of one of its commands. words: e.g. benchmark, video-rl, diversity."""
+    """The file of a verb, or of one of its commands. words: e.g. benchmark, diversity."""
     return FOLDER / f"{'-'.join(words)}.txt"
 
 
