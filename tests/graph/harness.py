@@ -25,10 +25,10 @@ from rclpy.qos import QoSProfile
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.errors import WireError
 from wm_nodes.ros.clients import goal_result
 from wm_nodes.ros.endpoint_matching import EndpointTable
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.wire import WireError
 
 DOMAINS = range(20, 90)
 PORT, FIRST_PORT, PORTS_PER_DOMAIN = "fastrtps_port", 7400, 250

@@ -10,9 +10,10 @@ from std_msgs.msg import Bool
 
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.ros import calls, convert
-from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
 
 pytestmark = pytest.mark.graph
 N = 4

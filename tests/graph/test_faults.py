@@ -12,7 +12,7 @@ from graph.harness import Graph, Probe, shm_files, wait_until
 
 from wm_msgs.action import Train
 from wm_msgs.msg import Credit, TransitionBatch
-from wm_nodes.ros.wire import WireError
+from wm_nodes.core.errors import WireError
 from wm_nodes.training.weights import save_weights
 
 pytestmark = [pytest.mark.graph, pytest.mark.alone]

@@ -20,11 +20,12 @@ from lifecycle_msgs.srv import ChangeState
 from wm_msgs.action import Train
 from wm_msgs.msg import EpisodeEvent, ErrorCode
 from wm_msgs.srv import ResetBatch, StartRecording, StopRecording
+from wm_nodes.core.errors import WireError
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.training_run import restore
 from wm_nodes.recording import BagError, recover
 from wm_nodes.ros import calls
-from wm_nodes.ros.wire import ResetCommand, WireError
+from wm_nodes.ros.wire import ResetCommand
 
 pytestmark = pytest.mark.graph
 

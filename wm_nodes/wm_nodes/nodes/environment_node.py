@@ -18,6 +18,8 @@ from std_msgs.msg import Bool
 
 from wm_msgs.msg import ActionBatch, EpisodeEvent, ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import Goals, LockStep
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.nodes.environment.asynchronous import AsynchronousEnvironment
@@ -26,12 +28,13 @@ from wm_nodes.nodes.environment.image_views import PARAMS as VIEW_PARAMS
 from wm_nodes.nodes.environment.image_views import ImageViews
 from wm_nodes.nodes.environment.lockstep import LockstepEnvironment, StampClock
 from wm_nodes.nodes.factories import BACKENDS, make_environment
+from wm_nodes.recording.messages import tiles_of
 from wm_nodes.ros import calls, convert, diagnostics
 from wm_nodes.ros.flow_control import ProducerCredits
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import EpisodeNote, Goals, Transition, WireError
+from wm_nodes.ros.wire import EpisodeNote
 
 MODES = ("lockstep", "asynchronous")
 
@@ -160,7 +163,7 @@ class EnvironmentNode(ManagedNode):
     def goals(self, goals: Goals) -> None:
         self._send(lambda: self._goals.publish(convert.goal_msg(goals, self._spec)))
 
-    def transition(self, transition: Transition) -> None:
+    def transition(self, transition: LockStep) -> None:
         self._send(lambda: self._transitions.publish(convert.transition_msg(transition)))
 
     def episode(self, note: EpisodeNote) -> None:
@@ -297,7 +300,7 @@ class EnvironmentNode(ManagedNode):
 
 def mosaic_bytes(spec: EnvironmentSpec) -> int:
     """Bytes of one env/image: all environments' tiles, empty ones included."""
-    height, width = convert.tiles_of(spec).mosaic_shape
+    height, width = tiles_of(spec).mosaic_shape
     return height * width * spec.channels
 
 

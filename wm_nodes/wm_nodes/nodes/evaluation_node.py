@@ -5,6 +5,7 @@ from typing import Any
 
 from wm_msgs.action import Evaluate
 from wm_msgs.msg import PolicyVersion
+from wm_nodes.core.errors import WireError
 from wm_nodes.nodes.environment.remote_environment import RemoteEnvironment
 from wm_nodes.nodes.factories import existing, make_policy
 from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
@@ -16,7 +17,7 @@ from wm_nodes.ros.clients import RosEnvironmentClient
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
 
 PARAMS = (

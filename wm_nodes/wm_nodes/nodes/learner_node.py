@@ -17,6 +17,8 @@ from wm_msgs.msg import EnvSpec, ErrorCode, RewardBatch, TransitionBatch
 from wm_msgs.srv import GetWeights, SaveCheckpoint
 from wm_nodes.config.load import load_config
 from wm_nodes.config.schema import AGENT
+from wm_nodes.core.errors import WireError
+from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.named_files import NamedFiles
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Environment, Rollout
@@ -25,21 +27,20 @@ from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.nodes.factories import existing, expected_spec, make_learner, make_policy, refuse_other
 from wm_nodes.nodes.learner.device_rollouts import DeviceRollouts
 from wm_nodes.nodes.learner.meter import LearnerMeter
-from wm_nodes.nodes.learner.replay_assembler import ReplayAssembler
 from wm_nodes.nodes.learner.report import LearnerReport
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
 from wm_nodes.nodes.learner.rollout_sources import BagRollouts, LiveRollouts, ReplayedRollouts, RolloutSource, bag_paths
 from wm_nodes.nodes.learner.training_node import TrainingNode, run_learner
 from wm_nodes.policy_rl.rollouts import Canceled
 from wm_nodes.policy_rl.tensor_rollout import TensorRollout
-from wm_nodes.policy_rl.training_run import DroppedTransitions, PolicyTraining
+from wm_nodes.policy_rl.training_run import PolicyTraining
+from wm_nodes.recording.messages import images_of, time_ns
 from wm_nodes.recording.reader import read_spec
 from wm_nodes.recording.rollouts import recorded_reward_name
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import GuardedActionClient
 from wm_nodes.ros.params import COMMON, Param, named_files
 from wm_nodes.ros.sequence_numbers import check_session
-from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks, own_device
 from wm_nodes.training.weights import INLINE_LIMIT_BYTES, WeightsError, load_weights
@@ -103,8 +104,7 @@ class LearnerNode(TrainingNode):
         self._expected_spec = expected_spec(
             self._config, str(self.param("model_dir")), str(self.param("policy_factory"))
         )
-        self._assembler, self._reward_name, self._max_episode_steps = RolloutAssembler(), "", 0
-        self._replayed = ReplayAssembler(self._withhold)
+        self._assembler, self._reward_name, self._max_episode_steps = RolloutAssembler(self._withhold), "", 0
         self.listen("env/spec", self._on_spec, while_inactive=True)
         self.listen("env/image", self._on_image)
         self._credit = self.listen("env/transition", self._on_transition, credit=True)
@@ -210,7 +210,7 @@ class LearnerNode(TrainingNode):
             uris = [str(path) for path in bag_paths(goal.bag_uris, self._files)] if goal.bag_uris else []
             if uris:
                 self._refused = None
-            return ReplayedRollouts(self, check, progress, self._replayed, self._replay, uris, num_steps=num_steps)
+            return ReplayedRollouts(self, check, progress, self._assembler, self._replay, uris, num_steps=num_steps)
         if self._device_rollouts is not None:
             self._reward_name = "endogenous"
             named = str(self.param("model_dir")), str(self.param("learner_factory"))
@@ -281,11 +281,6 @@ class LearnerNode(TrainingNode):
         if self._credit is not None:
             self._credit.withhold(withheld)
 
-    @property
-    def _collecting(self) -> RolloutAssembler | ReplayAssembler | None:
-        """Where messages go now: the source that the running goal trains from; None between goals and with bags."""
-        return next((assembler for assembler in (self._assembler, self._replayed) if assembler.collecting), None)
-
     def _on_spec(self, message: EnvSpec) -> None:
         try:
             check_session(message.session)
@@ -302,28 +297,22 @@ class LearnerNode(TrainingNode):
             self._max_episode_steps = self._spec.max_episode_steps
             self._spec_session = message.session
             self._assembler.enter_session(message.session)
-            self._replayed.enter_session(message.session)
         except WireError as error:
             self._spec, self._refused = None, error
             self.diagnostics.count("refused_specs", level=diagnostics.ERROR, text=str(error))
 
     def _on_image(self, message: Image) -> None:
-        assembler = self._collecting
-        if self._spec is None or assembler is None:
-            return
-        assembler.put_image(convert.time_ns(message.header.stamp), convert.images_of(message, self._spec))
+        if self._spec is not None and self._assembler.collecting:
+            self._assembler.put_image(time_ns(message.header.stamp), images_of(message, self._spec))
 
     def _on_transition(self, message: TransitionBatch) -> None:
-        assembler = self._collecting
-        if self._spec is None or assembler is None:
-            return
-        check_session(message.session, self._spec_session)
-        assembler.put_transition(convert.transition_of(message, self._spec))
+        if self._spec is not None and self._assembler.collecting:
+            check_session(message.session, self._spec_session)
+            self._assembler.put_transition(convert.transition_of(message, self._spec))
 
     def _on_reward(self, message: RewardBatch) -> None:
-        assembler = self._collecting
-        if assembler is not None:
-            assembler.put_rewards(convert.rewards_of(message))
+        if self._assembler.collecting:
+            self._assembler.put_rewards(convert.rewards_of(message))
             self._reward_name = message.reward_name
 
     def _on_save(self, request: SaveCheckpoint.Request, response: SaveCheckpoint.Response) -> SaveCheckpoint.Response:

@@ -14,6 +14,7 @@ from std_msgs.msg import Bool
 from wm_msgs.action import Rollout
 from wm_msgs.msg import ActionBatch, EnvSpec, ErrorCode, PolicyVersion
 from wm_msgs.srv import InferAction, LoadPolicy
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import UInt64Array
 from wm_nodes.nodes.factories import existing, expected_spec, make_policy, refuse_other
@@ -22,6 +23,7 @@ from wm_nodes.nodes.policy.weights import PolicyHolder, read_weights
 from wm_nodes.policy_rl.image_policy import PolicyOutput
 from wm_nodes.policy_rl.rollouts import action_noise, reset_seeds
 from wm_nodes.recording.layout import Tiles
+from wm_nodes.recording.messages import floats, images_of
 from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.clients import EnvironmentClient, LocalEnvironmentClient, RosEnvironmentClient
@@ -30,7 +32,7 @@ from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.qos import LIVE_ACTION
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand
 from wm_nodes.ros.worker import Work
 
 FEEDBACK_S = 0.5
@@ -286,7 +288,7 @@ class PolicyNode(ManagedNode):
                 raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
             count = len(request.state) // self._holder.state_dim
             spec = replace(self._spec, num_envs=max(count, 1))
-            states = convert.floats(request.state, (spec.num_envs, spec.state_dim), "state")
+            states = floats(request.state, (spec.num_envs, spec.state_dim), "state")
             if not np.isfinite(states).all():
                 raise WireError(ErrorCode.NAN_INPUT, "state is NaN or infinite; send finite values")
             tile = request.tile
@@ -296,7 +298,7 @@ class PolicyNode(ManagedNode):
                     f"{tile.rows} x {tile.cols} tiles of {tile.tile_height} x {tile.tile_width} px do not hold {count} "
                     f"of {spec.height} x {spec.width} px; lay them out as EnvSpec.tile does",
                 )
-            images = convert.images_of(
+            images = images_of(
                 request.observation, spec, Tiles(tile.rows, tile.cols, tile.tile_height, tile.tile_width)
             )
             noise = None if request.deterministic else np.random.default_rng().standard_normal(

@@ -15,6 +15,7 @@ from std_srvs.srv import Trigger
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import StartRecording, StopRecording
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.named_files import OutsideFolders
 from wm_nodes.nodes.recorder.qos import recorded_qos
@@ -28,7 +29,6 @@ from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.qos import TOPICS, GraphTopic, row_name
 from wm_nodes.ros.sequence_numbers import GapTracker
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import WireError
 
 FLUSH_S = 0.25
 QUIET_S = 0.3

@@ -12,6 +12,7 @@ from wm_msgs.action import GenerateClips
 from wm_msgs.msg import ClipBatch, PolicyVersion
 from wm_nodes.config.load import load_video_config
 from wm_nodes.core.device import compute_device
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.types import UInt8Array
 from wm_nodes.nodes.policy.weights import read_weights
@@ -21,7 +22,6 @@ from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param, named_files
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.run_folder import VersionFiles
 from wm_nodes.training.weights import WeightsError, load_weights

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from wm_nodes.core.lockstep import LockStep
 from wm_nodes.core.specs import POLICY_FIELDS, EnvironmentSpec, SpecMismatch, agree
 from wm_nodes.core.types import Episode, FloatArray, UInt8Array
 from wm_nodes.recording.bag import Bag
 from wm_nodes.recording.errors import BagError
-from wm_nodes.recording.lockstep import MAX_LAG, LockSteps, RecordedStep
+from wm_nodes.recording.join import MAX_LAG, LockSteps
 from wm_nodes.recording.messages import KIND_END
 
 EPISODE_FIELDS = (*POLICY_FIELDS, "ground_truth_names")
@@ -46,7 +47,7 @@ class _Builder:
     success: list[bool]
     actions: list[FloatArray] = field(default_factory=list)
     rewards: list[float] = field(default_factory=list)
-    last: RecordedStep | None = None
+    last: LockStep | None = None
     problem: str = ""
     finished_at: int = 0
 
@@ -121,9 +122,9 @@ class _EpisodeJoiner:
         self._notes.unfinished += sum(builder is not None for builder in self._open)
         self._notes.lost_steps += self._steps.lost
 
-    def _add_step(self, step: RecordedStep, index: int) -> None:
+    def _add_step(self, step: LockStep, index: int) -> None:
         builder = self._open[index]
-        key = step.session, int(step.episode_id[index])
+        key = step.session, int(step.episode_ids[index])
         if builder is not None and key != (builder.session, builder.episode_id):
             self._finish(index)
             builder = None
@@ -135,7 +136,7 @@ class _EpisodeJoiner:
             builder = self._start(step, index, key)
             if builder is None:
                 return
-        if step.episode_step[index] != len(builder.actions):
+        if step.episode_steps[index] != len(builder.actions):
             builder.problem = builder.problem or f"step {len(builder.actions)} is missing"
         if step.next_images is None:
             builder.problem = builder.problem or f"the image at stamp {step.next_stamp_ns} is missing"
@@ -145,15 +146,15 @@ class _EpisodeJoiner:
         builder.states.append(step.next_states[index])
         builder.truth.append(step.ground_truth[index])
         builder.success.append(success)
-        has_reward = step.reward is not None and bool(step.reward.valid[index])
-        builder.rewards.append(float(step.reward.total[index]) if step.reward is not None and has_reward else np.nan)
+        has_reward = step.rewards is not None and bool(step.rewards.valid[index])
+        builder.rewards.append(float(step.rewards.total[index]) if step.rewards is not None and has_reward else np.nan)
         builder.last = step
         if step.terminated[index] or step.truncated[index]:
             self._finish(index)
 
-    def _start(self, step: RecordedStep, index: int, key: tuple[int, int]) -> _Builder | None:
+    def _start(self, step: LockStep, index: int, key: tuple[int, int]) -> _Builder | None:
         """Open an episode at its first step; None inside an episode whose beginning was not recorded."""
-        if step.episode_step[index] != 0:
+        if step.episode_steps[index] != 0:
             if self._skipped[index] != key:
                 self._skipped[index] = key
                 self._notes.unfinished += 1
@@ -216,6 +217,6 @@ class _EpisodeJoiner:
             task=event.task if event is not None else spec.task,
             instruction=event.instruction if event is not None else spec.instruction,
             behaviour=event.behaviour if event is not None else "", seed=int(event.seed) if event is not None else 0,
-            episode_id=builder.episode_id, source=last.source, policy_version=int(last.policy_version[index]),
+            episode_id=builder.episode_id, source=last.source, policy_version=int(last.policy_versions[index]),
             extra=extra,
         )

@@ -9,21 +9,12 @@ from sensor_msgs.msg import Image
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import ResetBatch, StepBatch
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import UInt64Array
-from wm_nodes.ros.convert import (
-    flags,
-    floats,
-    from_field,
-    images_of,
-    mosaic_msg,
-    reshape_field,
-    set_optional,
-    time_msg,
-    time_ns,
-    to_field,
-)
-from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.recording.messages import array_of, flags, floats, images_of, time_ns
+from wm_nodes.ros.convert import mosaic_msg, set_optional, time_msg, to_field
+from wm_nodes.ros.wire import Reply, ResetCommand, StepCommand
 
 
 def step_request(command: StepCommand) -> StepBatch.Request:
@@ -122,7 +113,7 @@ def _common_reply(response: Any, spec: EnvironmentSpec, session: int, step_id: i
         session=session, step_id=step_id, stamp_ns=time_ns(response.stamp),
         images=images_of(response.observation, spec) if len(response.observation.data) else None,
         states=floats(response.state, (count, spec.state_dim), "state"), terminated=zeros != 0, truncated=zeros != 0,
-        episode_ids=reshape_field(from_field(response.episode_id, np.uint64), (count,), "episode_id"),
+        episode_ids=array_of(response.episode_id, np.uint64, (count,), "episode_id"),
         success_probability=zeros, uncertainty=zeros,
     )
 
@@ -133,4 +124,4 @@ def _raise_for(response: Any) -> None:
 
 
 def _seeds(field: Any, count: int, name: str) -> UInt64Array | None:
-    return reshape_field(from_field(field, np.uint64), (count,), name) if len(field) else None
+    return array_of(field, np.uint64, (count,), name) if len(field) else None

@@ -13,10 +13,11 @@ from rclpy.task import Future
 
 from wm_msgs.msg import ErrorCode
 from wm_msgs.srv import GetEnvSpec, ResetBatch, StepBatch
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.ros import calls, convert
 from wm_nodes.ros.liveliness import PeerWatch
-from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand, WireError
+from wm_nodes.ros.wire import PeerLost, Reply, ResetCommand, StepCommand
 
 if TYPE_CHECKING:
     from wm_nodes.ros.lifecycle import ManagedNode

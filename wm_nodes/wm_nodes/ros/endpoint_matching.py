@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from rclpy.node import Node
 
 from wm_msgs.msg import ErrorCode, NodeLinks
+from wm_nodes.core.errors import WireError
 from wm_nodes.ros.guard import check_sender, nodes_of
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
-from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work, WorkerNode
 
 Ends = Callable[[str], set[str]]

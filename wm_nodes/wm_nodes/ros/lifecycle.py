@@ -18,6 +18,7 @@ from rclpy.service_introspection import ServiceIntrospectionState
 from wm_msgs.msg import RunState
 from wm_nodes.config.load import ConfigError, load_config
 from wm_nodes.config.schema import RunConfig
+from wm_nodes.core.errors import WireError
 from wm_nodes.ros import diagnostics
 from wm_nodes.ros.diagnostics import Diagnostics
 from wm_nodes.ros.endpoint_matching import Links
@@ -28,7 +29,6 @@ from wm_nodes.ros.params import COMMON, Param, declare, refusal
 from wm_nodes.ros.publishing import StampedPublisher
 from wm_nodes.ros.qos import topic
 from wm_nodes.ros.sequence_numbers import GapTracker, new_session
-from wm_nodes.ros.wire import WireError
 
 T = TypeVar("T")
 

@@ -16,6 +16,7 @@ from wm_msgs.srv import SetRubric
 from wm_nodes.config.load import ConfigError
 from wm_nodes.config.schema import JudgeConfig, RunConfig
 from wm_nodes.config.video import VideoRlConfig
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.named_files import FileKind, shown
 from wm_nodes.judge.agent.contract import pause_reason
 from wm_nodes.judge.agent.types import GATED, Status
@@ -27,7 +28,6 @@ from wm_nodes.ros import convert, diagnostics
 from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import Param, named_files
-from wm_nodes.ros.wire import WireError
 from wm_nodes.ros.worker import Work
 
 PARAMS = (

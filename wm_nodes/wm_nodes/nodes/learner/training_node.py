@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wm_msgs.msg import PolicyVersion
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.run_lock import RunLock
 from wm_nodes.judge.service import TrainingPaused
 from wm_nodes.ros import convert
@@ -15,7 +16,7 @@ from wm_nodes.ros.actions import WorkerAction
 from wm_nodes.ros.lifecycle import ManagedNode
 from wm_nodes.ros.params import COMMON, Param, read_parameters
 from wm_nodes.ros.spin import run_node
-from wm_nodes.ros.wire import PeerLost, WireError
+from wm_nodes.ros.wire import PeerLost
 from wm_nodes.ros.worker import Work
 from wm_nodes.training.ranks import Ranks, join
 from wm_nodes.training.run_folder import TrainingRun

@@ -4,11 +4,11 @@ import threading
 
 from wm_msgs.msg import ErrorCode, PolicyVersion
 from wm_nodes.core.device import explain_memory
+from wm_nodes.core.errors import WireError
 from wm_nodes.core.named_files import WEIGHTS, FileRefused, NamedFiles, shown
 from wm_nodes.core.types import FloatArray, UInt8Array
 from wm_nodes.policy_rl.image_policy import ImagePolicy, PolicyOutput
 from wm_nodes.ros import convert
-from wm_nodes.ros.wire import WireError
 from wm_nodes.training.weights import WeightsError, arch_hash, load_weights
 
 

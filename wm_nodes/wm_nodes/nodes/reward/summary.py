@@ -4,8 +4,8 @@ from collections import defaultdict
 
 import numpy as np
 
+from wm_nodes.core.lockstep import LockStep
 from wm_nodes.reward import RewardResult
-from wm_nodes.ros.wire import Transition
 
 EPISODES_KEPT = 2**15
 """Episodes that have begun and not ended; more than environments exist are of no use."""
@@ -19,7 +19,7 @@ class SummaryWindow:
         self._returns: dict[int, float] = defaultdict(float)
         self._clear()
 
-    def add(self, transition: Transition, result: RewardResult) -> None:
+    def add(self, transition: LockStep, result: RewardResult) -> None:
         """Count one judged lock-step."""
         valid = result.valid
         self.invalid += int((transition.valid & ~valid).sum())
