@@ -72,7 +72,7 @@ class RunningEpisodes:
 
     def end(self, mask: BoolArray, reason: int, stamp_ns: int, *, abort: bool = False) -> None:
         """End what runs where mask is True. abort: nothing their environments do is valid until they are reset."""
-        for i in np.flatnonzero(mask & self.running).tolist():
+        for i in np.flatnonzero(mask & self.running).tolist() if mask.any() else ():
             self._end(i, EpisodeEvent.OUTCOME_UNKNOWN, reason, stamp_ns)
             self._slots[i].aborted = abort
 
