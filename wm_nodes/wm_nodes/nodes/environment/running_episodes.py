@@ -16,13 +16,19 @@ class _Slot:
     """The episode of one environment."""
 
     episode_id: int = 0
+    """Of the environment, from 1."""
     seed: int = 0
+    """Of its reset."""
     running: bool = False
+    """Whether it goes on."""
     aborted: bool = False
     """Ended from outside (estop, error, stop): nothing it does counts until it is reset."""
     length: int = 0
+    """Steps made."""
     version_first: int = 0
+    """Policy version of its first step."""
     version_last: int = 0
+    """Policy version of its newest step."""
 
 
 class RunningEpisodes:
