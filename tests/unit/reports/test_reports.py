@@ -56,10 +56,13 @@ SUMMARY = Summary(
     bag="/runs/a/bags/training", paired=PAIRED, samples=40960, minutes=9.7, command="python3 online_rl.py --task <x>",
     machine={"processor": "P & Q"},
     acceptance={
-        "passed": False, "outcome": "failed", "episodes": 96, "notes": ["a note"], "metrics": {"tool_ratio_h16": 0.1, "auc": None},
+        "passed": False, "outcome": "failed",
+        "episodes": 96, "notes": ["a note"], "metrics": {"tool_ratio_h16": 0.1, "auc": None},
         "criteria": [
-            {"name": "tool error", "value": 0.1, "threshold": 0.3, "rule": "<=", "outcome": "passed", "remedy": "nothing"},
-            {"name": "recall", "value": None, "threshold": 0.6, "rule": ">=", "outcome": "failed", "remedy": "more data"},
+            {"name": "tool error", "value": 0.1, "threshold": 0.3, "rule": "<=", "outcome": "passed",
+             "remedy": "nothing"},
+            {"name": "recall", "value": None, "threshold": 0.6, "rule": ">=", "outcome": "failed",
+             "remedy": "more data"},
         ],
     },
 )
