@@ -69,7 +69,8 @@ class RunRecord:
         return replace(self, settings={**self.settings, DEVICE: device})
 
     def with_options(self, starter: Starter[Any], options: Mapping[str, Any]) -> "RunRecord":
-        kept = {name: value for name, value in options.items() if name in {**starter.fixed, **starter.free}}
+        names = {*starter.fixed, *starter.free} - {PRESET}
+        kept = {name: value for name, value in options.items() if name in names}
         return replace(self, options={**self.options, starter.name: kept})
 
     def write(self, folder: Path) -> None:
