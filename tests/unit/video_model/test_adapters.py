@@ -599,7 +599,7 @@ class TestFolder:
     def test_the_doctor_passes_it_with_and_without_an_adapter_and_refuses_a_folder_that_is_none(
         self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        small = ["--size", "32x32", "--frames", "5", "--set", "rollout.num_steps=3", "--set", "grpo.kl.anchor=buffer"]
+        small = ["--size", "32x32", "--frames", "5", "--rollout.num_steps", "3", "--grpo.kl.anchor", "buffer"]
         for more in ([], ["--lora-rank", "2"]):
             assert main(["check-video-model", "--public", str(folder), *small, *more]) == 0, capsys.readouterr().out
         assert main(["check-video-model", "--public", str(tmp_path), *small]) == 2

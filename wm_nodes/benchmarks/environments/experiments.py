@@ -43,7 +43,7 @@ class InModels(Experiment):
 
     @classmethod
     def add_settings(cls, parser: argparse.ArgumentParser) -> None:
-        options.add_set(parser)
+        options.add_settings(parser)
         options.add_device(parser)
 
     @classmethod
