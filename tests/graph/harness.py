@@ -17,12 +17,14 @@ from pathlib import Path
 from typing import IO, Any, ClassVar
 
 import rclpy
+from action_msgs.msg import GoalStatusArray
+from deadlines import PATIENCE_S
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from graph.forked import ForkedNode, fork_node
 from left_over import remove_left_over
 from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, qos_profile_action_status_default
 
 from wm_nodes.config.load import dump_config, load_config
 from wm_nodes.config.schema import RunConfig
@@ -35,7 +37,8 @@ DOMAINS = range(20, 90)
 PORT, FIRST_PORT, PORTS_PER_DOMAIN = "fastrtps_port", 7400, 250
 """Of Fast DDS: names of files in /dev/shm, and the numbers of DDS."""
 TOY_FOLDER = Path(__file__).parent
-START_S = 60.0
+LOST_S = 5.0
+"""A killed node is reported as lost after so much silence at most."""
 MATCH_S = 0.5
 """A server that has not matched a new client's reader yet loses its answer (rmw_fastrtps 556)."""
 IN_MIDDLEWARE = re.compile(r"Garbage-collecting\n  File \".*/ros/spin\.py\", line \d+ in run_nodes\n")
@@ -68,7 +71,7 @@ def own_domain() -> Iterator[int]:
     raise RuntimeError(f"all domains {DOMAINS} are in use; are test processes left over?")
 
 
-def wait_until(what: str, ready: Callable[[], Any], timeout_s: float = 20.0) -> Any:
+def wait_until(what: str, ready: Callable[[], Any], timeout_s: float = PATIENCE_S) -> Any:
     """Return the first true value of ready(); fail after timeout_s."""
     deadline = time.monotonic() + timeout_s
     while not (value := ready()):
@@ -113,6 +116,28 @@ class Probe:
         time.sleep(MATCH_S)
         return told
 
+    def wait_for_loss(self, reporter: str, lost: str, limit_s: float = LOST_S) -> None:
+        """Wait for a node's report that it lost another; the silence that it names is `limit_s` at most."""
+        said = wait_until(f"a report of {reporter} that {lost} is lost", lambda: self.losses(reporter, lost))[0]
+        assert said <= limit_s, f"{reporter} called {lost} lost after {said:g} s of silence"
+
+    def losses(self, reporter: str, lost: str) -> list[float]:
+        """Seconds of silence in each report of a node that it lost another."""
+        reported = re.compile(rf"{lost} is lost: silent for ([\d.]+) s")
+        return [float(seconds[1]) for text in self.seen_errors[reporter] for seconds in reported.finditer(text)]
+
+    def goals(self, action: str) -> dict[bytes, int]:
+        """State of each goal of an action, a constant of GoalStatus, in the order in which they came."""
+        known = dict[bytes, int]()
+
+        def hear(message: GoalStatusArray) -> None:
+            known.update({bytes(each.goal_info.goal_id.uuid): each.status for each in message.status_list})
+
+        self.node.create_subscription(
+            GoalStatusArray, f"{action}/_action/status", hear, qos_profile_action_status_default
+        )
+        return known
+
     def links(self) -> EndpointTable:
         """A book of what the nodes say of their links from now on; a node restarted before it was reported as lost is
         in use again only when the others have matched its new session."""
@@ -129,13 +154,13 @@ class Probe:
         row = topic(name)
         return self.node.create_publisher(row.type, name, row.qos)
 
-    def call(self, kind: type[Any], name: str, request: Any, timeout_s: float = 20.0) -> Any:
+    def call(self, kind: type[Any], name: str, request: Any, timeout_s: float = PATIENCE_S) -> Any:
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
-            wait_until(f"service {name}", self._clients[name].service_is_ready, START_S)
+            wait_until(f"service {name}", self._clients[name].service_is_ready)
             time.sleep(MATCH_S)
         client = self._clients[name]
-        wait_until(f"service {name}", client.service_is_ready, START_S)
+        wait_until(f"service {name}", client.service_is_ready)
         if timeout_s <= RESEND_S:
             return self.result(client.call_async(request), timeout_s, name)
         sent = [client.call_async(request)]
@@ -150,20 +175,25 @@ class Probe:
     def action(self, kind: type[Any], name: str) -> ActionClient:
         if name not in self._clients:
             self._clients[name] = ActionClient(self.node, kind, name)
-            wait_until(f"action {name}", self._clients[name].server_is_ready, START_S)
+            wait_until(f"action {name}", self._clients[name].server_is_ready)
             time.sleep(MATCH_S)
-        wait_until(f"action {name}", self._clients[name].server_is_ready, START_S)
+        wait_until(f"action {name}", self._clients[name].server_is_ready)
         return self._clients[name]
 
     def send(self, client: ActionClient, goal: Any, feedback: Any = None) -> Any:
         """Send a goal and return its accepted handle."""
-        handle = self.run(lambda: client.send_goal_async(goal, feedback_callback=feedback), 20.0, "goal")
+        handle = self.run(lambda: client.send_goal_async(goal, feedback_callback=feedback), PATIENCE_S, "goal")
         assert handle.accepted
         return handle
 
-    def finish(self, handle: Any, timeout_s: float = 60.0) -> Any:
+    def finish(self, handle: Any, timeout_s: float = PATIENCE_S) -> Any:
         """Wait for a goal's result; return the Result message."""
         return goal_result(handle, timeout_s, lambda: None)
+
+    def cancel(self, handle: Any) -> Any:
+        """Cancel a goal; return the Result message."""
+        self.run(handle.cancel_goal_async, PATIENCE_S, "cancel")
+        return self.finish(handle)
 
     def run(self, send: Callable[[], Any], timeout_s: float, what: str) -> Any:
         """Call `send` in the executor's thread (rclpy's action client races with it otherwise) and wait."""
@@ -307,7 +337,7 @@ class Graph:
             book.forget(names[0], lost=True)
             start()
             try:
-                wait_until(f"links of {names[0]}", lambda: not book.missing(names), START_S if last else MATCHED_S)
+                wait_until(f"links of {names[0]}", lambda: not book.missing(names), PATIENCE_S if last else MATCHED_S)
                 time.sleep(MATCH_S)  # for the probe's clients
                 return
             except AssertionError:

@@ -35,7 +35,7 @@ def make_storm(probe: Probe) -> Iterator[Callable[..., Storm]]:
 
     def make(*names: str) -> Storm:
         for name in names:
-            wait_until(f"active {name}", lambda n=name: probe.value(n, "state") == "active", 60)
+            wait_until(f"active {name}", lambda n=name: probe.value(n, "state") == "active")
         made.append(Storm(probe, list(names), MessageGenerator(SEED)))
         return made[0]
 

@@ -26,8 +26,7 @@ from wm_nodes.policy_rl.pretraining import model_from_recordings
 from wm_nodes.recording import read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import stack_episodes
 from wm_nodes.reports.summary import read_summary
-from wm_nodes.world_model import load_model_folder
-from wm_nodes.world_model.device_environment import DeviceEnvironment
+from wm_nodes.world_model import DeviceEnvironment, load_model_folder
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
 pytestmark = pytest.mark.graph
@@ -112,7 +111,7 @@ def test_it_imagines_how_measured_joints_move_and_not_what_the_action_asked_for(
     asked, made = 0.25 * 0.8, 0.7 * 0.25 * 0.8
     assert abs(moved.mean() - made) < abs(moved.mean() - asked)
     device = DeviceEnvironment.beside(imagined)
-    device.reset(torch.ones(4, dtype=torch.bool), torch.from_numpy(imagined._starts))
+    device.reset(torch.ones(4, dtype=torch.bool), imagined.episodes.starts_N)
     with torch.inference_mode():
         device.step(torch.from_numpy(action))
     np.testing.assert_allclose(device.states_NP.numpy(), imagined.current().state, atol=1e-6)

@@ -23,7 +23,7 @@ def start_learner(graph: Graph, namespace: str = "/wm") -> int:
     process = graph.start("learner", namespace, policy__factory="toy:make_policy")
     lock = graph.folder / NAME
     wait_until("lock", lambda: process.poll() is not None or (lock.exists() and f'"process": {process.pid},' in
-                                                             lock.read_text()), 60)
+                                                             lock.read_text()))
     return process.pid if process.poll() is None else process.wait(0)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from wm_nodes.config.tasks import ModelPart
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill import table_top
 from wm_nodes.environments.maniskill.tasks import push_cube
@@ -25,6 +26,5 @@ TASK = replace(
     instruction="nudge the blue cube away",
     success=nudged,
     settings={"data.behaviours": {"expert": 1.0}},
-    model_tasks=(),
-    weak_policies=(),
+    model=ModelPart(positions=table_top.POSITIONS),
 )

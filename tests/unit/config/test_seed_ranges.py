@@ -21,7 +21,7 @@ from wm_nodes.config.seed_ranges import (
     seed_spans,
 )
 from wm_nodes.config.tasks import WeakPolicy
-from wm_nodes.environments.maniskill.collection import CollectionPlan
+from wm_nodes.environments.collection import CollectionPlan
 from wm_nodes.environments.record import acceptance_plan, demonstration_plan
 from wm_nodes.policy_rl.initial_policy import starts_plan
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.speed.inputs import Effort, console, interleave, time_episode, time_steps
+from benchmarks.experiment import console
+from benchmarks.speed.inputs import Effort, interleave, time_episode, time_steps
 from wm_nodes.config.load import dump_config
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.policy_rl.factories import make_imagined_environment

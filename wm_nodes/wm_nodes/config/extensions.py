@@ -11,21 +11,26 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def find_files(what: str, package: str, variable: str) -> dict[str, str]:
-    """Package by file name, of our package and of those packages and single modules that an environment variable names,
-    separated by commas.
+ROOM = "wm_nodes.environments"
+
+
+def find_files(kind: str, folder: str, variable: str) -> dict[str, str]:
+    """Package by file name, of our packages and of those packages and single modules that an environment variable
+    names, separated by commas.
 
     Args:
-        what: a file defines, for errors.
+        kind: what a file defines, for errors.
+        folder: name of our packages, each in a package of ROOM.
 
     Raises:
         ValueError: a package is missing, or two have the same file.
     """
     packages: dict[str, str] = {}
-    for name in (package, *filter(None, (part.strip() for part in os.environ.get(variable, "").split(",")))):
+    named = filter(None, (part.strip() for part in os.environ.get(variable, "").split(",")))
+    for name in (*_shipped(folder), *named):
         for parent, module in _modules(name, variable):
             if module in packages:
-                raise ValueError(f"{what} {module!r} is in {packages[module]} and in {parent}; rename one")
+                raise ValueError(f"{kind} {module!r} is in {packages[module]} and in {parent}; rename one")
             packages[module] = parent
     return packages
 
@@ -49,7 +54,7 @@ def load_file(name: str, packages: dict[str, str], kind: type[T], guide: str) ->
 
     Args:
         packages: see find_files.
-        guide: the package that says how to write one, for the error.
+        guide: the module that says how to write one, for the error.
 
     Raises:
         ValueError: the file has no such constant.
@@ -59,3 +64,9 @@ def load_file(name: str, packages: dict[str, str], kind: type[T], guide: str) ->
     if not isinstance(found, kind):
         raise ValueError(f"{module.__file__} has no {kind.__name__.upper()} = {kind.__name__}(...); see {guide}")
     return found
+
+
+def _shipped(folder: str) -> list[str]:
+    parts = pkgutil.iter_modules(importlib.import_module(ROOM).__path__)
+    names = [f"{ROOM}.{part.name}.{folder}" for part in parts if part.ispkg]
+    return [name for name in names if importlib.util.find_spec(name)]

@@ -180,8 +180,8 @@ class RewardConfig(SettingsSection):
     """module:callable(config) -> RewardModel (reward/base.py) instead of the built-in one; empty: none."""
 
 
-class OtherJudge(SettingsSection):
-    """A further judge; as in JudgeConfig, whose other values it shares."""
+class StageJudge(SettingsSection):
+    """A judge of some stages of every clip; as in JudgeConfig, whose other values it shares."""
 
     kind: Literal["openai", "embedded"] = "openai"
     endpoints: list[str] = Field(default=[])
@@ -189,11 +189,6 @@ class OtherJudge(SettingsSection):
     api_key_env: str = ""
     folder: str = ""
     extra_body: dict[str, Any] = Field(default={})
-
-
-class StageJudge(OtherJudge):
-    """A judge of some stages of every clip."""
-
     stages: Annotated[list[Literal["PLAN", "VQ", "IF", "TC", "PC", "HACK"]], Field(min_length=1)]
 
 
@@ -256,10 +251,6 @@ class JudgeConfig(SettingsSection):
     routes: list[StageJudge]
     """Other judges for some stages, e.g. [{stages: [TC, PC], endpoints: [URL], model: NAME}] beside the embedded one. A
     verdict is of all of them together; where one does not answer, the clip has no reward."""
-    fallbacks: list[OtherJudge]
-    """Loop 2: other judges, in the order in which they are tried, e.g. [{kind: openai, endpoints: [URL], model: NAME}].
-    A round that the judge could not judge is judged anew by the next one, as a whole; the round after begins with the
-    first again. Empty: an outage pauses training."""
 
 
 class PolicyConfig(SettingsSection):
@@ -272,6 +263,12 @@ class PolicyConfig(SettingsSection):
     """Initial log standard deviation of the Gaussian, normalised action units."""
     positions: bool
     """Whether the policy also sees the positions that the tokenizer's probe reads off the latents, unprojected."""
+    position_center_m: tuple[float, float, float] = (0.6, 0.0, 0.15)
+    """Commanded positions (x, y, z) are shifted by it before the networks see them."""
+    position_scale_m: PositiveFloat = 0.2
+    """Commanded positions lie within about this of the centre, by which they are divided."""
+    rotation_scale_rad: PositiveFloat = 0.5
+    """Commanded angles are divided by it."""
     factory: FactoryName = ""
     """module:callable(config) -> ImagePolicy instead of the one that sees by the tokenizer; empty: none."""
 

@@ -32,13 +32,18 @@ from wm_nodes.reward.base import version_of
 
 @dataclass
 class _Episode:
-    """The collected part of an episode. fault: why it cannot be judged."""
+    """The collected part of an episode."""
 
     episode_id: int
+    """As in the messages."""
     frames: list[UInt8Array] = field(default_factory=list)
+    """uint8 (H, W, 3) each."""
     actions: list[FloatArray] = field(default_factory=list)
+    """(A,) each."""
     goal: UInt8Array | None = None
+    """The newest goal image."""
     fault: str = ""
+    """Why it cannot be judged."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +95,9 @@ def check_agent(config: RunConfig, *, trains: bool = True) -> None:
     trains: rollouts of ppo.num_steps are trained on.
 
     Raises:
-        ValueError, ConfigError: as check_judge, load_rubric, check_horizon and check_clips; fallbacks are named.
+        ValueError, ConfigError: as check_judge, load_rubric, check_horizon and check_clips.
     """
     check_judge(config.judge)
-    _refuse_fallbacks(config.judge)
     load_rubric(config.judge.rubric)
     spec = _scene(config)
     if trains:
@@ -113,15 +117,6 @@ def _scene(config: RunConfig) -> EnvironmentSpec:
 def _longest_clip(spec: EnvironmentSpec) -> tuple[int, ...]:
     """Shape of the longest episode as a clip."""
     return (spec.max_episode_steps + 1, spec.height, spec.width, spec.channels)
-
-
-def _refuse_fallbacks(settings: JudgeConfig) -> None:
-    if settings.fallbacks:
-        raise ValueError(
-            f"judge.fallbacks names {len(settings.fallbacks)}, but others stand in for whole rounds of loop 2 only; a "
-            "policy's episodes are judged one by one. Leave it empty: an outage pauses training, which then makes the "
-            "same rollout again"
-        )
 
 
 def check_horizon(num_steps: int, max_episode_steps: int) -> None:
@@ -157,13 +152,12 @@ def unjudged_reason(rollout: Rollout) -> str:
 class EpisodeReward:
     """Collects the lock-steps of one environment node into episodes and has each judged at its end.
 
-    cut: episodes that a reset ended before their last step, unjudged. Raises ValueError: the judge has fallbacks.
+    cut: episodes that a reset ended before their last step, unjudged.
     """
 
     name = AGENT
 
     def __init__(self, judge: JudgeService) -> None:
-        _refuse_fallbacks(judge.settings)
         self._judge = judge
         self.cut = 0
         self._open: dict[int, _Episode] = {}

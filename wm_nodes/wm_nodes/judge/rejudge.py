@@ -38,7 +38,7 @@ def judge_bag(path: Path, judge: JudgeService, *, namespace: str | None = None) 
     """Judge every episode that ends in a live recording. namespace: of the environment; None takes the only one.
 
     Raises:
-        BagError: an unusable bag. ValueError: the judge has fallbacks.
+        BagError: an unusable bag.
     """
     judged, model = JudgedBag(), EpisodeReward(judge)
     waiting = deque[tuple[LockStep, PendingReward]]()

@@ -12,6 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from wm_nodes.config.load import default_task
 from wm_nodes.config.tasks import task_names
 from wm_nodes.launching.graph import Graph, GraphError, NodeSpec, ParameterValue
 
@@ -43,7 +44,7 @@ class LaunchArgument:
 
 ARGUMENTS: tuple[LaunchArgument, ...] = (
     LaunchArgument("preset", "cpu", "Settings to start from, when config_file is empty: a name or a .yaml file"),
-    LaunchArgument("task", "push_cube", "Task, when config_file is empty; empty: none, the spec of the model or "
+    LaunchArgument("task", default_task(), "Task, when config_file is empty; empty: none, the spec of the model or "
                    "the environment says everything", ("", *task_names())),
     LaunchArgument("set", "", "Settings over those of the preset, when config_file is empty: section.key=value (YAML), "
                    "separated by semicolons"),

@@ -201,7 +201,7 @@ class EnvironmentNode(ManagedNode):
         except WireError as error:
             return self._refusal(response, error, "step")
         self.diagnostics.latency("step", reply.step_s)
-        return calls.fill_step_response(response, reply, self._spec, self._shown)
+        return calls.fill_response(response, reply, self._spec, self._shown)
 
     def _on_reset(self, request: ResetBatch.Request, response: ResetBatch.Response) -> ResetBatch.Response:
         try:
@@ -210,11 +210,13 @@ class EnvironmentNode(ManagedNode):
             reply = served.reset(command) if self._asynchronous is None else self._asynchronous.reset(command)
         except WireError as error:
             return self._refusal(response, error, "reset")
-        return calls.fill_reset_response(response, reply, self._spec, self._shown)
+        return calls.fill_response(response, reply, self._spec, self._shown)
 
     def _on_get_spec(self, request: GetEnvSpec.Request, response: GetEnvSpec.Response) -> GetEnvSpec.Response:
-        if not self.active:
-            return convert.fill_error(response, self._not_active())
+        try:
+            self.require_active()
+        except WireError as error:
+            return convert.fill_error(response, error)
         response.spec = convert.spec_msg(self._spec, self.get_clock().now().nanoseconds)
         response.spec.session = self.session
         return response
@@ -260,16 +262,12 @@ class EnvironmentNode(ManagedNode):
         self.served.end_episodes(EpisodeEvent.REASON_ESTOP)
 
     def _ready(self) -> LockstepEnvironment:
-        if not self.active or self.served is None:
-            raise self._not_active()
+        self.require_active()
+        assert self.served is not None  # while it is active
         return self.served
 
-    def _not_active(self) -> WireError:
-        return WireError(ErrorCode.NOT_ACTIVE, "the environment node is not active; activate it first")
-
     def _require_credit(self) -> None:
-        if not self.active:
-            raise self._not_active()
+        self.require_active()
         next_seq = self._transitions.next_seq
         blocking = self._credits.blocking_consumers(next_seq)
         if not blocking:

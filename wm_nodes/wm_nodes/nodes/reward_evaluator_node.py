@@ -72,7 +72,7 @@ class RewardEvaluatorNode(ManagedNode):
         self.listen("env/image", self._on_image)
         self.listen("env/goal", self._on_goal, while_inactive=True)
         self.listen("env/transition", self._on_transition, credit=True)
-        self.serve(EvaluateReward, "reward/evaluate", self._on_evaluate)
+        self.serve(EvaluateReward, "reward/evaluate", self._on_evaluate, counted="refused_evaluations")
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timers = (
             self.create_timer(0.1, self._on_timer, clock=steady),
@@ -207,21 +207,15 @@ class RewardEvaluatorNode(ManagedNode):
     def _on_evaluate(
         self, request: EvaluateReward.Request, response: EvaluateReward.Response
     ) -> EvaluateReward.Response:
-        try:
-            if not self.active:
-                raise WireError(ErrorCode.NOT_ACTIVE, "the reward evaluator is not active; activate it first")
-            if self._spec is None:
-                raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
-            goals = images_of(request.goal, self._spec) if len(request.goal.data) else None
-            step = replace(
-                convert.transition_of(request.transition, self._spec),
-                images=images_of(request.observation, self._spec),
-                next_images=images_of(request.next_observation, self._spec),
-                goals=None if goals is None else (goals, np.ones(len(goals), bool)),
-            )
-        except WireError as error:
-            self.count_refused("evaluation", error)
-            return convert.fill_error(response, error)
+        self.require_active()
+        if self._spec is None:
+            raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
+        goals = images_of(request.goal, self._spec) if len(request.goal.data) else None
+        step = replace(
+            convert.transition_of(request.transition, self._spec), images=images_of(request.observation, self._spec),
+            next_images=images_of(request.next_observation, self._spec),
+            goals=None if goals is None else (goals, np.ones(len(goals), bool)),
+        )
         began = time.perf_counter()
         result = self._judge(step)
         response.reward = convert.reward_msg(

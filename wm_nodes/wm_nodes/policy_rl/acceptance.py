@@ -11,7 +11,7 @@ from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.initial_policy import write_starts
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.world_model.folder import read_world_manifest
-from wm_nodes.world_model.imagined_episodes import load_start_seeds
+from wm_nodes.world_model.starts import load_start_seeds
 from wm_nodes.world_model.validation.acceptance import (
     AcceptanceReport,
     CloneRollouts,

@@ -15,15 +15,16 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from wm_nodes.config.schema import RunConfig
 from wm_nodes.config.shipped import shipped_model
+from wm_nodes.config.tasks import is_simulated
 from wm_nodes.core.cameras import CameraModel
 from wm_nodes.core.device import CPU, compute_device, explain_memory
 from wm_nodes.core.factory import load_factory
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.specs import MODEL_FIELDS, EnvironmentSpec, agree, tool_spec
 from wm_nodes.core.types import Environment, FloatArray, Observation, UInt8Array
-from wm_nodes.environments.maniskill.cameras import hand_over, table_top_cameras
+from wm_nodes.environments.cameras import simulated_cameras
 from wm_nodes.environments.registry import configured_spec, make_environment
-from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy
+from wm_nodes.policy_rl.image_policy import ImageEncoder, ImagePolicy, commanded_range
 from wm_nodes.policy_rl.ppo import PpoLearner
 from wm_nodes.policy_rl.training_run import Learner
 from wm_nodes.reward import EncoderDistance, EndogenousReward, RewardModel, RuleReward
@@ -81,9 +82,11 @@ def chosen_model(config: RunConfig, folder: str = "") -> Path | None:
 
 
 def run_spec(config: RunConfig, model_dir: Path) -> EnvironmentSpec:
-    """The environment of a run: of the configured task in its simulator, or without a task the one that the world model
-    was trained with. Raises ModelFolderError: the folder says none."""
-    return configured_spec(config) if config.task else model_spec(model_dir, read_world_manifest(model_dir))
+    """The environment of a run: of the configured task in its simulator, or where it has none the one that the world
+    model was trained with. Raises ModelFolderError: the folder says none."""
+    if is_simulated(config.task):
+        return configured_spec(config)
+    return model_spec(model_dir, read_world_manifest(model_dir))
 
 
 def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
@@ -101,10 +104,12 @@ def make_policy(config: RunConfig, model_dir: Path | None) -> ImagePolicy:
                          f"{UNTRAINED}")
     encoder = make_encoder(model_dir, config.device, positions=config.policy.positions)
     spec = run_spec(config, model_dir)
-    recorded = models_of(Path(model_dir), config.device).action.condition if spec.measured else None
+    state_range = commanded_range(spec, config.policy)
+    if spec.measured:
+        recorded = models_of(Path(model_dir), config.device).action.condition
+        state_range = recorded.state_mean.tolist(), recorded.state_scale.tolist()
     policy = ImagePolicy(
-        encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed,
-        state_range=None if recorded is None else (recorded.state_mean.tolist(), recorded.state_scale.tolist()),
+        encoder, spec.state_dim, spec.action_dim, config.policy, seed=config.seed, state_range=state_range
     )
     return policy.to(compute_device(config.device))
 
@@ -240,9 +245,9 @@ def make_device_environment(
 
 
 def _cameras(config: RunConfig, environment: ImaginedEpisodes) -> Sequence[CameraModel]:
-    if not config.task:
+    if not is_simulated(config.task):
         return ()
-    return table_top_cameras(config.simulation, lambda env: hand_over(environment.current().state[env]))
+    return simulated_cameras(config.simulation, lambda env: environment.current().state[env])
 
 
 def _imagine(

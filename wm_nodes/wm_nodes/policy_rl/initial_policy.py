@@ -13,11 +13,11 @@ from safetensors.torch import save
 
 from wm_nodes.config import seed_ranges
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import get_task, success
+from wm_nodes.config.tasks import get_task, has_rule, success
 from wm_nodes.core.files import write_atomic
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode
-from wm_nodes.environments.maniskill.collection import CollectionPlan
+from wm_nodes.environments.collection import CollectionPlan
 from wm_nodes.environments.record import collect_plan, demonstration_plan, first_frames_plan, scripted_plan
 from wm_nodes.policy_rl.behaviour_cloning import EXPERT, demonstrations, train_sft
 from wm_nodes.policy_rl.factories import STARTS, make_policy, make_reconstruct, run_spec
@@ -25,7 +25,7 @@ from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.recording import BagReport, read_episodes
 from wm_nodes.training.weights import save_weights
 from wm_nodes.world_model.folder import read_world_manifest
-from wm_nodes.world_model.imagined_episodes import INSTRUCTIONS, join_starts, pack_instructions
+from wm_nodes.world_model.starts import INSTRUCTIONS, join_starts, pack_instructions
 
 MADE_OF = "starts.json"
 MAX_STARTS, MODEL_STARTS = 512, 64
@@ -91,7 +91,7 @@ def write_round_starts(config: RunConfig, first_frames: Path, bags: Iterable[Pat
 
 def frames_before_success(episode: Episode, tasks: Sequence[str] = ()) -> int:
     """Return how many frames an episode has before it succeeds in any of the tasks or its own; at least 1."""
-    others = [success(task, episode.ground_truth) for task in tasks if task != episode.task]
+    others = [success(task, episode.ground_truth) for task in tasks if task != episode.task and has_rule(task)]
     done = np.logical_or.reduce([episode.success, *others])
     return max(1, int(done.argmax())) if done.any() else len(done)
 

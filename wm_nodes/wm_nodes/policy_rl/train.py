@@ -13,8 +13,7 @@ from wm_nodes.policy_rl import acceptance, factories
 from wm_nodes.policy_rl.device_rollout import make_collector
 from wm_nodes.policy_rl.exploit_meter import ExploitMeter
 from wm_nodes.policy_rl.image_policy import ImagePolicy
-from wm_nodes.policy_rl.rollouts import Convergence, rollout_statistics
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import Convergence, TensorRollout, rollout_statistics
 from wm_nodes.reward import RewardModel
 from wm_nodes.world_model import DeviceEnvironment
 

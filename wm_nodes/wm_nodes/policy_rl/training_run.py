@@ -25,8 +25,7 @@ from wm_nodes.core.named_files import CHECKPOINT, read_regular
 from wm_nodes.core.types import Rollout
 from wm_nodes.policy_rl.image_policy import ImagePolicy
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.rollouts import Canceled, rollout_statistics, terminate_at_episode_end
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import Canceled, TensorRollout, rollout_statistics, terminate_at_episode_end
 from wm_nodes.training.checkpoint import RESTORE, DamagedFileError
 from wm_nodes.training.ranks import Ranks, broadcast_rollout
 from wm_nodes.training.run_folder import TrainingRun, VersionFiles

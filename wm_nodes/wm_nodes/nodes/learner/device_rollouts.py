@@ -10,7 +10,7 @@ from wm_nodes.core.lockstep import DroppedTransitions
 from wm_nodes.core.types import Environment
 from wm_nodes.nodes.factories import make_reward
 from wm_nodes.policy_rl.device_rollout import DeviceCollector
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import TensorRollout
 from wm_nodes.policy_rl.training_run import PolicyTraining
 from wm_nodes.ros.clients import Check
 from wm_nodes.world_model import DeviceEnvironment, ImaginedEnvironment

@@ -15,12 +15,13 @@ import numpy as np
 from rich.table import Table
 
 from wm_nodes.config.schema import RunConfig
-from wm_nodes.config.tasks import get_task, parts_of
+from wm_nodes.config.tasks import parts_of
 from wm_nodes.core.statistics import newcombe_difference, wilson_of_share
 from wm_nodes.core.types import BoolArray
 from wm_nodes.recording.episode_arrays import EpisodeArrays
 from wm_nodes.reports.console_table import make_table
 from wm_nodes.world_model import WorldModels
+from wm_nodes.world_model.positions import judged_things
 from wm_nodes.world_model.validation.goals import goal_metrics
 from wm_nodes.world_model.validation.open_loop import MOVED_M, evaluate_rollouts
 
@@ -172,7 +173,7 @@ def apply_criteria(
     if any(name.startswith("tool_") for name in metrics):
         criteria, notes = _position_criteria(metrics, config, num_steps)
     else:
-        criteria, notes = [], ["Positions were not judged: the environment has no ground truth to compare with."]
+        criteria, notes = [], ["Positions were not judged: no ground truth names them."]
     for kind, threshold, remedy in (
         ("precision", limits.done_precision, MORE_NEAR_MISSES), ("recall", limits.done_recall, MORE_SUCCESSES),
     ):
@@ -195,12 +196,12 @@ def _position_criteria(
         f"{_at(metrics, 'object_floor_cm', num_steps):.2f} cm (object) and "
         f"{_at(metrics, 'tool_floor_cm', num_steps):.2f} cm (tool) on real frames."
     ]
-    if not get_task(task).moves_object:
+    if "object" not in judged_things(task):
         notes.append(f"The object hardly moves in {task}, so its error is not judged; the tool's is.")
     for name, key, limit in (
         ("object", "object_moved_ratio", limits.object_error_ratio), ("tool", "tool_ratio", limits.tool_error_ratio),
     ):
-        if name == "tool" or get_task(task).moves_object:
+        if name in judged_things(task):
             ratio, *ends = (_at(metrics, f"{key}{end}", num_steps) for end in ("", "_low", "_high"))
             criteria.append(_below(f"{name} error / copying, step {num_steps}", ratio, limit, _interval(*ends)))
     return criteria, notes
@@ -311,7 +312,7 @@ def _goals(found: Mapping[str, float], config: RunConfig, part: str) -> list[Cri
     outcome: Outcome = "passed" if share >= limits.done_recall else "failed"
     ends = _interval(found["goal_found_low"], found["goal_found_high"])
     criteria = [Criterion(f"{of}: found", share, limits.done_recall, ">=", outcome, BETTER_GOALS, ends)]
-    for name in ("object", "tool") if get_task(part).moves_object else ("tool",):
+    for name in sorted(judged_things(part)):
         copied = found[f"goal_{name}_copy_cm"]
         ratio = found[f"goal_{name}_cm"] / copied if copied > 0 else math.nan
         ends = _interval(found[f"goal_{name}_ratio_low"], found[f"goal_{name}_ratio_high"])
