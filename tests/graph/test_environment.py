@@ -38,11 +38,11 @@ class Client:
 
     def step(self, command: StepCommand) -> Reply:
         response = self.probe.call(StepBatch, "env/step", calls.step_request(command))
-        return calls.step_reply(response, self.spec, self.session)
+        return calls.reply_of(response, self.spec, self.session)
 
     def reset(self, **arguments: Any) -> Reply:
         request = calls.reset_request(ResetCommand(**arguments))
-        return calls.reset_reply(self.probe.call(ResetBatch, "env/reset", request), self.spec)
+        return calls.reply_of(self.probe.call(ResetBatch, "env/reset", request), self.spec)
 
 
 @pytest.fixture

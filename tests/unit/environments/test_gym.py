@@ -76,10 +76,11 @@ def test_every_task_is_registered_and_settings_are_checked() -> None:
         gymnasium.make("wm/push-v0", color=1)
 
 
+@pytest.mark.slow
 def test_naming_the_module_is_enough_to_make_one() -> None:
     code = (
         "import gymnasium; env = gymnasium.make('wm_nodes.environments.gym:wm/reach-v0'); "
         "print(env.reset(seed=1)[1]['instruction'])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=200)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "move the gripper above the blue cube\n"

@@ -117,6 +117,7 @@ def test_its_demonstrations_are_recorded_and_what_a_world_model_probes_is_found_
     np.testing.assert_array_equal(probed[:, columns_of("nudge", "object")[0]], episode.ground_truth[:, 1])
 
 
+@pytest.mark.slow
 def test_a_judge_of_its_recordings_decides_whether_it_is_done_and_refuses_what_they_never_show(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from deadlines import PATIENCE_S
 from graph.video_loop import write_contexts
 from judge_server import PickyServer
 from recording_samples import make_spec
@@ -34,8 +35,7 @@ from wm_nodes.judge.service import ClipJob, JudgeService
 from wm_nodes.launching import arguments as launch_arguments
 from wm_nodes.launching.graph import GraphError
 from wm_nodes.policy_rl.ppo import PpoLearner
-from wm_nodes.policy_rl.rollouts import terminate_at_episode_end
-from wm_nodes.policy_rl.tensor_rollout import tensors_of
+from wm_nodes.policy_rl.rollouts import tensors_of, terminate_at_episode_end
 
 JUDGE = ("--judge", "http://127.0.0.1:9/v1", "--judge-model", "judge")
 SPEC = make_spec(num_envs=2, height=8, width=8)
@@ -145,7 +145,7 @@ def step(number: int, *, ended: tuple[bool, bool] = (False, False), ids: tuple[i
 
 
 def wait_for(pending: PendingReward) -> PendingReward:
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + PATIENCE_S
     while not pending.done:
         assert time.monotonic() < deadline
         time.sleep(0.01)

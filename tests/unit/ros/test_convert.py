@@ -146,9 +146,9 @@ def test_a_reply_survives_the_wire_and_takes_a_shown_mosaic_of_its_own_stamp_onl
     if shown_stamp_ns is not None:
         images = reply.images if shown_stamp_ns == reply.stamp_ns else np.zeros_like(reply.images)
         shown = convert.mosaic_msg(images, shown_stamp_ns, spec())
-    response = calls.fill_step_response(StepBatch.Response(), reply, spec(), shown)
+    response = calls.fill_response(StepBatch.Response(), reply, spec(), shown)
     assert (response.observation is shown) == (shown_stamp_ns == reply.stamp_ns)
-    found = calls.step_reply(response, spec(), 1)
+    found = calls.reply_of(response, spec(), 1)
     for name, value in vars(reply).items():
         np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
 
@@ -167,7 +167,7 @@ def test_the_same_tests_hold_with_checked_fields() -> None:
         pytest.skip("this is the run with checked fields")
     command = [sys.executable, "-m", "pytest", "-q", "--rootdir", str(Path(__file__).parents[3]), __file__]
     done = subprocess.run(
-        command, env={**os.environ, "ROS_PYTHON_CHECK_FIELDS": "1"}, capture_output=True, text=True, timeout=120
+        command, env={**os.environ, "ROS_PYTHON_CHECK_FIELDS": "1"}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout[-2000:]
 

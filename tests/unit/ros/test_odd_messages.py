@@ -61,10 +61,10 @@ READERS: dict[type[Any], tuple[Any, Callable[[Any], object]]] = {
         calls.reset_request(ResetCommand(ONES, SEEDS)), lambda m: calls.reset_command(m, SPEC)
     ),
     StepBatch.Response: (
-        calls.fill_step_response(StepBatch.Response(), REPLY, SPEC), lambda m: calls.step_reply(m, SPEC, 1)
+        calls.fill_response(StepBatch.Response(), REPLY, SPEC), lambda m: calls.reply_of(m, SPEC, 1)
     ),
     ResetBatch.Response: (
-        calls.fill_reset_response(ResetBatch.Response(), REPLY, SPEC), lambda m: calls.reset_reply(m, SPEC)
+        calls.fill_response(ResetBatch.Response(), REPLY, SPEC), lambda m: calls.reply_of(m, SPEC)
     ),
 }
 

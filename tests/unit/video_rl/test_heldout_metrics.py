@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from wm_nodes.config.load import load_config, load_video_config
@@ -59,6 +60,7 @@ def test_every_metric_of_a_clip_is_a_number_and_the_other_reader_looks_at_the_la
     assert found["reader_success"].sum() == 2
 
 
+@pytest.mark.slow
 def test_both_models_of_a_run_are_measured_in_the_simulator_and_by_the_other_reader(tmp_path: Path) -> None:
     scene = load_config("cpu", {"task": "push_cube", "data.num_workers": 1})
     (bag,) = collect_plan(scripted_plan(scene, 3, HELDOUT), scene, tmp_path / "bags")

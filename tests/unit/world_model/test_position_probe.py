@@ -19,6 +19,7 @@ def arrays(count: int, first_seed: int = 0) -> EpisodeArrays:
     return stack_episodes([episode(first_seed + i) for i in range(count)], ("push_cube", "reach"), success)
 
 
+@pytest.mark.slow
 def test_a_trained_probe_reads_positions_of_episodes_it_has_not_seen(tmp_path: Path) -> None:
     config = load_config("base", {"tokenizer.num_iterations": 500, "tokenizer.batch_size": 32})
     probe, metrics = train_position_probe(arrays(120), config, 0, tmp_path)

@@ -4,7 +4,14 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from wm_nodes.config.sections import Fraction, NonNegativeInt, PositiveFloat, PositiveInt, SettingsSection
+from wm_nodes.config.sections import (
+    EnvironmentName,
+    Fraction,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    SettingsSection,
+)
 from wm_nodes.config.seed_ranges import EVALUATION
 
 
@@ -62,6 +69,8 @@ class ModelRefreshConfig(SettingsSection):
 
 
 class EvaluationConfig(SettingsSection):
+    environment: EnvironmentName
+    """What the policy is measured in, said as environment.factory; none: only what is imagined is measured."""
     episodes: PositiveInt
     """Per evaluation."""
     first_seed: NonNegativeInt

@@ -5,11 +5,13 @@ Loop 2's are in video.py.
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from wm_nodes.config.environments import EnvironmentConfig, GymnasiumConfig
 from wm_nodes.config.measurement import AcceptanceConfig, EvaluationConfig, ExploitMeterConfig, ModelRefreshConfig
 from wm_nodes.config.scenes import check_scenes
 from wm_nodes.config.sections import (
+    FactoryName,
     Fraction,
     NonNegativeFloat,
     NonNegativeInt,
@@ -22,7 +24,9 @@ from wm_nodes.config.tasks import check_task, instruction
 AGENT = "agent"
 """Name of the reward agent among the rewards of both loops."""
 
-TaskName = Annotated[str, AfterValidator(lambda name: name and check_task(name))]
+TaskName = Annotated[
+    str, BeforeValidator(lambda name: name or ""), AfterValidator(lambda name: name and check_task(name))
+]
 """Name of a task's file, see config/tasks.py. Empty: there is none, and `simulation` is not read; everything follows
 the spec of the environment, of its recordings or of the model that was trained on them."""
 ScenesName = Annotated[str, AfterValidator(check_scenes)]
@@ -172,6 +176,8 @@ class RewardConfig(SettingsSection):
     """The dense reward of one step is clipped to [-dense_clip, dense_clip]."""
     uncertainty_limit: NonNegativeFloat
     """An imagined step above it pays no sparse reward and truncates the episode; 0: off."""
+    factory: FactoryName = ""
+    """module:callable(config) -> RewardModel (reward/base.py) instead of the built-in one; empty: none."""
 
 
 class StageJudge(SettingsSection):
@@ -263,6 +269,13 @@ class PolicyConfig(SettingsSection):
     """Commanded positions lie within about this of the centre, by which they are divided."""
     rotation_scale_rad: PositiveFloat = 0.5
     """Commanded angles are divided by it."""
+    factory: FactoryName = ""
+    """module:callable(config) -> ImagePolicy instead of the one that sees by the tokenizer; empty: none."""
+
+
+class LearnerConfig(SettingsSection):
+    factory: FactoryName = ""
+    """module:callable(policy, config) -> Learner (policy_rl/training_run.py) instead of PPO; empty: none."""
 
 
 class SftConfig(SettingsSection):
@@ -271,6 +284,8 @@ class SftConfig(SettingsSection):
     num_iterations: PositiveInt
     batch_size: PositiveInt
     learning_rate: PositiveFloat
+    bags: list[str] = Field(default=[])
+    """Recordings whose successful episodes are the demonstrations, whoever acted; empty: MPLib plans them."""
 
 
 class PpoConfig(SettingsSection):
@@ -331,7 +346,9 @@ class RunConfig(SettingsSection):
     task: TaskName
     device: DeviceName
     """Of every model, reward and learner. Processes that collect in the simulator compute on the CPU."""
+    environment: EnvironmentConfig
     simulation: SimulationConfig
+    gymnasium: GymnasiumConfig
     data: DataConfig
     tokenizer: TokenizerConfig
     world_model: WorldModelConfig
@@ -340,6 +357,7 @@ class RunConfig(SettingsSection):
     reward: RewardConfig
     judge: JudgeConfig
     policy: PolicyConfig
+    learner: LearnerConfig
     sft: SftConfig
     ppo: PpoConfig
     exploit_meter: ExploitMeterConfig

@@ -35,7 +35,6 @@ from wm_nodes.ros.spin import run_node
 
 PARAMS = (
     Param("reward", "endogenous", "Reward model", read_only=True, choices=REWARDS),
-    Param("reward_factory", "", "module:callable(config) -> RewardModel instead of a built-in one", read_only=True),
     Param("model_dir", "", "World-model folder, for the endogenous reward's distance", read_only=True),
     Param("image_wait_s", 1.0, "A transition waits for its images and goals at most so long", "s",
           minimum=0.0, maximum=60.0),
@@ -53,16 +52,16 @@ class RewardEvaluatorNode(ManagedNode):
         self._agent: JudgeServices | None = None
 
     def configure(self) -> None:
-        config, kind, factory = self.run_config(), str(self.param("reward")), str(self.param("reward_factory"))
+        config, kind = self.run_config(), str(self.param("reward"))
         self._agent = None
         self._undecided: deque[tuple[float, LockStep, PendingReward]] = deque()
         self._model: RewardModel | EpisodeReward
-        if kind == AGENT and not factory:
+        if kind == AGENT and not config.reward.factory:
             agent = JudgeServices(self, episode_judge(config), config, lambda: bool(self._undecided))
             self._model = EpisodeReward(agent.judge)
             self._agent = agent
         else:
-            self._model = make_reward(kind, config, str(self.param("model_dir")), factory)
+            self._model = make_reward(kind, config, str(self.param("model_dir")))
         self._spec: EnvironmentSpec | None = None
         self._session = 0
         self._joiner = Joiner(with_goals=True)
@@ -73,7 +72,7 @@ class RewardEvaluatorNode(ManagedNode):
         self.listen("env/image", self._on_image)
         self.listen("env/goal", self._on_goal, while_inactive=True)
         self.listen("env/transition", self._on_transition, credit=True)
-        self.serve(EvaluateReward, "reward/evaluate", self._on_evaluate)
+        self.serve(EvaluateReward, "reward/evaluate", self._on_evaluate, counted="refused_evaluations")
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timers = (
             self.create_timer(0.1, self._on_timer, clock=steady),
@@ -208,21 +207,15 @@ class RewardEvaluatorNode(ManagedNode):
     def _on_evaluate(
         self, request: EvaluateReward.Request, response: EvaluateReward.Response
     ) -> EvaluateReward.Response:
-        try:
-            if not self.active:
-                raise WireError(ErrorCode.NOT_ACTIVE, "the reward evaluator is not active; activate it first")
-            if self._spec is None:
-                raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
-            goals = images_of(request.goal, self._spec) if len(request.goal.data) else None
-            step = replace(
-                convert.transition_of(request.transition, self._spec),
-                images=images_of(request.observation, self._spec),
-                next_images=images_of(request.next_observation, self._spec),
-                goals=None if goals is None else (goals, np.ones(len(goals), bool)),
-            )
-        except WireError as error:
-            self.count_refused("evaluation", error)
-            return convert.fill_error(response, error)
+        self.require_active()
+        if self._spec is None:
+            raise WireError(ErrorCode.NOT_ACTIVE, "no env/spec seen yet; start an environment or replay a bag")
+        goals = images_of(request.goal, self._spec) if len(request.goal.data) else None
+        step = replace(
+            convert.transition_of(request.transition, self._spec), images=images_of(request.observation, self._spec),
+            next_images=images_of(request.next_observation, self._spec),
+            goals=None if goals is None else (goals, np.ones(len(goals), bool)),
+        )
         began = time.perf_counter()
         result = self._judge(step)
         response.reward = convert.reward_msg(

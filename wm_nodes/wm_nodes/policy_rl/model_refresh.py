@@ -19,8 +19,8 @@ from wm_nodes.core.model_folder import MANIFEST
 from wm_nodes.core.statistics import bootstrap_mean, paired_difference
 from wm_nodes.environments.collection import CollectionPlan
 from wm_nodes.environments.record import collect_plan, scripted_plan
-from wm_nodes.policy_rl.factories import policy_actor
-from wm_nodes.policy_rl.initial_policy import STARTS, write_round_starts
+from wm_nodes.policy_rl.factories import STARTS, policy_actor
+from wm_nodes.policy_rl.initial_policy import write_round_starts
 from wm_nodes.policy_rl.pretraining import load_arrays
 from wm_nodes.recording import read_episodes
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes

@@ -22,8 +22,8 @@ from wm_nodes.core.seeding import initial_weights
 from wm_nodes.core.specs import EnvironmentSpec, tool_spec
 from wm_nodes.environments.collection import EXTREME, POLICY_LABEL, CollectionPlan
 from wm_nodes.environments.record import collect_plan, collect_scripted, demonstration_plan
-from wm_nodes.policy_rl.factories import policy_actor
-from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, STARTS, train_weak_policy, write_starts
+from wm_nodes.policy_rl.factories import STARTS, policy_actor
+from wm_nodes.policy_rl.initial_policy import MODEL_STARTS, train_weak_policy, write_starts
 from wm_nodes.recording import BagReport, read_episodes, read_spec
 from wm_nodes.recording.episode_arrays import EpisodeArrays, stack_episodes
 from wm_nodes.reports.summary import plain

@@ -78,9 +78,12 @@ def fill_error(response: Any, error: WireError) -> Any:
     return response
 
 
-def file_error(error: ValueError) -> WireError:
-    """What a request that names a file which is refused is answered."""
-    return WireError(ErrorCode.OUT_OF_RANGE if isinstance(error, OutsideFolders) else ErrorCode.IO_ERROR, str(error))
+def refusal_of(error: Exception, code: int = ErrorCode.IO_ERROR) -> WireError:
+    """What is answered to a request that raised: a WireError itself; else of this code, or OUT_OF_RANGE for a file
+    outside the folders."""
+    if isinstance(error, WireError):
+        return error
+    return WireError(ErrorCode.OUT_OF_RANGE if isinstance(error, OutsideFolders) else code, str(error))
 
 
 def time_msg(stamp_ns: int) -> Time:

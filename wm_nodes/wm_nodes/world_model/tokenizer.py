@@ -158,12 +158,16 @@ class Tokenizer(nn.Module):
 
         return in_parts(part, len(images), self.device)
 
+    def decode_part(self, latents_BSD: Tensor) -> Tensor:
+        """decode, all at once and in the present autocast."""
+        pixels = self.decode_pixels(latents_BSD)
+        return pixels.clamp_(0, 1).mul_(255).round_().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+
     def decode(self, latents_BSD: Tensor) -> Tensor:
         """Images uint8 (B, H, W, 3) of latents (B, S, D)."""
 
         def part(rows: slice) -> Tensor:
             with compute_context(self.device):
-                pixels = self.decode_pixels(latents_BSD[rows])
-            return pixels.clamp_(0, 1).mul_(255).round_().to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+                return self.decode_part(latents_BSD[rows])
 
         return in_parts(part, len(latents_BSD), self.device)

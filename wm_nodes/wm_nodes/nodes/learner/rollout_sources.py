@@ -18,7 +18,7 @@ from wm_nodes.core.specs import EnvironmentSpec
 from wm_nodes.core.types import Rollout
 from wm_nodes.nodes.factories import existing
 from wm_nodes.nodes.learner.rollout_assembler import RolloutAssembler
-from wm_nodes.policy_rl.tensor_rollout import TensorRollout
+from wm_nodes.policy_rl.rollouts import TensorRollout
 from wm_nodes.policy_rl.training_run import Progress
 from wm_nodes.recording import BagReport, read_rollouts, topics
 from wm_nodes.ros.clients import Check, run_goal, same_process

@@ -80,9 +80,9 @@ class AcceptanceReport:
 
     @property
     def outcome(self) -> Outcome:
-        """failed: in any criterion; else undecided: in any."""
+        """failed: in any criterion; else undecided: in any, or there is none."""
         found = {criterion.outcome for criterion in self.criteria}
-        return "failed" if "failed" in found else "undecided" if "undecided" in found else "passed"
+        return "failed" if "failed" in found else "undecided" if "undecided" in found or not found else "passed"
 
     @property
     def passed(self) -> bool:
@@ -216,19 +216,37 @@ def accept_video_model(
     return AcceptanceReport(config.task, 0, tuple(criteria), {}, told)
 
 
-def accepted_when_made(manifest: Mapping[str, Any], config: RunConfig) -> str:
-    """Say in a line what the held-out metrics in a world model's manifest mean for config.task, without a simulator."""
-    found = manifest.get("heldout", {})
-    metrics = found.get(config.task, found)
-    steps = config.simulation.max_episode_steps
-    if f"tool_ratio_h{steps:02d}" not in metrics:
-        return f"not judged: the model's manifest holds no metrics of held-out episodes of {config.task}"
-    criteria, _ = apply_criteria(metrics, config, steps, None, None)
-    left_out = "the policy in it"
+def report_when_made(
+    manifest: Mapping[str, Any], config: RunConfig, imagined: tuple[int, int] | None = None,
+    real: tuple[int, int] | None = None,
+) -> AcceptanceReport:
+    """What the held-out metrics in a world model's manifest mean for config.task, or the model's own where it is empty,
+    without a simulator; without such metrics there are no criteria of them. imagined, real: as accept_world_model."""
+    spec, held = manifest.get("spec", {}), manifest.get("heldout", {})
+    task, steps = config.task, config.simulation.max_episode_steps
+    if not task:
+        task, steps = spec["task"], spec["max_episode_steps"]
+        config = config.model_copy(update={"task": task})
+    metrics = held.get(task, held)
+    if f"tool_ratio_h{steps:02d}" not in metrics and (spec.get("ground_truth_names", True) or not metrics):
+        criteria, notes = _policy_criteria(config, imagined, real, None)
+        note = f"the model's manifest holds no metrics of held-out episodes of {task}"
+        return AcceptanceReport(task, 0, tuple(criteria), {}, (note, *notes))
+    found, told = apply_criteria(metrics, config, steps, imagined, real)
     if manifest.get("success_threshold") != config.reward.success_threshold:
-        criteria = tuple(row for row in criteria if not row.name.startswith("done"))
+        found = tuple(row for row in found if not row.name.startswith("done"))
+        at = f"reward.success_threshold {config.reward.success_threshold:g}"
+        told = (f"The done signal at {at} was not judged.", *told)
+    return AcceptanceReport(task, int(metrics.get("episodes") or 0), found, {}, told)
+
+
+def accepted_when_made(manifest: Mapping[str, Any], config: RunConfig) -> str:
+    """Say report_when_made in a line."""
+    report, left_out = report_when_made(manifest, config), "the policy in it"
+    if not report.episodes:
+        return f"not judged: {report.notes[0]}"
+    if manifest.get("success_threshold") != config.reward.success_threshold:
         left_out = f"its done signal at reward.success_threshold {config.reward.success_threshold:g} and {left_out}"
-    report = AcceptanceReport(config.task, int(metrics.get("episodes") or 0), criteria, {})
     return (f"{report.words} on {report.episodes} held-out episodes when it was made; {left_out} not judged, without a "
             "simulator")
 
