@@ -31,6 +31,7 @@ from wm_nodes.core.model_folder import files_sha256
 from wm_nodes.core.progress import tqdm
 from wm_nodes.core.statistics import paired_difference
 from wm_nodes.core.types import Environment
+from wm_nodes.environments.registry import make_environment
 from wm_nodes.policy_rl.acceptance import accept_model
 from wm_nodes.policy_rl.evaluation import EvaluationResult, evaluate
 from wm_nodes.policy_rl.exploit_meter import ExploitMeter, make_exploit_meter
@@ -175,13 +176,11 @@ def _plain_items(row: Mapping[str, Any]) -> set[tuple[str, Any]]:
 
 
 def _run(config: RunConfig, arm: str, model_dir: Path, folder: Path, identity: Mapping[str, Any]) -> None:
-    from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-
     started = time.monotonic()
     run_dir = folder / f"{config.task}_{config.seed}"
     starts, weak = prepare_start(config, run_dir, model_dir)
     policy = load_policy(config, model_dir, weak)
-    real = ManiSkillEnvironment(config.task, config.simulation, SIMULATOR_ENVS, seed=config.seed)
+    real = make_environment(config, config.evaluation.environment, num_envs=SIMULATOR_ENVS, seed=config.seed)
 
     def measure(folder: Path) -> tuple[EvaluationResult, EvaluationResult]:
         """In the simulator and in the world model of a folder."""
