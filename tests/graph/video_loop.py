@@ -156,7 +156,7 @@ class VideoLoop:
     def wait_active(self, *nodes: str) -> None:
         """Wait until the nodes are active, and none of them is lost to the learner any more."""
         for node in nodes or NAMES:
-            wait_until(f"active {node}", lambda n=node: self.probe.value(NAMES[n], "state") == "active", 60)
+            wait_until(f"active {node}", lambda n=node: self.probe.value(NAMES[n], "state") == "active")
             wait_until(f"a learner that hears {node}", lambda n=node: not self._lost(NAMES[n]))
 
     def _lost(self, name: str) -> bool:
@@ -183,8 +183,7 @@ class VideoLoop:
         return self.probe.send(client, TrainVideo.Goal(iterations=iterations, **goal), feedback)
 
     def cancel(self, handle: Any) -> TrainVideo.Result:
-        self.probe.run(handle.cancel_goal_async, 5, "cancel")
-        return self.probe.finish(handle, 5)
+        return self.probe.cancel(handle)
 
     def newest(self, result: TrainVideo.Result) -> bytes:
         """The weights file of a result's version."""

@@ -54,6 +54,7 @@ def check_numbers(found: dict[str, Any]) -> None:
                 assert row["n"] >= 1 and 0 < row["p10"] <= row["median"] <= row["p90"] < math.inf
 
 
+@pytest.mark.slow
 def test_every_point_is_in_the_file_with_its_spread_and_the_cpu_is_not_taken_for_a_gpu(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -70,6 +71,7 @@ def test_every_point_is_in_the_file_with_its_spread_and_the_cpu_is_not_taken_for
     assert "nothing was measured on a GPU" in shown and "imagined steps/s" in shown
 
 
+@pytest.mark.slow
 def test_on_a_device_all_is_measured_and_a_graph_that_cannot_be_captured_is_never_reported_as_one(
     tmp_path: Path, device: Device
 ) -> None:
@@ -116,7 +118,7 @@ def test_ctrl_c_keeps_what_was_measured(tmp_path: Path) -> None:
             process.send_signal(signal.SIGINT)
             break
     rest = process.stdout.read()
-    assert process.wait(60) == 130 and f"written to {file}" in rest
+    assert process.wait() == 130 and f"written to {file}" in rest
     found = json.loads(file.read_text())
     assert found["state"] == "interrupted" and found["agreement"][0]["terminated_equal"] == 1
     assert {left["reason"] for left in found["skipped"]} == {"interrupted"}

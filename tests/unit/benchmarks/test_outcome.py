@@ -20,6 +20,7 @@ def rows_of(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+@pytest.mark.slow
 def test_the_command_trains_measures_the_kept_weights_and_goes_on_where_its_file_stops(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

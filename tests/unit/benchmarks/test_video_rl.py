@@ -143,6 +143,7 @@ def test_a_reward_that_is_bought_with_too_much_mass_is_named_and_mass_that_becom
     assert hacked(rising(1.5, 1.3, 1.2, 1.1), "reward") == []
 
 
+@pytest.mark.slow
 def test_the_detector_names_what_a_hackable_reward_destroys_and_nothing_under_the_honest_one() -> None:
     """Temporal consistency rises because the disc fades: it obeys less and has less mass."""
     plan = DiscPlan(iterations=8, contexts=3, eval_contexts=32, eval_every=2)
@@ -159,6 +160,7 @@ def test_the_detector_names_what_a_hackable_reward_destroys_and_nothing_under_th
 # command
 
 
+@pytest.mark.slow
 def test_ablations_go_on_where_their_file_stops_and_refuse_another_plan(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,7 +21,8 @@ from wm_nodes.video_model.codec import PatchCodec
 from wm_nodes.video_model.conditions import hashed_words
 from wm_nodes.video_model.folder import load_video_folder, save_video_folder
 from wm_nodes.video_rl.reference_reward import PICTURE_SCORES, all_scores, mix_rewards, score_clips, score_pictures
-from wm_nodes.world_model.tokenizer import PROBE_NAMES
+from wm_nodes.world_model.positions import position_names
+from wm_nodes.world_model.tokenizer import NUM_POSITIONS
 
 
 def pictures(count: int, height: int = 8, width: int = 12) -> Tensor:
@@ -88,7 +89,7 @@ class TruthfulProbe:
     """Reads the positions that the test wrote into the first pixels, in cm."""
 
     def read(self, images: Tensor) -> np.ndarray:  # type: ignore[type-arg]
-        values = images[..., 0, : len(PROBE_NAMES), 0].numpy().astype(np.float32) / 100
+        values = images[..., 0, : NUM_POSITIONS, 0].numpy().astype(np.float32) / 100
         return values
 
 
@@ -98,7 +99,7 @@ def recorded(positions_cm: Tensor) -> Clips:
     frames = torch.full((N, F, 8, 8, 3), 7, dtype=torch.uint8)
     frames[:, :, 0, :P, 0] = positions_cm.to(torch.uint8)
     truth = np.zeros((N, F, len(GROUND_TRUTH_NAMES)), np.float32)
-    for index, name in enumerate(PROBE_NAMES):
+    for index, name in enumerate(position_names("push_cube")):
         truth[..., GROUND_TRUTH_NAMES.index(name.replace("object", "cube"))] = positions_cm[..., index].numpy() / 100
     return Clips(frames, torch.zeros(N, F - 1, 6), truth, ("push",) * N, "push_cube")
 

@@ -231,7 +231,7 @@ def test_damaged_weights_are_an_error_and_leave_the_episode_where_it_was() -> No
 
 def test_the_spec_says_imagined_and_names_the_model() -> None:
     env = make()
-    assert (env.spec.source, env.spec.world_model_sha256) == (SOURCE_IMAGINED, env.folder.sha256)
+    assert (env.spec.source, env.spec.world_model_sha256) == (SOURCE_IMAGINED, env.episodes.folder.sha256)
     assert env.goals() is None
 
 

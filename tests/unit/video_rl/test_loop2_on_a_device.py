@@ -101,6 +101,7 @@ def test_flow_matching_learns_the_same_weights_and_goes_on_from_a_checkpoint(dev
     check_both(device, work)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [

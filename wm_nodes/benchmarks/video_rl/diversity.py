@@ -34,7 +34,7 @@ from wm_nodes.video_rl.reference_reward import SEEN_MOTION, load_probe
 from wm_nodes.video_rl.sampling import GroupRequest, RecordedContexts
 from wm_nodes.video_rl.toy_scene import centred_pixels, draw_scenes, load_base, opacity_at
 from wm_nodes.world_model import Tokenizer, load_model_folder
-from wm_nodes.world_model.validation.open_loop import OBJECT
+from wm_nodes.world_model.positions import columns_of
 
 FEATURES = "centred pixels (each frame less its mean), no learned backbone"
 REACH = 5.0
@@ -163,7 +163,7 @@ def measure_clips(
         request = GroupRequest((index,), group_size, index, 0, sampler.shared_noise)
         buffer = source.score(request, source.sample(request))
         frames, K = source.folder.codec.decode(buffer.rollout.latents), buffer.condition.num_conditioning
-        last = source.probe.read(frames[:, -1:])[:, 0][..., OBJECT]
+        last = source.probe.read(frames[:, -1:])[:, 0][..., columns_of(source.contexts.task, "object")]
         moving = moving_part(source.contexts.frames[index]).to(frames.device)
         values = {
             "diversity": group_diversity(frames[:, K:], tokenizer),

@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--video-model", type=Path, help="folder of an embedded video model; default: the shipped toy")
     parser.add_argument("--context-bags", type=Path, nargs="+", help="bags to take first frames and actions from")
     parser.add_argument("--public", type=Path, help="folder of a public model, diffusers format (Wan, Cosmos-Predict)")
-    parser.add_argument("--prompt", default="a robot arm pushes a cube across the table", help="for a public model")
+    parser.add_argument("--prompt", default="a robot arm pushes a block across the table", help="for a public model")
     parser.add_argument("--text-only", action="store_true", help="give a public model no first frame")
     parser.add_argument("--picture", type=Path, help="first frame for a public model; default: a test card")
     parser.add_argument("--size", type=_size, default=(480, 832), metavar="HxW", help="pixels; default 480x832")

@@ -48,9 +48,9 @@ class Summary:
     """That the settings began with."""
     seed: int
     """Of every random number."""
-    real_before: SuccessRate
-    """Success in the simulator before training."""
-    real_after: SuccessRate
+    real_before: SuccessRate | None
+    """Success in evaluation.environment before training; None where that is none."""
+    real_after: SuccessRate | None
     """And after."""
     imagined_before: SuccessRate
     """Success in the world model before training."""

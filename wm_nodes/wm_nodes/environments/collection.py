@@ -20,6 +20,7 @@ from wm_nodes.core.progress import tqdm
 from wm_nodes.core.seeding import numpy_stream
 from wm_nodes.core.types import Episode, FloatArray, Observation
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
+from wm_nodes.environments.maniskill.episodes import EXTREME as EXTREME
 from wm_nodes.environments.maniskill.episodes import planned_or_scripted_episode, record_episode
 from wm_nodes.environments.maniskill.planner import DemonstrationPlanner
 
@@ -33,23 +34,26 @@ PolicyAct = Callable[[Observation, int], FloatArray]
 
 @dataclass(frozen=True)
 class CollectionPlan:
-    """What to collect.
-
-    behaviours: relative shares of the scripted behaviours; empty when a policy acts.
-    make_policy: builds the acting policy inside a worker; must be picklable (a module-level function or a partial).
-    end_on_success: False lets episodes run to the step limit, so that done heads see frames after success.
-    first_seed: episode i is reset with first_seed + i.
-    """
+    """What to collect."""
 
     task: str
+    """In whose scene."""
     simulation: SimulationConfig
+    """Of the simulator."""
     num_episodes: int
+    """In all."""
     first_seed: int
+    """Episode i is reset with first_seed + i."""
     behaviours: dict[str, float]
+    """Relative shares of the scripted behaviours; empty when a policy acts."""
     end_on_success: bool = False
+    """False lets episodes run to the step limit, so that done heads see frames after success."""
     make_policy: Callable[[], PolicyAct] | None = None
+    """Builds the acting policy inside a worker; must be picklable (a module-level function or a partial)."""
     policy_label: str = POLICY_LABEL
+    """Episode.behaviour of its episodes."""
     policy_version: int = 0
+    """Learner step of its weights."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for seeds of the evaluation."""

@@ -14,25 +14,23 @@ import torch
 from numpy.typing import NDArray
 
 from wm_nodes.config.schema import SimulationConfig
-from wm_nodes.config.tasks import success
+from wm_nodes.config.tasks import success, truth_columns
 from wm_nodes.core.types import BoolArray, FloatArray
 from wm_nodes.environments.maniskill.environment import ManiSkillEnvironment
-from wm_nodes.environments.maniskill.table_top import CUBE, TOOL
 
 
 @dataclass(frozen=True)
 class Executed:
-    """Per clip. starts: float32 (N, P), ground truth after the reset. success: bool (N,), the task is done at the end.
-    object_m: float32 (N, 3), where the object ends.
-    object_error_cm: (N,), from there to the imagined place, in the plane. tool_error_cm: (N,), mean distance of the
-    tool from the path, at its frames.
-    """
+    """What came of each clip."""
 
     starts: FloatArray
+    """(N, P), ground truth after the reset."""
     success: BoolArray
-    object_m: FloatArray
+    """(N,), the task is done at the end."""
     object_error_cm: NDArray[np.float64]
+    """(N,), from where the object ends to the imagined place, in the plane."""
     tool_error_cm: NDArray[np.float64]
+    """(N,), mean distance of the tool from the path, at its frames."""
 
 
 def execute_paths(
@@ -78,6 +76,7 @@ def _follow(
     """Return the ground truth at the frames, (N, F, P)."""
     steps = stride * (paths.shape[1] - 1)
     enough = simulation.model_copy(update={"max_episode_steps": max(steps, 1) + 1})
+    tool = truth_columns(task, "tool")
     env = ManiSkillEnvironment(task, enough, end_on_success=False, pictures=False)
     truths = np.empty((*paths.shape[:2], env.spec.ground_truth_dim), np.float32)
     for clip, path in enumerate(paths):
@@ -86,15 +85,15 @@ def _follow(
         for step in range(steps):
             frame, share = step // stride, (step % stride + 1) / stride
             target = path[frame] + share * (path[frame + 1] - path[frame])
-            action = (target - env.ground_truth[0, TOOL]) / simulation.max_action_m
+            action = (target - env.ground_truth[0, tool]) / simulation.max_action_m
             truths[clip, frame + 1] = env.step(np.clip(action, -1, 1)[None].astype(np.float32)).ground_truth[0]
     env.close()
     return truths
 
 
 def _compare(task: str, truths: FloatArray, paths: FloatArray, objects: FloatArray) -> Executed:
-    ends = truths[:, -1]
-    missed = np.linalg.norm(ends[:, CUBE][:, :2] - objects, axis=-1)
-    strayed = np.linalg.norm(truths[..., TOOL] - paths, axis=-1).mean(1)
+    ends, tool = truths[:, -1], truth_columns(task, "tool")
+    missed = np.linalg.norm(ends[:, truth_columns(task, "object")] - objects, axis=-1)
+    strayed = np.linalg.norm(truths[..., tool] - paths, axis=-1).mean(1)
     errors_cm = (100 * metres.astype(float) for metres in (missed, strayed))
-    return Executed(truths[:, 0], success(task, ends), ends[:, CUBE], *errors_cm)
+    return Executed(truths[:, 0], success(task, ends), *errors_cm)
