@@ -26,7 +26,7 @@ from wm_nodes.world_model import load_model_folder
 from wm_nodes.world_model.device_environment import DeviceEnvironment
 from wm_nodes.world_model.validation.acceptance import accept_world_model
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.slow]
 STEPS = 120
 SMALL = {
     "task": "", "tokenizer.width": 32, "tokenizer.patch_px": 8, "tokenizer.num_iterations": 60,

@@ -76,6 +76,7 @@ def test_the_control_is_trained_and_measured_in_the_simulator(work: Workplace) -
     assert trained.parent.name == "simulator" and file_sha256(trained) != file_sha256(work.start[1])
 
 
+@pytest.mark.slow
 def test_speed_and_imagined_success_are_measured_in_each_model(work: Workplace, tmp_path: Path) -> None:
     config = work.config
     models = [WORLD_MODEL, str(make_stepped_folder(tmp_path / "video_model"))]

@@ -215,6 +215,7 @@ CALLS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", CALLS)
 def test_every_file_says_how_it_was_made_and_lies_beside_its_picture(
     experiment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
